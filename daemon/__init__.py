@@ -1,0 +1,1 @@
+"""The daemon: scene, judge, publisher, service loop, command line."""

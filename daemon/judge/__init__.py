@@ -1,0 +1,1 @@
+"""The functional core: readings in, verdicts out; no socket, no file, no clock of its own."""

@@ -1,0 +1,164 @@
+"""What every driver has in common: readings, the driver interface, exceptions, counters."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntFlag
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FINGERS = ("ff", "mf", "rf", "lf", "th")
+"""Finger names in the order of the Shadow hand: first, middle, ring, little, thumb."""
+ELECTRODES = 24
+"""Electrodes of one BioTac SP (manual section 5)."""
+COUNT_MAX = 4095
+"""Largest 12-bit reading of an electrode (manual section 5.1)."""
+
+
+class ElectrodeFault(IntFlag):
+    """What is wrong with one electrode of one reading. Zero means: a fresh 12-bit count."""
+
+    NONE = 0
+    MISSING = 1
+    """No sample of this electrode arrived in this reading."""
+    NOT_A_COUNT = 2
+    """The value is not an integer in 0..4095."""
+    PARITY = 4
+    """A byte of the response word has even parity (manual figure 15)."""
+    ERROR_WORD = 8
+    """The sensor answered with an error word instead of data (manual table 8)."""
+    HELD = 16
+    """The value repeats an earlier sweep: nothing new was sampled."""
+    CUT_OFF = 32
+    """The record ends in the middle, so its values may be cut off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Annotation:
+    """What a recording says about a reading beside its counts. The judge never looks at it."""
+
+    source: Path
+    line: int
+    """Line of the file, from 1, where the reading stands."""
+    object_name: str | None = None
+    slipped: bool | None = None
+    """How the lift ended: True slip, False stable, None not recorded."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TactileReading:
+    """One sweep over all electrodes of all fingers of a hand."""
+
+    t_ns: int
+    """Monotonic time, ns, when the last byte of the reading was received."""
+    seq: int
+    """Counts up by one per reading that the sensor made; a gap is a loss."""
+    counts: NDArray[np.uint16]
+    """Shape (fingers, 24), raw counts 0..4095, meaningless where `faults` is not zero."""
+    faults: NDArray[np.uint8]
+    """Shape (fingers, 24), `ElectrodeFault` bits per electrode."""
+    annotation: Annotation | None = None
+
+    def __post_init__(self) -> None:
+        """Check the shapes: a driver that breaks them is a bug, not bad input."""
+        if self.counts.ndim != 2 or self.counts.shape[1] != ELECTRODES:
+            raise ValueError(f"counts have shape {self.counts.shape}, not (fingers, {ELECTRODES})")
+        if self.faults.shape != self.counts.shape:
+            raise ValueError(f"faults {self.faults.shape} do not fit counts {self.counts.shape}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointReading:
+    """Joint angles of a hand at one time."""
+
+    t_ns: int
+    """Monotonic time, ns, when the last byte of the reading was received."""
+    seq: int
+    names: tuple[str, ...]
+    """Joint names without hand prefix, such as `FFJ3`."""
+    position_rad: NDArray[np.float64]
+    """Shape (joints,), radians; NaN where a joint has no valid angle."""
+
+
+Reading = TactileReading | JointReading
+
+
+@dataclass(slots=True)
+class DriverCounters:
+    """Counts since `open`. A driver adds its own fields by subclassing."""
+
+    readings: int = 0
+    """Readings handed over, valid or not."""
+    faulty_readings: int = 0
+    """Of these, readings with at least one electrode fault."""
+    missed_readings: int = 0
+    """Readings that the sensor made (by its sequence) and that never arrived."""
+
+    def as_dict(self) -> dict[str, int]:
+        """All counters by name, for the status message."""
+        return dataclasses.asdict(self)
+
+
+class Driver(Protocol):
+    """A source of readings that the service loop waits on.
+
+    The loop calls `read_ready` when `fileno` is readable or when `due_ns` has passed. No method
+    blocks. `close` may be called more than once.
+    """
+
+    @property
+    def name(self) -> str:
+        """Short name for logs and status, such as `replay`."""
+
+    @property
+    def counters(self) -> DriverCounters:
+        """Counters since `open`."""
+
+    @property
+    def exhausted(self) -> bool:
+        """True when no further reading can come: a recording has ended. Never for live links."""
+
+    def open(self) -> None:
+        """Take the device. Raises `DriverError`."""
+
+    def close(self) -> None:
+        """Release everything that `open` took."""
+
+    def fileno(self) -> int | None:
+        """Descriptor to wait on, or None while there is none."""
+
+    def due_ns(self) -> int | None:
+        """Monotonic time, ns, when `read_ready` wants to be called without a byte, or None."""
+
+    def read_ready(self) -> Sequence[Reading]:
+        """Readings that are complete now, oldest first, possibly none. Raises `DriverError`."""
+
+
+class DriverError(Exception):
+    """Base of all driver failures."""
+
+
+class LinkError(DriverError):
+    """The device does not answer or went away: try again later."""
+
+
+class RecordingError(DriverError):
+    """A recording cannot be read as what it claims to be: give up."""
+
+    def __init__(
+        self, path: Path, problem: str, *, line: int | None = None, column: str | None = None
+    ) -> None:
+        place = str(path)
+        if line is not None:
+            place += f", line {line}"
+        if column is not None:
+            place += f", column {column}"
+        super().__init__(f"{place}: {problem}")
+        self.path = path
+        self.line = line
+        self.column = column

@@ -1,0 +1,1 @@
+"""Stand-ins for hardware and grasps that tests and demonstrations use, never the daemon."""

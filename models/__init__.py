@@ -1,0 +1,1 @@
+"""What the tactile image is, which networks judge it, and what they state about themselves."""

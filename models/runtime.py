@@ -1,0 +1,122 @@
+"""Loading an ONNX model and running it on one tactile image, with nothing allocated per run."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from models.contract import (
+    INPUT_NAME,
+    METADATA_KEY,
+    OUTPUT_NAME,
+    ModelContract,
+    ModelError,
+)
+from models.layout import LAYOUTS
+from models.tactile_image import Fill, Normalisation, TactileImager
+
+MAX_MODEL_BYTES = 256 * 2**20
+"""A larger file is no model of this kind: the published CNN1 has 12 MB."""
+WARM_UP_RUNS = 20
+"""Runs before the first verdict, so that lazy allocation and page faults are behind us."""
+
+
+class TactileModel:
+    """One model, loaded and warm, with its input and output bound to fixed buffers.
+
+    Write an image into `image` (shape (12, 11, fingers) for D1, float32) with `imager.build`, then
+    call `run`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent."""
+        data = _read(path)
+        self.path = path
+        self.sha256 = hashlib.sha256(data).hexdigest()
+        self._session = _session(path, data)
+        self.contract = _contract(path, self._session)
+        self.imager = _imager(path, self.contract)
+        _check_signature(path, self._session, self.imager.shape)
+        self._batch = np.zeros((1, *self.imager.shape), dtype=np.float32)
+        self.image: NDArray[np.float32] = self._batch[0]
+        self._probability = np.zeros((1, 2), dtype=np.float32)
+        self._binding = self._session.io_binding()
+        self._binding.bind_input(
+            INPUT_NAME, "cpu", 0, np.float32, self._batch.shape, self._batch.ctypes.data
+        )
+        self._binding.bind_output(
+            OUTPUT_NAME, "cpu", 0, np.float32, (1, 2), self._probability.ctypes.data
+        )
+        for _ in range(WARM_UP_RUNS):
+            self.run()
+
+    def run(self) -> tuple[float, float]:
+        """Probabilities (stable, slip) of the image in `image`. Raises `ModelError`."""
+        try:
+            self._session.run_with_iobinding(self._binding)
+        except Exception as error:  # onnxruntime's exceptions share no narrower base
+            raise ModelError(f"{self.path}: {error}") from error
+        return float(self._probability[0, 0]), float(self._probability[0, 1])
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_MODEL_BYTES:
+            raise ModelError(f"{path}: larger than {MAX_MODEL_BYTES} bytes, not a model")
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: cannot read the model: {error.strerror}") from error
+
+
+def _session(path: Path, data: bytes) -> ort.InferenceSession:
+    options = ort.SessionOptions()
+    # One thread, no spinning: a second thread gains nothing on a network this small, and spinning
+    # between readings would burn a core of the robot's PC.
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 3
+    try:
+        return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exceptions share no narrower base
+        raise ModelError(f"{path}: not a usable ONNX model: {error}") from error
+
+
+def _contract(path: Path, session: ort.InferenceSession) -> ModelContract:
+    text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+    if text is None:
+        raise ModelError(f"{path}: has no contract (no metadata entry '{METADATA_KEY}')")
+    try:
+        return ModelContract.from_json(text)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _imager(path: Path, contract: ModelContract) -> TactileImager:
+    try:
+        layout = LAYOUTS[contract.layout]
+        fill = Fill(contract.fill)
+        normalisation = Normalisation(contract.normalisation)
+    except (KeyError, ValueError) as error:
+        raise ModelError(f"{path}: asks for an image that is not known: {error}") from error
+    return TactileImager(len(contract.fingers), layout, fill, normalisation)
+
+
+def _check_signature(path: Path, session: ort.InferenceSession, shape: tuple[int, ...]) -> None:
+    inputs = {node.name: node for node in session.get_inputs()}
+    outputs = {node.name: node for node in session.get_outputs()}
+    if set(inputs) != {INPUT_NAME} or OUTPUT_NAME not in outputs:
+        raise ModelError(
+            f"{path}: has inputs {sorted(inputs)} and outputs {sorted(outputs)}, "
+            f"not {INPUT_NAME} and {OUTPUT_NAME}"
+        )
+    node = inputs[INPUT_NAME]
+    if node.type != "tensor(float)" or tuple(node.shape[1:]) != shape:
+        raise ModelError(f"{path}: takes {node.type} {node.shape}, its contract says {shape}")
+    node = outputs[OUTPUT_NAME]
+    if node.type != "tensor(float)" or tuple(node.shape[1:]) != (2,):
+        raise ModelError(f"{path}: returns {node.type} {node.shape}, not float (N, 2)")

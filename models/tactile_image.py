@@ -1,0 +1,132 @@
+"""Counts to tactile images: one definition, for training and for the daemon alike.
+
+For a fixed layout both gap fillings are linear in the counts (least contact: linear in the counts
+and their maximum), and every row of the fill matrix sums to one. So subtracting the mean commutes
+with filling, and a normalised image is one small matrix product and one division.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.layout import D1, ELECTRODES, Layout
+
+SPREAD_FLOOR_COUNTS = 1.0
+"""A finger whose standard deviation is below one count has no image: a z-score would magnify the
+quantisation of the converter. On real fingers the electrodes differ by 145 counts or more."""
+
+
+class Fill(StrEnum):
+    """What a pixel without an electrode shows (paper, section II-A)."""
+
+    LEAST_CONTACT = "least-contact"
+    """The finger's largest count: contact lowers a count."""
+    NEIGHBOUR_MEAN = "neighbour-mean"
+    """The mean of the filled 8-neighbours, in passes until no pixel is empty."""
+
+
+class Normalisation(StrEnum):
+    """Over what a finger's mean and (population) standard deviation are taken."""
+
+    FILLED_IMAGE = "filled-image"
+    """All pixels of the filled image: what the authors' notebooks do."""
+    ELECTRODES = "electrodes"
+    """The 24 electrodes: what the paper says (section II-B)."""
+
+
+def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
+    """Linear part of the filling: shape (pixels, 25), pixels in row-major order.
+
+    The filled image is `matrix @ [24 counts, their maximum]`; each row sums to one.
+    """
+    height, width = layout.shape
+    matrix = np.zeros((height, width, ELECTRODES + 1))
+    filled = np.zeros((height, width), dtype=bool)
+    for electrode, pixel in enumerate(zip(layout.rows, layout.columns, strict=True)):
+        matrix[*pixel, electrode] = 1.0
+        filled[pixel] = True
+    if fill is Fill.LEAST_CONTACT:
+        matrix[~filled, ELECTRODES] = 1.0
+    while not filled.all() and fill is Fill.NEIGHBOUR_MEAN:
+        before, known = matrix.copy(), filled.copy()
+        for row, column in np.argwhere(~known):
+            window = (slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2))
+            if known[window].any():
+                matrix[row, column] = before[window][known[window]].mean(axis=0)
+                filled[row, column] = True
+    return matrix.reshape(height * width, ELECTRODES + 1)
+
+
+class TactileImager:
+    """Builds normalised tactile images, fingers as channels, without allocating per reading.
+
+    The arithmetic is float64 on integers below 2**12, so an image differs from the exact one by
+    less than 1e-9 before it is rounded to float32.
+    """
+
+    def __init__(
+        self,
+        fingers: int,
+        layout: Layout = D1,
+        fill: Fill = Fill.NEIGHBOUR_MEAN,
+        normalisation: Normalisation = Normalisation.FILLED_IMAGE,
+    ) -> None:
+        self.shape = (*layout.shape, fingers)
+        matrix = fill_matrix(layout, fill)
+        self._needs_maximum = fill is Fill.LEAST_CONTACT
+        width = ELECTRODES + 1 if self._needs_maximum else ELECTRODES
+        matrix = matrix[:, :width]
+        if normalisation is Normalisation.FILLED_IMAGE:
+            weights = matrix.mean(axis=0)
+        else:
+            weights = np.zeros(width)
+            weights[:ELECTRODES] = 1.0 / ELECTRODES
+        # Row sums are one, so taking the weighted mean off each row centres the image.
+        self._centre = matrix - weights
+        self._spread_over_image = normalisation is Normalisation.FILLED_IMAGE
+        self._counts = np.zeros((width, fingers))
+        self._pixels = np.zeros((matrix.shape[0], fingers))
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Write the image of one reading into `out` and return each finger's spread.
+
+        `counts` has shape (fingers, 24), `out` has shape `self.shape` and is C-contiguous. The
+        result, shape (fingers,), is the standard deviation in counts; where it is below
+        `SPREAD_FLOOR_COUNTS` (or not finite) the finger's image is all zeros and must not be
+        judged.
+        """
+        if out.shape != self.shape or not out.flags.c_contiguous:
+            raise ValueError(f"out must be C-contiguous {self.shape}, is {out.shape}")
+        electrodes = self._counts[:ELECTRODES]
+        electrodes[...] = counts.T
+        if self._needs_maximum:
+            electrodes.max(axis=0, out=self._counts[ELECTRODES])
+        pixels = np.matmul(self._centre, self._counts, out=self._pixels)
+        if self._spread_over_image:
+            squares: NDArray[np.float64] = np.einsum("pf,pf->f", pixels, pixels)
+            spread = np.sqrt(squares / len(pixels))
+        else:
+            spread = electrodes.std(axis=0)
+        judgeable = spread >= SPREAD_FLOOR_COUNTS
+        scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
+        flat_out = out.reshape(pixels.shape)
+        np.multiply(pixels, scale, out=flat_out, casting="same_kind")
+        if not judgeable.all():
+            flat_out[:, ~judgeable] = 0.0
+        return spread
+
+    def build_batch(
+        self, counts: NDArray[np.generic]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Images of many readings: counts (N, fingers, 24) to (N, *shape) and spreads (N, fingers).
+
+        Runs `build` on each reading, so training sees bit for bit what the daemon sees.
+        """
+        images = np.empty((len(counts), *self.shape), dtype=np.float32)
+        spreads = np.empty((len(counts), self.shape[2]))
+        for index, reading in enumerate(counts):
+            spreads[index] = self.build(reading, images[index])
+        return images, spreads

@@ -1,0 +1,1 @@
+"""Making models: data sets, networks, recipes, evaluation, export. Needs the `train` extra."""
