@@ -123,6 +123,10 @@ class Driver(Protocol):
     def exhausted(self) -> bool:
         """True when no further reading can come: a recording has ended. Never for live links."""
 
+    @property
+    def period_ns(self) -> int | None:
+        """Nominal time between tactile readings, ns, or None while it is not known."""
+
     def open(self) -> None:
         """Take the device. Raises `DriverError`."""
 

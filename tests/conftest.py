@@ -1,0 +1,51 @@
+"""Fixtures for all tests: where the real recordings are, and that nothing is left behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def data_dir() -> Path | None:
+    """Folder of the real recordings, or None where there is none."""
+    given = os.environ.get("GRASPD_DATA")
+    candidates = [Path(given)] if given else [ROOT.parent / "shared" / "data"]
+    return next((path for path in candidates if (path / "bts3").is_dir()), None)
+
+
+@pytest.fixture(scope="session")
+def bts3_dir() -> Path:
+    """Folder with palm_down.csv, palm_side.csv and palm_45.csv of the real data set."""
+    folder = data_dir()
+    if folder is None:
+        pytest.skip("the real recordings are neither in ../shared/data nor in $GRASPD_DATA")
+    return folder / "bts3"
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_left_behind() -> Iterator[None]:
+    """Fail a test that leaves threads or descriptors behind."""
+    threads = threading.active_count()
+    descriptors = _open_descriptors()
+    yield
+    gc.collect()
+    assert threading.active_count() <= threads, "a thread was left running"
+    left = _open_descriptors() - descriptors
+    assert not left, f"descriptors were left open: {sorted(left)}"
+
+
+def _open_descriptors() -> set[str]:
+    links = set()
+    for entry in os.scandir("/proc/self/fd"):
+        try:
+            links.add(f"{entry.name} -> {os.readlink(entry.path)}")
+        except FileNotFoundError:
+            continue  # the descriptor of this very listing
+    return links

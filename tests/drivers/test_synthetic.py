@@ -1,0 +1,170 @@
+"""Synthetic grasps: reproducible, in the real range, and told apart as the real ones are."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.base import RecordingError
+from drivers.replay import DEMO_RECORDING
+from drivers.twins import synthetic
+
+RANGE_MARGIN_COUNTS = 250
+
+
+def load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Counts (grasps, 72) and labels, read without the code under test."""
+    with path.open(newline="") as file:
+        rows = list(csv.reader(file))[1:]
+    return np.array([row[2:] for row in rows], dtype=float), np.array([int(row[1]) for row in rows])
+
+
+def z_scores(counts: NDArray[np.float64]) -> NDArray[np.float64]:
+    fingers = counts.reshape(-1, 3, 24)
+    centred = fingers - fingers.mean(axis=2, keepdims=True)
+    scaled: NDArray[np.float64] = centred / fingers.std(axis=2, keepdims=True)
+    return scaled.reshape(-1, 72)
+
+
+@pytest.fixture(scope="module")
+def whole(bts3_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    down, side = load(bts3_dir / "palm_down.csv"), load(bts3_dir / "palm_side.csv")
+    return np.vstack([down[0], side[0]]), np.hstack([down[1], side[1]])
+
+
+def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
+    out = tmp_path / "demo.csv"
+    synthetic.main(["--out", str(out)])
+    assert out.read_bytes() == DEMO_RECORDING.read_bytes()
+
+
+def test_the_demo_is_small_labelled_and_called_synthetic() -> None:
+    assert DEMO_RECORDING.stat().st_size < 120_000
+    with DEMO_RECORDING.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 200
+    assert sum(row["slipped"] == "1" for row in rows) == 100
+    assert all(row["object"].startswith("synthetic") for row in rows)
+
+
+def test_the_model_is_far_smaller_than_what_it_was_fitted_to() -> None:
+    model = synthetic.read_model()
+    assert [model[label].parameters for label in (False, True)] == [2307, 2307]
+    assert synthetic.MODEL.stat().st_size < 40_000
+
+
+def test_size_and_seed_may_be_chosen(tmp_path: Path) -> None:
+    first, second = tmp_path / "1.csv", tmp_path / "2.csv"
+    synthetic.main(["--out", str(first), "--grasps", "11", "--seed", "1"])
+    synthetic.main(["--out", str(second), "--grasps", "11", "--seed", "2"])
+    counts, slipped = load(first)
+    assert counts.shape == (11, 72)
+    assert slipped.sum() == 5
+    assert not np.array_equal(counts, load(second)[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--fit", "/nowhere"], "/nowhere/palm_down.csv: no such file or directory"),
+        (["--model", "/nowhere.json"], "No such file or directory"),
+    ],
+)
+def test_a_wrong_path_is_one_line_on_stderr(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        synthetic.main([*arguments, "--out", str(tmp_path / "out.csv")])
+    assert caught.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_fit_finds_what_it_was_drawn_from(tmp_path: Path) -> None:
+    drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(5), 3000)
+    again = synthetic.fit(drawn.counts, drawn.slipped)
+    for label in (False, True):
+        real = drawn.counts[drawn.slipped == label].astype(float)
+        redrawn = synthetic.draw(again, np.random.default_rng(6), 3000)
+        same = redrawn.counts[redrawn.slipped == label].astype(float)
+        error = np.abs(same.mean(axis=0) - real.mean(axis=0))
+        # Two means of 1500 draws: 5 standard errors.
+        assert (error < 5 * real.std(axis=0) * np.sqrt(2 / 1500)).all()
+        np.testing.assert_allclose(same.std(axis=0), real.std(axis=0), rtol=0.25)
+
+
+def test_a_model_reads_back_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    synthetic.write_model(synthetic.read_model(), path)
+    assert path.read_bytes() == synthetic.MODEL.read_bytes()
+
+
+def test_too_few_grasps_are_refused() -> None:
+    counts = np.full((20, 72), 2000, dtype=np.uint16)
+    with pytest.raises(ValueError, match="too few"):
+        synthetic.fit(counts, np.arange(20) % 2 == 0)
+    with pytest.raises(ValueError, match="too few"):
+        synthetic.fit(counts[:2], np.array([True, False]))
+
+
+def test_tables_without_labels_cannot_be_fitted(tmp_path: Path) -> None:
+    drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(0), 4)
+    text = io.StringIO()
+    synthetic.write_table(drawn, text)
+    path = tmp_path / "grasps.csv"
+    path.write_text(text.getvalue().replace("slipped", "outcome"))
+    with pytest.raises(RecordingError, match="column slipped: the grasps have no labels"):
+        synthetic.read_tables([path])
+
+
+def test_the_demo_stays_in_the_real_range(
+    whole: tuple[NDArray[np.float64], NDArray[np.int64]],
+) -> None:
+    counts, _ = load(DEMO_RECORDING)
+    assert (counts >= whole[0].min(axis=0) - RANGE_MARGIN_COUNTS).all()
+    assert (counts <= whole[0].max(axis=0) + RANGE_MARGIN_COUNTS).all()
+
+
+def test_no_synthetic_grasp_is_a_real_one(
+    whole: tuple[NDArray[np.float64], NDArray[np.int64]],
+) -> None:
+    counts, _ = load(DEMO_RECORDING)
+    nearest = [np.abs(whole[0] - grasp).max(axis=1).min() for grasp in counts]
+    assert min(nearest) > 100, "counts, at the electrode that differs most"
+
+
+def test_a_classifier_of_real_grasps_judges_synthetic_ones_about_as_well_as_real_ones(
+    whole: tuple[NDArray[np.float64], NDArray[np.int64]],
+) -> None:
+    reason = "the `train` extra is not installed"
+    f1_score = pytest.importorskip("sklearn.metrics", reason=reason).f1_score
+    classifier = (
+        pytest.importorskip("sklearn.svm", reason=reason)
+        .SVC(C=5.0)
+        .fit(z_scores(whole[0]), whole[1])
+    )
+    drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(1), 4000)
+    score = f1_score(drawn.slipped, classifier.predict(z_scores(drawn.counts.astype(float))))
+    # Cross-validated on the real grasps the same classifier reaches 0.91.
+    assert 0.85 < score < 0.97
+    counts, slipped = load(DEMO_RECORDING)
+    demo_score = f1_score(slipped, classifier.predict(z_scores(counts)))
+    # The demo is 200 such draws: four standard errors of 0.017.
+    assert demo_score == pytest.approx(score, abs=0.07)
+
+
+def test_the_committed_model_is_a_fit_to_the_real_grasps(bts3_dir: Path, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    arguments = ["--fit", str(bts3_dir), "--model", str(path), "--out", str(tmp_path / "out.csv")]
+    synthetic.main(arguments)
+    for label, committed in synthetic.read_model().items():
+        fitted = synthetic.read_model(path)[label]
+        np.testing.assert_array_equal(fitted.lowest, committed.lowest)
+        for one, other in zip(fitted.components, committed.components, strict=True):
+            assert one.weight == pytest.approx(other.weight, abs=1e-3)
+            np.testing.assert_allclose(one.mean, other.mean, atol=1.0)
