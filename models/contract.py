@@ -18,6 +18,8 @@ CLASSES = ("stable", "slip")
 INPUT_NAME = "tactile_image"
 OUTPUT_NAME = "probability"
 
+Finger = Literal["ff", "mf", "rf", "lf", "th"]
+"""First, middle, ring, little finger, thumb."""
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=4095)]
 
@@ -66,7 +68,7 @@ class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fill: str
     normalisation: str
     composition: Literal["channels"]
-    fingers: tuple[str, ...]
+    fingers: tuple[Finger, ...]
     """Order of the image's channels."""
     classes: tuple[str, ...]
     seed: int

@@ -1,0 +1,1 @@
+"""The commands of `graspd`, one module each, imported only when called."""

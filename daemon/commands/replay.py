@@ -1,0 +1,176 @@
+"""`graspd replay [RECORDING...]`: judge recordings, print the verdicts and how good they were."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from daemon import assembly, scene
+from daemon.judge.verdict import Verdict
+from daemon.publisher import Publisher, PublishError
+from daemon.reporter import Reporter
+from daemon.service import Service
+from daemon.stop import StopSignal
+from daemon.summary import Summary
+from drivers.base import DriverError, TactileReading
+from drivers.replay import DEMO_RECORDING
+from models.contract import ModelError
+
+MAX_AGE_MS = 1000.0
+"""Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "recordings",
+        nargs="*",
+        type=Path,
+        metavar="RECORDING",
+        help="grasp tables or streams (CSV); without any, the synthetic demo recording",
+    )
+    parser.add_argument(
+        "--model", default=assembly.DEFAULT_MODEL, help="model of the zoo, or an .onnx file"
+    )
+    parser.add_argument(
+        "--speed",
+        type=_positive,
+        metavar="FACTOR",
+        help="pace at this factor of real time (default: as fast as possible)",
+    )
+    parser.add_argument(
+        "--rate", type=_positive, default=100.0, metavar="HZ", help="readings/s of a grasp table"
+    )
+    parser.add_argument("--loop", action="store_true", help="start again at the end, for ever")
+    parser.add_argument(
+        "--strict", action="store_true", help="stop at the first value that is not a count"
+    )
+    parser.add_argument(
+        "--publish", type=_endpoint, metavar="ENDPOINT", help="publish too, as `graspd run` does"
+    )
+    parser.add_argument(
+        "--wait",
+        type=_positive,
+        metavar="S",
+        help="with --publish: start when somebody has subscribed, fail after S seconds",
+    )
+    parser.add_argument(
+        "--json", action="store_true", help="verdict messages on stdout, summary on stderr"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay; 0 when the recordings were played to their end."""
+    try:
+        return _replay(args)
+    except (scene.SceneError, ModelError, DriverError) as error:
+        sys.stdout.flush()
+        sys.stderr.write(f"graspd: {error}\n")
+        return 2
+    except PublishError as error:
+        sys.stderr.write(f"graspd: {error}\n")
+        return 1
+
+
+def _replay(args: argparse.Namespace) -> int:
+    wanted = _scene(args)
+    model = assembly.load_model(wanted)
+    wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
+    pipeline = assembly.build_pipeline(wanted, model)
+    driver = assembly.build_driver(wanted)
+    printer = _Printer(args.json)
+    with ExitStack() as stack:
+        stop = stack.enter_context(StopSignal())
+        publisher = None
+        if args.publish:
+            publisher = stack.enter_context(Publisher(args.publish))
+        stack.callback(driver.close)
+        driver.open()
+        if publisher is not None and args.wait and not publisher.wait_for_subscriber(args.wait):
+            raise PublishError(f"nobody subscribed to {args.publish} within {args.wait:g} s")
+        service = Service(
+            driver,
+            pipeline,
+            Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
+            stop,
+            max_age_ns=wanted.max_age_ns,
+            publisher=publisher,
+            listener=printer.verdict,
+        )
+        try:
+            service.run()
+        finally:
+            printer.summary()
+    return 0 if stop.received is None else 128 + stop.received
+
+
+def _scene(args: argparse.Namespace) -> scene.Scene:
+    model = {"path": args.model} if args.model.endswith(".onnx") else {"name": args.model}
+    data = {
+        "tactile": {
+            "driver": "replay",
+            "recordings": [path.absolute() for path in args.recordings or [DEMO_RECORDING]],
+            "pace": "realtime" if args.speed else "fast",
+            "speed": args.speed or 1.0,
+            "rate_hz": args.rate,
+            "loop": args.loop,
+            "strict": args.strict,
+        },
+        "model": model,
+        "gate": {"max_age_ms": MAX_AGE_MS},
+    }
+    return scene.parse(data, Path("command line"))
+
+
+class _Printer:
+    """Writes verdicts as they come and the summary at the end."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json = as_json
+        self._summary = Summary()
+        self._start_s = time.monotonic()
+
+    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        annotation = reading.annotation if reading else None
+        self._summary.add(verdict, annotation.slipped if annotation else None)
+        if self._as_json:
+            sys.stdout.write(payload.decode() + "\n")
+            return
+        if verdict.p_slip is None:
+            line = f"{verdict.grasp:6d}  {verdict.verdict:8}{', '.join(verdict.reasons):16}"
+        else:
+            line = f"{verdict.grasp:6d}  {verdict.verdict:8}p_slip {verdict.p_slip:.3f}    "
+        line += f"{verdict.latency_us:6.0f} us"
+        if annotation is not None:
+            line += f"  {annotation.object_name or ''}"
+            if annotation.slipped is not None:
+                line += f" (was {'slip' if annotation.slipped else 'stable'})"
+        sys.stdout.write(line.rstrip() + "\n")
+
+    def summary(self) -> None:
+        wall_s = time.monotonic() - self._start_s
+        if self._as_json:
+            sys.stdout.flush()
+            sys.stderr.write(json.dumps(self._summary.as_dict(wall_s)) + "\n")
+        else:
+            sys.stdout.write("\n" + "\n".join(self._summary.lines(wall_s)) + "\n")
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not (math.isfinite(value) and value > 0):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _endpoint(text: str) -> str:
+    try:
+        scene.check_endpoint(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text}: {error}") from error
+    return text

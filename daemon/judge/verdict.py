@@ -1,0 +1,165 @@
+"""The messages on the wire, version 1: verdict and status, as JSON objects without NaN.
+
+`graspd schema` prints their JSON Schema; golden messages stand in `tests/daemon/golden/`. Fields
+are only ever added; `v` changes when a meaning does.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+
+WIRE_VERSION: Final = 1
+
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Duration = Annotated[float, msgspec.Meta(ge=0.0)]
+Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+class Outcome(StrEnum):
+    """What graspd says of a grasp."""
+
+    STABLE = "stable"
+    SLIP = "slip"
+    UNKNOWN = "unknown"
+
+
+OUTCOME_CODE: dict[Outcome, Literal[0, 1, 2]] = {
+    Outcome.UNKNOWN: 0,
+    Outcome.STABLE: 1,
+    Outcome.SLIP: 2,
+}
+"""The same as a number, because plotting tools draw numbers and skip text."""
+
+
+class Reason(StrEnum):
+    """Why a verdict is `unknown`; `ADVICE` says what the operator can do about each."""
+
+    STALE = "stale"
+    SENSOR_MISSING = "sensor-missing"
+    NOT_A_COUNT = "not-a-count"
+    CUT_OFF = "cut-off"
+    PARITY = "parity"
+    ERROR_WORD = "error-word"
+    HELD = "held"
+    FROZEN = "frozen"
+    SATURATED = "saturated"
+    FLAT = "flat"
+    NEVER_SEEN = "never-seen"
+    MODEL_MISMATCH = "model-mismatch"
+    MODEL_FAILED = "model-failed"
+
+
+ADVICE: dict[Reason, str] = {
+    Reason.STALE: "no fresh reading within the age limit: check cable, power and bus load",
+    Reason.SENSOR_MISSING: "electrodes without a sample: check the finger's plug and chip select",
+    Reason.NOT_A_COUNT: "values outside 0..4095: the recording or the sensor is broken",
+    Reason.CUT_OFF: "the recording ends in the middle of a line: copy it again",
+    Reason.PARITY: "words with bad parity: check the SPI wiring and clock",
+    Reason.ERROR_WORD: "the sensor answers with error words: check the sampling delay",
+    Reason.HELD: "values repeat an earlier sweep: wait for a fresh sweep",
+    Reason.FROZEN: "a finger repeats itself to the count: power-cycle the sensor",
+    Reason.SATURATED: "electrodes at 0 or 4095: a dead electrode or far too much force",
+    Reason.FLAT: "all electrodes of a finger read the same: the sensor is not working",
+    Reason.NEVER_SEEN: "counts outside everything the model was trained on: retrain or recalibrate",
+    Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
+    Reason.MODEL_FAILED: "the network gave no probability: check the model file",
+}
+
+
+class Verdict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=False):
+    """One judgement, on topic `verdict.<hand>`."""
+
+    v: Literal[1] = WIRE_VERSION
+    boot_id: str
+    """Identifies this start of the daemon; a new one means that `seq` and `grasp` start again."""
+    seq: Count
+    """Counts up by one per message of this topic; a gap is a loss."""
+    t: float
+    """Wall-clock seconds since 1970 at publishing, for plots and people only."""
+    t_mono_ns: Count
+    """Monotonic time, ns, when the last byte of the reading was received."""
+    grasp: Count
+    """Counts up per contact episode (with gate mode `every`: per reading), from 1."""
+    verdict: Outcome
+    verdict_code: Literal[0, 1, 2]
+    """0 unknown, 1 stable, 2 slip."""
+    p_slip: Probability | None
+    """Probability of slip; null exactly when the verdict is `unknown`."""
+    valid: bool
+    """False exactly when the verdict is `unknown`."""
+    reasons: list[Reason]
+    """Why it is `unknown`; empty otherwise."""
+    age_ms: Duration
+    """From `t_mono_ns` to publishing, ms."""
+    latency_us: Duration
+    """From the driver handing the reading over to publishing, us."""
+    model: str
+    model_sha: str
+    """First 12 hex digits of the model file's SHA-256."""
+
+
+class State(StrEnum):
+    """What the daemon is doing."""
+
+    RUNNING = "running"
+    SILENT = "silent"
+    """No reading arrives; every verdict is `unknown`."""
+    STOPPING = "stopping"
+
+
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """How the daemon is, once a second even when idle, on topic `status.<hand>`."""
+
+    v: Literal[1] = WIRE_VERSION
+    boot_id: str
+    seq: Count
+    t: float
+    t_mono_ns: Count
+    """Monotonic time, ns, of this message."""
+    state: State
+    readings_hz: Duration
+    """Tactile readings per second since the last status."""
+    verdicts: dict[Outcome, Count]
+    """Verdicts since start, by outcome."""
+    reasons: dict[Reason, Count]
+    """Reasons given since start; only those that occurred."""
+    drivers: dict[str, dict[str, Count]]
+    """Counters of each driver, by driver name."""
+    latency_us: dict[Literal["p50", "p99", "max"], Duration]
+    """Reading to publish since start; all zero before the first verdict."""
+    model: str
+    model_sha: str
+    versions: dict[str, str]
+
+
+_verdict_decoder = msgspec.json.Decoder(Verdict)
+_status_decoder = msgspec.json.Decoder(Status)
+_encoder = msgspec.json.Encoder()
+
+
+def encode(message: Verdict | Status) -> bytes:
+    """JSON payload of a message."""
+    return _encoder.encode(message)
+
+
+def decode_verdict(payload: bytes) -> Verdict:
+    """Parse and check a verdict payload. Raises `msgspec.DecodeError`."""
+    return _verdict_decoder.decode(payload)
+
+
+def decode_status(payload: bytes) -> Status:
+    """Parse and check a status payload. Raises `msgspec.DecodeError`."""
+    return _status_decoder.decode(payload)
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema (2020-12) of both messages, each under its name in `$defs`."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "graspd wire messages, version 1",
+        "anyOf": [{"$ref": "#/$defs/Verdict"}, {"$ref": "#/$defs/Status"}],
+        "$defs": msgspec.json.schema_components([Verdict, Status])[1],
+    }

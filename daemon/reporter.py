@@ -1,0 +1,119 @@
+"""Judgements to messages: numbers them, stamps them, encodes them once, hands them out."""
+
+from __future__ import annotations
+
+import platform
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Protocol
+
+from daemon.judge.pipeline import Judgement
+from daemon.judge.verdict import (
+    OUTCOME_CODE,
+    Outcome,
+    Reason,
+    State,
+    Status,
+    Verdict,
+    encode,
+)
+from daemon.latency import LatencyHistogram
+
+SHA_DIGITS = 12
+
+
+class Output(Protocol):
+    """Takes finished messages; a `Publisher` is one."""
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Pass one message on, without blocking."""
+
+
+class Reporter:
+    """Makes the verdict and status messages of one run of the daemon."""
+
+    def __init__(
+        self,
+        hand: str,
+        model: str,
+        model_sha256: str,
+        output: Output | None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        wall_clock: Callable[[], float] = time.time,
+    ) -> None:
+        """`clock` gives monotonic ns, `wall_clock` seconds since 1970."""
+        self.latency = LatencyHistogram()
+        self.outcomes: Counter[Outcome] = Counter()
+        self.reasons: Counter[Reason] = Counter()
+        self._verdict_topic = f"verdict.{hand}".encode()
+        self._status_topic = f"status.{hand}".encode()
+        self._model = model
+        self._model_sha = model_sha256[:SHA_DIGITS]
+        self._output = output
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._boot_id = uuid.uuid4().hex
+        self._verdict_seq = 0
+        self._status_seq = 0
+        self._versions = {
+            "graspd": version("graspd"),
+            "onnxruntime": version("onnxruntime"),
+            "python": platform.python_version(),
+        }
+
+    def verdict(self, judgement: Judgement, received_ns: int) -> tuple[Verdict, bytes]:
+        """Send one verdict; `received_ns` is when the driver handed the reading over."""
+        now_ns = self._clock()
+        latency_us = max(now_ns - received_ns, 0) / 1e3
+        message = Verdict(
+            boot_id=self._boot_id,
+            seq=self._verdict_seq,
+            t=self._wall_clock(),
+            t_mono_ns=judgement.t_ns,
+            grasp=judgement.grasp,
+            verdict=judgement.outcome,
+            verdict_code=OUTCOME_CODE[judgement.outcome],
+            p_slip=judgement.p_slip,
+            valid=judgement.outcome is not Outcome.UNKNOWN,
+            reasons=list(judgement.reasons),
+            age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
+            latency_us=latency_us,
+            model=self._model,
+            model_sha=self._model_sha,
+        )
+        payload = encode(message)
+        if self._output is not None:
+            self._output.send(self._verdict_topic, payload)
+        self._verdict_seq += 1
+        self.latency.add(latency_us)
+        self.outcomes[judgement.outcome] += 1
+        self.reasons.update(judgement.reasons)
+        return message, payload
+
+    def status(self, state: State, readings_hz: float, drivers: dict[str, dict[str, int]]) -> None:
+        """Send one status message."""
+        message = Status(
+            boot_id=self._boot_id,
+            seq=self._status_seq,
+            t=self._wall_clock(),
+            t_mono_ns=self._clock(),
+            state=state,
+            readings_hz=readings_hz,
+            verdicts={outcome: self.outcomes[outcome] for outcome in Outcome},
+            reasons=dict(self.reasons),
+            drivers=drivers,
+            latency_us={
+                "p50": self.latency.quantile_us(0.5),
+                "p99": self.latency.quantile_us(0.99),
+                "max": self.latency.max_us,
+            },
+            model=self._model,
+            model_sha=self._model_sha,
+            versions=self._versions,
+        )
+        self._status_seq += 1
+        if self._output is not None:
+            self._output.send(self._status_topic, encode(message))

@@ -1,0 +1,131 @@
+"""The loop: waits for the driver, judges what it brings, reports, says so when nothing comes."""
+
+from __future__ import annotations
+
+import selectors
+import time
+from collections.abc import Callable
+
+from daemon.judge.pipeline import Pipeline
+from daemon.judge.verdict import State, Verdict
+from daemon.publisher import Publisher
+from daemon.reporter import Reporter
+from daemon.stop import StopSignal
+from drivers.base import Driver, TactileReading
+
+STATUS_PERIOD_NS = 1_000_000_000
+"""Status goes out this often, ns, even when nothing happens."""
+SILENCE_PERIODS = 10
+"""Readings that may be missing before the daemon says so, as long as that is longer than the age
+limit. Consumers apply the same rule to the daemon."""
+
+Listener = Callable[[Verdict, bytes, TactileReading | None], None]
+"""Gets every verdict after it was published, with its payload and the reading it is about."""
+
+
+class Service:
+    """Runs one hand in one thread until told to stop or until a recording ends."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        pipeline: Pipeline,
+        reporter: Reporter,
+        stop: StopSignal,
+        *,
+        max_age_ns: int,
+        publisher: Publisher | None = None,
+        listener: Listener | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`driver` is open; `max_age_ns` is the age limit of a reading, ns."""
+        self._driver = driver
+        self._pipeline = pipeline
+        self._reporter = reporter
+        self._stop = stop
+        self._publisher = publisher
+        self._listener = listener
+        self._clock = clock
+        self._max_age_ns = max_age_ns
+        self._state = State.RUNNING
+        now_ns = clock()
+        self._last_t_ns = now_ns
+        self._silence_due_ns = now_ns + self._silence_ns()
+        self._status_due_ns = now_ns + STATUS_PERIOD_NS
+        self._status_at_ns = now_ns
+        self._readings_since_status = 0
+
+    def run(self) -> None:
+        """Run. Raises `DriverError` if the driver gives up; sends a last status in any case."""
+        try:
+            with selectors.SelectSelector() as selector:
+                selector.register(self._stop, selectors.EVENT_READ)
+                while self._stop.received is None and not self._driver.exhausted:
+                    self._wait(selector)
+                    if not self._take_readings():
+                        self._mind_silence()
+                    if self._clock() >= self._status_due_ns:
+                        self._send_status()
+        finally:
+            self._state = State.STOPPING
+            self._send_status()
+
+    def _wait(self, selector: selectors.BaseSelector) -> None:
+        """Sleep until the driver, a timer or a signal wants attention."""
+        descriptor = self._driver.fileno()
+        watched = {key.fd for key in selector.get_map().values()} - {self._stop.fileno()}
+        for former in watched - {descriptor}:
+            selector.unregister(former)
+        if descriptor is not None and descriptor not in watched:
+            selector.register(descriptor, selectors.EVENT_READ)
+        due_ns = min(self._silence_due_ns, self._status_due_ns)
+        driver_due_ns = self._driver.due_ns()
+        if driver_due_ns is not None:
+            due_ns = min(due_ns, driver_due_ns)
+        selector.select(max(due_ns - self._clock(), 0) / 1e9)
+
+    def _take_readings(self) -> bool:
+        """Judge and report what the driver has; False if it had no tactile reading."""
+        taken = False
+        for reading in self._driver.read_ready():
+            received_ns = self._clock()
+            if not isinstance(reading, TactileReading):
+                continue  # no part of this scene uses joint readings
+            judgement = self._pipeline.judge(reading)
+            verdict, payload = self._reporter.verdict(judgement, received_ns)
+            self._state = State.RUNNING
+            self._last_t_ns = reading.t_ns
+            self._silence_due_ns = received_ns + self._silence_ns()
+            self._readings_since_status += 1
+            taken = True
+            if self._listener is not None:
+                self._listener(verdict, payload, reading)
+        return taken
+
+    def _mind_silence(self) -> None:
+        now_ns = self._clock()
+        if now_ns < self._silence_due_ns or self._driver.exhausted:
+            return
+        self._state = State.SILENT
+        self._silence_due_ns = now_ns + self._silence_ns()
+        verdict, payload = self._reporter.verdict(self._pipeline.silence(self._last_t_ns), now_ns)
+        if self._listener is not None:
+            self._listener(verdict, payload, None)
+
+    def _silence_ns(self) -> int:
+        """How long nothing may come before it is said, ns."""
+        return max(self._max_age_ns, SILENCE_PERIODS * (self._driver.period_ns or 0))
+
+    def _send_status(self) -> None:
+        now_ns = self._clock()
+        elapsed_s = max(now_ns - self._status_at_ns, 1) / 1e9
+        self._reporter.status(
+            self._state,
+            self._readings_since_status / elapsed_s,
+            {self._driver.name: self._driver.counters.as_dict()},
+        )
+        self._readings_since_status = 0
+        self._status_at_ns = now_ns
+        self._status_due_ns = now_ns + STATUS_PERIOD_NS
+        if self._publisher is not None:
+            self._publisher.drain()

@@ -1,0 +1,85 @@
+"""What a replay has shown: counts, scores against the recorded outcomes, latencies."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from daemon.judge.verdict import Outcome, Reason, Verdict
+from daemon.latency import LatencyHistogram
+
+
+class Summary:
+    """Collects verdicts in constant memory. Slip is the positive class, as in the paper."""
+
+    def __init__(self) -> None:
+        self.outcomes: Counter[Outcome] = Counter()
+        self.reasons: Counter[Reason] = Counter()
+        self.confusion: Counter[tuple[bool, bool]] = Counter()
+        """(recorded slip, judged slip) of the judged grasps whose outcome was recorded."""
+        self.labelled = 0
+        self.latency = LatencyHistogram()
+
+    def add(self, verdict: Verdict, slipped: bool | None) -> None:
+        """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
+        self.outcomes[verdict.verdict] += 1
+        self.reasons.update(verdict.reasons)
+        self.latency.add(verdict.latency_us)
+        if slipped is not None:
+            self.labelled += 1
+            if verdict.valid:
+                self.confusion[slipped, verdict.verdict is Outcome.SLIP] += 1
+
+    def scores(self) -> dict[str, float] | None:
+        """Accuracy, precision, recall and F1 over judged, labelled grasps; None if there are none.
+
+        A score whose denominator is zero is left out.
+        """
+        hit, miss = self.confusion[True, True], self.confusion[True, False]
+        false_alarm, rest = self.confusion[False, True], self.confusion[False, False]
+        total = hit + miss + false_alarm + rest
+        if not total:
+            return None
+        fractions = {
+            "accuracy": (hit + rest, total),
+            "precision": (hit, hit + false_alarm),
+            "recall": (hit, hit + miss),
+            "f1": (2 * hit, 2 * hit + false_alarm + miss),
+        }
+        return {name: part / whole for name, (part, whole) in fractions.items() if whole}
+
+    def as_dict(self, wall_s: float) -> dict[str, Any]:
+        """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""
+        return {
+            "verdicts": {outcome.value: self.outcomes[outcome] for outcome in Outcome},
+            "reasons": {reason.value: number for reason, number in self.reasons.items()},
+            "labelled": self.labelled,
+            "judged_and_labelled": self.confusion.total(),
+            "scores": self.scores(),
+            "latency_us": {
+                "p50": self.latency.quantile_us(0.5),
+                "p99": self.latency.quantile_us(0.99),
+                "max": self.latency.max_us,
+            },
+            "wall_s": wall_s,
+        }
+
+    def lines(self, wall_s: float) -> list[str]:
+        """The same for people."""
+        total = self.outcomes.total()
+        counts = ", ".join(f"{self.outcomes[outcome]} {outcome}" for outcome in Outcome)
+        lines = [f"{total} verdicts in {wall_s:.2f} s: {counts}"]
+        if self.reasons:
+            given = ", ".join(f"{number} {reason}" for reason, number in self.reasons.most_common())
+            lines.append(f"unknown because: {given}")
+        scores = self.scores()
+        if scores is not None:
+            lines.append(
+                f"against {self.confusion.total()} recorded outcomes (slip positive): "
+                + ", ".join(f"{name} {100 * value:.1f} %" for name, value in scores.items())
+            )
+        lines.append(
+            f"reading to verdict: p50 {self.latency.quantile_us(0.5):.0f} us, "
+            f"p99 {self.latency.quantile_us(0.99):.0f} us, max {self.latency.max_us:.0f} us"
+        )
+        return lines

@@ -1,0 +1,124 @@
+"""Stand-ins for the parts around the judge, and sound readings to feed it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from daemon.judge.pipeline import Limits, Pipeline
+from drivers.base import DriverCounters, DriverError, Reading, TactileReading
+from models.contract import Dataset, Finger, MeasuredError, ModelContract, ModelError, SeenCounts
+from models.runtime import TactileModel
+from models.tactile_image import TactileImager
+
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
+MS = 1_000_000
+LOW, HIGH, MARGIN = 1000, 3000, 250
+
+
+def contract(fingers: tuple[Finger, ...] = FINGERS) -> ModelContract:
+    return ModelContract(
+        version=1,
+        name="fake",
+        layout="D1",
+        fill="neighbour-mean",
+        normalisation="filled-image",
+        composition="channels",
+        fingers=fingers,
+        classes=("stable", "slip"),
+        seed=0,
+        datasets=(Dataset("none", "0" * 64, 1),),
+        measured=MeasuredError("cv", 10, 0.9, 0.01, 0.9, 0.01),
+        seen=SeenCounts(((LOW,) * 24,) * len(fingers), ((HIGH,) * 24,) * len(fingers), MARGIN),
+    )
+
+
+class FakeModel:
+    """A model that answers what the test says."""
+
+    def __init__(self, p_slip: float | Exception = 0.1) -> None:
+        self.answer = p_slip
+        self.path = Path("fake.onnx")
+        self.sha256 = "0123456789abcdef" * 4
+        self.contract = contract()
+        self.imager = TactileImager(3)
+        self.image = np.zeros(self.imager.shape, dtype=np.float32)
+        self.runs = 0
+
+    def run(self) -> tuple[float, float]:
+        self.runs += 1
+        if isinstance(self.answer, Exception):
+            raise ModelError("broken") from self.answer
+        return 1.0 - self.answer, self.answer
+
+
+class Clock:
+    """A clock that moves only when told to."""
+
+    def __init__(self, now_ns: int = 10**12) -> None:
+        self.now_ns = now_ns
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def pipeline(
+    model: FakeModel, clock: Clock, fingers: Sequence[str] = FINGERS, **limits: float
+) -> Pipeline:
+    return Pipeline(
+        cast(TactileModel, model),
+        fingers,
+        Limits(
+            max_age_ns=int(limits.get("max_age_ns", 100 * MS)),
+            slip_threshold=limits.get("slip_threshold", 0.5),
+        ),
+        clock,
+    )
+
+
+def reading(t_ns: int, seed: int = 0, seq: int = 0) -> TactileReading:
+    """A sound reading: counts within what the fake model has seen."""
+    counts = np.random.default_rng(seed).integers(LOW, HIGH, (3, 24), dtype=np.uint16)
+    return TactileReading(t_ns, seq, counts, np.zeros((3, 24), dtype=np.uint8))
+
+
+class FakeDriver:
+    """Hands over what the test has queued, one reading per call."""
+
+    name = "fake"
+    period_ns: int | None = 10 * MS
+
+    def __init__(self, readings: Sequence[Reading | DriverError], clock: Clock) -> None:
+        self.queue = list(readings)
+        self.counters = DriverCounters()
+        self.clock = clock
+        self.ends = True
+        self.is_open = False
+
+    @property
+    def exhausted(self) -> bool:
+        return self.ends and not self.queue
+
+    def open(self) -> None:
+        self.is_open = True
+
+    def close(self) -> None:
+        self.is_open = False
+
+    def fileno(self) -> int | None:
+        return None
+
+    def due_ns(self) -> int | None:
+        return self.clock() if self.queue else None
+
+    def read_ready(self) -> Sequence[Reading]:
+        if not self.queue:
+            return []
+        item = self.queue.pop(0)
+        if isinstance(item, DriverError):
+            raise item
+        self.counters.readings += 1
+        return [item]

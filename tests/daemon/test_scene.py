@@ -1,0 +1,123 @@
+"""The scene file: what is right is taken over, what is wrong is one line that names the key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from daemon.scene import Scene, SceneError, load
+
+GOOD = """
+[tactile]
+driver = "replay"
+recordings = ["grasps.csv"]
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(text)
+    return path
+
+
+def test_the_smallest_scene_has_the_documented_defaults(tmp_path: Path) -> None:
+    scene = load(write(tmp_path, GOOD))
+    assert scene.hand.fingers == ("ff", "mf", "th")
+    assert scene.endpoint == "ipc:///run/graspd/right.ipc"
+    assert scene.max_age_ns == 100_000_000
+    assert scene.gate.mode == "every"
+
+
+def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
+    scene = load(write(tmp_path, GOOD + '[model]\npath = "mine.onnx"\n'))
+    assert scene.tactile.recordings == (tmp_path / "grasps.csv",)
+    assert scene.model.path == tmp_path / "mine.onnx"
+
+
+def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
+    scene = load(write(tmp_path, GOOD))
+    with pytest.raises(ValidationError):
+        scene.hand.name = "left"
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "says"),
+    [
+        ("", "tactile", "is missing"),
+        ("[tactile]\nrecordings = ['a']", "tactile.driver", "is missing"),
+        ("[tactile]\ndriver = 'spy'\nrecordings = ['a']", "tactile.driver", "replay"),
+        ("[tactile]\ndriver = 'replay'\nrecordings = []", "tactile.recordings", "at least 1"),
+        ("[tactile]\ndriver = 'replay'\nrecordings = 'a'", "tactile.recordings", "valid list"),
+        (GOOD + "[hnad]\nname = 'left'", "hnad", "did you mean hand?"),
+        (GOOD + "sped = 2.0", "tactile.sped", "did you mean speed?"),
+        (GOOD + "[gate]\nmax_age_s = 0.1", "gate.max_age_s", "did you mean max_age_ms?"),
+        (GOOD + "[gate]\nmax_age_ms = '100 ms'", "gate.max_age_ms", "valid number"),
+        (GOOD + "[gate]\nmax_age_ms = -1.0", "gate.max_age_ms", "greater than 0"),
+        (GOOD + "[gate]\nmax_age_ms = inf", "gate.max_age_ms", "finite"),
+        (GOOD + "speed = true", "tactile.speed", "valid number"),
+        (GOOD + "loop = 'yes'", "tactile.loop", "valid boolean"),
+        (GOOD + "[hand]\nname = 'a b'", "hand.name", "pattern"),
+        (GOOD + "[hand]\nfingers = ['ff', 'ff']", "hand.fingers", "twice"),
+        (GOOD + "[hand]\nfingers = ['thumb']", "hand.fingers.0", "'th'"),
+        (GOOD + "[model]\nname = 'cnn1'\npath = 'x.onnx'", "model", "not both"),
+        (GOOD + "[model]\nslip_threshold = 1.0", "model.slip_threshold", "less than 1"),
+        (GOOD + "[publish]\nendpoint = 'tcp://0.0.0.0:5555'", "publish.endpoint", "loopback"),
+        (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1'", "publish.endpoint", "port"),
+        (GOOD + "[publish]\nendpoint = 'tcp://robot:5'", "publish.endpoint", "IP address"),
+        (GOOD + "[publish]\nendpoint = 'udp://127.0.0.1:5'", "publish.endpoint", "ipc://"),
+        (GOOD + f"[publish]\nendpoint = 'ipc://{'x' * 108}'", "publish.endpoint", "107 bytes"),
+        (GOOD + "[tactile.faults]\nslow_every = 0", "tactile.faults.slow_every", "greater"),
+        (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, which the hand lacks"),
+        (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
+    ],
+)
+def test_a_mistake_is_one_line_naming_file_and_key(
+    tmp_path: Path, text: str, key: str, says: str
+) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(SceneError) as error:
+        load(path)
+    message = str(error.value)
+    assert message.startswith(f"{path}: {key}: ")
+    assert says in message
+    assert "\n" not in message
+
+
+def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:
+    with pytest.raises(SceneError) as error:
+        load(write(tmp_path, GOOD + "sped = 1\n[gate]\nmode = 'never'"))
+    assert len(str(error.value).splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"[tactile\n", "not TOML"),
+        (b"a = 1\na = 2\n", "not TOML"),
+        (b"\xff\xfe\x00", "not a text file"),
+    ],
+)
+def test_what_is_not_toml_is_said_in_one_line(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_bytes(content)
+    with pytest.raises(SceneError, match=says) as error:
+        load(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_said_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"absent\.toml: cannot read the scene: No such file"):
+        load(tmp_path / "absent.toml")
+
+
+def test_every_section_of_the_scene_forbids_unknown_keys() -> None:
+    sections = [Scene]
+    for section in sections:
+        assert section.model_config["extra"] == "forbid"
+        assert section.model_config["frozen"] is True
+        for field in section.model_fields.values():
+            if isinstance(field.annotation, type) and hasattr(field.annotation, "model_fields"):
+                sections += [field.annotation]
+    assert len(sections) >= 6

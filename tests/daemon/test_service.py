@@ -1,0 +1,209 @@
+"""The loop: every reading is answered, silence is answered too, and stopping is clean."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from daemon.judge.verdict import Outcome, Reason, State, Status, Verdict, decode_status
+from daemon.reporter import Reporter
+from daemon.service import Service
+from daemon.stop import StopSignal
+from drivers.base import DriverError, JointReading, LinkError, TactileReading
+from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, pipeline, reading
+
+
+class TestOutput:
+    """Keeps what was sent."""
+
+    __test__ = False
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bytes, bytes]] = []
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        self.sent.append((topic, payload))
+
+    def statuses(self) -> list[Status]:
+        return [decode_status(payload) for topic, payload in self.sent if topic == b"status.right"]
+
+
+@pytest.fixture
+def stop() -> Iterator[StopSignal]:
+    with StopSignal() as stop:
+        yield stop
+
+
+class Bench:
+    """A service with everything around it replaced, and what came out of it."""
+
+    def __init__(self, driver: FakeDriver, clock: Clock, stop: StopSignal) -> None:
+        self.output = TestOutput()
+        self.verdicts: list[Verdict] = []
+        self.payloads: list[bytes] = []
+        self.clock = clock
+        reporter = Reporter("right", "fake", "ab" * 32, self.output, clock, lambda: 1.79e9)
+        self.service = Service(
+            driver,
+            pipeline(FakeModel(), clock),
+            reporter,
+            stop,
+            max_age_ns=100 * MS,
+            listener=self._listen,
+            clock=clock,
+        )
+
+    def _listen(self, verdict: Verdict, payload: bytes, _reading: TactileReading | None) -> None:
+        self.verdicts.append(verdict)
+        self.payloads.append(payload)
+
+
+def test_every_reading_gets_one_verdict_in_order(stop: StopSignal) -> None:
+    clock = Clock()
+    bench = Bench(FakeDriver([reading(clock(), seed) for seed in range(20)], clock), clock, stop)
+    bench.service.run()
+    assert [verdict.seq for verdict in bench.verdicts] == list(range(20))
+    assert [verdict.grasp for verdict in bench.verdicts] == list(range(1, 21))
+    assert {verdict.verdict for verdict in bench.verdicts} == {Outcome.STABLE}
+    assert len({verdict.boot_id for verdict in bench.verdicts}) == 1
+    sent = [payload for topic, payload in bench.output.sent if topic == b"verdict.right"]
+    assert sent == bench.payloads
+
+
+def test_joint_readings_are_no_verdicts(stop: StopSignal) -> None:
+    clock = Clock()
+    joints = JointReading(clock(), 0, ("FFJ3",), np.array([0.5]))
+    bench = Bench(FakeDriver([joints, reading(clock())], clock), clock, stop)
+    bench.service.run()
+    assert len(bench.verdicts) == 1
+
+
+def test_the_last_message_is_a_status_that_says_stopping(stop: StopSignal) -> None:
+    clock = Clock()
+    bench = Bench(FakeDriver([reading(clock())], clock), clock, stop)
+    bench.service.run()
+    status = bench.output.statuses()[-1]
+    assert bench.output.sent[-1][0] == b"status.right"
+    assert status.state is State.STOPPING
+    assert status.verdicts == {Outcome.STABLE: 1, Outcome.SLIP: 0, Outcome.UNKNOWN: 0}
+    assert status.drivers["fake"]["readings"] == 1
+
+
+class ScriptedDriver(FakeDriver):
+    """Moves the clock at every look, and delivers at set times only."""
+
+    def __init__(self, times_ms: list[int], clock: Clock, end_ms: int) -> None:
+        super().__init__([], clock)
+        self.start_ns = clock()
+        self.times_ns = [self.start_ns + time * MS for time in times_ms]
+        self.end_ns = self.start_ns + end_ms * MS
+
+    @property
+    def exhausted(self) -> bool:
+        return self.clock() >= self.end_ns
+
+    def due_ns(self) -> int | None:
+        return self.clock()
+
+    def read_ready(self) -> list[TactileReading]:
+        self.clock.now_ns += MS
+        if self.times_ns and self.clock() >= self.times_ns[0]:
+            del self.times_ns[0]
+            return [reading(self.clock(), self.clock() // MS % 1000)]
+        return []
+
+
+def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading(
+    stop: StopSignal,
+) -> None:
+    clock = Clock()
+    start_ns = clock()
+    bench = Bench(ScriptedDriver([10, 400], clock, 450), clock, stop)
+    bench.service.run()
+    said = [(round((v.t_mono_ns - start_ns) / MS), v.verdict, v.reasons) for v in bench.verdicts]
+    assert said == [
+        (10, Outcome.STABLE, []),
+        (10, Outcome.UNKNOWN, [Reason.STALE]),
+        (10, Outcome.UNKNOWN, [Reason.STALE]),
+        (10, Outcome.UNKNOWN, [Reason.STALE]),
+        (400, Outcome.STABLE, []),
+    ]
+    assert [round(verdict.age_ms) for verdict in bench.verdicts] == [0, 100, 200, 300, 0]
+
+
+def test_a_sensor_that_never_speaks_is_unknown(stop: StopSignal) -> None:
+    clock = Clock()
+    bench = Bench(ScriptedDriver([], clock, 250), clock, stop)
+    bench.service.run()
+    assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN] * 2
+
+
+def test_status_comes_every_second_even_when_idle(stop: StopSignal) -> None:
+    clock = Clock()
+    bench = Bench(ScriptedDriver([], clock, 3500), clock, stop)
+    bench.service.run()
+    statuses = bench.output.statuses()
+    assert [status.seq for status in statuses] == [0, 1, 2, 3]
+    assert [status.state for status in statuses[:3]] == [State.SILENT] * 3
+    assert statuses[0].readings_hz == 0.0
+
+
+def test_status_tells_the_rate(stop: StopSignal) -> None:
+    clock = Clock()
+    bench = Bench(ScriptedDriver(list(range(10, 2010, 10)), clock, 2100), clock, stop)
+    bench.service.run()
+    assert [round(status.readings_hz) for status in bench.output.statuses()[:2]] == [100, 100]
+
+
+@pytest.mark.parametrize("error", [LinkError("gone"), DriverError("broken")])
+def test_a_driver_that_gives_up_ends_the_loop_with_a_last_status(
+    stop: StopSignal, error: DriverError
+) -> None:
+    clock = Clock()
+    bench = Bench(FakeDriver([reading(clock()), error], clock), clock, stop)
+    with pytest.raises(DriverError):
+        bench.service.run()
+    assert bench.output.statuses()[-1].state is State.STOPPING
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_an_idle_loop(number: signal.Signals) -> None:
+    before = signal.getsignal(number)
+    with StopSignal() as stop:
+        clock = Clock()
+        driver = FakeDriver([], clock)
+        driver.ends = False
+        bench = Bench(driver, clock, stop)
+        timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
+        timer.start()
+        bench.service.run()
+        timer.join()
+        assert stop.received is number
+    assert signal.getsignal(number) is before
+
+
+def test_a_driver_with_a_descriptor_is_read_when_bytes_are_there(stop: StopSignal) -> None:
+    clock = Clock()
+    read, write = os.pipe()
+
+    class PipeDriver(FakeDriver):
+        def fileno(self) -> int | None:
+            return read if self.queue else None
+
+        def due_ns(self) -> int | None:
+            return None
+
+        def read_ready(self) -> list[TactileReading]:
+            return [self.queue.pop(0)] if os.read(read, 1) else []  # type: ignore[list-item]
+
+    bench = Bench(PipeDriver([reading(clock(), 1), reading(clock(), 2)], clock), clock, stop)
+    os.write(write, b"12")
+    bench.service.run()
+    os.close(read)
+    os.close(write)
+    assert len(bench.verdicts) == 2

@@ -1,0 +1,157 @@
+"""The wire: golden messages, the exported schema, and what a plotting tool can take."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import msgspec
+import pytest
+
+from daemon.commands.schema import schema_text
+from daemon.judge.verdict import (
+    Outcome,
+    Reason,
+    State,
+    Status,
+    Verdict,
+    decode_status,
+    decode_verdict,
+    encode,
+    schema,
+)
+
+GOLDEN = Path(__file__).parent / "golden"
+SCHEMA_FILE = Path(__file__).parents[2] / "deploy" / "wire" / "messages.schema.json"
+
+BOOT = "0f0e0d0c0b0a09080706050403020100"
+MESSAGES: dict[str, Verdict | Status] = {
+    "verdict_stable": Verdict(
+        boot_id=BOOT,
+        seq=41,
+        t=1790000000.25,
+        t_mono_ns=123456789012345,
+        grasp=42,
+        verdict=Outcome.STABLE,
+        verdict_code=1,
+        p_slip=0.03125,
+        valid=True,
+        reasons=[],
+        age_ms=0.25,
+        latency_us=250.0,
+        model="cnn1",
+        model_sha="0123456789ab",
+    ),
+    "verdict_slip": Verdict(
+        boot_id=BOOT,
+        seq=42,
+        t=1790000000.5,
+        t_mono_ns=123456799012345,
+        grasp=43,
+        verdict=Outcome.SLIP,
+        verdict_code=2,
+        p_slip=0.96875,
+        valid=True,
+        reasons=[],
+        age_ms=0.5,
+        latency_us=500.0,
+        model="cnn1",
+        model_sha="0123456789ab",
+    ),
+    "verdict_unknown": Verdict(
+        boot_id=BOOT,
+        seq=43,
+        t=1790000000.75,
+        t_mono_ns=123456809012345,
+        grasp=44,
+        verdict=Outcome.UNKNOWN,
+        verdict_code=0,
+        p_slip=None,
+        valid=False,
+        reasons=[Reason.PARITY, Reason.STALE],
+        age_ms=150.5,
+        latency_us=75.0,
+        model="cnn1",
+        model_sha="0123456789ab",
+    ),
+    "status": Status(
+        boot_id=BOOT,
+        seq=7,
+        t=1790000001.0,
+        t_mono_ns=123456909012345,
+        state=State.RUNNING,
+        readings_hz=100.0,
+        verdicts={Outcome.STABLE: 1, Outcome.SLIP: 1, Outcome.UNKNOWN: 1},
+        reasons={Reason.PARITY: 1, Reason.STALE: 1},
+        drivers={"replay": {"readings": 3, "faulty_readings": 1, "missed_readings": 0}},
+        latency_us={"p50": 250.0, "p99": 500.0, "max": 500.0},
+        model="cnn1",
+        model_sha="0123456789ab",
+        versions={"graspd": "0.1.0", "onnxruntime": "1.31.1", "python": "3.11.7"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_golden_messages_are_written_and_read_as_committed(name: str) -> None:
+    payload = (GOLDEN / f"{name}.json").read_bytes().rstrip(b"\n")
+    message = MESSAGES[name]
+    assert encode(message) == payload
+    decode = decode_verdict if isinstance(message, Verdict) else decode_status
+    assert decode(payload) == message
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_golden_messages_fit_the_exported_schema(name: str) -> None:
+    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA_FILE.read_text()))
+    validator.validate(json.loads((GOLDEN / f"{name}.json").read_text()))
+
+
+def test_the_committed_schema_is_the_one_of_the_code() -> None:
+    assert SCHEMA_FILE.read_text() == schema_text()
+    jsonschema.Draft202012Validator.check_schema(schema())
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_a_message_is_one_object_without_nan(name: str) -> None:
+    def refuse(text: str) -> Any:  # noqa: ANN401 - the json module's own signature
+        raise AssertionError(f"{text} on the wire")
+
+    content = json.loads((GOLDEN / f"{name}.json").read_text(), parse_constant=refuse)
+    assert isinstance(content, dict)
+    assert content["v"] == 1
+
+
+def test_a_probability_that_is_not_a_number_never_reaches_the_wire_as_one() -> None:
+    broken = msgspec.structs.replace(MESSAGES["verdict_unknown"], p_slip=math.nan)
+    assert json.loads(encode(broken))["p_slip"] is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"v": 2},
+        {"verdict": "maybe"},
+        {"p_slip": 1.5},
+        {"seq": -1},
+        {"seq": "1"},
+        {"reasons": ["because"]},
+        {"verdict_code": 3},
+    ],
+)
+def test_a_message_that_breaks_the_schema_is_refused_by_both(change: dict[str, Any]) -> None:
+    content = json.loads((GOLDEN / "verdict_stable.json").read_text()) | change
+    with pytest.raises(msgspec.ValidationError):
+        decode_verdict(json.dumps(content).encode())
+    validator = jsonschema.Draft202012Validator(
+        json.loads(SCHEMA_FILE.read_text()) | {"anyOf": [{"$ref": "#/$defs/Verdict"}]}
+    )
+    assert not validator.is_valid(content)
+
+
+def test_a_reader_of_version_1_skips_fields_added_later() -> None:
+    content = json.loads((GOLDEN / "verdict_stable.json").read_text()) | {"new_field": 1}
+    assert decode_verdict(json.dumps(content).encode()) == MESSAGES["verdict_stable"]
