@@ -1,0 +1,168 @@
+"""Grasp tables (BTS3) into arrays: one row per grasp, read before the lift, labelled by the lift.
+
+Columns: `object`, `slipped` (0 or 1) and 24 raw counts per finger, `ff_biotac_1` to `th_biotac_24`.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bts3 import FINGERS, NEW_SESSION, TABLES, WHOLE
+from models.contract import Dataset
+from models.layout import ELECTRODES
+
+COUNT_MAX = 4095
+"""Largest 12-bit count."""
+MAX_TABLE_BYTES = 64 * 2**20
+"""A larger file is no table of this kind: 2133 grasps take 0.8 MB."""
+COUNT_COLUMNS = tuple(
+    f"{finger}_biotac_{electrode}" for finger in FINGERS for electrode in range(1, ELECTRODES + 1)
+)
+
+
+class DatasetError(Exception):
+    """A grasp table is missing or is not what it claims to be. Give up until it is fixed."""
+
+    def __init__(
+        self, path: Path, problem: str, *, line: int | None = None, column: str | None = None
+    ) -> None:
+        place = str(path)
+        if line is not None:
+            place += f", line {line}"
+        if column is not None:
+            place += f", column {column}"
+        super().__init__(f"{place}: {problem}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grasps:
+    """Labelled grasps and the files they come from."""
+
+    counts: NDArray[np.uint16]
+    """Shape (N, 3, 24), raw counts 0..4095, fingers in the order ff, mf, th."""
+    slipped: NDArray[np.bool_]
+    """Shape (N,): True where the object slipped in the lift."""
+    objects: tuple[str, ...]
+    """Object name of each grasp."""
+    files: tuple[Dataset, ...]
+    """Name, digest and rows of each file, in the order of the grasps."""
+
+    def __len__(self) -> int:
+        return len(self.slipped)
+
+
+def read_table(path: Path) -> Grasps:
+    """Read one grasp table. Raises `DatasetError` with file, line and column."""
+    data = _read(path)
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise DatasetError(path, "is not text") from error
+    rows = csv.reader(io.StringIO(text, newline=""), strict=True)
+    counts: list[list[int]] = []
+    slipped: list[bool] = []
+    objects: list[str] = []
+    try:
+        table = _Table(path, next(rows, []))
+        for row in rows:
+            name, slip, values = table.parse(row, rows.line_num)
+            objects.append(name)
+            slipped.append(slip)
+            counts.append(values)
+    except csv.Error as error:
+        raise DatasetError(path, f"is not a table: {error}", line=rows.line_num) from error
+    if not counts:
+        raise DatasetError(path, "has no grasps")
+    return Grasps(
+        np.array(counts, dtype=np.uint16).reshape(-1, len(FINGERS), ELECTRODES),
+        np.array(slipped, dtype=np.bool_),
+        tuple(objects),
+        (Dataset(path.stem, hashlib.sha256(data).hexdigest(), len(counts)),),
+    )
+
+
+def read_whole(folder: Path) -> Grasps:
+    """The data of the paper, *Whole*: palm_down.csv, then palm_side.csv. Raises `DatasetError`."""
+    if not folder.is_dir():
+        raise DatasetError(folder, "no such folder")
+    return concatenate([read_table(folder / f"{name}.csv") for name in WHOLE])
+
+
+def read_new_session(folder: Path) -> Grasps | None:
+    """The later session, palm_45.csv; None if the folder lacks it. Raises `DatasetError`."""
+    path = folder / f"{NEW_SESSION}.csv"
+    return read_table(path) if path.exists() else None
+
+
+def concatenate(parts: Sequence[Grasps]) -> Grasps:
+    """The grasps of several tables, one after the other."""
+    return Grasps(
+        np.concatenate([part.counts for part in parts]),
+        np.concatenate([part.slipped for part in parts]),
+        tuple(name for part in parts for name in part.objects),
+        tuple(file for part in parts for file in part.files),
+    )
+
+
+def unpublished(files: Sequence[Dataset]) -> list[str]:
+    """Names of the files that are not, byte for byte, a published table."""
+    published = {(table.name, table.sha256) for table in TABLES}
+    return [file.name for file in files if (file.name, file.sha256) not in published]
+
+
+class _Table:
+    """Where the columns of one table stand, and how its rows are read."""
+
+    def __init__(self, path: Path, header: list[str]) -> None:
+        self._path = path
+        self._header = header
+        for name in ("object", "slipped", *COUNT_COLUMNS):
+            if header.count(name) != 1:
+                found = "missing" if name not in header else "there more than once"
+                raise DatasetError(path, f"column is {found}", line=1, column=name)
+        self._object = header.index("object")
+        self._slipped = header.index("slipped")
+        self._counts = [header.index(name) for name in COUNT_COLUMNS]
+
+    def parse(self, row: list[str], line: int) -> tuple[str, bool, list[int]]:
+        if len(row) != len(self._header):
+            raise DatasetError(
+                self._path, f"has {len(row)} values, not {len(self._header)}", line=line
+            )
+        name = row[self._object]
+        if not name:
+            raise DatasetError(self._path, "object has no name", line=line, column="object")
+        if row[self._slipped] not in ("0", "1"):
+            raise DatasetError(
+                self._path, f"{row[self._slipped]!r} is not 0 or 1", line=line, column="slipped"
+            )
+        counts = [self._count(row[column], line, column) for column in self._counts]
+        return name, row[self._slipped] == "1", counts
+
+    def _count(self, text: str, line: int, column: int) -> int:
+        # No count has more than four digits; int() alone would also take "1_0" or " 7".
+        if text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= COUNT_MAX:
+            return int(text)
+        raise DatasetError(
+            self._path,
+            f"{text[:20]!r} is not a count (0..{COUNT_MAX})",
+            line=line,
+            column=self._header[column],
+        )
+
+
+def _read(path: Path) -> bytes:
+    try:
+        if path.stat().st_size > MAX_TABLE_BYTES:
+            raise DatasetError(path, f"larger than {MAX_TABLE_BYTES} bytes, not a grasp table")
+        return path.read_bytes()
+    except OSError as error:
+        raise DatasetError(path, f"cannot read: {error.strerror}") from error

@@ -1,0 +1,162 @@
+"""The committed models: they run, they say what they are, and they judge as their weights say."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from numpy.typing import NDArray
+
+from models import zoo
+from models.contract import ModelError
+from models.runtime import TactileModel
+from models.tactile_image import TactileImager
+from models.training.datasets import Grasps, read_whole
+
+CARD: dict[str, Any] = json.loads((zoo.ZOO / "cnn1.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def whole(bts3_dir: Path) -> Grasps:
+    return read_whole(bts3_dir)
+
+
+@pytest.fixture(scope="module")
+def images(whole: Grasps) -> NDArray[np.float32]:
+    return TactileImager(3).build_batch(whole.counts)[0]
+
+
+@pytest.fixture(scope="module")
+def probability(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    session = ort.InferenceSession(zoo.find("cnn1"), providers=["CPUExecutionProvider"])
+    (result,) = session.run(["probability"], {"tactile_image": images})
+    return np.asarray(result)
+
+
+def plain_forward(path: Path, images: NDArray[np.float32]) -> NDArray[np.float64]:
+    """CNN1 by its definition in float64, from nothing of the file but its six weight arrays."""
+    onnx = pytest.importorskip("onnx", reason="the train extra is not installed")
+    arrays = [onnx.numpy_helper.to_array(item) for item in onnx.load(path).graph.initializer]
+    weights = {item.shape: item.astype(np.float64) for item in arrays if item.dtype == np.float32}
+    assert set(weights) == {(32, 3, 3, 3), (32,), (1024, 2880), (1024,), (2, 1024), (2,)}
+    probability = np.empty((len(images), 2))
+    for index, image in enumerate(images.astype(np.float64)):
+        features = np.zeros((32, 10, 9))
+        for row in range(3):
+            for column in range(3):
+                window = image[row : row + 10, column : column + 9]
+                kernel = weights[32, 3, 3, 3][:, :, row, column]
+                features += np.einsum("oc,hwc->ohw", kernel, window)
+        features = np.maximum(features + weights[32,][:, None, None], 0.0)
+        hidden = np.maximum(weights[1024, 2880] @ features.ravel() + weights[1024,], 0.0)
+        stable, slip = weights[2, 1024] @ hidden + weights[2,]
+        probability[index, 1] = 1.0 / (1.0 + np.exp(stable - slip))
+        probability[index, 0] = 1.0 / (1.0 + np.exp(slip - stable))
+    return probability
+
+
+def test_cnn1_judges_every_real_grasp_as_its_weights_say(
+    images: NDArray[np.float32], probability: NDArray[np.float32]
+) -> None:
+    assert len(images) == 2549
+    expected = plain_forward(zoo.find("cnn1"), images)
+    assert np.abs(probability - expected).max() <= 1e-5
+    assert np.array_equal(probability.argmax(axis=1), expected.argmax(axis=1))
+
+
+def test_one_reading_at_a_time_is_judged_as_all_together(
+    whole: Grasps, probability: NDArray[np.float32]
+) -> None:
+    model = TactileModel(zoo.find("cnn1"))
+    for reading, expected in zip(whole.counts, probability, strict=True):
+        model.imager.build(reading, model.image)
+        assert model.run() == pytest.approx(tuple(expected), abs=1e-6)
+
+
+def test_cnn1_knows_its_own_training_data_better_than_left_out_data(
+    whole: Grasps, probability: NDArray[np.float32]
+) -> None:
+    says_slip = probability[:, 1] > 0.5
+    hits = int((says_slip & whole.slipped).sum())
+    f1 = 2 * hits / (int(says_slip.sum()) + int(whole.slipped.sum()))
+    assert f1 > CARD["contract"]["measured"]["f1_mean"]
+
+
+def test_cnn1_reaches_the_published_f1_within_its_spread() -> None:
+    # The paper gives 94.2 +- 0.8 % for CNN1.
+    assert CARD["contract"]["measured"]["f1_mean"] > 0.942 - 0.008
+    assert CARD["contract"]["measured"]["folds"] == 10
+
+
+def test_the_summary_of_the_card_follows_from_its_folds() -> None:
+    folds = CARD["cross_validation"]["folds"]
+    assert sum(fold["grasps"] for fold in folds) == 2549
+    for name, spread in CARD["cross_validation"]["summary"].items():
+        values = [fold[name] for fold in folds]
+        assert spread["mean"] == pytest.approx(np.mean(values))
+        assert spread["std"] == pytest.approx(np.std(values))
+    measured = CARD["contract"]["measured"]
+    assert measured["f1_mean"] == CARD["cross_validation"]["summary"]["f1"]["mean"]
+    assert measured["accuracy_std"] == CARD["cross_validation"]["summary"]["accuracy"]["std"]
+
+
+def test_the_card_is_about_the_file_beside_it() -> None:
+    model = TactileModel(zoo.find("cnn1"))
+    assert CARD["file"]["sha256"] == hashlib.sha256(model.path.read_bytes()).hexdigest()
+    assert CARD["file"]["size_bytes"] == model.path.stat().st_size
+    assert CARD["contract"] == json.loads(model.contract.to_json())
+    assert CARD["trained_parameters"] == 2_955_170
+    assert CARD["file"]["parity"]["grasps"] == 2549
+    assert CARD["file"]["parity"]["largest_difference"] <= 1e-5
+    assert CARD["file"]["parity"]["verdicts_flipped"] == 0
+
+
+def test_the_contract_says_what_the_published_network_was_fed_with() -> None:
+    contract = CARD["contract"]
+    assert contract["name"] == "cnn1"
+    assert contract["layout"] == "D1"
+    assert contract["fill"] == "neighbour-mean"
+    assert contract["normalisation"] == "filled-image"
+    assert contract["fingers"] == ["ff", "mf", "th"]
+    assert contract["classes"] == ["stable", "slip"]
+
+
+def test_the_contract_names_the_data_and_its_range(bts3_dir: Path) -> None:
+    columns: list[NDArray[np.int64]] = []
+    for stated in CARD["contract"]["datasets"]:
+        path = bts3_dir / f"{stated['name']}.csv"
+        assert stated["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        table = np.genfromtxt(path, np.int64, delimiter=",", skip_header=1, usecols=range(2, 74))
+        assert stated["rows"] == len(table)
+        columns.append(table)
+    counts = np.concatenate(columns).reshape(-1, 3, 24)
+    seen = CARD["contract"]["seen"]
+    assert seen["low"] == counts.min(axis=0).tolist()
+    assert seen["high"] == counts.max(axis=0).tolist()
+    assert seen["margin"] == 100
+
+
+def test_calibrated_probabilities_are_near_the_frequencies() -> None:
+    calibration = CARD["calibration"]
+    assert calibration["after"]["log_loss"] < calibration["before"]["log_loss"]
+    assert calibration["after"]["ece"] < 0.03
+
+
+def test_no_committed_file_tells_of_the_machine_that_made_it() -> None:
+    for path in (zoo.find("cnn1"), zoo.find("cnn1").with_suffix(".json")):
+        text = path.read_bytes().decode("latin-1")
+        assert "site-packages" not in text
+        assert not re.search(r"/(tmp|home|usr|work|root)/", text)
+
+
+def test_a_model_is_found_by_name_and_an_unknown_name_lists_the_known() -> None:
+    assert "cnn1" in zoo.names()
+    assert zoo.find("cnn1") == zoo.ZOO / "cnn1.onnx"
+    with pytest.raises(ModelError, match=r"no model 'cnn9' in the zoo; there are: .*cnn1"):
+        zoo.find("cnn9")
