@@ -1,10 +1,11 @@
-"""The loop: waits for the driver, judges what it brings, reports, says so when nothing comes."""
+"""The loop: waits for drivers, judges what they bring, reports, says so when nothing comes."""
 
 from __future__ import annotations
 
 import selectors
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import chain
 
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import State, Verdict
@@ -28,7 +29,7 @@ class Service:
 
     def __init__(
         self,
-        driver: Driver,
+        drivers: Sequence[Driver],
         pipeline: Pipeline,
         reporter: Reporter,
         stop: StopSignal,
@@ -38,8 +39,9 @@ class Service:
         listener: Listener | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`driver` is open; `max_age_ns` is the age limit of a reading, ns."""
-        self._driver = driver
+        """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns."""
+        self._drivers = drivers
+        self._tactile = drivers[0]
         self._pipeline = pipeline
         self._reporter = reporter
         self._stop = stop
@@ -60,7 +62,7 @@ class Service:
         try:
             with selectors.SelectSelector() as selector:
                 selector.register(self._stop, selectors.EVENT_READ)
-                while self._stop.received is None and not self._driver.exhausted:
+                while self._stop.received is None and not self._tactile.exhausted:
                     self._wait(selector)
                     if not self._take_readings():
                         self._mind_silence()
@@ -71,26 +73,27 @@ class Service:
             self._send_status()
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
-        """Sleep until the driver, a timer or a signal wants attention."""
-        descriptor = self._driver.fileno()
+        """Sleep until a driver, a timer or a signal wants attention."""
+        descriptors = (driver.fileno() for driver in self._drivers)
+        wanted = {descriptor for descriptor in descriptors if descriptor is not None}
         watched = {key.fd for key in selector.get_map().values()} - {self._stop.fileno()}
-        for former in watched - {descriptor}:
+        for former in watched - wanted:
             selector.unregister(former)
-        if descriptor is not None and descriptor not in watched:
+        for descriptor in wanted - watched:
             selector.register(descriptor, selectors.EVENT_READ)
-        due_ns = min(self._silence_due_ns, self._status_due_ns)
-        driver_due_ns = self._driver.due_ns()
-        if driver_due_ns is not None:
-            due_ns = min(due_ns, driver_due_ns)
+        dues_ns = [driver.due_ns() for driver in self._drivers]
+        due_ns = min(
+            self._silence_due_ns, self._status_due_ns, *(due for due in dues_ns if due is not None)
+        )
         selector.select(max(due_ns - self._clock(), 0) / 1e9)
 
     def _take_readings(self) -> bool:
-        """Judge and report what the driver has; False if it had no tactile reading."""
+        """Judge and report what the drivers have; False if there was no tactile reading."""
         taken = False
-        for reading in self._driver.read_ready():
+        for reading in chain.from_iterable(driver.read_ready() for driver in self._drivers):
             received_ns = self._clock()
             if not isinstance(reading, TactileReading):
-                continue  # no part of this scene uses joint readings
+                continue  # the verdict does not depend on joints
             judgement = self._pipeline.judge(reading)
             verdict, payload = self._reporter.verdict(judgement, received_ns)
             self._state = State.RUNNING
@@ -104,7 +107,7 @@ class Service:
 
     def _mind_silence(self) -> None:
         now_ns = self._clock()
-        if now_ns < self._silence_due_ns or self._driver.exhausted:
+        if now_ns < self._silence_due_ns or self._tactile.exhausted:
             return
         self._state = State.SILENT
         self._silence_due_ns = now_ns + self._silence_ns()
@@ -114,7 +117,7 @@ class Service:
 
     def _silence_ns(self) -> int:
         """How long nothing may come before it is said, ns."""
-        return max(self._max_age_ns, SILENCE_PERIODS * (self._driver.period_ns or 0))
+        return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
 
     def _send_status(self) -> None:
         now_ns = self._clock()
@@ -122,7 +125,7 @@ class Service:
         self._reporter.status(
             self._state,
             self._readings_since_status / elapsed_s,
-            {self._driver.name: self._driver.counters.as_dict()},
+            {driver.name: driver.counters.as_dict() for driver in self._drivers},
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns

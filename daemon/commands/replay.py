@@ -94,7 +94,7 @@ def _replay(args: argparse.Namespace) -> int:
         if publisher is not None and args.wait and not publisher.wait_for_subscriber(args.wait):
             raise PublishError(f"nobody subscribed to {args.publish} within {args.wait:g} s")
         service = Service(
-            driver,
+            [driver],
             pipeline,
             Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
             stop,

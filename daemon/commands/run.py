@@ -49,7 +49,7 @@ def _run(wanted: scene.Scene) -> None:
             driver.open()
             log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
             Service(
-                driver,
+                [driver],
                 pipeline,
                 reporter,
                 stop,

@@ -49,7 +49,7 @@ class Bench:
         self.clock = clock
         reporter = Reporter("right", "fake", "ab" * 32, self.output, clock, lambda: 1.79e9)
         self.service = Service(
-            driver,
+            [driver],
             pipeline(FakeModel(), clock),
             reporter,
             stop,

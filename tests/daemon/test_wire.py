@@ -13,6 +13,7 @@ import pytest
 
 from daemon.commands.schema import schema_text
 from daemon.judge.verdict import (
+    ADVICE,
     Outcome,
     Reason,
     State,
@@ -150,6 +151,15 @@ def test_a_message_that_breaks_the_schema_is_refused_by_both(change: dict[str, A
         json.loads(SCHEMA_FILE.read_text()) | {"anyOf": [{"$ref": "#/$defs/Verdict"}]}
     )
     assert not validator.is_valid(content)
+
+
+def test_the_documentation_names_every_field_and_every_reason_with_its_advice() -> None:
+    text = (SCHEMA_FILE.parent / "README.md").read_text()
+    for reason in Reason:
+        assert f"| `{reason}` | {ADVICE[reason]} |" in text
+    for message in (Verdict, Status):
+        for field in message.__struct_fields__:
+            assert f"`{field}`" in text, field
 
 
 def test_a_reader_of_version_1_skips_fields_added_later() -> None:
