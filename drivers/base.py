@@ -127,6 +127,9 @@ class Driver(Protocol):
     def period_ns(self) -> int | None:
         """Nominal time between tactile readings, ns, or None while it is not known."""
 
+    def describe(self) -> dict[str, str]:
+        """What is known about the device, for people: versions, serials, why a link is down."""
+
     def open(self) -> None:
         """Take the device. Raises `DriverError`."""
 

@@ -129,6 +129,10 @@ class ReplayDriver:
         self._seq = 0
         self._released = 0
 
+    def describe(self) -> dict[str, str]:
+        """Which recordings are played."""
+        return {"recordings": ", ".join(map(str, self._paths))}
+
     def open(self) -> None:
         """Check the header of every file, then start over with the first one."""
         self.close()

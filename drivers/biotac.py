@@ -1,0 +1,137 @@
+"""BioTac SP on SPI: command bytes, response words, error words, sampling sequences. Bytes only.
+
+Source: BioTac SP Product Manual V2 (October 2015), sections 8 and 9; the C library published by
+SynTouch where the manual is silent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault
+
+PAC, PDC, TAC, TDC = 0, 1, 2, 3
+"""Channels of pressure (AC, DC) and temperature (AC, DC) (manual table 7)."""
+E1: Final = 17
+"""Channel of electrode 1; E24 is channel 40 (manual table 7)."""
+E24: Final = E1 + ELECTRODES - 1
+FORBIDDEN_COMMAND = 0xA1
+"""Channel 16 starts the streaming loop of the old protocol V1.1, which a sensor leaves only after
+five seconds of idle clock. Never sent."""
+CHANNELS = (PAC, PDC, TAC, TDC, *range(E1, E24 + 1))
+"""All channels that are sampled."""
+
+CLOCK_MIN_HZ, CLOCK_MAX_HZ = 500_000, 10_000_000
+"""SPI clock range; mode 0, most significant bit first (manual section 8.2)."""
+SETTLE_US = 50
+"""Least wait between a command and reading its answer (manual figure 14)."""
+
+ERROR_WORDS: dict[int, str] = {
+    0xA52D: "insufficient sampling delay",
+    0xA558: "channel not recognised",
+    0xA552: "parameter is read-only",
+    0xA545: "parity of the command is wrong",
+    0xA53F: "unknown command",
+    0xA52E: "insufficient delay",
+    0xA55F: "nothing to resend",
+    0xA557: "write failed",
+}
+"""Sent in place of data (manual tables 8 and 11, C library). With parity ignored each of them
+decodes to 2629..2635, a perfectly plausible electrode."""
+UNPLUGGED_WORDS = (0x0000, 0xFFFF)
+"""A line that nothing drives reads all zeros or all ones; both have even parity."""
+
+SEQUENCE_ELECTRODES = tuple(range(E1, E24 + 1))
+"""Electrodes only: 24 samples (manual table 12)."""
+SEQUENCE_ALL = CHANNELS
+"""Every channel once: 28 samples (manual table 12)."""
+SEQUENCE_INTERLEAVED = tuple(
+    channel for other in (*range(E1, E24 + 1), PDC, TAC, TDC) for channel in (other, PAC)
+)
+"""The default: every other sample is PAC, 54 samples (manual table 12, order of the C library)."""
+SEQUENCE_PRESSURE = (PAC, PDC)
+"""Vibration and pressure only: 2 samples (manual table 12)."""
+
+REFERENCE_OHM = 10_000.0
+"""Resistor in series with an electrode (manual section 5.1)."""
+
+
+def sample_command(channel: int) -> int:
+    """First command byte that samples a channel: `1 CCCCCC P`, odd parity (manual figure 13).
+
+    Raises `ValueError` for a channel that a BioTac SP does not have, channel 16 among them.
+    """
+    if channel not in CHANNELS:
+        raise ValueError(f"a BioTac SP has no channel {channel}")
+    byte = 0x80 | channel << 1
+    return byte | (byte.bit_count() + 1) % 2
+
+
+def channel_of(command: int) -> int | None:
+    """Channel that a command byte samples, or None if it is no valid sampling command."""
+    channel = (command & 0x7E) >> 1
+    if channel not in CHANNELS or command != sample_command(channel):
+        return None
+    return channel
+
+
+def encode_word(count: int) -> int:
+    """Response word of a 12-bit count, most significant byte first (manual figure 15).
+
+    `D11..D5 P  D4..D0 0 0 P`, each byte with odd parity. Raises `ValueError` outside 0..4095.
+    """
+    if not 0 <= count <= COUNT_MAX:
+        raise ValueError(f"{count} is not a 12-bit count")
+    high, low = count >> 5 << 1, (count & 0x1F) << 3
+    high |= (high.bit_count() + 1) % 2
+    low |= (low.bit_count() + 1) % 2
+    return high << 8 | low
+
+
+def decode_words(
+    words: NDArray[np.uint16],
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    """Counts and `ElectrodeFault` bits of response words, in the shape of `words`.
+
+    A word with a fault has the count 0. Words are the 16 bits as sent, first byte high.
+    """
+    return _COUNTS[words], _FAULTS[words]
+
+
+def impedance_ohm(counts: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """Impedance of electrodes, ohm: `(4095 / count - 1) * 10 kohm` (manual section 5.1).
+
+    A count of 0 is infinite: more pressure means more impedance and a lower count.
+    """
+    with np.errstate(divide="ignore"):
+        return (COUNT_MAX / counts.astype(np.float64) - 1.0) * REFERENCE_OHM
+
+
+def counts_of_impedance(impedance: NDArray[np.float64]) -> NDArray[np.uint16]:
+    """Counts at which electrodes of these impedances, ohm and not negative, are read."""
+    return np.rint(COUNT_MAX / (impedance / REFERENCE_OHM + 1.0)).astype(np.uint16)
+
+
+def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:
+    """Which of the samples are electrodes: shape (n, 2), rows of (sample, electrode 0..23)."""
+    pairs = [(at, channel - E1) for at, channel in enumerate(channels) if E1 <= channel <= E24]
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+
+def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    """Count and fault of all 65536 words, so that a sweep is decoded by two look-ups."""
+    words = np.arange(1 << 16, dtype=np.uint32)
+    odd = np.array([byte.bit_count() % 2 == 1 for byte in range(256)])
+    sound = odd[words >> 8] & odd[words & 0xFF] & (words & 0x06 == 0)
+    faults = np.where(sound, 0, int(ElectrodeFault.PARITY)).astype(np.uint8)
+    faults[list(ERROR_WORDS)] = int(ElectrodeFault.ERROR_WORD)
+    faults[list(UNPLUGGED_WORDS)] = int(ElectrodeFault.MISSING)
+    counts = np.where(faults == 0, (words >> 9) << 5 | (words & 0xFF) >> 3, 0)
+    return counts.astype(np.uint16), faults
+
+
+_COUNTS, _FAULTS = _tables()

@@ -1,0 +1,98 @@
+"""The state of a link that must come back: what it is doing, and when it tries again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from enum import StrEnum
+
+BACKOFF_FIRST_S = 0.05
+BACKOFF_FACTOR = 1.8
+BACKOFF_MAX_S = 1.0
+"""A device that is plugged in again is found within this time plus its greeting, s."""
+WARNINGS_MAX = 8
+"""Different reasons that one outage may warn of."""
+
+_log = logging.getLogger(__name__)
+
+
+class LinkState(StrEnum):
+    """What a link is doing."""
+
+    CLOSED = "closed"
+    """Not wanted."""
+    WAITING = "waiting"
+    """Lost or not yet found; the next try comes at `Link.retry_ns`."""
+    GREETING = "greeting"
+    """Open, and waiting for the device to say what it is."""
+    UP = "up"
+    """Readings can come."""
+
+
+class Link:
+    """State and retry schedule of one link. Does no I/O itself.
+
+    A failure is a warning when its reason is new in this outage and a debug line otherwise, so that
+    a night without the device does not fill the journal, and a device of the wrong version that is
+    plugged in at last is heard of.
+    """
+
+    def __init__(self, name: str, clock: Callable[[], int]) -> None:
+        """`clock` gives monotonic ns."""
+        self.name = name
+        self.state = LinkState.CLOSED
+        self.retry_ns: int | None = None
+        """When to try again, monotonic ns, while waiting."""
+        self.losses = 0
+        """Times that the link was up and was lost."""
+        self.reason: str | None = None
+        """Why it is not up, None while it is or has not been tried."""
+        self._clock = clock
+        self._tries = 0
+        self._warned: set[str] = set()
+        self._down_since_ns = clock()
+
+    def start(self) -> None:
+        """Want the link: the first try is due at once."""
+        self.state = LinkState.WAITING
+        self.reason = None
+        self._tries = 0
+        self._warned.clear()
+        self._down_since_ns = self.retry_ns = self._clock()
+
+    def greeting(self) -> None:
+        """The device was opened."""
+        self.state = LinkState.GREETING
+        self.retry_ns = None
+
+    def up(self, what: str) -> None:
+        """The device has said what it is; `what` goes into the log."""
+        down_s = (self._clock() - self._down_since_ns) / 1e9
+        _log.info("%s: up after %.2f s: %s", self.name, down_s, what)
+        self.state = LinkState.UP
+        self.retry_ns = None
+        self.reason = None
+        self._tries = 0
+        self._warned.clear()
+
+    def failed(self, why: str) -> None:
+        """A try did not succeed or the link was lost: wait, longer after each failure."""
+        now_ns = self._clock()
+        if self.state is LinkState.UP:
+            self.losses += 1
+            self._down_since_ns = now_ns
+        self.reason = why
+        level = logging.DEBUG
+        if why not in self._warned and len(self._warned) < WARNINGS_MAX:
+            self._warned.add(why)
+            level = logging.WARNING
+        _log.log(level, "%s: %s; trying again", self.name, why)
+        wait_s = min(BACKOFF_FIRST_S * BACKOFF_FACTOR**self._tries, BACKOFF_MAX_S)
+        self._tries = min(self._tries + 1, 64)
+        self.retry_ns = now_ns + round(wait_s * 1e9)
+        self.state = LinkState.WAITING
+
+    def close(self) -> None:
+        """The link is no longer wanted."""
+        self.state = LinkState.CLOSED
+        self.retry_ns = None

@@ -1,0 +1,120 @@
+"""Faults that a hardware twin puts on its link on request, counted one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class LinkFaults:
+    """Which faults a twin injects; by default none. Raises `ValueError` for a value out of range.
+
+    Chances are per frame. Fingers and electrodes are numbered as in a reading, from 0.
+    """
+
+    bit_flip_probability: float = 0.0
+    """Chance that one random bit of a frame flips."""
+    drop_probability: float = 0.0
+    """Chance that a frame is lost."""
+    duplicate_probability: float = 0.0
+    """Chance that a frame comes twice."""
+    reorder_probability: float = 0.0
+    """Chance that a frame comes after the next one instead of before it."""
+    one_byte_at_a_time: bool = False
+    """Every byte is written on its own (byte streams only)."""
+    burst_frames: int = 1
+    """Frames are held back and written so many at once."""
+    disconnect_every_frames: int | None = None
+    """The link breaks in the middle of every n-th frame."""
+    wrong_version: bool = False
+    """The twin says that it speaks a later version of the protocol."""
+    dead_electrodes: tuple[tuple[int, int], ...] = ()
+    """(finger, electrode) pairs that read 0 for ever."""
+    unplugged_fingers: tuple[int, ...] = ()
+    """Fingers whose line nothing drives."""
+    stuck_clock: bool = False
+    """The device's clock does not move."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.name.endswith("_probability") and not 0.0 <= value <= 1.0:
+                raise ValueError(f"{field.name} is {value}, must be in 0..1")
+        if self.burst_frames < 1:
+            raise ValueError(f"burst_frames is {self.burst_frames}, must be at least 1")
+        if self.disconnect_every_frames is not None and self.disconnect_every_frames < 1:
+            raise ValueError("disconnect_every_frames must be at least 1")
+
+
+class LinkFaultInjector:
+    """Spoils a twin's frames; `injected` counts each fault by its name."""
+
+    def __init__(self, faults: LinkFaults) -> None:
+        self.faults = faults
+        self.injected: Counter[str] = Counter()
+        self._random = np.random.default_rng(faults.seed)
+        self._held_back: bytes | None = None
+        self._burst: list[bytes] = []
+        self._frames = 0
+
+    def spoil(self, frame: bytes, *, waits: bool = True) -> list[bytes]:
+        """Frames to put on the wire now, in order, instead of this one; each is one whole write.
+
+        A frame that does not wait is neither reordered nor held back for a burst, and takes
+        along what was.
+        """
+        faults = self.faults
+        if self._happens(faults.drop_probability, "drop"):
+            return []
+        if self._happens(faults.bit_flip_probability, "bit_flip"):
+            frame = self._flipped(frame)
+        frames = [frame]
+        if self._happens(faults.duplicate_probability, "duplicate"):
+            frames.append(frame)
+        if not waits:
+            return [*self.flush(), *frames]
+        if self._held_back is not None:
+            frames.append(self._held_back)
+            self._held_back = None
+        elif self._happens(faults.reorder_probability, "reorder"):
+            self._held_back = frames.pop(0)
+        if faults.burst_frames == 1:
+            return frames
+        self._burst += frames
+        if len(self._burst) < faults.burst_frames:
+            return []
+        burst, self._burst = self._burst, []
+        self.injected["burst"] += 1
+        return [b"".join(burst)]
+
+    def flush(self) -> list[bytes]:
+        """Frames that are held back, to be put on the wire now: the link ends or goes on."""
+        held = [*self._burst, *([] if self._held_back is None else [self._held_back])]
+        self._burst, self._held_back = [], None
+        return held
+
+    def breaks_here(self) -> bool:
+        """Whether the link is to break in the middle of the next frame; call once per frame."""
+        self._frames += 1
+        every = self.faults.disconnect_every_frames
+        if every is None or self._frames % every:
+            return False
+        self.injected["disconnect"] += 1
+        return True
+
+    def _happens(self, probability: float, name: str) -> bool:
+        if probability == 0.0 or self._random.random() >= probability:
+            return False
+        self.injected[name] += 1
+        return True
+
+    def _flipped(self, frame: bytes) -> bytes:
+        at = int(self._random.integers(len(frame) * 8))
+        spoiled = bytearray(frame)
+        spoiled[at // 8] ^= 1 << at % 8
+        return bytes(spoiled)

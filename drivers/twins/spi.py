@@ -1,0 +1,369 @@
+"""A bridge with BioTac SPs that are not there, on a pseudo-terminal that a driver opens by path."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import select
+import time
+import tty
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
+from drivers.bridge_protocol import (
+    DIGEST,
+    TEXT_BYTES,
+    VERSION,
+    Hello,
+    Message,
+    Ping,
+    Start,
+    Status,
+    Stop,
+    Sweep,
+    decode,
+    encode,
+    frame_parser,
+)
+from drivers.framing import DELIMITER
+from drivers.twins.faults import LinkFaultInjector, LinkFaults
+from drivers.twins.grasps import Counts
+
+TICK_HZ = 1_000_000
+SLOT_NS = 80_000
+"""One sample of three sensors at 4.4 MHz, ns (facts of manual figure 14)."""
+NOMINAL_HZ = 100.0
+"""Rate that a twin claims when it sends as fast as the host reads."""
+STATUS_PERIOD_NS = 1_000_000_000
+REPLUG_NS = 50_000_000
+"""How long a link that broke stays broken, ns."""
+UNSENT_MAX_BYTES = 4096
+"""What waits for the host to read, bytes, before whole frames are dropped."""
+READ_BYTES = 4096
+IDLE_NS = 20_000_000
+"""How long `serve` waits at most before it looks whether to stop, ns."""
+SWEEPS_AT_ONCE = 64
+"""Sweeps in one go, so that the host is heard in between."""
+UNDRIVEN_WORD = 0xFFFF
+OTHER_COUNT = 2000
+"""What channels that are no electrodes read."""
+
+_WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16)
+
+
+class SpiTwin:
+    """The bridge's side of the protocol, one thread, driven by `run_once` or `serve`.
+
+    `path` becomes a symbolic link to the pseudo-terminal, a new one after each `plug`. `source`
+    gives the counts of each sweep, shape (sensors, 24); when it ends the twin falls silent but
+    still answers. With `rate_hz` None sweeps come as fast as the host reads and none is dropped;
+    else what the host does not take in time is dropped in whole frames. As on a real bridge,
+    unplugging resets it.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        source: Iterable[Counts],
+        *,
+        rate_hz: float | None = NOMINAL_HZ,
+        channels: Sequence[int] = SEQUENCE_ELECTRODES,
+        faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
+        digest: int = DIGEST,
+        drift_ppm: float = 0.0,
+        clock: Callable[[], int] = time.monotonic_ns,
+        tap: Callable[[bytes], None] | None = None,
+    ) -> None:
+        """`digest` is of the layout that it was built with; `drift_ppm` how fast its clock is.
+
+        `tap` is called with every piece of bytes that goes to the host. Raises `ValueError` for a
+        rate that is not positive and for a source without counts.
+        """
+        if rate_hz is not None and not rate_hz > 0.0:
+            raise ValueError(f"rate_hz is {rate_hz}, must be positive")
+        counts = iter(source)
+        first = next(counts, None)
+        if first is None:
+            raise ValueError("the source has no counts")
+        self.path = path
+        self.sweeps = 0
+        """Sweeps made since it was last plugged in."""
+        self.sweeps_made = 0
+        """Sweeps made in all."""
+        self.tx_dropped = 0
+        """Frames that the host did not take in time, in all."""
+        self.exhausted = False
+        """The source has ended."""
+        self._sensors = first.shape[0]
+        self._source = itertools.chain([first], counts)
+        self._period_ns = round(1e9 / (rate_hz or NOMINAL_HZ))
+        self._as_fast_as_read = rate_hz is None
+        self._commands = tuple(sample_command(channel) for channel in channels)
+        self._slots = [slot for slot, channel in enumerate(channels) if E1 <= channel <= E24]
+        self._electrodes = [channels[slot] - E1 for slot in self._slots]
+        self.injected_in_sweeps: Counter[str] = Counter()
+        """Of the faults injected, those that hit sweeps."""
+        self._faults = faults
+        self._injector = LinkFaultInjector(faults)
+        self._digest = digest
+        self._ticks_per_ns = TICK_HZ / 1e9 * (1.0 + drift_ppm * 1e-6)
+        self._clock = clock
+        self._tap = tap
+        self._parser = frame_parser()
+        self._master: int | None = None
+        self._slave: int | None = None
+        self._replug_ns: int | None = None
+        self._reset()
+
+    def _reset(self) -> None:
+        """As after power comes: nothing is known, ticks begin at 0."""
+        now_ns = self._clock()
+        self._boot_ns = now_ns
+        self._started = False
+        self._seq = 0
+        self.sweeps = 0
+        self._sweep_due_ns = now_ns
+        self._status_due_ns = now_ns + STATUS_PERIOD_NS
+        self._unsent: deque[bytes] = deque()
+        self._unsent_bytes = 0
+        self._spi_errors = [0] * self._sensors
+        self._parser.reset()
+
+    @property
+    def injected(self) -> Counter[str]:
+        """Faults injected so far by name."""
+        return self._injector.injected
+
+    @property
+    def started(self) -> bool:
+        """Whether the host has asked for sweeps."""
+        return self._started
+
+    def open(self) -> None:
+        """Plug in."""
+        self.plug()
+
+    def close(self) -> None:
+        """Unplug and remove the path."""
+        self.unplug()
+        self._replug_ns = None
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def plug(self) -> None:
+        """Make a pseudo-terminal, point the path at it, and say HELLO as after a reset."""
+        self.unplug()
+        self._replug_ns = None
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._reset()
+        new = self.path.with_name(self.path.name + ".new")
+        new.unlink(missing_ok=True)
+        new.symlink_to(os.ttyname(self._slave))
+        new.replace(self.path)
+        self._write(DELIMITER)
+        self._send(self._hello(0), waits=False)
+
+    def unplug(self) -> None:
+        """Take the pseudo-terminal away: whoever has it open is told by the system."""
+        self.path.unlink(missing_ok=True)
+        for descriptor in (self._master, self._slave):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._master = self._slave = None
+        self._unsent.clear()
+        self._unsent_bytes = 0
+
+    def fileno(self) -> int | None:
+        """Descriptor on which the host's bytes come, None while unplugged."""
+        return self._master
+
+    def due_ns(self) -> int | None:
+        """When the next sweep, status or plugging in is due."""
+        if self._master is None:
+            return self._replug_ns
+        if self._sweeping() and not self._unsent:
+            return min(self._sweep_due_ns, self._status_due_ns)
+        return self._status_due_ns
+
+    def serve(self, stop: Callable[[], bool]) -> None:
+        """Run until `stop` says so; it is asked at least fifty times a second."""
+        while not stop():
+            due_ns = self.due_ns()
+            wait_ns = IDLE_NS if due_ns is None else max(due_ns - self._clock(), 0)
+            self.run_once(min(wait_ns, IDLE_NS) / 1e9)
+
+    def run_once(self, timeout_s: float = 0.0) -> None:
+        """Wait for the host so long at most, then do what is due."""
+        if self._master is None:
+            if self._replug_ns is None or self._clock() < self._replug_ns:
+                time.sleep(timeout_s)
+                return
+            self.plug()
+        master = self._master
+        if master is None:
+            return
+        waiting = [master] if self._unsent else []
+        readable, _, _ = select.select([master], waiting, [], timeout_s)
+        if readable:
+            self._hear()
+        self._drain()
+        self._do_what_is_due()
+
+    def _hear(self) -> None:
+        if self._master is None:
+            return
+        for kind, payload in self._parser.feed(os.read(self._master, READ_BYTES)):
+            message = decode(kind, payload)
+            if isinstance(message, Ping):
+                self._send(self._hello(message.nonce), waits=False)
+            elif isinstance(message, Start) and not self._started:
+                self._started = True
+                self._seq = 0
+                self._sweep_due_ns = self._clock() + (
+                    0 if self._as_fast_as_read else self._period_ns
+                )
+            elif isinstance(message, Stop):
+                self._started = False
+
+    def _sweeping(self) -> bool:
+        return self._started and not self.exhausted
+
+    def _do_what_is_due(self) -> None:
+        now_ns = self._clock()
+        for _ in range(SWEEPS_AT_ONCE):
+            if self._master is None or not self._sweeping() or self._sweep_due_ns > now_ns:
+                break
+            if not self._as_fast_as_read:
+                end_ns = self._sweep_due_ns
+                self._sweep_due_ns += self._period_ns
+                self._sweep(end_ns)
+            elif not self._unsent:
+                self._sweep(self._clock())
+        if self._master is not None and now_ns >= self._status_due_ns:
+            self._status_due_ns += STATUS_PERIOD_NS
+            self._send(self._status(), waits=False)
+
+    def _sweep(self, end_ns: int) -> None:
+        counts = next(self._source, None)
+        if counts is None:
+            self.exhausted = True
+            for frame in self._injector.flush():
+                self._write(frame)
+            self._drain()
+            return
+        words = self._words(counts)
+        length_ns = min(len(self._commands) * SLOT_NS, self._period_ns // 2)
+        begin_ns = end_ns if self._as_fast_as_read else end_ns - length_ns
+        ticks = self._tick(begin_ns), self._tick(end_ns)
+        present = sum(1 << i for i in range(self._sensors) if self._is_plugged(i))
+        seq, self._seq = self._seq, (self._seq + 1) % (1 << 32)
+        self.sweeps += 1
+        self.sweeps_made += 1
+        self._send(Sweep(seq, *ticks, present, words))
+
+    def _words(self, counts: Counts) -> NDArray[np.uint16]:
+        """Shape (slots, sensors), as the sensors would answer."""
+        felt = counts.copy()
+        for finger, electrode in self._faults.dead_electrodes:
+            felt[finger, electrode] = 0
+        words = np.full((len(self._commands), self._sensors), _WORDS[OTHER_COUNT], np.uint16)
+        words[self._slots] = _WORDS[felt[:, self._electrodes].T]
+        for finger in self._faults.unplugged_fingers:
+            words[:, finger] = UNDRIVEN_WORD
+            self._spi_errors[finger] = (self._spi_errors[finger] + len(words)) % (1 << 32)
+        return words
+
+    def _is_plugged(self, finger: int) -> bool:
+        return finger not in self._faults.unplugged_fingers
+
+    def _tick(self, host_ns: int) -> int:
+        if self._faults.stuck_clock:
+            return 0
+        return max(int((host_ns - self._boot_ns) * self._ticks_per_ns), 0)
+
+    def _hello(self, nonce: int) -> Hello:
+        return Hello(
+            nonce=nonce,
+            tick=self._tick(self._clock()),
+            tick_hz=TICK_HZ,
+            period_ticks=max(self._period_ns * TICK_HZ // 1_000_000_000, 1),
+            serials=tuple(
+                f"BTSP-TWIN-{i}"[:TEXT_BYTES] if self._is_plugged(i) else ""
+                for i in range(self._sensors)
+            ),
+            commands=self._commands,
+            board="twin",
+            version=VERSION + self._faults.wrong_version,
+            digest=self._digest,
+        )
+
+    def _status(self) -> Status:
+        rx = self._parser.counters
+        return Status(
+            tick=self._tick(self._clock()),
+            sweeps=self.sweeps,
+            overruns=0,
+            tx_dropped=self.tx_dropped,
+            rx_errors=rx.bad_cobs + rx.bad_crc + rx.too_long,
+            spi_errors=tuple(self._spi_errors),
+        )
+
+    def _send(self, message: Message, *, waits: bool = True) -> None:
+        frame = encode(message, self._digest)
+        if isinstance(message, Sweep) and self._injector.breaks_here():
+            self._write(frame[: len(frame) // 2])
+            self._drain()
+            self.unplug()
+            self._replug_ns = self._clock() + REPLUG_NS
+            return
+        before = Counter(self.injected)
+        for outgoing in self._injector.spoil(frame, waits=waits):
+            self._write(outgoing)
+        if isinstance(message, Sweep):
+            self.injected_in_sweeps += self.injected - before
+        self._drain()
+
+    def _write(self, data: bytes) -> None:
+        """Queue whole frames, or drop them if the host does not read."""
+        if self._unsent_bytes + len(data) > UNSENT_MAX_BYTES and self._unsent:
+            self.tx_dropped += 1
+            return
+        if self._faults.one_byte_at_a_time:
+            self._unsent.extend(data[at : at + 1] for at in range(len(data)))
+        else:
+            self._unsent.append(data)
+        self._unsent_bytes += len(data)
+
+    def _drain(self) -> None:
+        while self._unsent and self._master is not None:
+            piece = self._unsent[0]
+            try:
+                written = os.write(self._master, piece)
+            except BlockingIOError:
+                return
+            if self._tap is not None:
+                self._tap(piece[:written])
+            self._unsent_bytes -= written
+            if written < len(piece):
+                self._unsent[0] = piece[written:]
+                return
+            self._unsent.popleft()

@@ -1,0 +1,179 @@
+"""What the tests of the bridge's firmware share: its programs, its frames, a host to talk to it.
+
+Frames are computed with `zlib`, `cobs` and `struct` alone, so that they owe nothing to the driver.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+import subprocess
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cobs import cobs
+from numpy.typing import NDArray
+
+from tests.conftest import ROOT
+
+BRIDGE = ROOT / "deploy" / "bridge"
+WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-g", "-O1")
+SANITIZERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+POSIX = "-D_XOPEN_SOURCE=700"
+
+HELLO, SWEEP, STATUS, PING, START, STOP = 0x01, 0x02, 0x03, 0x81, 0x82, 0x83
+DIGEST = 0x0D99E4D6
+UNSEEDED = (HELLO, PING)
+HOST_PAYLOADS = {PING: 4, START: 0, STOP: 0}
+ENCODED_MAX = 1024
+ELECTRODE_COMMANDS = bytes.fromhex(
+    "A2 A4 A7 A8 AB AD AE B0 B3 B5 B6 B9 BA BC BF C1 C2 C4 C7 C8 CB CD CE D0"
+)
+"""First command bytes of E1..E24 (manual table 7)."""
+PAC, PDC, TAC, TDC = 0x80, 0x83, 0x85, 0x86
+
+Counts = NDArray[np.uint16]
+
+
+def build_program(folder: Path, name: str, *sources: str) -> Path:
+    """Compile a program of files under `deploy/bridge`, as the house wants its C."""
+    program = folder / name
+    files = [str(file) for source in sources for file in sorted(BRIDGE.glob(source))]
+    includes = [f"-I{BRIDGE}/src", f"-I{BRIDGE}/host"]
+    command = ["cc", *WARNINGS, *SANITIZERS, POSIX, *includes, *files, "-o", str(program)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def ask(probe: Path, requests: Sequence[str]) -> list[str]:
+    """The answers of the C implementation, one per request."""
+    done = subprocess.run(
+        [probe], input="\n".join(requests) + "\n", capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    answers = done.stdout.splitlines()
+    assert len(answers) == len(requests)
+    return answers
+
+
+def hexed(data: bytes) -> str:
+    return data.hex() or "-"
+
+
+def frame(kind: int, payload: bytes = b"", digest: int = DIGEST) -> bytes:
+    """A frame with its zero, computed with zlib and cobs alone."""
+    body = bytes([kind]) + payload
+    crc = zlib.crc32(body, 0 if kind in UNSEEDED else digest)
+    encoded: bytes = cobs.encode(body + struct.pack("<I", crc))
+    return encoded + b"\0"
+
+
+def unframe(encoded: bytes) -> tuple[int, bytes] | None:
+    """Type and payload of what stood before a zero, or None if it is damaged."""
+    if len(encoded) > ENCODED_MAX:
+        return None
+    try:
+        body = cobs.decode(encoded)
+    except cobs.DecodeError:
+        return None
+    if len(body) < 5:
+        return None
+    seed = 0 if body[0] in UNSEEDED else DIGEST
+    if zlib.crc32(body[:-4], seed) != int.from_bytes(body[-4:], "little"):
+        return None
+    return body[0], body[1:-4]
+
+
+def judged(stream: bytes) -> tuple[list[str], int]:
+    """What a receiver must find in a stream: the frames as the probe prints them, and errors."""
+    found, errors = [], 0
+    for encoded in stream.split(b"\0")[:-1]:
+        if not encoded:
+            continue
+        one = unframe(encoded)
+        if one is None or len(one[1]) != HOST_PAYLOADS.get(one[0]):
+            errors += 1
+        else:
+            found.append(f"{one[0]:02x} {int.from_bytes(one[1], 'little')}")
+    return found, errors
+
+
+@dataclass
+class Host:
+    """The host's side of a running bridge."""
+
+    process: subprocess.Popen[bytes]
+    path: str
+    descriptor: int
+    held: bytes = b""
+
+    def stop(self) -> None:
+        """Hang up and end the bridge. May be called more than once."""
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
+            self.process.terminate()
+            assert self.process.wait(10) == 0
+
+    def send(self, *data: bytes) -> None:
+        os.write(self.descriptor, b"".join(data))
+
+    def frames(self, timeout_s: float = 10.0) -> Iterator[tuple[int, bytes]]:
+        """Frames as they come; the test fails on a damaged one and after `timeout_s`."""
+        end_s = time.monotonic() + timeout_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            *whole, self.held = self.held.split(b"\0")
+            self.held = b"".join(one + b"\0" for one in whole[1:]) + self.held
+            if whole and whole[0]:
+                one = unframe(whole[0])
+                assert one is not None, whole[0].hex()
+                yield one
+            elif not whole and select.select([self.descriptor], [], [], left_s)[0]:
+                self.held += os.read(self.descriptor, 65536)
+        pytest.fail(f"nothing more came within {timeout_s} s")
+
+    def next_of(self, kind: int, count: int = 1) -> list[bytes]:
+        """The next payloads of a type."""
+        payloads = (payload for found, payload in self.frames() if found == kind)
+        return [next(payloads) for _ in range(count)]
+
+    def hello(self, nonce: int = 99) -> bytes:
+        """Greet the bridge as PROTOCOL.md says."""
+        self.send(b"\0", frame(STOP), frame(PING, struct.pack("<I", nonce)))
+        while True:
+            payload = self.next_of(HELLO)[0]
+            if struct.unpack_from("<I", payload, 5)[0] == nonce:
+                return payload
+
+
+StartBridge = Callable[..., Host]
+"""Starts a bridge with the given options; `stdin` is what it may read."""
+
+
+def words_of(sweep: bytes) -> Counts:
+    """Response words of a SWEEP, shape (slots, sensors)."""
+    sensors, slots = sweep[21], sweep[22]
+    return np.frombuffer(sweep, ">u2", offset=23).reshape(slots, sensors).astype(np.uint16)
+
+
+def counts_of(sweep: bytes) -> Counts:
+    """Counts of an electrodes-only SWEEP, shape (sensors, 24), as the C library decodes them."""
+    words = words_of(sweep).T
+    return ((words >> 9) * 32 + ((words & 0xFF) >> 3)).astype(np.uint16)
+
+
+def pattern(row: int, sensors: int = 3) -> Counts:
+    sensor, electrode = np.ogrid[:sensors, :24]
+    counts: Counts = ((1000 + 7 * row + 811 * sensor + 131 * electrode) % 4096).astype(np.uint16)
+    return counts
+
+
+def seq_of(sweep: bytes) -> int:
+    return int.from_bytes(sweep[:4], "little")

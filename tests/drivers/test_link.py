@@ -1,0 +1,75 @@
+"""The state of a link: patience that grows, and a journal that does not fill."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from drivers.link import BACKOFF_FIRST_S, BACKOFF_MAX_S, Link, LinkState
+from tests.drivers.bridge_bench import Clock
+
+
+def test_patience_grows_up_to_a_limit_and_begins_anew_when_the_link_is_up() -> None:
+    clock = Clock()
+    link = Link("spi", clock)
+    link.start()
+    assert link.retry_ns == clock.now_ns
+    waits_s = []
+    for _ in range(12):
+        link.failed("not there")
+        assert link.retry_ns is not None
+        waits_s.append((link.retry_ns - clock.now_ns) / 1e9)
+        clock.now_ns = link.retry_ns
+    assert waits_s == sorted(waits_s)
+    assert (waits_s[0], waits_s[-1]) == (BACKOFF_FIRST_S, BACKOFF_MAX_S)
+    link.greeting()
+    link.up("a device")
+    link.failed("gone")
+    assert link.retry_ns is not None
+    assert (link.retry_ns - clock.now_ns) / 1e9 == BACKOFF_FIRST_S
+
+
+def test_only_a_link_that_was_up_is_lost() -> None:
+    link = Link("spi", Clock())
+    link.start()
+    link.failed("not there")
+    link.greeting()
+    link.failed("no answer")
+    assert link.losses == 0
+    link.greeting()
+    link.up("a device")
+    assert (link.state, link.reason, link.retry_ns) == (LinkState.UP, None, None)
+    link.failed("gone")
+    assert link.losses == 1
+    assert link.reason == "gone"
+    link.close()
+    assert (link.state, link.retry_ns) == (LinkState.CLOSED, None)
+
+
+def test_a_reason_is_warned_of_once_per_outage(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link("spi", Clock())
+    with caplog.at_level(logging.DEBUG):
+        link.start()
+        for _ in range(50):
+            link.failed("not there")
+            link.failed("wrong version")
+        link.up("a device")
+        link.failed("not there")
+    warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert warnings == [
+        "spi: not there; trying again",
+        "spi: wrong version; trying again",
+        "spi: not there; trying again",
+    ]
+
+
+def test_reasons_that_never_repeat_do_not_fill_the_journal(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    link = Link("spi", Clock())
+    link.start()
+    with caplog.at_level(logging.WARNING):
+        for number in range(1000):
+            link.failed(f"reason {number}")
+    assert len(caplog.records) == 8
