@@ -7,12 +7,23 @@ from collections.abc import Callable
 from pathlib import Path
 
 from daemon.judge.pipeline import Limits, Pipeline
-from daemon.scene import ReplayTactile, Scene
+from daemon.scene import (
+    CanTactile,
+    PalmJoints,
+    PalmTactile,
+    ReplayTactile,
+    Scene,
+    SpiTactile,
+    StreamJoints,
+)
 from drivers.base import Driver
 from models import zoo
 from models.runtime import TactileModel
 
 DEFAULT_MODEL = "cnn1"
+
+Clock = Callable[[], int]
+"""Gives monotonic ns."""
 
 
 def model_path(scene: Scene) -> Path:
@@ -25,20 +36,47 @@ def load_model(scene: Scene) -> TactileModel:
     return TactileModel(model_path(scene))
 
 
-def build_pipeline(
-    scene: Scene, model: TactileModel, clock: Callable[[], int] = time.monotonic_ns
-) -> Pipeline:
+def build_pipeline(scene: Scene, model: TactileModel, clock: Clock = time.monotonic_ns) -> Pipeline:
     """The judge of this scene. Raises `ModelError` if the model does not fit the hand."""
     limits = Limits(max_age_ns=scene.max_age_ns, slip_threshold=scene.model.slip_threshold)
     return Pipeline(model, scene.hand.fingers, limits, clock)
 
 
-def build_driver(scene: Scene, clock: Callable[[], int] = time.monotonic_ns) -> Driver:
-    """The tactile driver of this scene, not yet open."""
-    return _replay(scene, scene.tactile, clock)
+def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
+    """The drivers of this scene, not yet open, the tactile one first."""
+    drivers = [_tactile(scene, clock)]
+    if isinstance(scene.joints, StreamJoints):
+        from drivers.joints import JointStreamDriver
+
+        drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
+    return drivers
 
 
-def _replay(scene: Scene, options: ReplayTactile, clock: Callable[[], int]) -> Driver:
+def _tactile(scene: Scene, clock: Clock) -> Driver:
+    match scene.tactile:
+        case ReplayTactile() as options:
+            return _replay(scene, options, clock)
+        case SpiTactile() as options:
+            from drivers.spi_bridge import SpiBridgeDriver
+
+            wanted = options.model_dump(exclude={"driver"})
+            return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
+        case CanTactile() as options:
+            from drivers.can_bridge import CanBridgeDriver
+
+            wanted = options.model_dump(exclude={"driver"})
+            return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
+        case PalmTactile() as options:
+            from drivers.palm import PalmDriver
+
+            joints = scene.joints
+            calibration = joints.calibration if isinstance(joints, PalmJoints) else None
+            return PalmDriver(
+                options.source, scene.hand.fingers, calibration=calibration, clock=clock
+            )
+
+
+def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     from drivers.faults import ReplayFaults
     from drivers.replay import Pace, ReplayDriver
 

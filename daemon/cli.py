@@ -18,6 +18,11 @@ COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
     "replay": ("daemon.commands.replay", "judge recordings and print the verdicts"),
     "check": ("daemon.commands.check", "say whether a scene is right and what it needs"),
+    "doctor": (
+        "daemon.commands.doctor",
+        "look at hardware, model and privileges for what is wrong",
+    ),
+    "twin": ("daemon.commands.twin", "stand in for a bridge, a CAN board or a palm"),
     "data": ("daemon.commands.data", "get the real grasp recordings"),
     "schema": ("daemon.commands.schema", "print the JSON Schema of the messages"),
     "train": ("models.training.command", "train and export a model (extra: train)"),

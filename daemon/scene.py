@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 import ipaddress
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -18,8 +17,8 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import ErrorDetails
 
+from daemon.scene_errors import lines_of
 from models.contract import Finger
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -106,8 +105,90 @@ class ReplayTactile(Section):
         return tuple(base / path for path in paths)
 
 
-Tactile = ReplayTactile
+class SpiTactile(Section):
+    """`[tactile]` with `driver = "spi"`: a bridge on a serial line (deploy/bridge/PROTOCOL.md)."""
+
+    driver: Literal["spi"]
+    port: Annotated[str, Field(min_length=1)]
+    """Serial port, best by its name in `/dev/serial/by-id/`, or a pyserial URL."""
+    sensors: (
+        Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
+    ) = None
+    """Fingers in the order of the chip selects; `hand.fingers` unless given."""
+    baud: Annotated[int, Field(ge=115_200, le=12_000_000)] = 921_600
+    """Line rate, bit/s; USB CDC ignores it."""
+
+
+class CanTactile(Section):
+    """`[tactile]` with `driver = "can"`: sensors behind a CAN board (deploy/can/PROTOCOL.md)."""
+
+    driver: Literal["can"]
+    interface: Annotated[str, Field(min_length=1)] = "socketcan"
+    """Name of a python-can interface."""
+    channel: Annotated[str, Field(min_length=1)] = "can0"
+    sensors: (
+        Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
+    ) = None
+    """Fingers in the order of the board's words (`syntouch`); `hand.fingers` unless given."""
+    format: Literal["syntouch", "sweep_fd"] = "syntouch"
+    """SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
+    arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF)] | None = None
+    """Of the samples, or of finger `ff` of the sweep frames. With `syntouch`, where it is not
+    documented, every frame of the right form is taken unless given."""
+    sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
+    """Order in which the board samples (`syntouch` only)."""
+    data_length: Annotated[int, Field(ge=3, le=8)] | None = None
+    """Bytes of a sample frame, where the board pads it."""
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] | None = None
+    """Bit/s; not with socketcan, where it belongs to `ip link`."""
+    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = None
+    """Bit/s of the data phase of CAN FD; not with socketcan."""
+
+
+class PalmTactile(Section):
+    """`[tactile]` with `driver = "palm"`: status packets of the hand's palm."""
+
+    driver: Literal["palm"]
+    source: Annotated[str, Field(min_length=1)]
+    """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
+
+    @field_validator("source")
+    @classmethod
+    def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
+        base: Path = (info.context or {}).get("base", Path())
+        return source if "://" in source else str(base / source)
+
+
+Tactile = Annotated[
+    ReplayTactile | SpiTactile | CanTactile | PalmTactile, Field(discriminator="driver")
+]
 """Section of each tactile driver, told apart by its key `driver`."""
+
+
+class PalmJoints(Section):
+    """`[joints]` with `driver = "palm"`: Hall sensors in the palm's packets."""
+
+    driver: Literal["palm"]
+    calibration: FilePath
+    """The hand's calibration (TOML), relative to the scene file."""
+
+    @field_validator("calibration")
+    @classmethod
+    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
+        base: Path = (info.context or {}).get("base", Path())
+        return base / path
+
+
+class StreamJoints(Section):
+    """`[joints]` with `driver = "stream"`: joint angles from elsewhere (deploy/wire/JOINTS.md)."""
+
+    driver: Literal["stream"]
+    source: Annotated[str, Field(pattern=r"^udp://")]
+    """`udp://ADDRESS:PORT` to listen on."""
+
+
+Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]
+"""Section of each source of joint angles, told apart by its key `driver`."""
 
 
 class Model(Section):
@@ -163,15 +244,26 @@ class Scene(Section):
 
     hand: Hand = Hand()
     tactile: Tactile
+    joints: Joints | None = None
     model: Model = Model()
     gate: Gate = Gate()
     publish: Publish = Publish()
 
     @model_validator(mode="after")
-    def _faults_are_of_this_hand(self) -> Self:
-        for finger in self.tactile.faults.fingers or ():
-            if finger not in self.hand.fingers:
-                raise ValueError(f"tactile.faults.fingers names {finger}, which the hand lacks")
+    def _sections_fit_together(self) -> Self:
+        tactile, fingers = self.tactile, self.hand.fingers
+        if isinstance(tactile, ReplayTactile):
+            for finger in tactile.faults.fingers or ():
+                if finger not in fingers:
+                    raise ValueError(f"tactile.faults.fingers names {finger}, not in hand.fingers")
+        if isinstance(tactile, SpiTactile | CanTactile) and tactile.sensors is not None:
+            without = [finger for finger in fingers if finger not in tactile.sensors]
+            if without or len(set(tactile.sensors)) != len(tactile.sensors):
+                raise ValueError("tactile.sensors must name every finger of hand.fingers once")
+        if isinstance(tactile, CanTactile) and tactile.format == "syntouch" and len(fingers) > 3:
+            raise ValueError("tactile.format syntouch carries three sensors, hand.fingers has more")
+        if isinstance(self.joints, PalmJoints) and not isinstance(tactile, PalmTactile):
+            raise ValueError("joints.driver palm needs tactile.driver palm: it is the same stream")
         return self
 
     @property
@@ -225,43 +317,4 @@ def parse(data: Mapping[str, Any], path: Path) -> Scene:
     try:
         return Scene.model_validate(data, context={"base": path.parent})
     except ValidationError as error:
-        mistakes = error.errors(include_url=False)
-        inner = {
-            mistake["loc"][:depth] for mistake in mistakes for depth in range(len(mistake["loc"]))
-        }
-        # A wrong item also makes its list wrong; only the item is worth a line.
-        lines = [_line(path, mistake) for mistake in mistakes if mistake["loc"] not in inner]
-        raise SceneError("\n".join(lines)) from error
-
-
-def _line(path: Path, mistake: ErrorDetails) -> str:
-    location = tuple(mistake["loc"])
-    key = ".".join(str(part) for part in location)
-    if mistake["type"] == "extra_forbidden":
-        return f"{path}: {key}: no such key{_suggestion(location)}"
-    if mistake["type"] == "missing":
-        return f"{path}: {key}: is missing"
-    message = mistake["msg"].removeprefix("Value error, ").replace("tuple", "list")
-    given = mistake["input"]
-    shown = "" if isinstance(given, dict | BaseModel) else f" (is {given!r})"
-    return f"{path}: {key or 'scene'}: {message[0].lower()}{message[1:]}{shown}"
-
-
-def _suggestion(location: tuple[int | str, ...]) -> str:
-    *parents, wrong = (str(part) for part in location)
-    known = list(_keys_of(Scene, parents))
-    stem = wrong.rsplit("_", 1)[0]  # `max_age_s` for `max_age_ms`: the unit is the mistake
-    close = difflib.get_close_matches(wrong, known, n=1) or [
-        name for name in known if name.rsplit("_", 1)[0] == stem
-    ]
-    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(known)}"
-
-
-def _keys_of(section: type[BaseModel], parents: list[str]) -> Iterator[str]:
-    if not parents:
-        yield from section.model_fields
-        return
-    field = section.model_fields.get(parents[0])
-    inner = field.annotation if field else None
-    if isinstance(inner, type) and issubclass(inner, BaseModel):
-        yield from _keys_of(inner, parents[1:])
+        raise SceneError("\n".join(lines_of(error, Scene, path))) from error

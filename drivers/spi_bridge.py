@@ -60,10 +60,10 @@ class SpiBridgeDriver:
     """Readings of the sensors behind one bridge; finds the bridge again whenever it was lost.
 
     `fingers` are the rows of a reading. `sensors` are the fingers in the order of the chip selects,
-    the same unless given; a board may have more sensors than fingers are wanted. `t_ns` of a reading is when the
-    bridge finished the sweep, by `drivers.clock`; `seq` goes on across losses of the link. An
-    electrode that the bridge's sequence leaves out, and every one of an absent sensor, is
-    `MISSING`.
+    the same unless given; a board may have more sensors than fingers are wanted. `t_ns` of a
+    reading is when the bridge finished the sweep, by `drivers.clock`; `seq` goes on across losses
+    of the link. An electrode that the bridge's sequence leaves out, and every one of an absent
+    sensor, is `MISSING`.
 
     `baud` means nothing to a USB device. Ports without a descriptor (`rfc2217://`, `loop://`) are
     polled. The constructor raises `ValueError`. `open` raises `DriverError` for a port name that

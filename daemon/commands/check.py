@@ -6,12 +6,19 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import get_args
 
 from daemon import assembly, scene
 from drivers.base import DriverError
-from models.contract import ModelError
+from models.contract import Finger, ModelError
 from models.runtime import TactileModel
+
+TACTILE_SECTIONS = (
+    scene.ReplayTactile,
+    scene.SpiTactile,
+    scene.CanTactile,
+    scene.PalmTactile,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
         wanted = scene.load(args.scene)
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
-        _try_driver(wanted)
+        _try_drivers(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
         sys.stderr.write(f"graspd: {error}\n")
         return 2
@@ -42,21 +49,20 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _try_driver(wanted: scene.Scene) -> None:
-    driver = assembly.build_driver(wanted)
-    try:
-        driver.open()
-    finally:
-        driver.close()
+def _try_drivers(wanted: scene.Scene) -> None:
+    for driver in assembly.build_drivers(wanted):
+        try:
+            driver.open()
+        finally:
+            driver.close()
 
 
-def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, Any]:
-    tactile = wanted.tactile
+def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
     contract = model.contract
     measured = contract.measured
-    return {
+    parts = {
         "hand": f"{wanted.hand.name}: {', '.join(wanted.hand.fingers)}",
-        "tactile": f"{tactile.driver}: {', '.join(map(str, tactile.recordings))}, {tactile.pace}",
+        "tactile": _section(wanted.tactile),
         "model": (
             f"{contract.name} ({model.sha256[:12]}): F1 {100 * measured.f1_mean:.1f} +- "
             f"{100 * measured.f1_std:.1f} % ({measured.protocol}), slip from p_slip "
@@ -65,14 +71,26 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, Any]:
         "gate": f"{wanted.gate.mode} reading, not older than {wanted.gate.max_age_ms:g} ms",
         "publish": f"verdict.{wanted.hand.name}, status.{wanted.hand.name} on {wanted.endpoint}",
     }
+    if wanted.joints is not None:
+        parts["joints"] = _section(wanted.joints)
+    return parts
 
 
-def _what_is_left_out(wanted: scene.Scene) -> dict[str, Any]:
-    left_out: dict[str, Any] = {"joints": "no joint readings are used"}
-    without = [name for name in ("ff", "mf", "rf", "lf", "th") if name not in wanted.hand.fingers]
+def _section(section: scene.Section) -> str:
+    """The driver and whatever the scene says about it."""
+    options = section.model_dump(mode="json", exclude_unset=True)
+    driver = options.pop("driver")
+    return f"{driver}: " + ", ".join(f"{key} {value}" for key, value in options.items())
+
+
+def _what_is_left_out(wanted: scene.Scene) -> dict[str, str]:
+    left_out = {}
+    drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
+    others = [driver for driver in drivers if driver != wanted.tactile.driver]
+    left_out["drivers"] = f"{', '.join(others)}: not imported"
+    if wanted.joints is None:
+        left_out["joints"] = "no joint code"
+    without = [name for name in get_args(Finger) if name not in wanted.hand.fingers]
     if without:
         left_out["fingers"] = f"{', '.join(without)}: no channel in image or network"
-    faults = wanted.tactile.faults
-    if faults == type(faults)():
-        left_out["faults"] = "none are injected"
     return left_out

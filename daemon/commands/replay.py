@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
-import time
 from contextlib import ExitStack
 from pathlib import Path
 
 from daemon import assembly, scene
-from daemon.judge.verdict import Verdict
+from daemon.printer import Printer
 from daemon.publisher import Publisher, PublishError
 from daemon.reporter import Reporter
 from daemon.service import Service
 from daemon.stop import StopSignal
-from daemon.summary import Summary
-from drivers.base import DriverError, TactileReading
+from drivers.base import DriverError
 from drivers.replay import DEMO_RECORDING
 from models.contract import ModelError
 
@@ -82,19 +79,20 @@ def _replay(args: argparse.Namespace) -> int:
     model = assembly.load_model(wanted)
     wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
     pipeline = assembly.build_pipeline(wanted, model)
-    driver = assembly.build_driver(wanted)
-    printer = _Printer(args.json)
+    drivers = assembly.build_drivers(wanted)
+    printer = Printer(as_json=args.json, prompt=args.speed is not None)
     with ExitStack() as stack:
         stop = stack.enter_context(StopSignal())
         publisher = None
         if args.publish:
             publisher = stack.enter_context(Publisher(args.publish))
-        stack.callback(driver.close)
-        driver.open()
+        for driver in drivers:
+            stack.callback(driver.close)
+            driver.open()
         if publisher is not None and args.wait and not publisher.wait_for_subscriber(args.wait):
             raise PublishError(f"nobody subscribed to {args.publish} within {args.wait:g} s")
         service = Service(
-            [driver],
+            drivers,
             pipeline,
             Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
             stop,
@@ -125,40 +123,6 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
         "gate": {"max_age_ms": MAX_AGE_MS},
     }
     return scene.parse(data, Path("command line"))
-
-
-class _Printer:
-    """Writes verdicts as they come and the summary at the end."""
-
-    def __init__(self, as_json: bool) -> None:
-        self._as_json = as_json
-        self._summary = Summary()
-        self._start_s = time.monotonic()
-
-    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        annotation = reading.annotation if reading else None
-        self._summary.add(verdict, annotation.slipped if annotation else None)
-        if self._as_json:
-            sys.stdout.write(payload.decode() + "\n")
-            return
-        if verdict.p_slip is None:
-            line = f"{verdict.grasp:6d}  {verdict.verdict:8}{', '.join(verdict.reasons):16}"
-        else:
-            line = f"{verdict.grasp:6d}  {verdict.verdict:8}p_slip {verdict.p_slip:.3f}    "
-        line += f"{verdict.latency_us:6.0f} us"
-        if annotation is not None:
-            line += f"  {annotation.object_name or ''}"
-            if annotation.slipped is not None:
-                line += f" (was {'slip' if annotation.slipped else 'stable'})"
-        sys.stdout.write(line.rstrip() + "\n")
-
-    def summary(self) -> None:
-        wall_s = time.monotonic() - self._start_s
-        if self._as_json:
-            sys.stdout.flush()
-            sys.stderr.write(json.dumps(self._summary.as_dict(wall_s)) + "\n")
-        else:
-            sys.stdout.write("\n" + "\n".join(self._summary.lines(wall_s)) + "\n")
 
 
 def _positive(text: str) -> float:

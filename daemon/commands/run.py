@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from daemon import assembly, scene
+from daemon.printer import Printer
 from daemon.publisher import Publisher, PublishError
 from daemon.reporter import Reporter
 from daemon.service import Service
@@ -21,12 +23,13 @@ log = logging.getLogger("graspd")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", type=Path, help="scene file (TOML)")
+    parser.add_argument("--print", action="store_true", help="print every verdict, and a summary")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording."""
     try:
-        _run(scene.load(args.scene))
+        _run(scene.load(args.scene), Printer(as_json=False, prompt=True) if args.print else None)
     except (scene.SceneError, ModelError, RecordingError) as error:
         sys.stderr.write(f"graspd: {error}\n")
         return 2
@@ -36,25 +39,28 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _run(wanted: scene.Scene) -> None:
+def _run(wanted: scene.Scene, printer: Printer | None) -> None:
     model = assembly.load_model(wanted)
     pipeline = assembly.build_pipeline(wanted, model)
-    driver = assembly.build_driver(wanted)
-    with (
-        StopSignal() as stop,
-        Publisher(wanted.endpoint, wanted.publish.high_water_mark) as publisher,
-    ):
-        reporter = Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher)
-        try:
+    drivers = assembly.build_drivers(wanted)
+    with ExitStack() as stack:
+        stop = stack.enter_context(StopSignal())
+        publisher = stack.enter_context(Publisher(wanted.endpoint, wanted.publish.high_water_mark))
+        for driver in drivers:
+            stack.callback(driver.close)
             driver.open()
-            log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-            Service(
-                [driver],
-                pipeline,
-                reporter,
-                stop,
-                max_age_ns=wanted.max_age_ns,
-                publisher=publisher,
-            ).run()
+        log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
+        service = Service(
+            drivers,
+            pipeline,
+            Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
+            stop,
+            max_age_ns=wanted.max_age_ns,
+            publisher=publisher,
+            listener=printer.verdict if printer else None,
+        )
+        try:
+            service.run()
         finally:
-            driver.close()
+            if printer is not None:
+                printer.summary()

@@ -102,6 +102,9 @@ class FakeDriver:
     def exhausted(self) -> bool:
         return self.ends and not self.queue
 
+    def describe(self) -> dict[str, str]:
+        return {"made": "by the test"}
+
     def open(self) -> None:
         self.is_open = True
 

@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,49 +22,7 @@ import pytest
 from daemon.judge.verdict import decode_verdict, schema
 from drivers.replay import DEMO_RECORDING
 from models.bts3 import TABLES
-
-GRASPD = (sys.executable, "-m", "daemon")
-TIMEOUT_S = 50
-
-SUBSCRIBER = """
-import sys, zmq
-endpoint, wanted = sys.argv[1], int(sys.argv[2])
-with zmq.Context() as context, context.socket(zmq.SUB) as socket:
-    socket.connect(endpoint)
-    socket.subscribe("verdict.")
-    for _ in range(wanted):
-        if not socket.poll(20000):
-            break
-        topic, payload = socket.recv_multipart()
-        print(payload.decode())
-"""
-
-
-def graspd(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*GRASPD, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        cwd=cwd,
-        check=False,
-    )
-
-
-def start(*arguments: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*GRASPD, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_for(path: Path) -> None:
-    deadline_s = time.monotonic() + 20
-    while not path.exists():
-        assert time.monotonic() < deadline_s, f"{path} did not appear"
-        time.sleep(0.01)
+from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
 
 def demo_rows() -> list[dict[str, str]]:

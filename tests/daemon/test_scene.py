@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import get_args
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from daemon.scene import Scene, SceneError, load
+from daemon.scene import ReplayTactile, Scene, SceneError, load
 
 GOOD = """
 [tactile]
@@ -32,6 +34,7 @@ def test_the_smallest_scene_has_the_documented_defaults(tmp_path: Path) -> None:
 
 def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:
     scene = load(write(tmp_path, GOOD + '[model]\npath = "mine.onnx"\n'))
+    assert isinstance(scene.tactile, ReplayTactile)
     assert scene.tactile.recordings == (tmp_path / "grasps.csv",)
     assert scene.model.path == tmp_path / "mine.onnx"
 
@@ -47,7 +50,11 @@ def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
     [
         ("", "tactile", "is missing"),
         ("[tactile]\nrecordings = ['a']", "tactile.driver", "is missing"),
-        ("[tactile]\ndriver = 'spy'\nrecordings = ['a']", "tactile.driver", "replay"),
+        (
+            "[tactile]\ndriver = 'spy'\nrecordings = ['a']",
+            "tactile.driver",
+            "there are: replay, spi, can, palm",
+        ),
         ("[tactile]\ndriver = 'replay'\nrecordings = []", "tactile.recordings", "at least 1"),
         ("[tactile]\ndriver = 'replay'\nrecordings = 'a'", "tactile.recordings", "valid list"),
         (GOOD + "[hnad]\nname = 'left'", "hnad", "did you mean hand?"),
@@ -69,7 +76,7 @@ def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
         (GOOD + "[publish]\nendpoint = 'udp://127.0.0.1:5'", "publish.endpoint", "ipc://"),
         (GOOD + f"[publish]\nendpoint = 'ipc://{'x' * 108}'", "publish.endpoint", "107 bytes"),
         (GOOD + "[tactile.faults]\nslow_every = 0", "tactile.faults.slow_every", "greater"),
-        (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, which the hand lacks"),
+        (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, not in hand.fingers"),
         (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
     ],
 )
@@ -112,12 +119,61 @@ def test_a_missing_file_is_said_in_one_line(tmp_path: Path) -> None:
         load(tmp_path / "absent.toml")
 
 
+def sections_below(annotation: object) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+        for field in annotation.model_fields.values():
+            yield from sections_below(field.annotation)
+    for argument in get_args(annotation):
+        yield from sections_below(argument)
+
+
 def test_every_section_of_the_scene_forbids_unknown_keys() -> None:
-    sections = [Scene]
+    sections = set(sections_below(Scene))
+    assert len(sections) >= 12
     for section in sections:
         assert section.model_config["extra"] == "forbid"
         assert section.model_config["frozen"] is True
-        for field in section.model_fields.values():
-            if isinstance(field.annotation, type) and hasattr(field.annotation, "model_fields"):
-                sections += [field.annotation]
-    assert len(sections) >= 6
+
+
+SPI = "[tactile]\ndriver = 'spi'\nport = '/dev/ttyACM0'\n"
+CAN = "[tactile]\ndriver = 'can'\n"
+PALM = "[tactile]\ndriver = 'palm'\nsource = 'udp://127.0.0.1:5555'\n"
+
+
+@pytest.mark.parametrize("text", [SPI, CAN, PALM, CAN + "format = 'sweep_fd'\n"])
+def test_every_driver_has_a_scene(tmp_path: Path, text: str) -> None:
+    assert load(write(tmp_path, text)).tactile.driver in text
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "says"),
+    [
+        (SPI + "sped = 1", "tactile.sped", "there are: driver, port, sensors, baud"),
+        (SPI + "baud = 9600", "tactile.baud", "greater than or equal to 115200"),
+        (CAN + "bitrate = '1M'", "tactile.bitrate", "valid integer"),
+        (CAN + "format = 'iso-tp'", "tactile.format", "'syntouch' or 'sweep_fd'"),
+        (
+            "[hand]\nfingers = ['ff', 'mf', 'rf', 'th']\n" + CAN,
+            "scene",
+            "syntouch carries three sensors",
+        ),
+        (
+            CAN + "[joints]\ndriver = 'palm'\ncalibration = 'hand.toml'",
+            "scene",
+            "joints.driver palm needs tactile.driver palm",
+        ),
+        (PALM + "[joints]\ndriver = 'palm'", "joints.calibration", "is missing"),
+        (PALM + "[joints]\ndriver = 'stream'\nsource = 'tcp://x'", "joints.source", "pattern"),
+        (PALM + "[joints]\ndriver = 'ros'", "joints.driver", "there are: palm, stream"),
+    ],
+)
+def test_a_mistake_in_a_driver_names_its_key(
+    tmp_path: Path, text: str, key: str, says: str
+) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(SceneError) as error:
+        load(path)
+    assert str(error.value).startswith(f"{path}: {key}: ")
+    assert says in str(error.value)
+    assert len(str(error.value).splitlines()) == 1

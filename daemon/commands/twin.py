@@ -1,0 +1,204 @@
+"""`graspd twin KIND`: stands in for hardware, to try graspd and a controller without a hand."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+from drivers.base import DriverError
+from drivers.sweep import SEQUENCES
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps import Counts, GeneratedContact, recorded_counts
+from models.bts3 import FINGERS
+
+log = logging.getLogger("graspd")
+
+SPI_PATH = Path("/tmp/graspd-twin")
+CAN_GROUP = "239.74.163.2"
+"""Default multicast group of python-can's `udp_multicast`."""
+PALM_TARGET = "udp://127.0.0.1:9870"
+JOINT_TARGET = "udp://127.0.0.1:9871"
+PALM_RATE_HZ = 1000 / 14
+"""Sweeps/s of a palm: 14 packets of a millisecond each."""
+PROBABILITIES = ("bit-flip", "drop", "duplicate", "reorder")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
+    spi = kinds.add_parser("spi", help="an SPI bridge on a pseudo-terminal")
+    spi.add_argument("--path", type=Path, default=SPI_PATH, help=f"(default: {SPI_PATH})")
+    can = kinds.add_parser("can", help="a CAN board on any python-can bus")
+    can.add_argument("--interface", default="udp_multicast", help="(default: udp_multicast)")
+    can.add_argument("--channel", default=CAN_GROUP, help=f"(default: {CAN_GROUP})")
+    can.add_argument("--format", choices=("syntouch", "sweep_fd"), default="syntouch")
+    can.add_argument("--arbitration-id", type=lambda text: int(text, 0), metavar="ID")
+    palm = kinds.add_parser("palm", help="a Shadow hand's palm over UDP")
+    palm.add_argument("--to", default=PALM_TARGET, help=f"(default: {PALM_TARGET})")
+    joints = kinds.add_parser("joints", help="a stream of joint angles over UDP")
+    joints.add_argument("--to", default=JOINT_TARGET, help=f"(default: {JOINT_TARGET})")
+    for kind in (spi, can):
+        kind.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="sweeps/s")
+        kind.add_argument("--sequence", choices=sorted(SEQUENCES), default="electrodes")
+    for kind in (spi, can, palm):
+        kind.add_argument(
+            "--recording",
+            type=Path,
+            action="append",
+            metavar="FILE",
+            help="play this recording, row by row (default: a generated contact)",
+        )
+        kind.add_argument("--loop", action="store_true", help="play recordings for ever")
+    for kind in (spi, can, palm, joints):
+        _add_faults(kind)
+
+
+def _add_faults(parser: argparse.ArgumentParser) -> None:
+    faults = parser.add_argument_group("faults, none by default; chances are per frame")
+    for name in PROBABILITIES:
+        faults.add_argument(f"--{name}", type=float, default=0.0, metavar="P")
+    faults.add_argument("--one-byte-at-a-time", action="store_true")
+    faults.add_argument("--burst", type=int, default=1, metavar="FRAMES")
+    faults.add_argument("--disconnect-every", type=int, metavar="FRAMES")
+    faults.add_argument("--wrong-version", action="store_true")
+    faults.add_argument("--stuck-clock", action="store_true")
+    faults.add_argument("--dead", action="append", default=[], metavar="FINGER:ELECTRODE")
+    faults.add_argument("--unplugged", action="append", default=[], choices=FINGERS)
+    faults.add_argument("--seed", type=int, default=0)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until stopped or until the recording ends; prints the faults injected, as JSON."""
+    stop = threading.Event()
+
+    def ask_to_stop(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    former = {number: signal.signal(number, ask_to_stop) for number in STOP_SIGNALS}
+    try:
+        injected = SERVE[args.kind](args, _faults(args), stop)
+    except (DriverError, ValueError, OSError) as error:
+        sys.stderr.write(f"graspd: {error}\n")
+        return 2
+    finally:
+        for number, handler in former.items():
+            signal.signal(number, handler)
+    sys.stdout.write(json.dumps({"injected": injected}) + "\n")
+    return 0
+
+
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+def _counts(args: argparse.Namespace, rate_hz: float) -> Iterator[Counts]:
+    if not args.recording:
+        yield from GeneratedContact(len(FINGERS), rate_hz)
+    while True:
+        for path in args.recording:
+            yield from recorded_counts(path)
+        if not args.loop:
+            return
+
+
+def _faults(args: argparse.Namespace) -> LinkFaults:
+    chances = {
+        f"{name.replace('-', '_')}_probability": _given(args, name) for name in PROBABILITIES
+    }
+    return LinkFaults(
+        **chances,
+        one_byte_at_a_time=args.one_byte_at_a_time,
+        burst_frames=args.burst,
+        disconnect_every_frames=args.disconnect_every,
+        wrong_version=args.wrong_version,
+        stuck_clock=args.stuck_clock,
+        dead_electrodes=tuple(map(_electrode, args.dead)),
+        unplugged_fingers=tuple(FINGERS.index(finger) for finger in args.unplugged),
+        seed=args.seed,
+    )
+
+
+def _given(args: argparse.Namespace, name: str) -> float:
+    return float(getattr(args, name.replace("-", "_")))
+
+
+def _electrode(text: str) -> tuple[int, int]:
+    finger, _, number = text.partition(":")
+    if finger not in FINGERS or not number.isdecimal() or not 1 <= int(number) <= 24:
+        raise ValueError(f"{text!r} is no electrode; th:24 would be one")
+    return FINGERS.index(finger), int(number) - 1
+
+
+def _serve_spi(
+    args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
+) -> dict[str, int]:
+    from drivers.twins.spi import SpiTwin
+
+    twin = SpiTwin(
+        args.path,
+        _counts(args, args.rate),
+        rate_hz=args.rate,
+        channels=SEQUENCES[args.sequence],
+        faults=faults,
+    )
+    with twin:
+        log.info("SPI bridge on %s", args.path)
+        twin.serve(lambda: stop.is_set() or twin.exhausted)
+    return dict(twin.injected)
+
+
+def _serve_can(
+    args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
+) -> dict[str, int]:
+    from drivers.twins.can import CanTwin
+
+    twin = CanTwin(
+        args.interface,
+        args.channel,
+        _counts(args, args.rate),
+        format=args.format,
+        arbitration_id=args.arbitration_id,
+        sequence=args.sequence,
+        rate_hz=args.rate,
+        faults=faults,
+    )
+    with twin:
+        log.info("CAN board on %s %s", args.interface, args.channel)
+        twin.serve(stop)
+    return dict(twin.injected)
+
+
+def _serve_palm(
+    args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
+) -> dict[str, int]:
+    from drivers.twins.palm import PalmTwin
+
+    twin = PalmTwin(_counts(args, PALM_RATE_HZ), faults=faults)
+    log.info("palm to %s", args.to)
+    twin.serve(args.to, stop)
+    return dict(twin.injected)
+
+
+def _serve_joints(
+    args: argparse.Namespace, faults: LinkFaults, stop: threading.Event
+) -> dict[str, int]:
+    from drivers.twins.joints import JointTwin
+
+    twin = JointTwin(faults=faults)
+    log.info("joints to %s", args.to)
+    twin.serve(args.to, stop)
+    return dict(twin.injected)
+
+
+SERVE = {
+    "spi": _serve_spi,
+    "can": _serve_can,
+    "palm": _serve_palm,
+    "joints": _serve_joints,
+}

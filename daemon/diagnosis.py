@@ -1,0 +1,151 @@
+"""What readings and counters say about the health of sensors and link, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+
+RAIL_COUNTS = 20
+"""A mean this near to 0 or 4095 is a rail; 0.3 % of loaded electrodes come this low."""
+QUIET_COUNTS = 40.0
+"""An untouched electrode's standard deviation is 3 to 12 counts; beyond this something moves."""
+STILL_READINGS = 10
+"""So many equal counts in a row do not happen with 3 counts of noise."""
+FAULTY_FRACTION = 0.5
+"""An electrode with more faulty readings than this is missing, with fewer it is unreliable."""
+NAMED_MAX = 6
+"""More electrodes than this are counted instead of named."""
+RATE_FRACTION = 0.9
+"""Readings per nominal rate below which the link is slow."""
+
+
+class Level(StrEnum):
+    """How bad a finding is."""
+
+    OK = "ok"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing found, and what to do about it."""
+
+    level: Level
+    what: str
+    advice: str = ""
+
+
+class ElectrodeStatistics:
+    """Running mean, spread and faults of every electrode, in constant memory (Welford)."""
+
+    def __init__(self, fingers: Sequence[str]) -> None:
+        self.fingers = tuple(fingers)
+        shape = (len(fingers), ELECTRODES)
+        self.readings = 0
+        self.faulty = np.zeros(shape, dtype=np.int64)
+        """Readings with a fault, shape (fingers, 24)."""
+        self.fault_bits = np.zeros(shape, dtype=np.uint8)
+        self.mean = np.zeros(shape)
+        """Counts, over readings without a fault."""
+        self._sound = np.zeros(shape, dtype=np.int64)
+        self._squares = np.zeros(shape)
+
+    def add(self, reading: TactileReading) -> None:
+        """Take in one reading of these fingers."""
+        self.readings += 1
+        faulty = reading.faults != 0
+        self.faulty += faulty
+        self.fault_bits |= reading.faults
+        self._sound += ~faulty
+        step = np.where(faulty, 0.0, reading.counts - self.mean)
+        self.mean += step / np.maximum(self._sound, 1)
+        self._squares += step * np.where(faulty, 0.0, reading.counts - self.mean)
+
+    @property
+    def deviation(self) -> NDArray[np.float64]:
+        """Standard deviation, counts, shape (fingers, 24)."""
+        deviation: NDArray[np.float64] = np.sqrt(self._squares / np.maximum(self._sound, 1))
+        return deviation
+
+    def findings(self) -> list[Finding]:
+        """What is wrong with the electrodes, finger by finger."""
+        found: list[Finding] = []
+        for finger, name in enumerate(self.fingers):
+            found += self._of_finger(finger, name)
+        return found
+
+    def _of_finger(self, finger: int, name: str) -> list[Finding]:
+        if not self.readings:
+            return []
+        missing = self.faulty[finger] > FAULTY_FRACTION * self.readings
+        why = _faults_in_words(int(np.bitwise_or.reduce(self.fault_bits[finger])))
+        if missing.all():
+            advice = "check the finger's plug, its chip select and its supply (3.3 to 5 V)"
+            return [Finding(Level.ERROR, f"{name}: no electrode can be read ({why})", advice)]
+        unreliable = (self.faulty[finger] > 0) & ~missing
+        mean, deviation = self.mean[finger], self.deviation[finger]
+        rail = ~missing & ((mean <= RAIL_COUNTS) | (mean >= COUNT_MAX - RAIL_COUNTS))
+        enough = self._sound[finger] >= STILL_READINGS
+        still = ~missing & ~rail & enough & (deviation == 0.0)
+        moving = ~missing & ~rail & (deviation > QUIET_COUNTS)
+        table = [
+            (missing, Level.ERROR, f"never or rarely sampled ({why})", "check bus load and wiring"),
+            (
+                rail,
+                Level.ERROR,
+                "stuck at a rail",
+                "a dead electrode: refill or replace the sensor",
+            ),
+            (still, Level.ERROR, "frozen", "power-cycle the sensor; check who repeats old data"),
+            (unreliable, Level.WARNING, f"now and then faulty ({why})", "check wiring and clock"),
+            (moving, Level.WARNING, "restless", "leave the hand untouched while the doctor looks"),
+        ]
+        return [
+            Finding(level, f"{name}: {_names(which)} {what}", advice)
+            for which, level, what, advice in table
+            if which.any()
+        ]
+
+
+def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
+    """A warning for every counter of a driver that is about something going wrong."""
+    usual = {"readings", "bytes", "frames", "sweeps", "packets", "loops", "rows", "joint_readings"}
+    return [
+        Finding(Level.WARNING, f"{driver}: {number} {name.replace('_', ' ')}")
+        for name, number in counters.items()
+        if number and name not in usual
+    ]
+
+
+def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | None) -> Finding:
+    """Whether readings come, and as often as they should."""
+    rate_hz = readings / seconds
+    if not readings:
+        advice = "is it powered, connected, and the one that the scene names?"
+        return Finding(Level.ERROR, f"{driver}: no reading in {seconds:.1f} s", advice)
+    if period_ns is None:
+        return Finding(Level.OK, f"{driver}: {rate_hz:.1f} readings/s")
+    nominal_hz = 1e9 / period_ns
+    what = f"{driver}: {rate_hz:.1f} readings/s of {nominal_hz:.1f}"
+    if rate_hz < RATE_FRACTION * nominal_hz:
+        return Finding(Level.WARNING, what, "frames are lost: check bus load, cable and baud rate")
+    return Finding(Level.OK, what)
+
+
+def _faults_in_words(bits: int) -> str:
+    names = [fault.name or "" for fault in ElectrodeFault if fault & bits]
+    return ", ".join(name.lower().replace("_", " ") for name in names) or "no fault"
+
+
+def _names(which: NDArray[np.bool_]) -> str:
+    numbers = np.flatnonzero(which) + 1
+    if len(numbers) > NAMED_MAX:
+        return f"{len(numbers)} electrodes"
+    return ", ".join(f"E{number}" for number in numbers)

@@ -1,0 +1,56 @@
+"""Verdicts on standard output, for people or for programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+from daemon.judge.verdict import Verdict
+from daemon.summary import Summary
+from drivers.base import Annotation, TactileReading
+
+
+class Printer:
+    """Writes verdicts as they come, and a summary at the end."""
+
+    def __init__(self, *, as_json: bool, prompt: bool) -> None:
+        """`as_json`: the messages themselves on stdout, and the summary as JSON on stderr.
+
+        `prompt`: each line goes out at once, also into a pipe, for readings that come in time.
+        """
+        self._prompt = prompt
+        self._as_json = as_json
+        self._summary = Summary()
+        self._start_s = time.monotonic()
+
+    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Write one verdict; `reading` is None where the verdict is about silence."""
+        annotation = reading.annotation if reading else None
+        self._summary.add(verdict, annotation.slipped if annotation else None)
+        line = payload.decode() if self._as_json else _line(verdict, annotation)
+        sys.stdout.write(line + "\n")
+        if self._prompt:
+            sys.stdout.flush()
+
+    def summary(self) -> None:
+        """Write the summary of everything since the start."""
+        wall_s = time.monotonic() - self._start_s
+        if self._as_json:
+            sys.stdout.flush()
+            sys.stderr.write(json.dumps(self._summary.as_dict(wall_s)) + "\n")
+        else:
+            sys.stdout.write("\n" + "\n".join(self._summary.lines(wall_s)) + "\n")
+
+
+def _line(verdict: Verdict, annotation: Annotation | None) -> str:
+    if verdict.p_slip is None:
+        finding = ", ".join(verdict.reasons)
+    else:
+        finding = f"p_slip {verdict.p_slip:.3f}"
+    line = f"{verdict.grasp:6d}  {verdict.verdict:8}{finding:16}{verdict.latency_us:6.0f} us"
+    if annotation is not None:
+        line += f"  {annotation.object_name or ''}"
+        if annotation.slipped is not None:
+            line += f" (was {'slip' if annotation.slipped else 'stable'})"
+    return line.rstrip()

@@ -1,0 +1,121 @@
+"""CAN frames as graspd sees them, and the structs in which Linux hands them over. Bytes only.
+
+Source: linux/can.h and linux/can/error.h.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntFlag
+from typing import Final, NamedTuple
+
+STANDARD_ID_MAX: Final = 0x7FF
+EXTENDED_ID_MAX: Final = 0x1FFFFFFF
+CLASSIC_DATA_MAX: Final = 8
+FD_DATA_MAX: Final = 64
+
+EFF_FLAG: Final = 0x80000000
+RTR_FLAG: Final = 0x40000000
+ERR_FLAG: Final = 0x20000000
+CAN_FRAME: Final = struct.Struct("=IB3x8s")
+"""`struct can_frame`: id with flags, length, padding, data. 16 bytes, native byte order."""
+CANFD_FRAME: Final = struct.Struct("=IBB2x64s")
+"""`struct canfd_frame`: id with flags, length, FD flags, padding, data. 72 bytes."""
+
+ERROR_CONTROLLER: Final = 0x004
+ERROR_BUS_OFF: Final = 0x040
+CONTROLLER_RX_OVERFLOW: Final = 0x01
+_ERROR_CLASSES: Final = {
+    0x001: "transmit timeout",
+    0x002: "lost arbitration",
+    0x004: "controller problem",
+    0x008: "protocol violation",
+    0x010: "transceiver problem",
+    0x020: "no acknowledgement",
+    0x040: "bus-off",
+    0x080: "bus error",
+    0x100: "controller restarted",
+    0x200: "error counters",
+}
+
+
+class FrameFlag(IntFlag):
+    """What kind of frame this is; none set means a classic data frame with an 11-bit id."""
+
+    EXTENDED = 1
+    """29-bit arbitration id."""
+    REMOTE = 2
+    """Asks for data, has none."""
+    ERROR = 4
+    """Made by the controller: the id holds error classes."""
+    FD = 8
+
+
+EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
+"""`FrameFlag` as plain integers: an IntFlag costs a microsecond per operation."""
+
+
+class CanFrame(NamedTuple):
+    """One frame from a bus."""
+
+    arbitration_id: int
+    """Without the flag bits of Linux; for error frames the error classes."""
+    data: bytes
+    flags: int = 0
+    """`FrameFlag` bits."""
+
+
+def unpack_frame(raw: bytes) -> CanFrame | None:
+    """The frame in a `can_frame` or `canfd_frame`, None if it is neither."""
+    if len(raw) == CAN_FRAME.size:
+        word, length, data = CAN_FRAME.unpack(raw)
+        longest, flags = CLASSIC_DATA_MAX, 0
+    elif len(raw) == CANFD_FRAME.size:
+        word, length, _fd_flags, data = CANFD_FRAME.unpack(raw)
+        longest, flags = FD_DATA_MAX, FD
+    else:
+        return None
+    if length > longest:
+        return None
+    if word & ERR_FLAG:
+        return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | ERROR)
+    if word & RTR_FLAG:
+        flags |= REMOTE
+        data = b""
+    if word & EFF_FLAG:
+        return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | EXTENDED)
+    return CanFrame(word & STANDARD_ID_MAX, data[:length], flags)
+
+
+def pack_frame(frame: CanFrame) -> bytes:
+    """The struct that Linux would hand over. Raises `ValueError` for a frame that cannot be."""
+    extended = bool(frame.flags & (EXTENDED | ERROR))
+    if not 0 <= frame.arbitration_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX):
+        raise ValueError(f"arbitration id {frame.arbitration_id:#x} is out of range")
+    if len(frame.data) > (FD_DATA_MAX if frame.flags & FD else CLASSIC_DATA_MAX):
+        raise ValueError(f"{len(frame.data)} bytes of data do not fit into a frame")
+    word = frame.arbitration_id
+    word |= EFF_FLAG if frame.flags & EXTENDED else 0
+    word |= RTR_FLAG if frame.flags & REMOTE else 0
+    word |= ERR_FLAG if frame.flags & ERROR else 0
+    if frame.flags & FD:
+        return CANFD_FRAME.pack(word, len(frame.data), 0, frame.data)
+    return CAN_FRAME.pack(word, len(frame.data), frame.data)
+
+
+def is_bus_off(frame: CanFrame) -> bool:
+    """Whether an error frame says that the controller has left the bus."""
+    return bool(frame.flags & ERROR and frame.arbitration_id & ERROR_BUS_OFF)
+
+
+def is_overflow(frame: CanFrame) -> bool:
+    """Whether an error frame says that the controller's receive buffer ran over."""
+    if not (frame.flags & ERROR and frame.arbitration_id & ERROR_CONTROLLER):
+        return False
+    return len(frame.data) > 1 and bool(frame.data[1] & CONTROLLER_RX_OVERFLOW)
+
+
+def describe_error(frame: CanFrame) -> str:
+    """The error classes of an error frame in words."""
+    names = [name for bit, name in _ERROR_CLASSES.items() if frame.arbitration_id & bit]
+    return ", ".join(names) or "unknown error class"

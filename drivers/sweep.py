@@ -1,0 +1,329 @@
+"""Samples -> one `TactileReading` per sweep; what is missing is flagged.
+
+The real CAN format has no counter. What a sample is, its command byte says; which sweep it belongs
+to, only its place in the known order of the sequence and the time between samples can say:
+
+- An electrode earlier in the order starts a new sweep, unless it is a copy of what this sweep has
+  (duplicated) or one that this sweep lacks and just passed by (reordered, up to `REORDER_MAX`).
+- A sample that comes later than its place in the order explains starts a new sweep too.
+- A sweep that is lost as a whole is found by time alone.
+
+What cannot be told apart: a sample of which the data is damaged so that it names another valid
+channel; a loss of exactly one sweep's worth of samples before the period is known; copies that
+come more than `REORDER_MAX` electrodes late, which count as a new sweep. In none of these is an
+electrode shifted or filled from memory: what a sweep did not receive is `MISSING` in it.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
+from drivers.biotac import (
+    E1,
+    E24,
+    SEQUENCE_ALL,
+    SEQUENCE_ELECTRODES,
+    SEQUENCE_INTERLEAVED,
+    decode_words,
+)
+
+SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
+    "electrodes": SEQUENCE_ELECTRODES,
+    "all": SEQUENCE_ALL,
+    "interleaved": SEQUENCE_INTERLEAVED,
+}
+"""Sampling sequences by the name that a scene gives them."""
+
+REORDER_MAX: Final = 3
+"""Samples may come so many electrodes late: adapters with two or three receive buffers swap
+neighbours, a bus does not."""
+PERIODS_KEPT: Final = 15
+PERIODS_NEEDED: Final = 5
+"""The period is the median of the last 15 and known after 5."""
+NEXT_SWEEP_PERIODS: Final = 0.75
+"""A sample this much later than its place explains, in periods, is of another sweep. Losing a
+whole sweep's worth of samples in a row is rarer than a late one, hence more than a half."""
+ARRIVAL_JITTER_NS: Final = 5_000_000
+READING_JITTER_NS: Final = 50_000_000
+"""Lateness, ns, that means nothing: where frames are stamped as they arrive, and where they are
+stamped when the loop gets to read them, which may stall."""
+SUCCESSOR_PATIENCE: Final = 4
+"""The very next electrode may come so many times later than any other: it is of another sweep only
+if the samples of whole sweeps were lost and not one more or less, while senders do stall."""
+SILENCE_NS: Final = 200_000_000
+"""While the period is not known: after this long, ns, a sample is of another sweep."""
+OUTAGE_NS: Final = 2_000_000_000
+"""After this long, ns, nobody knows how many sweeps were made: it counts as one missed."""
+
+_ALL: Final = (1 << ELECTRODES) - 1
+
+
+@dataclass(slots=True)
+class SweepCounters(DriverCounters):
+    """What happened to samples and sweep frames on the way to a reading."""
+
+    lost_frames: int = 0
+    """Frames with electrodes that did not come although others of their sweep did."""
+    duplicate_frames: int = 0
+    """Frames that came again; the copy is dropped."""
+    reordered_frames: int = 0
+    """Frames that came after their successor and in time for their sweep."""
+    late_frames: int = 0
+    """Frames that came when their sweep was over; dropped."""
+    unsynchronised_frames: int = 0
+    """Frames dropped after opening until a sweep began."""
+    unexpected_channels: int = 0
+    """Samples of a channel that the configured sequence does not have."""
+    interrupted_sweeps: int = 0
+    """Sweeps dropped because the link broke in the middle."""
+    restarts: int = 0
+    """Times that the device's sweep counter started anew."""
+    parity_words: int = 0
+    """Response words with a byte of even parity."""
+    error_words: int = 0
+    """Response words that are error words."""
+    unplugged_words: int = 0
+    """Response words of a line that nothing drives, or of a sensor that is reported absent."""
+
+
+class ReadingMaker:
+    """Numbers readings, counts what is wrong with them, knows their period."""
+
+    def __init__(self, counters: SweepCounters) -> None:
+        self.counters = counters
+        self.seq = 0
+        self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self.period_ns: int | None = None
+
+    def learn(self, gap_ns: int) -> None:
+        """Take in the time between two sweeps in a row, ns."""
+        self._gaps_ns.append(gap_ns)
+        if len(self._gaps_ns) >= PERIODS_NEEDED:
+            self.period_ns = max(round(statistics.median(self._gaps_ns)), 1)
+
+    def miss(self, sweeps: int) -> None:
+        """So many sweeps were made and never arrived."""
+        self.seq += sweeps
+        self.counters.missed_readings += sweeps
+
+    def make(
+        self, words: NDArray[np.uint16], marks: NDArray[np.uint8], t_ns: int
+    ) -> TactileReading:
+        """The reading of response words, shape (fingers, 24).
+
+        `marks`: `ElectrodeFault` bits that are known beforehand; a word under `MISSING` means
+        nothing and is not looked at.
+        """
+        counts, faults = decode_words(words)
+        absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
+        faults[absent] = 0
+        if faults.any():
+            self._count_words(faults)
+        faults |= marks
+        counts[absent] = 0
+        self.counters.readings += 1
+        self.counters.faulty_readings += bool(faults.any())
+        reading = TactileReading(t_ns, self.seq, counts, faults)
+        self.seq += 1
+        return reading
+
+    def _count_words(self, faults: NDArray[np.uint8]) -> None:
+        self.counters.parity_words += int((faults == ElectrodeFault.PARITY).sum())
+        self.counters.error_words += int((faults == ElectrodeFault.ERROR_WORD).sum())
+        self.counters.unplugged_words += int((faults == ElectrodeFault.MISSING).sum())
+
+
+class SampleSweeps:
+    """Sweeps from single samples in the order of a sequence."""
+
+    def __init__(
+        self,
+        fingers: int,
+        sequence: Sequence[int],
+        counters: SweepCounters,
+        jitter_ns: int = ARRIVAL_JITTER_NS,
+    ) -> None:
+        """`sequence`: channels in order. `jitter_ns`: how late a sample may be stamped, ns.
+
+        Raises `ValueError` unless E1 to E24 are in the sequence once each.
+        """
+        electrodes = [channel for channel in sequence if E1 <= channel <= E24]
+        if sorted(electrodes) != list(range(E1, E24 + 1)):
+            raise ValueError("the sequence does not have every electrode exactly once")
+        self._place = {channel: place for place, channel in enumerate(electrodes)}
+        self._others = frozenset(sequence) - set(electrodes)
+        self._electrodes = np.array(electrodes, dtype=np.intp) - E1
+        self._position = [sequence.index(channel) / len(sequence) for channel in electrodes]
+        self._jitter_ns = jitter_ns
+        self._fingers = fingers
+        self._width = 2 * fingers
+        self._readings = ReadingMaker(counters)
+        self._counters = counters
+        self._buffer = bytearray(ELECTRODES * self._width)
+        self._synchronised = False
+        self._previous_start_ns: int | None = None
+        self._previous_end_ns: int | None = None
+        self._previous_had = _ALL
+        self._have = 0
+        self._last = -1
+        self._t_ns = 0
+        self._finished = False
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between sweeps, ns, as measured; None until it is known."""
+        return self._readings.period_ns
+
+    @property
+    def expected_ns(self) -> int | None:
+        """When the next reading should be complete, monotonic ns; None while that is not known."""
+        period_ns = self._readings.period_ns
+        if period_ns is None or self._last < 0:
+            return None
+        left = 1.0 if self._finished else self._position[-1] - self._position[self._last]
+        return self._t_ns + round(left * period_ns)
+
+    def push(self, channel: int, words: bytes, t_ns: int) -> Sequence[TactileReading]:
+        """Take one sample, received at `t_ns`; the readings that it completes, oldest first.
+
+        `words` holds each finger's response word in turn, two bytes each.
+        """
+        place = self._place.get(channel)
+        if place is None:
+            self._counters.unexpected_channels += channel not in self._others
+            return ()
+        if not self._synchronised and not self._starts(place):
+            self._counters.unsynchronised_frames += 1
+            return ()
+        if self._ahead(place, t_ns):
+            if self._is_tail_of_previous(place):
+                self._counters.late_frames += 1
+                return ()
+            return self._store(place, words, t_ns)
+        if self._repeats(place, words, t_ns):
+            return ()
+        finished = self._finish()
+        self._begin()
+        return (*finished, *self._store(place, words, t_ns))
+
+    def interrupt(self) -> None:
+        """The link broke: drop the sweep at hand, wait for the beginning of another."""
+        self._counters.interrupted_sweeps += not self._finished and self._have != 0
+        self._synchronised = False
+        self._previous_had = _ALL
+        self._begin()
+
+    def _starts(self, place: int) -> bool:
+        """Whether a sweep begins with this sample, the first ones after opening."""
+        self._synchronised = place == 0 or place < self._last
+        self._last = -1 if self._synchronised else place
+        return self._synchronised
+
+    def _begin(self) -> None:
+        self._have = 0
+        self._last = -1
+        self._t_ns = 0
+        self._finished = False
+
+    def _ahead(self, place: int, t_ns: int) -> bool:
+        """Whether a sample is of this sweep and the furthest so far."""
+        return place > self._last and not self._is_next_sweep(place, t_ns)
+
+    def _is_next_sweep(self, place: int, t_ns: int) -> bool:
+        """Whether a sample comes too late to be of this sweep."""
+        if self._last < 0:
+            return False
+        gap_ns = t_ns - self._t_ns
+        period_ns = self._readings.period_ns
+        if period_ns is None:
+            return gap_ns > SILENCE_NS
+        advance = self._position[place] - self._position[self._last]
+        tolerance_ns = self._tolerance_ns(period_ns)
+        if place == self._last + 1:
+            tolerance_ns *= SUCCESSOR_PATIENCE
+        return gap_ns - advance * period_ns >= tolerance_ns
+
+    def _tolerance_ns(self, period_ns: int) -> float:
+        return max(NEXT_SWEEP_PERIODS * period_ns, self._jitter_ns)
+
+    def _is_tail_of_previous(self, place: int) -> bool:
+        """Whether one of the last electrodes comes just after the sweep that lacked it."""
+        return (
+            place >= ELECTRODES - REORDER_MAX
+            and 0 <= self._last < REORDER_MAX
+            and not self._previous_had >> place & 1
+        )
+
+    def _repeats(self, place: int, words: bytes, t_ns: int) -> bool:
+        """Deal with a sample that stays in this sweep: a copy or a late one. False: a new sweep."""
+        if self._last - place > REORDER_MAX or self._is_next_sweep(place, t_ns):
+            return False
+        if not self._have >> place & 1:
+            if self._finished:
+                self._counters.late_frames += 1
+            else:
+                self._counters.reordered_frames += 1
+                self._put(place, words, max(t_ns, self._t_ns))
+            return True
+        start = place * self._width
+        if self._buffer[start : start + self._width] != words:
+            return False
+        self._counters.duplicate_frames += 1
+        return True
+
+    def _store(self, place: int, words: bytes, t_ns: int) -> Sequence[TactileReading]:
+        self._last = place
+        self._put(place, words, t_ns)
+        if place < ELECTRODES - 1:
+            return ()
+        return self._finish()
+
+    def _put(self, place: int, words: bytes, t_ns: int) -> None:
+        start = place * self._width
+        self._buffer[start : start + self._width] = words
+        self._have |= 1 << place
+        self._t_ns = t_ns
+
+    def _finish(self) -> Sequence[TactileReading]:
+        """Close the sweep at hand and hand over its reading, unless that was done before."""
+        if self._finished or not self._have:
+            return ()
+        self._finished = True
+        self._mind_time()
+        self._previous_had = self._have
+        words = np.zeros((self._fingers, ELECTRODES), dtype=np.uint16)
+        came = np.frombuffer(self._buffer, dtype=">u2").reshape(ELECTRODES, self._fingers)
+        words[:, self._electrodes] = came.T
+        marks = np.zeros((self._fingers, ELECTRODES), dtype=np.uint8)
+        lost = ELECTRODES - self._have.bit_count()
+        if lost:
+            places = [place for place in range(ELECTRODES) if not self._have >> place & 1]
+            marks[:, self._electrodes[places]] = ElectrodeFault.MISSING
+            self._counters.lost_frames += lost
+        return (self._readings.make(words, marks, self._t_ns),)
+
+    def _mind_time(self) -> None:
+        """Find sweeps lost as a whole, and learn the period from two complete ends in a row."""
+        period_ns = self._readings.period_ns
+        start_ns = self._t_ns - round(self._position[self._last] * (period_ns or 0))
+        if self._previous_start_ns is not None:
+            gap_ns = start_ns - self._previous_start_ns
+            if gap_ns > OUTAGE_NS:
+                self._readings.miss(1)
+            elif period_ns and gap_ns - period_ns >= self._tolerance_ns(period_ns):
+                self._readings.miss(round(gap_ns / period_ns) - 1)
+        self._previous_start_ns = start_ns
+        complete = self._last == ELECTRODES - 1
+        if complete and self._previous_end_ns is not None:
+            gap_ns = self._t_ns - self._previous_end_ns
+            if 0 < gap_ns <= OUTAGE_NS:
+                self._readings.learn(gap_ns)
+        self._previous_end_ns = self._t_ns if complete else None

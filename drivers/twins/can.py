@@ -1,0 +1,272 @@
+"""A CAN twin: sensors that are not there, on any bus of python-can, with faults on request."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import TracebackType
+from typing import Any, Final, Self
+
+import can
+
+from drivers.base import ELECTRODES, FINGERS
+from drivers.biotac import E1, E24, PAC, PDC, TAC, TDC, encode_word
+from drivers.can_formats import (
+    SWEEP_BASE_ID,
+    SWEEP_VERSION,
+    CanFormat,
+    SweepFrame,
+    encode_sample,
+)
+from drivers.can_frames import STANDARD_ID_MAX
+from drivers.sweep import SEQUENCES
+from drivers.twins.faults import LinkFaultInjector, LinkFaults
+from drivers.twins.grasps import Counts
+
+SAMPLE_ID: Final = 0x100
+"""Arbitration id of the twin's samples: no public file says what the real board uses."""
+OTHER_COUNTS: Final = {PAC: 2050, PDC: 2800, TAC: 2010, TDC: 2260}
+"""What the channels that are no electrodes read; an untouched hand's values."""
+SEND_TIMEOUT_S: Final = 0.1
+"""How long a full transmit queue may hold the twin up, s. Not on a virtual bus, whose queue a
+reader in the same thread empties."""
+DOWN_S: Final = 0.2
+"""How long a broken link stays down, s."""
+_UNDRIVEN: Final = b"\xff\xff"
+_WORDS: Final = [encode_word(count).to_bytes(2, "big") for count in range(4096)]
+
+Outgoing = tuple[int, bytes]
+"""Arbitration id and data."""
+
+
+class CanTwin:
+    """Sends the sweeps of `counts` in one of the two formats.
+
+    `send_sweep` sends one at once and waits for nothing, for tests; `serve` sends at `rate_hz`.
+    `first_sweep` is the number of the first sweep frame. The constructor raises `ValueError` for
+    an argument that does not fit.
+    """
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        counts: Iterator[Counts],
+        fingers: Sequence[str] = ("ff", "mf", "th"),
+        *,
+        format: str = CanFormat.SYNTOUCH,  # noqa: A002 (as the driver calls it)
+        arbitration_id: int | None = None,
+        sequence: str = "interleaved",
+        rate_hz: float = 100.0,
+        first_sweep: int = 0,
+        faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
+        bus_options: Mapping[str, Any] | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._format = CanFormat(format)
+        is_sweep = self._format is CanFormat.SWEEP_FD
+        if sequence not in SEQUENCES:
+            raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
+        if not 0.0 < rate_hz <= 1000.0:
+            raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
+        if faults.one_byte_at_a_time:
+            raise ValueError("CAN has no single bytes")
+        if not is_sweep and (faults.wrong_version or faults.stuck_clock):
+            raise ValueError("SynTouch's format has neither a version nor a clock")
+        self._fingers = tuple(FINGERS.index(finger) for finger in fingers)
+        self._channels = SEQUENCES[sequence]
+        default_id = SWEEP_BASE_ID if is_sweep else SAMPLE_ID
+        self._id = default_id if arbitration_id is None else arbitration_id
+        self._counts = counts
+        self._period_ns = round(1e9 / rate_hz)
+        self._faults = faults
+        # A burst joins the bytes of frames, which on CAN must stay apart: done here instead.
+        self._injector = LinkFaultInjector(dataclasses.replace(faults, burst_frames=1))
+        self._clock = clock
+        self._interface, self._channel = interface, channel
+        self._options = dict(bus_options or {})
+        if is_sweep and interface == "virtual":
+            self._options.setdefault("protocol", can.CanProtocol.CAN_FD)
+        elif is_sweep:
+            self._options.setdefault("fd", True)
+        self._send_timeout_s = 0.0 if interface == "virtual" else SEND_TIMEOUT_S
+        self._bus: can.BusABC | None = None
+        self._held_id: int | None = None
+        self._burst: list[Outgoing] = []
+        self._sweep = first_sweep
+        self._stuck_tick_us = self._tick_us()
+        self.frames_sent = 0
+        self.unsent = 0
+        """Frames that the bus did not take."""
+
+    @property
+    def injected(self) -> Counter[str]:
+        """How often each fault was put in, by its name."""
+        return self._injector.injected
+
+    def open(self) -> None:
+        """Take the bus. Raises what python-can raises."""
+        self.close()
+        self._bus = can.Bus(
+            channel=self._channel, interface=self._interface, ignore_config=True, **self._options
+        )
+
+    def close(self) -> None:
+        """Let go of the bus."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.shutdown()
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def send_sweep(self) -> bool:
+        """Send the frames of one sweep at once. False when the counts have ended."""
+        frames = self.next_frames()
+        for frame in frames:
+            self._send(frame)
+        self._discard_received()
+        return bool(frames)
+
+    def flush(self) -> None:
+        """Send what a burst still holds back."""
+        burst, self._burst = self._burst, []
+        for outgoing in burst:
+            self._put(outgoing)
+
+    def serve(self, stop: threading.Event) -> None:
+        """Send sweeps at their rate, frames evenly spread, until told to stop or counts end.
+
+        A broken link is taken up again after `DOWN_S`.
+        """
+        due_ns = self._clock()
+        while not stop.is_set():
+            frames = self.next_frames()
+            if not frames:
+                return
+            for at, frame in enumerate(frames):
+                wait_ns = due_ns + self._period_ns * at // len(frames) - self._clock()
+                if wait_ns > 0:
+                    time.sleep(wait_ns / 1e9)
+                if not self._send(frame) and stop.wait(DOWN_S):
+                    return
+            self._discard_received()
+            due_ns = max(due_ns + self._period_ns, self._clock() - self._period_ns)
+
+    def next_frames(self) -> list[Outgoing]:
+        """The frames of the next sweep before any fault of the link; none when counts ended."""
+        counts = next(self._counts, None)
+        if counts is None:
+            return []
+        words = [self._words_of(row, counts) for row in range(len(self._fingers))]
+        frames = (
+            self._sweep_frames(words)
+            if self._format is CanFormat.SWEEP_FD
+            else self._sample_frames(words)
+        )
+        self._sweep += 1
+        return frames
+
+    def _words_of(self, row: int, counts: Counts) -> list[bytes]:
+        """One finger's response words of E1 to E24, with the sensor's faults."""
+        if row in self._faults.unplugged_fingers:
+            return [_UNDRIVEN] * ELECTRODES
+        dead = {electrode for finger, electrode in self._faults.dead_electrodes if finger == row}
+        return [
+            _WORDS[0 if electrode in dead else count]
+            for electrode, count in enumerate(counts[row].tolist())
+        ]
+
+    def _sample_frames(self, words: list[list[bytes]]) -> list[Outgoing]:
+        return [
+            (self._id, encode_sample(channel, b"".join(self._sample(channel, words))))
+            for channel in self._channels
+        ]
+
+    def _sample(self, channel: int, words: list[list[bytes]]) -> list[bytes]:
+        if E1 <= channel <= E24:
+            return [finger[channel - E1] for finger in words]
+        unplugged = self._faults.unplugged_fingers
+        other = _WORDS[OTHER_COUNTS[channel]]
+        return [_UNDRIVEN if row in unplugged else other for row in range(len(words))]
+
+    def _sweep_frames(self, words: list[list[bytes]]) -> list[Outgoing]:
+        tick_us = self._stuck_tick_us if self._faults.stuck_clock else self._tick_us()
+        frames = []
+        for finger, finger_words in zip(self._fingers, words, strict=True):
+            sweep = SweepFrame(finger, self._sweep % (1 << 16), tick_us, b"".join(finger_words))
+            data = sweep.to_bytes()
+            if self._faults.wrong_version:
+                data = bytes((SWEEP_VERSION + 1,)) + data[1:]
+            frames.append((self._id + finger, data))
+        return frames
+
+    def _tick_us(self) -> int:
+        return self._clock() // 1000 % (1 << 32)
+
+    def _send(self, frame: Outgoing) -> bool:
+        """Send one frame with the link's faults. False when the link broke, and was remade."""
+        if self._injector.breaks_here():
+            self.open()
+            return False
+        for outgoing in self._spoiled(frame):
+            if self._faults.burst_frames == 1:
+                self._put(outgoing)
+                continue
+            self._burst.append(outgoing)
+            if len(self._burst) >= self._faults.burst_frames:
+                self.injected["burst"] += 1
+                self.flush()
+        return True
+
+    def _spoiled(self, frame: Outgoing) -> list[Outgoing]:
+        """Frames to send instead of this one: the injector knows only the data, we keep the ids."""
+        identifier, data = frame
+        reordered = self.injected["reorder"]
+        spoiled = [(identifier, bytes_) for bytes_ in self._injector.spoil(data)]
+        if self._held_id is not None and spoiled:
+            spoiled[-1] = (self._held_id, spoiled[-1][1])
+            self._held_id = None
+        elif self.injected["reorder"] > reordered:
+            self._held_id = identifier
+        return spoiled
+
+    def _put(self, outgoing: Outgoing) -> None:
+        identifier, data = outgoing
+        message = can.Message(
+            timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps it
+            arbitration_id=identifier,
+            is_extended_id=identifier > STANDARD_ID_MAX,
+            data=data,
+            is_fd=self._format is CanFormat.SWEEP_FD,
+            bitrate_switch=self._format is CanFormat.SWEEP_FD,
+        )
+        bus = self._bus
+        if bus is None:
+            raise RuntimeError("the twin is not open")
+        try:
+            bus.send(message, timeout=self._send_timeout_s)
+        except can.CanError:
+            self.unsent += 1
+        else:
+            self.frames_sent += 1
+
+    def _discard_received(self) -> None:
+        """Others may talk on the bus; the queue of a virtual one has no bound."""
+        if self._interface == "virtual" and self._bus is not None:
+            with contextlib.suppress(can.CanError):
+                while self._bus.recv(timeout=0) is not None:
+                    pass

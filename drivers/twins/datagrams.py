@@ -1,0 +1,36 @@
+"""Sending datagrams at a steady pace, as the twins of datagram senders do."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterable
+
+from drivers.datagrams import Endpoint
+
+BEHIND_MAX_NS = 100_000_000
+"""A sender that is further behind its schedule, ns, starts a new one instead of catching up."""
+
+
+def send_paced(
+    cycles: Iterable[list[bytes]], target: Endpoint, stop: threading.Event, period_ns: int | None
+) -> None:
+    """Send the datagrams of one cycle after the other until told to stop or they end.
+
+    With `period_ns` None as fast as the kernel takes them. Whether anyone listens is not noticed.
+    """
+    with socket.socket(target.family, socket.SOCK_DGRAM) as sender:
+        due_ns = time.monotonic_ns()
+        for datagrams in cycles:
+            if period_ns is not None:
+                now_ns = time.monotonic_ns()
+                if now_ns - due_ns > BEHIND_MAX_NS:
+                    due_ns = now_ns
+                if due_ns > now_ns:
+                    time.sleep((due_ns - now_ns) / 1e9)
+                due_ns += period_ns
+            if stop.is_set():
+                return
+            for datagram in datagrams:
+                sender.sendto(datagram, (target.address, target.port))

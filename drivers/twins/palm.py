@@ -1,0 +1,164 @@
+"""The palm of a Shadow hand that is not there: real packets over UDP, one per millisecond."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from drivers.base import FINGERS
+from drivers.datagrams import Endpoint
+from drivers.palm_packet import (
+    CHANNELS,
+    COMMAND_SENSOR_DATA,
+    CYCLE_NS,
+    MOTORS,
+    ROUND,
+    VALID_ALL,
+    CanRecord,
+    Channel,
+    Palm,
+    PalmPacket,
+    TactileSlot,
+)
+from drivers.twins.datagrams import send_paced
+from drivers.twins.faults import LinkFaultInjector, LinkFaults
+from drivers.twins.grasps import Counts
+
+SENSORS_AT_REST = (
+    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706),
+    *(1730, 1434, 3060, 1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377),
+    *range(26, 37),
+)
+"""Raw sensor words of a real hand (Shadow's documentation), with noise of one count."""
+HALL_WORDS = 26
+"""Of these, the ones with noise."""
+IDLE_TIMES_US = (430, 394)
+MOTORS_ARRIVED = (0x55555, 0xAAAAA)
+"""Of the packets with even and with odd motors (same source)."""
+OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
+PAC_COUNT = 2048
+ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
+"""What a finger without a sensor shows, from a real recording; its electrodes show 0."""
+OUTAGE_CYCLES = 500
+"""A link that breaks stays silent for half a second while the palm goes on."""
+LATER_VERSION_BYTES = 4
+"""Packets of a palm that nobody knows yet are longer by so much."""
+
+
+class PalmTwin:
+    """Plays counts as a palm would send them: one shape (fingers, 24) per round of 14 packets.
+
+    `cycles` is deterministic: datagrams by the millisecond, after faults. `serve` sends them.
+    With `stuck_clock` the palm answers the same request for ever. Fingers that are not in
+    `fingers` have no sensor, and say so; those unplugged by a fault do not.
+    """
+
+    def __init__(
+        self,
+        counts: Iterable[Counts],
+        fingers: Sequence[str] = ("ff", "mf", "th"),
+        *,
+        palm: Palm = Palm.PALM_0220,
+        can_record: bool = False,
+        faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
+        sensors: Sequence[int] = SENSORS_AT_REST,
+        seed: int = 0,
+    ) -> None:
+        """`sensors` are the raw words that joints rest at."""
+        self._counts = iter(counts)
+        self._rows = {finger: row for row, finger in enumerate(fingers)}
+        self._palm = palm
+        self._can_record = CanRecord(0, 0, 0, bytes(8)) if can_record else None
+        self._faults = faults
+        self._injector = LinkFaultInjector(faults)
+        self._sensors = np.array(sensors)
+        self._random = np.random.default_rng(seed)
+        self._dead = frozenset(faults.dead_electrodes)
+        self.packets_made = 0
+        """Packets that the palm made, sent or not."""
+
+    @property
+    def injected(self) -> Counter[str]:
+        """Faults injected so far by name; `silenced` are packets made while the link was broken."""
+        return self._injector.injected
+
+    def packets(self) -> Iterator[PalmPacket]:
+        """What the palm makes, before any fault of the link."""
+        for counts in self._counts:
+            for position in range(ROUND):
+                yield self._packet(0 if self._faults.stuck_clock else position, counts)
+                self.packets_made += 1
+
+    def cycles(self) -> Iterator[list[bytes]]:
+        """Datagrams to send in each millisecond."""
+        silent = 0
+        for packet in self.packets():
+            if silent:
+                silent -= 1
+                self.injected["silenced"] += 1
+                yield []
+                continue
+            data = packet.to_bytes()
+            if self._faults.wrong_version:
+                data += bytes(LATER_VERSION_BYTES)
+            if self._injector.breaks_here():
+                silent = OUTAGE_CYCLES
+                yield [*self._injector.flush(), data[: len(data) // 2]]
+                continue
+            # A burst is many datagrams at once, not a long one.
+            yield [
+                burst[at : at + len(data)]
+                for burst in self._injector.spoil(data)
+                for at in range(0, len(burst), len(data))
+            ]
+        yield self._injector.flush()
+
+    def serve(
+        self, target: str, stop: threading.Event, *, period_ns: int | None = CYCLE_NS
+    ) -> None:
+        """Send to `udp://ADDRESS:PORT` until told to stop or the counts end.
+
+        With `period_ns` None as fast as possible. Raises `ValueError` for a bad target.
+        """
+        send_paced(self.cycles(), Endpoint.parse(target), stop, period_ns)
+
+    def _packet(self, position: int, counts: Counts) -> PalmPacket:
+        odd = self.packets_made % 2
+        sensors = self._sensors.copy()
+        sensors[:HALL_WORDS] += self._random.integers(-1, 2, HALL_WORDS)
+        fitted = sum(1 << FINGERS.index(finger) for finger in self._rows)
+        return PalmPacket(
+            palm=self._palm,
+            command=COMMAND_SENSOR_DATA,
+            sensors=tuple(sensors.tolist()),
+            motor_type=0,
+            which_motors=odd,
+            motors_arrived=MOTORS_ARRIVED[odd],
+            motors_failed=0,
+            motor_words=(0, 0) * MOTORS,
+            tactile_type=2 * position + 1,
+            tactile_valid=fitted,
+            tactile=tuple(self._slot(finger, position, counts) for finger in FINGERS),
+            idle_time_us=IDLE_TIMES_US[odd],
+            can_record=self._can_record,
+        )
+
+    def _slot(self, finger: str, position: int, counts: Counts) -> TactileSlot:
+        first, second = (self._value(finger, channel, counts) for channel in CHANNELS[position])
+        valid = VALID_ALL if finger in self._rows else 0
+        pac_0, pac_1 = (PAC_COUNT + self._random.integers(-12, 13, 2)).tolist() if valid else (0, 0)
+        return TactileSlot(pac_0, pac_1, first, valid, second)
+
+    def _value(self, finger: str, channel: Channel | None, counts: Counts) -> int:
+        row = self._rows.get(finger)
+        absent = row is None or row in self._faults.unplugged_fingers
+        if channel is None:
+            return 0
+        if channel.electrode is None:
+            return (ABSENT_WORDS if absent else OTHER_COUNTS)[channel.name]
+        if row is None or absent or (row, channel.electrode) in self._dead:
+            return 0
+        return int(counts[row, channel.electrode])

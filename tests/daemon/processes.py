@@ -1,0 +1,54 @@
+"""Running graspd, and a subscriber to it, as processes of their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+GRASPD = (sys.executable, "-m", "daemon")
+TIMEOUT_S = 50
+
+SUBSCRIBER = """
+import sys, zmq
+endpoint, wanted = sys.argv[1], int(sys.argv[2])
+with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+    socket.connect(endpoint)
+    socket.subscribe("verdict.")
+    for _ in range(wanted):
+        if not socket.poll(20000):
+            break
+        topic, payload = socket.recv_multipart()
+        print(payload.decode())
+"""
+"""Plain pyzmq: prints the verdicts that come at an endpoint, so many at most."""
+
+
+def graspd(*arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        [*GRASPD, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+    )
+
+
+def start(*arguments: object) -> subprocess.Popen[str]:
+    """Start a command and leave it running."""
+    return subprocess.Popen(
+        [*GRASPD, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(path: Path) -> None:
+    """Wait until a file is there."""
+    deadline_s = time.monotonic() + 20
+    while not path.exists():
+        assert time.monotonic() < deadline_s, f"{path} did not appear"
+        time.sleep(0.01)

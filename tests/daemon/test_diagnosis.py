@@ -1,0 +1,144 @@
+"""The doctor's findings, from readings whose faults are known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.commands.doctor import can_interfaces
+from daemon.diagnosis import (
+    ElectrodeStatistics,
+    Level,
+    counter_findings,
+    rate_finding,
+)
+from drivers.base import ElectrodeFault, TactileReading
+
+FINGERS = ("ff", "mf", "th")
+Counts = NDArray[np.float64]
+Faults = NDArray[np.uint8]
+
+
+def statistics(
+    spoil: Callable[[Counts, Faults, int], None],
+    readings: int = 100,
+) -> ElectrodeStatistics:
+    """Statistics over untouched sensors with 3.5 counts of noise, spoilt by the test."""
+    random = np.random.default_rng(0)
+    rest = random.uniform(2400, 3400, (3, 24))
+    found = ElectrodeStatistics(FINGERS)
+    for number in range(readings):
+        counts = rest + random.normal(0.0, 3.5, rest.shape)
+        faults = np.zeros((3, 24), dtype=np.uint8)
+        spoil(counts, faults, number)
+        found.add(TactileReading(number, number, counts.round().astype(np.uint16), faults))
+    return found
+
+
+def nothing(_counts: Counts, _faults: object, _number: int) -> None:
+    pass
+
+
+def test_healthy_sensors_have_no_findings() -> None:
+    assert statistics(nothing).findings() == []
+
+
+def test_the_running_figures_are_those_of_numpy() -> None:
+    kept: list[Counts] = []
+
+    def keep(counts: Counts, faults: Faults, n: int) -> None:
+        faults[1, 3] = ElectrodeFault.PARITY if n % 2 else 0
+        kept.append(counts.round())
+
+    found = statistics(keep)
+    np.testing.assert_allclose(found.mean[0], np.mean(kept, axis=0)[0], rtol=1e-12)
+    np.testing.assert_allclose(found.deviation[2], np.std(kept, axis=0)[2], rtol=1e-9)
+    np.testing.assert_allclose(found.mean[1, 3], np.mean(kept[::2], axis=0)[1, 3], rtol=1e-12)
+    assert found.faulty[1, 3] == 50
+
+
+def at(finger: int, electrode: int, value: float) -> Callable[[Counts, object, int], None]:
+    def spoil(counts: Counts, _faults: object, _number: int) -> None:
+        counts[finger, electrode] = value
+
+    return spoil
+
+
+def fault(
+    finger: int, electrode: int | slice, bits: ElectrodeFault, every: int
+) -> Callable[[Counts, Faults, int], None]:
+    def spoil(_counts: Counts, faults: Faults, n: int) -> None:
+        if n % every == 0:
+            faults[finger, electrode] = bits
+
+    return spoil
+
+
+def restless(counts: Counts, _faults: object, number: int) -> None:
+    counts[0, 20] += 100.0 * (number % 2)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "level", "says"),
+    [
+        (at(1, 7, 0.0), Level.ERROR, "mf: E8 stuck at a rail"),
+        (at(2, 23, 4095.0), Level.ERROR, "th: E24 stuck at a rail"),
+        (at(0, 0, 2500.0), Level.ERROR, "ff: E1 frozen"),
+        (fault(2, slice(None), ElectrodeFault.MISSING, 1), Level.ERROR, "th: no electrode"),
+        (fault(1, 4, ElectrodeFault.MISSING, 1), Level.ERROR, "mf: E5 never or rarely sampled"),
+        (
+            fault(0, 2, ElectrodeFault.PARITY, 10),
+            Level.WARNING,
+            "ff: E3 now and then faulty (parity)",
+        ),
+        (restless, Level.WARNING, "ff: E21 restless"),
+    ],
+)
+def test_a_fault_is_found_and_named(
+    spoil: Callable[[Counts, Faults, int], None],
+    level: Level,
+    says: str,
+) -> None:
+    (finding,) = statistics(spoil).findings()
+    assert finding.level is level
+    assert finding.what.startswith(says)
+    assert finding.advice
+
+
+def test_no_readings_is_no_electrode_finding() -> None:
+    assert statistics(nothing, readings=0).findings() == []
+
+
+@pytest.mark.parametrize(
+    ("readings", "period_ns", "level"),
+    [
+        (0, 10_000_000, Level.ERROR),
+        (300, 10_000_000, Level.OK),
+        (250, 10_000_000, Level.WARNING),
+        (5, None, Level.OK),
+    ],
+)
+def test_the_rate_is_judged_by_its_nominal(
+    readings: int, period_ns: int | None, level: Level
+) -> None:
+    assert rate_finding("spi", readings, 3.0, period_ns).level is level
+
+
+def test_only_counters_of_trouble_are_findings() -> None:
+    findings = counter_findings("spi", {"readings": 300, "bytes": 9, "bad_crc": 2, "too_long": 0})
+    assert [finding.what for finding in findings] == ["spi: 2 bad crc"]
+
+
+def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
+    for name, kind, state in (("can0", 280, "up"), ("can1", 280, "down"), ("eth0", 1, "up")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "type").write_text(f"{kind}\n")
+        (tmp_path / name / "operstate").write_text(f"{state}\n")
+    up, down = can_interfaces(tmp_path)
+    assert up.what == "CAN interface can0 is up"
+    assert (down.level, down.what) == (Level.WARNING, "CAN interface can1 is down")
+    assert "ip link set can1 up" in down.advice

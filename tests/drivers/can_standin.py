@@ -1,0 +1,121 @@
+"""What the tests of the CAN bridge share: stand-ins for buses, and what is sent over them."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+
+import can
+import pytest
+
+from drivers.base import Reading, TactileReading
+from drivers.can_bridge import CanBridgeDriver
+from drivers.can_bus import SO_TIMESTAMPNS
+from drivers.can_formats import encode_sample
+from drivers.can_frames import CanFrame, pack_frame
+from drivers.twins.can import SAMPLE_ID
+from drivers.twins.grasps import Counts, GeneratedContact
+from tests.drivers.can_words import samples
+
+CHANNELS = itertools.count()
+LOOPBACK = "lo"
+"""The driver looks for the interface before python-can does; this one is always there."""
+
+
+class SocketBus:
+    """What python-can's `socketcan` bus is to the driver: something with a raw socket.
+
+    The socket is one end of a pair of Unix datagram sockets, stamped like a CAN socket.
+    """
+
+    def __init__(self) -> None:
+        self.socket, self.far_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.far_end.setblocking(False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
+        self.far_end.close()
+
+    def send(self, frame: CanFrame) -> None:
+        self.far_end.send(pack_frame(frame))
+
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    def shutdown(self) -> None:
+        self.socket.close()
+
+
+class ScriptedBus:
+    """A bus without a descriptor whose `recv` follows a script of messages and exceptions."""
+
+    def __init__(self, script: Sequence[can.Message | BaseException | None] = ()) -> None:
+        self.script = list(script)
+        self.shut_down = 0
+        self.shutdown_error: BaseException | None = None
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        assert timeout == 0, "the driver waits"
+        if not self.script:
+            return None
+        step = self.script.pop(0)
+        if isinstance(step, BaseException):
+            raise step
+        return step
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        self.shut_down += 1
+        if self.shutdown_error is not None:
+            raise self.shutdown_error
+
+
+Opener = Callable[[], object]
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, opener: Opener) -> None:
+    """Have python-can open what `opener` returns or raises."""
+
+    def open_bus(**_: object) -> object:
+        return opener()
+
+    monkeypatch.setattr("drivers.can_bus.can.Bus", open_bus)
+
+
+def channel() -> str:
+    """A virtual channel that no other test uses."""
+    return f"test-{next(CHANNELS)}"
+
+
+def bridge(where: str, frame_format: str = "syntouch", **options: Any) -> CanBridgeDriver:  # noqa: ANN401
+    """A driver on a virtual bus, without the samples that it does not use."""
+    if frame_format == "syntouch":
+        options.setdefault("arbitration_id", SAMPLE_ID)
+        options.setdefault("sequence", "electrodes")
+    return CanBridgeDriver("virtual", where, format=frame_format, **options)
+
+
+def tactile(readings: Sequence[Reading]) -> list[TactileReading]:
+    assert all(isinstance(reading, TactileReading) for reading in readings)
+    return [reading for reading in readings if isinstance(reading, TactileReading)]
+
+
+def contact(sweeps: int, seed: int = 0) -> list[Counts]:
+    return list(itertools.islice(GeneratedContact(seed=seed), sweeps))
+
+
+def message(data: bytes = b"", identifier: int = SAMPLE_ID, **options: bool) -> can.Message:
+    options.setdefault("is_extended_id", False)
+    return can.Message(arbitration_id=identifier, data=data, **options)
+
+
+def sweep_messages(sweep: int = 0) -> list[can.Message]:
+    return [message(encode_sample(channel, words)) for channel, words, _ in samples(sweep)]

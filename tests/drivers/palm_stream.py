@@ -1,0 +1,154 @@
+"""Palm packets for tests: made by the twin or by hand, played through the parts that judge them."""
+
+from __future__ import annotations
+
+import itertools
+import select
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from drivers.joints import JointStreamDriver
+from drivers.palm import PalmDriver
+from drivers.palm_packet import Palm, PalmPacket, PalmParser
+from drivers.palm_sweep import PalmSweeps, RoundCounters
+from drivers.twins.grasps import Counts
+from drivers.twins.palm import PalmTwin
+
+FINGERS = ("ff", "mf", "th")
+MS = 1_000_000
+ROUND = 14
+
+
+class Clock:
+    """A clock that only moves when told to."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**12
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def rows(number: int, seed: int = 1) -> list[Counts]:
+    """Counts of so many rounds, all different, so that a value tells where it comes from."""
+    random = np.random.default_rng(seed)
+    return [random.integers(500, 3900, (3, 24)).astype(np.uint16) for _ in range(number)]
+
+
+@dataclass
+class Played:
+    """What came out of a stream."""
+
+    counters: RoundCounters = field(default_factory=RoundCounters)
+    readings: list[TactileReading] = field(default_factory=list)
+
+    def sound(self) -> list[TactileReading]:
+        return [reading for reading in self.readings if not reading.faults.any()]
+
+
+def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) -> Played:
+    """Datagrams by the millisecond through parser and sweeps, as the driver does it."""
+    played = Played()
+    parser, sweeps = PalmParser(played.counters), PalmSweeps(fingers, played.counters)
+    for cycle, datagrams in enumerate(cycles):
+        for data in datagrams:
+            packet = parser.parse(data)
+            if packet is None:
+                continue
+            if sweeps.repeats(packet):
+                played.counters.duplicate_packets += 1
+                continue
+            played.readings.extend(sweeps.push(packet, cycle * MS))
+    return played
+
+
+def packets(number: int) -> list[PalmPacket]:
+    """Packets of so many rounds of `rows`."""
+    return list(PalmTwin(rows(number)).packets())
+
+
+def datagrams(rounds: int, palm: Palm = Palm.PALM_0220) -> list[bytes]:
+    return [packet.to_bytes() for packet in PalmTwin(rows(rounds), palm=palm).packets()]
+
+
+def play_packets(stream: Iterable[PalmPacket | None]) -> Played:
+    """One packet per millisecond; None is one that does not come."""
+    return play([] if packet is None else [packet.to_bytes()] for packet in stream)
+
+
+def row_of(reading: TactileReading, truth: Sequence[Counts]) -> int | None:
+    """The row that all unflagged counts of a reading come from, or None if there is no such row."""
+    fresh = reading.faults == 0
+    for index, row in enumerate(truth):
+        if (reading.counts[fresh] == row[fresh]).all():
+            return index
+    return None
+
+
+def flags(reading: TactileReading, fault: ElectrodeFault) -> list[list[int]]:
+    """(finger, electrode) pairs, from 0, with this fault."""
+    found: list[list[int]] = np.argwhere(reading.faults & np.uint8(fault) != 0).tolist()
+    return found
+
+
+class Sender:
+    """Sends datagrams to a driver from a socket of its own."""
+
+    def __init__(self, driver: PalmDriver | JointStreamDriver) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        assert driver.port is not None
+        self.target = ("127.0.0.1", driver.port)
+
+    def send(self, *datagrams: bytes) -> None:
+        for data in datagrams:
+            self.socket.sendto(data, self.target)
+
+    def __enter__(self) -> Sender:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.socket.close()
+
+
+def wait_like_the_service(driver: PalmDriver | JointStreamDriver, most_s: float) -> list[Reading]:
+    """Wait for descriptor or due time once, then take what there is."""
+    descriptor, due_ns = driver.fileno(), driver.due_ns()
+    wait_s = most_s
+    if due_ns is not None:
+        wait_s = min(most_s, max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
+    select.select([] if descriptor is None else [descriptor], [], [], wait_s)
+    return list(driver.read_ready())
+
+
+def listen(
+    driver: PalmDriver | JointStreamDriver,
+    until: Callable[[list[Reading]], bool],
+    most_s: float = 10.0,
+) -> list[Reading]:
+    """Readings until a condition holds; fails after `most_s`."""
+    readings: list[Reading] = []
+    end = time.monotonic() + most_s
+    while not until(readings):
+        assert time.monotonic() < end, f"waited {most_s} s in vain"
+        readings += wait_like_the_service(driver, 0.05)
+    return readings
+
+
+def tactile(readings: Iterable[Reading]) -> list[TactileReading]:
+    return [reading for reading in readings if isinstance(reading, TactileReading)]
+
+
+def joints(readings: Iterable[Reading]) -> list[JointReading]:
+    return [reading for reading in readings if isinstance(reading, JointReading)]
+
+
+def rounds_of(data: Iterable[bytes]) -> Iterator[list[bytes]]:
+    """Fourteen datagrams at a time."""
+    iterator = iter(data)
+    while batch := list(itertools.islice(iterator, ROUND)):
+        yield batch

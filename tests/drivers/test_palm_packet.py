@@ -1,0 +1,287 @@
+"""The palm status packet against an independent description of its layout; what is no packet."""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import itertools
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.palm_packet import (
+    CHANNELS,
+    CanRecord,
+    Motor,
+    PacketCounters,
+    Palm,
+    PalmPacket,
+    PalmParser,
+    TactileSlot,
+    position_of,
+)
+
+# The layouts as C structures, written down from Shadow's protocol headers.
+
+
+class Biotac(ctypes.LittleEndianStructure):
+    _pack_ = 1
+    _fields_ = (
+        ("pac", ctypes.c_uint16 * 2),
+        ("other_0", ctypes.c_uint16),
+        ("data_valid", ctypes.c_uint8),
+        ("padding", ctypes.c_uint8),
+        ("other_1", ctypes.c_uint16),
+    )
+
+
+class MotorData(ctypes.LittleEndianStructure):
+    _pack_ = 1
+    _fields_ = (("torque", ctypes.c_int16), ("misc", ctypes.c_uint16))
+
+
+class CanBridge(ctypes.LittleEndianStructure):
+    _pack_ = 1
+    _fields_ = (
+        ("can_bus", ctypes.c_uint8),
+        ("length", ctypes.c_uint8),
+        ("identifier", ctypes.c_uint16),
+        ("data", ctypes.c_uint8 * 8),
+    )
+
+
+def slot(size: int) -> type[ctypes.LittleEndianStructure]:
+    fields = (("biotac", Biotac), ("rest", ctypes.c_uint8 * (size - ctypes.sizeof(Biotac))))
+    return type(f"Slot{size}", (ctypes.LittleEndianStructure,), {"_pack_": 1, "_fields_": fields})
+
+
+HEAD = [("command", ctypes.c_uint32), ("sensors", ctypes.c_uint16 * 37)]
+MOTORS = [
+    ("motor_data_type", ctypes.c_uint32),
+    ("which_motors", ctypes.c_int16),
+    ("arrived", ctypes.c_uint32),
+    ("had_errors", ctypes.c_uint32),
+    ("motors", MotorData * 10),
+]
+
+
+def tactile(size: int) -> list[tuple[str, Any]]:
+    return [
+        ("tactile_data_type", ctypes.c_uint32),
+        ("tactile_data_valid", ctypes.c_uint16),
+        ("tactile", slot(size) * 5),
+    ]
+
+
+def structure(fields: list[tuple[str, Any]]) -> type[ctypes.LittleEndianStructure]:
+    fields = [*HEAD, *fields, ("idle_time_us", ctypes.c_uint16)]
+    base = (ctypes.LittleEndianStructure,)
+    return type("Status", base, {"_pack_": 1, "_fields_": tuple(fields)})
+
+
+STRUCTURES = {
+    Palm.PALM_0220: structure([*MOTORS, *tactile(16)]),
+    Palm.PALM_0230: structure(
+        [
+            ("middle_and_proximal", ctypes.c_uint8 * 16 * 5),
+            *tactile(32),
+            ("aux_type", ctypes.c_uint32),
+            ("aux", ctypes.c_uint8 * 32),
+            *MOTORS,
+        ]
+    ),
+    Palm.PALM_0250: structure([*tactile(78), *MOTORS]),
+}
+OFFSETS = {
+    Palm.PALM_0220: {
+        "command": 0, "sensors": 4, "motor_data_type": 78, "which_motors": 82, "arrived": 84,
+        "had_errors": 88, "motors": 92, "tactile_data_type": 132, "tactile_data_valid": 136,
+        "tactile": 138, "idle_time_us": 218,
+    },
+    Palm.PALM_0230: {
+        "sensors": 4, "middle_and_proximal": 78, "tactile_data_type": 158,
+        "tactile_data_valid": 162, "tactile": 164, "aux_type": 324, "aux": 328,
+        "motor_data_type": 360, "idle_time_us": 414,
+    },
+    Palm.PALM_0250: {
+        "tactile_data_type": 78, "tactile_data_valid": 82, "tactile": 84,
+        "motor_data_type": 474, "idle_time_us": 528,
+    },
+}  # fmt: skip
+LENGTHS = {Palm.PALM_0220: 220, Palm.PALM_0230: 416, Palm.PALM_0250: 530}
+SNAPSHOT = [
+    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706, 1730, 1434, 3060),
+    *(1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377, *range(26, 37)),
+]
+palms = pytest.mark.parametrize("palm", list(Palm))
+
+
+def filled(palm: Palm) -> ctypes.LittleEndianStructure:
+    """A structure with another value in each field."""
+    numbers = itertools.count(7)
+    status = STRUCTURES[palm]()
+    status.command = 1
+    status.sensors[:] = SNAPSHOT
+    status.motor_data_type, status.which_motors = 5, 1
+    status.arrived, status.had_errors = 0xAAAAA, 0x00400
+    for motor in status.motors:
+        motor.torque, motor.misc = -next(numbers), next(numbers) + 0x8000
+    status.tactile_data_type, status.tactile_data_valid = 0x0019, 0x13
+    for finger in status.tactile:
+        finger.biotac.pac[:] = [next(numbers), next(numbers)]
+        finger.biotac.other_0, finger.biotac.other_1 = next(numbers), next(numbers)
+        finger.biotac.data_valid, finger.biotac.padding = next(numbers), 0xEE
+        finger.rest[:] = [0xDD] * len(finger.rest)
+    status.idle_time_us = 430
+    return status
+
+
+def parse(data: bytes) -> PalmPacket | None:
+    return PalmParser(PacketCounters()).parse(data)
+
+
+def packet_of(palm: Palm) -> PalmPacket:
+    packet = parse(bytes(filled(palm)))
+    assert packet is not None
+    return packet
+
+
+@palms
+def test_the_independent_description_has_the_documented_offsets(palm: Palm) -> None:
+    status = STRUCTURES[palm]
+    assert ctypes.sizeof(status) == LENGTHS[palm]
+    assert {name: getattr(status, name).offset for name in OFFSETS[palm]} == OFFSETS[palm]
+    places = [Biotac.pac, Biotac.other_0, Biotac.data_valid, Biotac.other_1]
+    assert [place.offset for place in places] == [0, 4, 6, 8]
+
+
+@pytest.mark.parametrize("appended", [b"", bytes(CanBridge(1, 3, 0x215, (1, 2, 3)))])
+@palms
+def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None:
+    status = filled(palm)
+    packet = parse(bytes(status) + appended)
+    assert packet is not None
+    assert packet.palm is palm
+    assert list(packet.sensors) == SNAPSHOT
+    assert (packet.command, packet.motor_type, packet.which_motors) == (1, 5, 1)
+    assert (packet.motors_arrived, packet.motors_failed) == (0xAAAAA, 0x00400)
+    assert packet.motors == tuple(Motor(motor.torque, motor.misc) for motor in status.motors)
+    assert (packet.tactile_type, packet.tactile_valid) == (0x0019, 0x13)
+    biotacs = [finger.biotac for finger in status.tactile]
+    assert packet.tactile == tuple(
+        TactileSlot(biotac.pac[0], biotac.pac[1], biotac.other_0, biotac.data_valid, biotac.other_1)
+        for biotac in biotacs
+    )
+    assert packet.idle_time_us == 430
+    record = CanRecord(1, 3, 0x215, bytes([1, 2, 3, 0, 0, 0, 0, 0])) if appended else None
+    assert packet.can_record == record
+
+
+@pytest.mark.parametrize("record", [None, CanRecord(0, 8, 0x201, bytes(range(8)))])
+@palms
+def test_a_packet_is_written_where_it_is_read(palm: Palm, record: CanRecord | None) -> None:
+    packet = dataclasses.replace(packet_of(palm), can_record=record)
+    data = packet.to_bytes()
+    assert len(data) == LENGTHS[palm] + (0 if record is None else 12)
+    assert parse(data) == packet
+    status = STRUCTURES[palm].from_buffer_copy(data)
+    assert status.tactile[4].biotac.other_1 == packet.tactile[4].other_1
+    assert status.motors[9].torque == packet.motors[9].torque
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"sensors": (0,) * 36},
+        {"sensors": (65536,) * 37},
+        {"which_motors": 1 << 15},
+        {"tactile": (TactileSlot(0, 0, -1, 0, 0),) * 5},
+        {"motor_words": (0,) * 19},
+        {"can_record": CanRecord(256, 0, 0, b"")},
+    ],
+)
+def test_what_does_not_fit_a_packet_is_not_written(change: dict[str, Any]) -> None:
+    packet = dataclasses.replace(packet_of(Palm.PALM_0220), **change)
+    with pytest.raises(ValueError, match="no palm packet"):
+        packet.to_bytes()
+
+
+@pytest.mark.parametrize("length", [0, 1, 219, 221, 231, 233, 415, 417, 429, 531, 541, 543, 65507])
+def test_a_length_that_no_palm_sends_is_counted_and_dropped(length: int) -> None:
+    counters = PacketCounters()
+    assert PalmParser(counters).parse(b"\x01" + bytes(max(length - 1, 0))) is None
+    assert (counters.bad_lengths, counters.packets) == (1, 0)
+
+
+@pytest.mark.parametrize("length", [220, 232, 416, 428, 530, 542])
+def test_an_empty_packet_is_counted_and_dropped(length: int) -> None:
+    counters = PacketCounters()
+    assert PalmParser(counters).parse(bytes(length)) is None
+    assert (counters.empty_packets, counters.packets) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("offset", "value", "counter"),
+    [
+        (0, 2, "service_packets"),
+        (0, 4, "service_packets"),
+        (0, 5, "nonsense_packets"),
+        (3, 1, "nonsense_packets"),
+        (82, 2, "nonsense_packets"),
+        (83, 0xFF, "nonsense_packets"),
+        (136, 0x20, "nonsense_packets"),
+        (137, 0x01, "nonsense_packets"),
+        (221, 9, "nonsense_packets"),
+    ],
+)
+def test_a_field_that_no_palm_sends_is_counted_and_dropped(
+    offset: int, value: int, counter: str
+) -> None:
+    data = bytearray(bytes(filled(Palm.PALM_0220)) + bytes(12))
+    counters = PacketCounters()
+    assert PalmParser(counters).parse(bytes(data)) is not None
+    data[offset] = value
+    assert PalmParser(counters).parse(bytes(data)) is None
+    assert getattr(counters, counter) == 1
+    assert counters.packets == 1
+
+
+@pytest.mark.parametrize(
+    ("tactile_type", "names"),
+    [
+        (0x0001, ("PDC", "TAC")),
+        (0x0003, ("TDC", "E1")),
+        (0x0005, ("E2", "E3")),
+        (0x0007, ("E4", "E5")),
+        (0x0019, ("E22", "E23")),
+        (0x001B, ("E24", None)),
+    ],
+)
+def test_a_type_stands_for_its_two_channels(
+    tactile_type: int, names: tuple[str, str | None]
+) -> None:
+    position = position_of(tactile_type)
+    assert position is not None
+    assert tuple(channel and channel.name for channel in CHANNELS[position]) == names
+
+
+def test_a_round_has_fourteen_types_and_every_electrode_once() -> None:
+    positions = [position for kind in range(0x10000) if (position := position_of(kind)) is not None]
+    assert positions == list(range(14))
+    channels = [channel for pair in CHANNELS for channel in pair if channel is not None]
+    electrodes = [channel.electrode for channel in channels if channel.electrode is not None]
+    assert electrodes == list(range(24))
+    assert len(channels) == 27
+
+
+@palms
+def test_random_bytes_of_the_right_length_never_raise(palm: Palm) -> None:
+    seed = 20
+    random = np.random.default_rng(seed)
+    counters = PacketCounters()
+    parser = PalmParser(counters)
+    for _ in range(2000):
+        parser.parse(b"\x01\x00\x00\x00" + random.bytes(LENGTHS[palm] - 4))
+    seen = counters.packets + counters.nonsense_packets
+    assert seen == 2000, f"seed {seed}"
