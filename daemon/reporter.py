@@ -64,8 +64,14 @@ class Reporter:
             "python": platform.python_version(),
         }
 
-    def verdict(self, judgement: Judgement, received_ns: int) -> tuple[Verdict, bytes]:
-        """Send one verdict; `received_ns` is when the driver handed the reading over."""
+    def verdict(
+        self, judgement: Judgement, received_ns: int, silence_ns: int
+    ) -> tuple[Verdict, bytes]:
+        """Send one verdict.
+
+        `received_ns` is when the driver handed the reading over, `silence_ns` how long no message
+        may come before the consumer must take it for unknown.
+        """
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
         message = Verdict(
@@ -81,6 +87,7 @@ class Reporter:
             reasons=list(judgement.reasons),
             age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
             latency_us=latency_us,
+            silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
         )

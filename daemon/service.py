@@ -5,11 +5,9 @@ from __future__ import annotations
 import selectors
 import time
 from collections.abc import Callable, Sequence
-from itertools import chain
 
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import State, Verdict
-from daemon.publisher import Publisher
 from daemon.reporter import Reporter
 from daemon.stop import StopSignal
 from drivers.base import Driver, TactileReading
@@ -35,7 +33,6 @@ class Service:
         stop: StopSignal,
         *,
         max_age_ns: int,
-        publisher: Publisher | None = None,
         listener: Listener | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
@@ -45,7 +42,6 @@ class Service:
         self._pipeline = pipeline
         self._reporter = reporter
         self._stop = stop
-        self._publisher = publisher
         self._listener = listener
         self._clock = clock
         self._max_age_ns = max_age_ns
@@ -90,12 +86,13 @@ class Service:
     def _take_readings(self) -> bool:
         """Judge and report what the drivers have; False if there was no tactile reading."""
         taken = False
-        for reading in chain.from_iterable(driver.read_ready() for driver in self._drivers):
-            received_ns = self._clock()
+        readings = [reading for driver in self._drivers for reading in driver.read_ready()]
+        received_ns = self._clock()
+        for reading in readings:
             if not isinstance(reading, TactileReading):
                 continue  # the verdict does not depend on joints
             judgement = self._pipeline.judge(reading)
-            verdict, payload = self._reporter.verdict(judgement, received_ns)
+            verdict, payload = self._reporter.verdict(judgement, received_ns, self._silence_ns())
             self._state = State.RUNNING
             self._last_t_ns = reading.t_ns
             self._silence_due_ns = received_ns + self._silence_ns()
@@ -111,7 +108,9 @@ class Service:
             return
         self._state = State.SILENT
         self._silence_due_ns = now_ns + self._silence_ns()
-        verdict, payload = self._reporter.verdict(self._pipeline.silence(self._last_t_ns), now_ns)
+        verdict, payload = self._reporter.verdict(
+            self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
+        )
         if self._listener is not None:
             self._listener(verdict, payload, None)
 
@@ -130,5 +129,3 @@ class Service:
         self._readings_since_status = 0
         self._status_at_ns = now_ns
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
-        if self._publisher is not None:
-            self._publisher.drain()

@@ -63,9 +63,10 @@ class ReplayDriver:
     """Plays CSV recordings, one row per call of `read_ready` at most.
 
     `fingers` picks the fingers and their order. A row gives a `TactileReading`, in a stream with
-    joints a `JointReading` before it. `t_ns` is the time of handing over. The run starts with the
-    first call of `read_ready`; several files play in a row, with `loop` without end. A late
-    reading is counted, never skipped.
+    joints a `JointReading` before it. In real time `t_ns` is when the row was due, so that a late
+    reading is an old one; else it is the time of handing over. The run starts with the first call
+    of `read_ready`; several files play in a row, with `loop` without end. A late reading is
+    counted, never skipped.
 
     The constructor raises `ValueError` for an argument out of range. `open` raises
     `RecordingError` if any of the files or headers is not right, `read_ready` if a row is not;
@@ -205,6 +206,7 @@ class ReplayDriver:
             return self._give_up()
         if self._pace is Pace.REALTIME and scheduled.period_ns is not None:
             self.counters.late += now_ns - due_ns > scheduled.period_ns
+        self.period_ns = scheduled.period_ns
         # Reading ahead now keeps the work of reading out of the reading's age.
         self._prepare_next()
         return self._readings(scheduled)
@@ -226,8 +228,6 @@ class ReplayDriver:
             return
         if self._next is None:
             self.exhausted = True
-        elif self._next.period_ns is not None:
-            self.period_ns = self._next.period_ns
 
     def _play(self) -> Generator[_Scheduled, None, None]:
         """All rows of all files on one time axis."""
@@ -251,9 +251,10 @@ class ReplayDriver:
             elif first_s is None:
                 first_s = row.t_s
             else:
-                passed_ns = round((row.t_s - first_s) * self._ns_per_recorded_s)
-                at_ns = start_ns + passed_ns
-                period_ns = passed_ns // index or None
+                before_ns = at_ns
+                at_ns = start_ns + round((row.t_s - first_s) * self._ns_per_recorded_s)
+                if at_ns > before_ns:  # the shortest step, so that a gap is seen as a gap
+                    period_ns = min(at_ns - before_ns, period_ns or at_ns)
             yield _Scheduled(row, names, at_ns, period_ns)
         return at_ns + (period_ns or round(table_ns))
 
@@ -265,6 +266,8 @@ class ReplayDriver:
         self._row_index += 1
         seq = self._seq_after_faults(row, index)
         t_ns = self._clock() - self._delay_ns
+        if self._pace is Pace.REALTIME and self._started_ns is not None:
+            t_ns = self._started_ns + scheduled.at_ns
         readings: list[Reading] = []
         if row.position_rad is not None:
             readings.append(JointReading(t_ns, index, scheduled.joint_names, row.position_rad))

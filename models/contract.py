@@ -11,8 +11,9 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from models.layout import ELECTRODES
+
 METADATA_KEY = "graspd"
-CONTRACT_VERSION = 1
 CLASSES = ("stable", "slip")
 """Order of the two probabilities that every model returns."""
 INPUT_NAME = "tactile_image"
@@ -49,14 +50,21 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Smallest and largest training count of each electrode, shape (fingers, 24).
-
-    A count further outside than the margin is data that the model has never seen.
-    """
+    """What the training counts look like; `models.seen` says what follows for a reading."""
 
     low: tuple[tuple[Count, ...], ...]
+    """Smallest count of each electrode, shape (fingers, 24)."""
     high: tuple[tuple[Count, ...], ...]
+    """Largest count of each electrode, shape (fingers, 24)."""
     margin: Count
+    """A count further outside of `low`..`high` than this was never seen."""
+    centre: tuple[tuple[float, ...], ...]
+    """Mean of each electrode, counts, shape (fingers, 24)."""
+    whitening: tuple[tuple[float, ...], ...]
+    """Rows of the lower triangle of a matrix L, 1/counts, whose product `L @ L.T` is the inverse
+    covariance of all electrodes, fingers one after the other: row i has i + 1 values."""
+    distance_max: Annotated[float, msgspec.Meta(gt=0.0)]
+    """A reading with a larger root-mean-square whitened deviation was never seen."""
 
 
 class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,7 +97,23 @@ class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ModelError(f"model contract is wrong: {error}") from error
         if contract.classes != CLASSES:
             raise ModelError(f"model classes are {contract.classes}, not {CLASSES}")
-        for bound in (contract.seen.low, contract.seen.high):
-            if [len(row) for row in bound] != [24] * len(contract.fingers):
-                raise ModelError("model contract is wrong: seen counts are not (fingers, 24)")
+        _check(contract)
         return contract
+
+
+def _check(contract: ModelContract) -> None:
+    """Raise `ModelError` for what the types alone do not say."""
+    fingers, seen = contract.fingers, contract.seen
+    if not fingers or len(set(fingers)) != len(fingers):
+        raise ModelError(f"model contract is wrong: fingers {fingers} are not different ones")
+    for rows in (seen.low, seen.high, seen.centre):
+        if [len(row) for row in rows] != [ELECTRODES] * len(fingers):
+            raise ModelError("model contract is wrong: seen counts are not (fingers, 24)")
+    if [len(row) for row in seen.whitening] != list(range(1, ELECTRODES * len(fingers) + 1)):
+        raise ModelError("model contract is wrong: whitening is not a triangle over all electrodes")
+    if any(
+        low > high
+        for rows in zip(seen.low, seen.high, strict=True)
+        for low, high in zip(*rows, strict=True)
+    ):
+        raise ModelError("model contract is wrong: a lowest count is above the highest")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -59,17 +60,22 @@ class TactileModel:
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's exceptions share no narrower base
-            raise ModelError(f"{self.path}: {error}") from error
+            raise ModelError(f"{self.path}: {_one_line(error)}") from error
         return float(self._probability[0, 0]), float(self._probability[0, 1])
 
 
 def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > MAX_MODEL_BYTES:
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):
+            raise ModelError(f"{path}: cannot read the model: not a regular file")
+        if about.st_size > MAX_MODEL_BYTES:
             raise ModelError(f"{path}: larger than {MAX_MODEL_BYTES} bytes, not a model")
         return path.read_bytes()
     except OSError as error:
         raise ModelError(f"{path}: cannot read the model: {error.strerror}") from error
+    except ValueError as error:  # a NUL in the path
+        raise ModelError(f"{str(path)!r}: cannot read the model: {error}") from error
 
 
 def _session(path: Path, data: bytes) -> ort.InferenceSession:
@@ -83,7 +89,11 @@ def _session(path: Path, data: bytes) -> ort.InferenceSession:
     try:
         return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no narrower base
-        raise ModelError(f"{path}: not a usable ONNX model: {error}") from error
+        raise ModelError(f"{path}: not a usable ONNX model: {_one_line(error)}") from error
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _contract(path: Path, session: ort.InferenceSession) -> ModelContract:

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 def data_dir() -> Path | None:
     """Folder of the real recordings, or None where there is none."""
     given = os.environ.get("GRASPD_DATA")
-    candidates = [Path(given)] if given else [ROOT.parent / "shared" / "data"]
+    candidates = [Path(given)] if given else [ROOT / "data", ROOT.parent / "shared" / "data"]
     return next((path for path in candidates if (path / "bts3").is_dir()), None)
 
 
@@ -25,7 +25,7 @@ def bts3_dir() -> Path:
     """Folder with palm_down.csv, palm_side.csv and palm_45.csv of the real data set."""
     folder = data_dir()
     if folder is None:
-        pytest.skip("the real recordings are neither in ../shared/data nor in $GRASPD_DATA")
+        pytest.skip("no real recordings: get them with `graspd data`, or set $GRASPD_DATA")
     return folder / "bts3"
 
 

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.verdict import Reason
-from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
+from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 from models.contract import SeenCounts
+from models.seen import SeenCheck
 
 REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
     ElectrodeFault.MISSING: Reason.SENSOR_MISSING,
@@ -19,41 +20,45 @@ REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
 }
 """What the judge says of each fault that a driver can flag."""
 
+UNCHANGED_MAX = 16
+"""Readings in a row in which a live electrode may keep its count. Its noise is 3 to 4 counts
+(standard deviation), so it keeps it about once in ten readings, 16 times in a row never; and all
+24 of a finger do not even keep it once. Something along the way repeats old data."""
+NO_COUNT = 0xFFFF
+
 
 class Health:
-    """Examines one reading after the other; remembers only the last one."""
+    """Examines one reading after the other; remembers only what has not changed."""
 
     def __init__(self, fingers: int, seen: SeenCounts) -> None:
-        """`seen` bounds what the model was trained on, shape (fingers, 24)."""
-        self._shape = (fingers, 24)
-        self._low = np.array(seen.low, dtype=np.int32) - seen.margin
-        self._high = np.array(seen.high, dtype=np.int32) + seen.margin
-        self._previous: NDArray[np.uint16] | None = None
+        """`seen` is what the model was trained on."""
+        self._shape = (fingers, ELECTRODES)
+        self._seen = SeenCheck(seen)
+        self._previous = np.full(self._shape, NO_COUNT, dtype=np.uint16)
+        self._unchanged = np.zeros(self._shape, dtype=np.int64)
+        """Readings in a row in which each electrode has not changed."""
 
     def examine(self, reading: TactileReading) -> list[Reason]:
         """Reasons against judging this reading, none if it is sound."""
         counts = reading.counts
         if counts.shape != self._shape:
-            self._previous = None
             return [Reason.MODEL_MISMATCH]
-        repeats = self._repeats(counts)
+        frozen = self._is_frozen(counts)
         if reading.faults.any():  # flagged counts mean nothing: no further findings on them
             return _fault_reasons(int(np.bitwise_or.reduce(reading.faults, axis=None)))
-        reasons = [Reason.FROZEN] if repeats else []
+        reasons = [Reason.FROZEN] if frozen else []
         if counts.min() == 0 or counts.max() >= COUNT_MAX:
             reasons.append(Reason.SATURATED)
-        elif (counts < self._low).any() or (counts > self._high).any():
+        elif self._seen.never_seen(counts[np.newaxis]).any():
             reasons.append(Reason.NEVER_SEEN)
         return reasons
 
-    def _repeats(self, counts: NDArray[np.uint16]) -> bool:
-        """Whether a whole finger reads exactly as before.
-
-        A live BioTac SP has 3 to 4 counts of noise on each electrode (standard deviation), so 24
-        equal values in a row do not happen: something along the way repeats old data.
-        """
-        previous, self._previous = self._previous, counts
-        return previous is not None and bool((previous == counts).all(axis=1).any())
+    def _is_frozen(self, counts: NDArray[np.uint16]) -> bool:
+        """Whether a whole finger reads exactly as before, or an electrode has for too long."""
+        same = counts == self._previous
+        self._previous = counts
+        self._unchanged = np.where(same, self._unchanged + 1, 0)
+        return bool(same.all(axis=1).any() or self._unchanged.max() >= UNCHANGED_MAX)
 
 
 def _fault_reasons(bits: int) -> list[Reason]:

@@ -69,7 +69,7 @@ ADVICE: dict[Reason, str] = {
 }
 
 
-class Verdict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=False):
+class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """One judgement, on topic `verdict.<hand>`."""
 
     v: Literal[1] = WIRE_VERSION
@@ -80,9 +80,9 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=F
     t: float
     """Wall-clock seconds since 1970 at publishing, for plots and people only."""
     t_mono_ns: Count
-    """Monotonic time, ns, when the last byte of the reading was received."""
+    """Monotonic time, ns, of the reading's last byte; of the start where none has come yet."""
     grasp: Count
-    """Counts up per contact episode (with gate mode `every`: per reading), from 1."""
+    """Counts up per contact episode (with gate mode `every`: per reading), from 1; 0 before."""
     verdict: Outcome
     verdict_code: Literal[0, 1, 2]
     """0 unknown, 1 stable, 2 slip."""
@@ -95,7 +95,9 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=F
     age_ms: Duration
     """From `t_mono_ns` to publishing, ms."""
     latency_us: Duration
-    """From the driver handing the reading over to publishing, us."""
+    """From the driver handing the reading over to encoding this message, us."""
+    silence_ms: Duration
+    """If no message comes for longer than this, take the grasp for unknown."""
     model: str
     model_sha: str
     """First 12 hex digits of the model file's SHA-256."""

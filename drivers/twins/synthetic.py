@@ -30,8 +30,8 @@ COUNTS = len(FINGERS) * ELECTRODES
 TABLES = ("palm_down.csv", "palm_side.csv")
 MODEL = Path(__file__).with_name("grasp_classes.json")
 COMPONENTS = 3
-AXES = 8
-"""Mixture components per class, and axes per component: 2307 parameters per class (`parameters`),
+AXES = 24
+"""Mixture components per class, and axes per component: 5763 parameters per class (`parameters`),
 against 92,000 counts or so that a class of the data set has."""
 DEMO_GRASPS = 200
 DEMO_SEED = 0

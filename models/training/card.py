@@ -81,7 +81,11 @@ class NeverSeen(msgspec.Struct, frozen=True):
     """Fraction of readings that the contract's `seen` refuses."""
 
     held_out_fold: float
-    uniformly_random_counts: float
+    """Grasps of a fold, by what the other folds look like."""
+    held_out_object: float | None
+    """Grasps of an object, by the other objects; None if there is only one."""
+    made_up: dict[str, float]
+    """Readings that no hand ever made, by the way they were made up."""
 
 
 class NewSession(msgspec.Struct, frozen=True):
@@ -126,8 +130,8 @@ def weak_points(session: NewSession | None) -> tuple[str, ...]:
     text = (
         f"In a later session ({session.file.name}: same objects, other palm pose, drifted sensors) "
         f"F1 is {100 * session.scores.f1:.1f} %: it still ranks (AUC {session.scores.auc:.2f}), "
-        f"its zero has moved. The range check refuses {100 * session.never_seen:.1f} % "
-        "of these grasps"
+        "its zero has moved. What looks unlike the training data is refused: "
+        f"{100 * session.never_seen:.1f} % of these grasps"
     )
     if session.scores_of_rest is not None:
         text += f"; on the rest F1 is {100 * session.scores_of_rest.f1:.1f} %"

@@ -13,6 +13,7 @@ from torch import nn
 from models.bts3 import FINGERS
 from models.contract import CLASSES, ModelContract
 from models.layout import D1
+from models.seen import SeenCheck
 from models.tactile_image import Fill, Normalisation, TactileImager
 from models.training import card as cards
 from models.training.calibration import cross_fitted_p_slip, fit_temperature, p_slip, reliability
@@ -29,8 +30,7 @@ from models.training.protocols import (
 from models.training.recipe import Progress, Recipe, logits, train
 from models.training.seen import (
     held_out_never_seen,
-    never_seen,
-    random_never_seen,
+    made_up_never_seen,
     seen_counts,
 )
 
@@ -105,7 +105,8 @@ def make(
         calibration=calibration,
         never_seen=cards.NeverSeen(
             held_out_fold=held_out_never_seen(grasps.counts, validation.fold_of),
-            uniformly_random_counts=random_never_seen(contract.seen, seed),
+            held_out_object=_held_out_object(grasps),
+            made_up=made_up_never_seen(grasps.counts, contract.seen, seed),
         ),
         new_session=session,
         repeatability=repeatability,
@@ -120,6 +121,11 @@ def make(
 def _images(grasps: Grasps) -> NDArray[np.float32]:
     imager = TactileImager(len(FINGERS), D1, FILL, NORMALISATION)
     return imager.build_batch(grasps.counts)[0]
+
+
+def _held_out_object(grasps: Grasps) -> float | None:
+    objects = np.array(grasps.objects)
+    return held_out_never_seen(grasps.counts, objects) if len(set(grasps.objects)) > 1 else None
 
 
 def _calibration(validation: CrossValidation, slipped: NDArray[np.bool_]) -> cards.Calibration:
@@ -159,7 +165,7 @@ def _judge_new_session(
     if session is None:
         return None
     values, slipped = logits(network, _images(session)), session.slipped
-    refused = never_seen(session.counts, contract.seen)
+    refused = SeenCheck(contract.seen).never_seen(session.counts)
     return cards.NewSession(
         file=session.files[0],
         scores=_score_if_both(values, slipped),

@@ -19,6 +19,18 @@ MS = 1_000_000
 LOW, HIGH, MARGIN = 1000, 3000, 250
 
 
+def seen_box(fingers: int) -> SeenCounts:
+    """Everything within the range was seen, however the electrodes go together."""
+    return SeenCounts(
+        low=((LOW,) * 24,) * fingers,
+        high=((HIGH,) * 24,) * fingers,
+        margin=MARGIN,
+        centre=((2000.0,) * 24,) * fingers,
+        whitening=tuple((0.0,) * (row + 1) for row in range(24 * fingers)),
+        distance_max=1.0,
+    )
+
+
 def contract(fingers: tuple[Finger, ...] = FINGERS) -> ModelContract:
     return ModelContract(
         version=1,
@@ -32,7 +44,7 @@ def contract(fingers: tuple[Finger, ...] = FINGERS) -> ModelContract:
         seed=0,
         datasets=(Dataset("none", "0" * 64, 1),),
         measured=MeasuredError("cv", 10, 0.9, 0.01, 0.9, 0.01),
-        seen=SeenCounts(((LOW,) * 24,) * len(fingers), ((HIGH,) * 24,) * len(fingers), MARGIN),
+        seen=seen_box(len(fingers)),
     )
 
 

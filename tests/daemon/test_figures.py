@@ -50,6 +50,7 @@ def verdict(outcome: Outcome) -> Verdict:
         reasons=[Reason.STALE] if unknown else [],
         age_ms=0.0,
         latency_us=100.0,
+        silence_ms=100.0,
         model="fake",
         model_sha="0",
     )

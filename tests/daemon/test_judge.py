@@ -136,6 +136,18 @@ def test_a_finger_that_repeats_itself_is_frozen_until_it_moves() -> None:
     assert judge.judge(third).outcome is Outcome.STABLE
 
 
+def test_an_electrode_that_keeps_its_count_is_frozen_in_time() -> None:
+    clock = Clock()
+    judge = pipeline(FakeModel(), clock)
+    outcomes = []
+    for number in range(40):
+        stuck = reading(clock(), seed=number)
+        stuck.counts[2, 7] = 2000 if number < 30 else 2001 + number
+        outcomes.append(judge.judge(stuck).reasons)
+    # 16 repeats after the first make it frozen, until it moves again.
+    assert outcomes == [()] * 16 + [(Reason.FROZEN,)] * 14 + [()] * 10
+
+
 @pytest.mark.parametrize(
     ("age_ns", "stale"),
     [(0, False), (100 * MS, False), (100 * MS + 1, True), (10**15, True), (-1, True)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from daemon.judge.verdict import Outcome, Reason, State, Status, Verdict, decode
 from daemon.reporter import Reporter
 from daemon.service import Service
 from daemon.stop import StopSignal
-from drivers.base import DriverError, JointReading, LinkError, TactileReading
+from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
 from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, pipeline, reading
 
 
@@ -42,7 +42,13 @@ def stop() -> Iterator[StopSignal]:
 class Bench:
     """A service with everything around it replaced, and what came out of it."""
 
-    def __init__(self, driver: FakeDriver, clock: Clock, stop: StopSignal) -> None:
+    def __init__(
+        self,
+        driver: FakeDriver,
+        clock: Clock,
+        stop: StopSignal,
+        model: FakeModel | None = None,
+    ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
         self.payloads: list[bytes] = []
@@ -50,7 +56,7 @@ class Bench:
         reporter = Reporter("right", "fake", "ab" * 32, self.output, clock, lambda: 1.79e9)
         self.service = Service(
             [driver],
-            pipeline(FakeModel(), clock),
+            pipeline(model or FakeModel(), clock),
             reporter,
             stop,
             max_age_ns=100 * MS,
@@ -70,6 +76,9 @@ def test_every_reading_gets_one_verdict_in_order(stop: StopSignal) -> None:
     assert [verdict.seq for verdict in bench.verdicts] == list(range(20))
     assert [verdict.grasp for verdict in bench.verdicts] == list(range(1, 21))
     assert {verdict.verdict for verdict in bench.verdicts} == {Outcome.STABLE}
+    assert {verdict.verdict_code for verdict in bench.verdicts} == {1}
+    assert {verdict.valid for verdict in bench.verdicts} == {True}
+    assert {verdict.silence_ms for verdict in bench.verdicts} == {100.0}
     assert len({verdict.boot_id for verdict in bench.verdicts}) == 1
     sent = [payload for topic, payload in bench.output.sent if topic == b"verdict.right"]
     assert sent == bench.payloads
@@ -134,6 +143,7 @@ def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading(
         (400, Outcome.STABLE, []),
     ]
     assert [round(verdict.age_ms) for verdict in bench.verdicts] == [0, 100, 200, 300, 0]
+    assert [verdict.valid for verdict in bench.verdicts] == [True, False, False, False, True]
 
 
 def test_a_sensor_that_never_speaks_is_unknown(stop: StopSignal) -> None:
@@ -141,6 +151,52 @@ def test_a_sensor_that_never_speaks_is_unknown(stop: StopSignal) -> None:
     bench = Bench(ScriptedDriver([], clock, 250), clock, stop)
     bench.service.run()
     assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN] * 2
+
+
+def test_a_slow_driver_may_be_silent_for_ten_of_its_periods(stop: StopSignal) -> None:
+    clock = Clock()
+    start_ns = clock()
+    driver = ScriptedDriver([10, 400], clock, 1000)
+    driver.period_ns = 50 * MS
+    bench = Bench(driver, clock, stop)
+    bench.service.run()
+    assert [verdict.reasons for verdict in bench.verdicts] == [[], [], [Reason.STALE]]
+    assert {verdict.silence_ms for verdict in bench.verdicts} == {500.0}
+    assert bench.verdicts[-1].t_mono_ns == start_ns + 400 * MS
+    assert round(bench.verdicts[-1].age_ms) == 500
+
+
+def test_latency_counts_the_wait_behind_other_readings_of_the_same_moment(
+    stop: StopSignal,
+) -> None:
+    clock = Clock()
+
+    class SlowModel(FakeModel):
+        def run(self) -> tuple[float, float]:
+            clock.now_ns += 3 * MS
+            return super().run()
+
+    class BatchDriver(FakeDriver):
+        def read_ready(self) -> Sequence[Reading]:
+            batch = [item for item in self.queue if not isinstance(item, DriverError)]
+            self.queue.clear()
+            return batch
+
+    driver = BatchDriver([reading(clock(), seed) for seed in range(3)], clock)
+    bench = Bench(driver, clock, stop, SlowModel())
+    bench.service.run()
+    assert [verdict.latency_us for verdict in bench.verdicts] == [3000.0, 6000.0, 9000.0]
+    assert bench.output.statuses()[-1].latency_us["max"] == 9000.0
+
+
+def test_status_tells_when_readings_come_again(stop: StopSignal) -> None:
+    clock = Clock()
+    start_ns = clock()
+    bench = Bench(ScriptedDriver([1950], clock, 2100), clock, stop)
+    bench.service.run()
+    silent, running, _ = bench.output.statuses()
+    assert (silent.state, running.state) == (State.SILENT, State.RUNNING)
+    assert silent.t_mono_ns - start_ns == 1000 * MS
 
 
 def test_status_comes_every_second_even_when_idle(stop: StopSignal) -> None:

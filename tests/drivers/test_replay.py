@@ -100,16 +100,26 @@ def test_a_stream_plays_at_its_own_times_whatever_their_offset(tmp_path: Path) -
     assert times_ms(play(ReplayDriver([path], speed=2, clock=clock), clock)) == [0, 5, 5, 125]
 
 
-def test_the_period_of_a_stream_is_the_mean_so_far_once_it_is_known(tmp_path: Path) -> None:
+def test_the_period_of_a_stream_is_the_shortest_step_so_far(tmp_path: Path) -> None:
     clock = Clock()
-    path = write(tmp_path, stream(["5", "5.02", "5.03", "5.06"]))
+    path = write(tmp_path, stream(["5", "5.02", "5.03", "35.0"]))
     with ReplayDriver([path], speed=2, clock=clock) as driver:
         periods_ms = [None if driver.period_ns is None else driver.period_ns / MS]
         while not driver.exhausted:
             clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
             driver.read_ready()
             periods_ms.append((driver.period_ns or 0) / MS)
-    assert periods_ms == [None, 10, 7.5, 10, 10]
+    assert periods_ms == [None, 0, 10, 5, 5]
+
+
+def test_a_late_reading_is_an_old_one(tmp_path: Path) -> None:
+    clock = Clock()
+    with ReplayDriver([write(tmp_path, table(3))], clock=clock) as driver:
+        started_ns = clock.now_ns
+        driver.read_ready()
+        clock.now_ns += 4000 * MS
+        late = tactile([*driver.read_ready(), *driver.read_ready()])
+    assert [reading.t_ns - started_ns for reading in late] == [10 * MS, 20 * MS]
 
 
 def test_nothing_comes_before_it_is_due(tmp_path: Path) -> None:
@@ -178,8 +188,8 @@ def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:
         write(tmp_path, table(2), "d.csv"),
     ]
     readings = play(ReplayDriver(paths, clock=clock), clock)
-    # A stream goes on for its mean period, 20 ms; one of a single row for that of tables.
-    assert times_ms(readings) == [0, 10, 20, 50, 60, 80, 90, 100]
+    # A stream goes on for its shortest step, 10 ms; one of a single row for that of tables.
+    assert times_ms(readings) == [0, 10, 20, 50, 60, 70, 80, 90]
     assert [reading.seq for reading in readings] == list(range(8))
     sources = [
         reading.annotation.source.name for reading in tactile(readings) if reading.annotation

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from sklearn.metrics import brier_score_loss, log_loss
 
-from models.contract import SeenCounts
+from models.seen import SeenCheck
 from models.training.calibration import (
     cross_fitted_p_slip,
     fit_temperature,
@@ -20,8 +21,7 @@ from models.training.calibration import (
 from models.training.protocols import TooFewGraspsError, folds_of, score
 from models.training.seen import (
     held_out_never_seen,
-    never_seen,
-    random_never_seen,
+    made_up_never_seen,
     seen_counts,
 )
 
@@ -76,36 +76,53 @@ def test_a_fold_is_calibrated_by_the_other_folds_alone() -> None:
     assert not np.array_equal(before[fold_of == 0], after[fold_of == 0])
 
 
-def test_seen_counts_are_the_range_of_each_electrode() -> None:
-    counts = np.full((3, 3, 24), 2000, dtype=np.uint16)
-    counts[1, 2, 23] = 1000
-    counts[2, 0, 5] = 3000
+def random_counts(number: int) -> NDArray[np.uint16]:
+    """Correlated readings: one common part moves all electrodes together."""
+    random = np.random.default_rng(5)
+    common = random.normal(0.0, 200.0, (number, 1, 1))
+    own = random.normal(0.0, 10.0, (number, 3, 24))
+    counts: NDArray[np.uint16] = (2000.0 + common + own).astype(np.uint16)
+    return counts
+
+
+def test_seen_counts_are_range_mean_and_inverse_covariance() -> None:
+    counts = random_counts(500)
     seen = seen_counts(counts)
-    assert (seen.low[2][23], seen.high[2][23]) == (1000, 2000)
-    assert (seen.low[0][5], seen.high[0][5]) == (2000, 3000)
-    assert (seen.low[1][0], seen.high[1][0]) == (2000, 2000)
+    assert seen.low[2][23] == counts[:, 2, 23].min()
+    assert seen.high[0][5] == counts[:, 0, 5].max()
+    np.testing.assert_allclose(np.array(seen.centre), counts.mean(axis=0), rtol=1e-8)
+    lower = np.zeros((72, 72))
+    for index, row in enumerate(seen.whitening):
+        lower[index, : len(row)] = row
+    # The inverse covariance, with 5 counts of sensor noise on each electrode.
+    covariance = np.cov(counts.reshape(500, 72).T) + 25.0 * np.eye(72)
+    np.testing.assert_allclose(lower @ lower.T @ covariance, np.eye(72), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("count", "refused"), [(1750, False), (1749, True), (2250, False), (2251, True), (0, True)]
-)
-def test_a_count_beyond_the_margin_was_never_seen(count: int, refused: bool) -> None:
-    row = (2000,) * 24
-    seen = SeenCounts(low=(row,) * 3, high=(row,) * 3, margin=250)
-    counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
-    counts[1, 1, 11] = count
-    assert never_seen(counts, seen).tolist() == [False, refused]
+def test_values_that_are_possible_alone_but_not_together_were_never_seen() -> None:
+    counts = random_counts(500)
+    check = SeenCheck(seen_counts(counts))
+    assert check.never_seen(counts).mean() < 0.02
+    torn = counts[:1].copy()
+    torn[0, 0, ::2], torn[0, 0, 1::2] = counts.min() + 50, counts.max() - 50
+    assert check.never_seen(torn).tolist() == [True]
 
 
-def test_a_held_out_fold_does_not_widen_its_own_range() -> None:
-    counts = np.full((4, 3, 24), 2000, dtype=np.uint16)
-    counts[0, 0, 0] = 3000
-    assert held_out_never_seen(counts, np.array([0, 0, 1, 1])) == 0.25
+def test_a_held_out_fold_is_not_judged_by_its_own_range() -> None:
+    counts = random_counts(100)
+    counts[:2, 0, 0] = 3500
+    group_of = np.arange(100) // 50
+    # Both odd readings are in the first group, so nothing in the second looks like them.
+    assert held_out_never_seen(counts, group_of) >= 0.02
+    assert SeenCheck(seen_counts(counts)).never_seen(counts)[:2].tolist() == [False, False]
 
 
-def test_uniformly_random_counts_are_refused_by_a_narrow_range() -> None:
-    row = (2000,) * 24
-    assert random_never_seen(SeenCounts((row,) * 3, (row,) * 3, 250), seed=1) == 1.0
+def test_made_up_readings_are_refused() -> None:
+    counts = random_counts(500)
+    fractions = made_up_never_seen(counts, seen_counts(counts), seed=1)
+    assert len(fractions) == 4
+    assert fractions.pop("middle of the ranges, with noise") < 1.0  # here this is a usual reading
+    assert set(fractions.values()) == {1.0}
 
 
 def test_folds_are_stratified_and_leave_each_grasp_out_once() -> None:
