@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Self
 
 from drivers.base import FINGERS, LinkError, Reading, TactileReading
@@ -180,12 +179,7 @@ class SpiBridgeDriver:
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_details: object) -> None:
         self.close()
 
     def fileno(self) -> int | None:

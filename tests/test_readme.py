@@ -42,7 +42,7 @@ def test_the_python_subscriber_prints_verdicts(tmp_path: Path) -> None:
     code = block("python")
     assert ENDPOINT in code
     # The process that starts first waits longer for the replay to come up.
-    code = code.replace(ENDPOINT, endpoint).replace("1000", "5000", 1)
+    code = code.replace(ENDPOINT, endpoint).replace("2000", "5000", 1)
     lines = verdict_lines([sys.executable, "-Wignore", "-u", "-c", code], endpoint)
     assert len(lines) == 200
     assert [ast.literal_eval(line)["seq"] for line in lines] == list(range(200))
@@ -55,7 +55,7 @@ def test_the_cpp_subscriber_compiles_and_prints_verdicts(tmp_path: Path) -> None
     source = tmp_path / "subscriber.cpp"
     code = block("cpp")
     assert ENDPOINT in code
-    source.write_text(code.replace(ENDPOINT, endpoint).replace("1000", "5000"))
+    source.write_text(code.replace(ENDPOINT, endpoint).replace("2000", "5000"))
     binary = tmp_path / "subscriber"
     subprocess.run(
         ["g++", "-std=c++17", "-Wall", "-Wextra", source, "-o", binary, "-lzmq"], check=True
