@@ -25,6 +25,14 @@ RATE_FRACTION = 0.9
 """Readings per nominal rate below which the link is slow."""
 
 
+USUAL_COUNTERS = frozenset(
+    {"readings", "bytes", "frames", "accepted_frames", "packets", "joint_readings"}
+)
+"""What a driver counts that is no trouble."""
+JOINING, JOINING_MAX = "unsynchronised", 108
+"""A listener that joins in mid-sweep takes nothing up to two sweeps of 54 samples: no trouble."""
+
+
 class Level(StrEnum):
     """How bad a finding is."""
 
@@ -116,11 +124,10 @@ class ElectrodeStatistics:
 
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     """A warning for every counter of a driver that is about something going wrong."""
-    usual = {"readings", "bytes", "frames", "sweeps", "packets", "loops", "rows", "joint_readings"}
     return [
         Finding(Level.WARNING, f"{driver}: {number} {name.replace('_', ' ')}")
         for name, number in counters.items()
-        if number and name not in usual
+        if number > JOINING_MAX * name.startswith(JOINING) and name not in USUAL_COUNTERS
     ]
 
 

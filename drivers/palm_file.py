@@ -68,10 +68,8 @@ def _share_of_sense(head: bytes, length: int) -> float:
 
 def _open(path: Path) -> BinaryIO:
     try:
-        file = path.open("rb")
+        if stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for its writer
+            return path.open("rb")
     except OSError as error:
         raise RecordingError(path, f"cannot be opened: {error.strerror}") from error
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-        file.close()
-        raise RecordingError(path, "is not a file")
-    return file
+    raise RecordingError(path, "is not a file")

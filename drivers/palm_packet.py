@@ -258,7 +258,6 @@ _MOTOR_WORDS = 4 + 2 * MOTORS
 _SLOT_WORDS = len(TactileSlot._fields)
 _TACTILE_WORDS = 2 + _SLOT_WORDS * TACTILE_FINGERS
 _WHICH_MOTORS = (0, 1)
-_FINGER_BITS = (1 << TACTILE_FINGERS) - 1
 _CAN_BYTES_MAX = 8
 
 
@@ -297,8 +296,6 @@ def _unpack(data: bytes, layout: _Layout) -> PalmPacket:
 def _is_plausible(packet: PalmPacket) -> bool:
     """Whether the fields of few values hold one of them. Padding may hold anything."""
     record = packet.can_record
-    return (
-        packet.which_motors in _WHICH_MOTORS
-        and packet.tactile_valid <= _FINGER_BITS
-        and (record is None or record.length <= _CAN_BYTES_MAX)
+    return packet.which_motors in _WHICH_MOTORS and (
+        record is None or record.length <= _CAN_BYTES_MAX
     )

@@ -69,7 +69,8 @@ class SerialLine:
                 if not port.out_waiting:
                     break
                 time.sleep(DRAIN_TRY_S)
-            port.reset_output_buffer()  # closing would wait up to 30 s for it to drain
+            else:
+                port.reset_output_buffer()  # closing would wait up to 30 s for it to drain
         except AttributeError:
             pass  # a port without a buffer of its own
         except (OSError, termios.error) as error:

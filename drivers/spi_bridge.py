@@ -47,6 +47,8 @@ PINGS_FIRST = 8
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """PINGs that may wait for an answer; the oldest is given up."""
+PERIOD_MAX_NS = 1_000_000_000
+"""A bridge that sweeps less often is of no use, and its silence would not be noticed in time."""
 SILENCE_PERIODS = 10
 """Sweeps that may be missing before the link is lost."""
 SILENCE_MIN_NS = 100_000_000
@@ -359,6 +361,11 @@ class SpiBridgeDriver:
             self._counters.refused_bridges += 1
             named = f"the scene needs {max(self._sensors) + 1}"
             self._lose(f"{self._line.port}: the bridge has {hello.sensors} sensors, {named}")
+            return None
+        if hello.period_ns > PERIOD_MAX_NS:
+            self._counters.refused_bridges += 1
+            period_s = hello.period_ns / 1e9
+            self._lose(f"{self._line.port}: the bridge sweeps once in {period_s:g} s only")
             return None
         if not self._send(encode(Start())):
             return None

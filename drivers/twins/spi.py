@@ -163,6 +163,8 @@ class SpiTwin:
 
     def plug(self) -> None:
         """Make a pseudo-terminal, point the path at it, and say HELLO as after a reset."""
+        if self.path.exists() and not self.path.is_symlink():
+            raise FileExistsError(f"{self.path} is in the way: it is no link of a twin's")
         self.unplug()
         self._replug_ns = None
         self._master, self._slave = os.openpty()
@@ -170,7 +172,8 @@ class SpiTwin:
         os.set_blocking(self._master, False)
         self._reset()
         new = self.path.with_name(self.path.name + ".new")
-        new.unlink(missing_ok=True)
+        if new.is_symlink():
+            new.unlink()
         new.symlink_to(os.ttyname(self._slave))
         new.replace(self.path)
         self._write(DELIMITER)
@@ -178,7 +181,8 @@ class SpiTwin:
 
     def unplug(self) -> None:
         """Take the pseudo-terminal away: whoever has it open is told by the system."""
-        self.path.unlink(missing_ok=True)
+        if self.path.is_symlink():
+            self.path.unlink()
         for descriptor in (self._master, self._slave):
             if descriptor is not None:
                 os.close(descriptor)

@@ -129,8 +129,14 @@ def test_the_rate_is_judged_by_its_nominal(
 
 
 def test_only_counters_of_trouble_are_findings() -> None:
-    findings = counter_findings("spi", {"readings": 300, "bytes": 9, "bad_crc": 2, "too_long": 0})
+    counters = {"readings": 300, "bytes": 9, "accepted_frames": 9, "bad_crc": 2, "too_long": 0}
+    findings = counter_findings("spi", counters)
     assert [finding.what for finding in findings] == ["spi: 2 bad crc"]
+
+
+@pytest.mark.parametrize(("number", "findings"), [(0, 0), (13, 0), (108, 0), (109, 1)])
+def test_joining_in_the_middle_of_a_sweep_is_no_trouble(number: int, findings: int) -> None:
+    assert len(counter_findings("palm", {"unsynchronised_packets": number})) == findings
 
 
 def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:

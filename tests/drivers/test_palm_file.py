@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,13 @@ def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
             clock.now_ns = due_ns
             times += [reading.t_ns - start_ns for reading in driver.read_ready()]
     assert times == [(14 * number + 13) * MS for number in range(10)]
+
+
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "hand.palm"
+    os.mkfifo(path)
+    with pytest.raises(RecordingError, match="is not a file"):
+        PalmDriver(path).open()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])

@@ -230,8 +230,6 @@ def test_an_empty_packet_is_counted_and_dropped(length: int) -> None:
         (3, 1, "nonsense_packets"),
         (82, 2, "nonsense_packets"),
         (83, 0xFF, "nonsense_packets"),
-        (136, 0x20, "nonsense_packets"),
-        (137, 0x01, "nonsense_packets"),
         (221, 9, "nonsense_packets"),
     ],
 )
@@ -245,6 +243,15 @@ def test_a_field_that_no_palm_sends_is_counted_and_dropped(
     assert PalmParser(counters).parse(bytes(data)) is None
     assert getattr(counters, counter) == 1
     assert counters.packets == 1
+
+
+@pytest.mark.parametrize("bits", [0x20, 0x0100, 0xFFFF])
+def test_finger_bits_that_nobody_defined_spoil_nothing(bits: int) -> None:
+    data = bytearray(bytes(filled(Palm.PALM_0220)))
+    data[136:138] = bits.to_bytes(2, "little")
+    packet = PalmParser(PacketCounters()).parse(bytes(data))
+    assert packet is not None
+    assert packet.tactile_valid == bits
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,14 @@ def test_a_bridge_with_too_few_sensors_is_refused(rig: Rig) -> None:
     assert rig.driver.counters.refused_bridges == 1
 
 
+def test_a_bridge_that_hardly_ever_sweeps_is_refused(rig: Rig) -> None:
+    rig.greet(dataclasses.replace(hello(0), period_ticks=1_000_001))
+    assert rig.driver.failure is not None
+    assert "the bridge sweeps once in 1 s only" in rig.driver.failure
+    assert rig.driver.counters.refused_bridges == 1
+    assert rig.bridge.says_nothing_more(), "not even START"
+
+
 def test_a_silent_device_is_asked_again_and_then_given_up(rig: Rig) -> None:
     rig.driver.open()
     for _ in range(4):

@@ -231,6 +231,16 @@ def test_a_bridge_that_is_plugged_in_again_is_back_soon(tmp_path: Path) -> None:
     assert max(times_s) < BACK_WITHIN_S, (seed, times_s)
 
 
+def test_a_file_in_the_way_of_the_link_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "bridge"
+    path.write_text("precious")
+    twin = SpiTwin(path, generated(1))
+    with pytest.raises(FileExistsError, match="in the way"):
+        twin.open()
+    twin.close()
+    assert path.read_text() == "precious"
+
+
 def test_a_source_without_counts_and_a_rate_of_nothing_are_refused(tmp_path: Path) -> None:
     empty: Iterator[Counts] = iter(())
     with pytest.raises(ValueError, match="no counts"):

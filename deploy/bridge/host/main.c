@@ -6,6 +6,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include "bridge.h"
@@ -262,11 +263,17 @@ static void catch_signals(void)
 static void make_link(const char *path)
 {
     char fresh[1024];
+    struct stat about;
 
+    if (lstat(path, &about) == 0 && !S_ISLNK(about.st_mode)) {
+        fail(EXIT_FAILED, "%s is in the way: it is no link", path);
+    }
     if (snprintf(fresh, sizeof fresh, "%s.new", path) >= (int)sizeof fresh) {
         fail(EXIT_FAILED, "%s is too long", path);
     }
-    (void)unlink(fresh);
+    if (lstat(fresh, &about) == 0 && S_ISLNK(about.st_mode)) {
+        (void)unlink(fresh);
+    }
     if (symlink(host_port.path, fresh) != 0 || rename(fresh, path) != 0) {
         fail(EXIT_FAILED, "%s: %s", path, strerror(errno));
     }
