@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from daemon.judge.pipeline import Limits, Pipeline
@@ -13,10 +14,11 @@ from daemon.scene import (
     PalmTactile,
     ReplayTactile,
     Scene,
+    SceneError,
     SpiTactile,
     StreamJoints,
 )
-from drivers.base import Driver
+from drivers.base import Driver, DriverError, LinkError
 from models import zoo
 from models.runtime import TactileModel
 
@@ -28,7 +30,9 @@ Clock = Callable[[], int]
 
 def model_path(scene: Scene) -> Path:
     """File of the scene's model. Raises `ModelError` if the zoo does not have it."""
-    return scene.model.path or zoo.find(scene.model.name or DEFAULT_MODEL)
+    if scene.model.path is not None:
+        return scene.model.path
+    return zoo.find(DEFAULT_MODEL if scene.model.name is None else scene.model.name)
 
 
 def load_model(scene: Scene) -> TactileModel:
@@ -43,13 +47,40 @@ def build_pipeline(scene: Scene, model: TactileModel, clock: Clock = time.monoto
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
-    """The drivers of this scene, not yet open, the tactile one first."""
-    drivers = [_tactile(scene, clock)]
+    """The drivers of this scene, not yet open, the tactile one first.
+
+    Raises `SceneError` naming the section where values do not fit the driver or each other.
+    """
+    with _section("tactile"):
+        drivers = [_tactile(scene, clock)]
     if isinstance(scene.joints, StreamJoints):
         from drivers.joints import JointStreamDriver
 
-        drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
+        with _section("joints"):
+            drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
     return drivers
+
+
+def open_driver(driver: Driver) -> None:
+    """Open a driver.
+
+    Raises `LinkError` where a later try may succeed, and `SceneError` where none can: a recording
+    or calibration with mistakes, a device of a kind that there is not.
+    """
+    try:
+        driver.open()
+    except LinkError:
+        raise
+    except (DriverError, ValueError) as error:
+        raise SceneError(str(error)) from error
+
+
+@contextmanager
+def _section(name: str) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise SceneError(f"[{name}] {error}") from error
 
 
 def _tactile(scene: Scene, clock: Clock) -> Driver:
@@ -72,7 +103,12 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
             joints = scene.joints
             calibration = joints.calibration if isinstance(joints, PalmJoints) else None
             return PalmDriver(
-                options.source, scene.hand.fingers, calibration=calibration, clock=clock
+                options.source,
+                scene.hand.fingers,
+                calibration=calibration,
+                only_from=options.only_from,
+                heed_finger_bits=options.heed_finger_bits,
+                clock=clock,
             )
 
 

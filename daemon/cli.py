@@ -1,18 +1,20 @@
 """The command line: `graspd COMMAND ...`.
 
-Exit codes: 0 done; 1 something failed while running; 2 the command line, scene, recording, model
-or data is wrong; 130 and 143 stopped by SIGINT and SIGTERM before the work was done.
+Exit codes: 0 done; 1 something failed while running: a device, the socket, the output, getting
+data, and what `doctor` finds; 2 the command line, scene, recording or model is wrong; 130 and 143
+stopped by SIGINT and SIGTERM before the work was done.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import importlib
 import logging
-import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
+from types import ModuleType
 
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
@@ -29,12 +31,19 @@ COMMANDS = {
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
-FAILED = 1
 WRONG = 2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code."""
+    """Run one command and return its exit code; without what the process needs around it."""
+    return parse(arguments)()
+
+
+def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
+    """Load the command that is named and bind its arguments.
+
+    Raises `SystemExit` where there is nothing to run: 0 after --help, 2 for what is wrong.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     parser = argparse.ArgumentParser(
         prog="graspd",
@@ -47,30 +56,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, (module_name, text) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         if name == named:
-            try:
-                module = importlib.import_module(module_name)
-            except ModuleNotFoundError as error:
-                return _extra_is_missing(name, error)
+            module = _load(name, module_name)
             module.add_arguments(command)
             run = module.run
     args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.INFO, format="graspd: %(levelname)s: %(message)s")
     if run is None:
         parser.error(f"'{args.command}' must come first")
+    return functools.partial(run, args)
+
+
+def _load(command: str, module: str) -> ModuleType:
     try:
-        code: int = run(args)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # Whoever read our output has gone, as in `graspd replay | head`: nothing is wrong.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    return code
-
-
-def _extra_is_missing(command: str, error: ModuleNotFoundError) -> int:
-    if command != "train" or (error.name or "").split(".")[0] in {"daemon", "drivers", "models"}:
-        raise error
-    sys.stderr.write(
-        f"graspd: {command} needs the package '{error.name}': pip install 'graspd[train]'\n"
-    )
-    return WRONG
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").split(".")[0]
+        if command != "train" or package in {"daemon", "drivers", "models"}:
+            raise
+        sys.stderr.write(
+            f"graspd: {command} needs the package '{package}': run pip install '.[train]' in the "
+            "folder of graspd's source\n"
+        )
+        raise SystemExit(WRONG) from None

@@ -8,7 +8,11 @@ import time
 
 from daemon.judge.verdict import Verdict
 from daemon.summary import Summary
+from daemon.text import printable
 from drivers.base import Annotation, TactileReading
+
+NAME_MAX = 80
+"""Characters of an object's name that are shown."""
 
 
 class Printer:
@@ -50,7 +54,7 @@ def _line(verdict: Verdict, annotation: Annotation | None) -> str:
         finding = f"p_slip {verdict.p_slip:.3f}"
     line = f"{verdict.grasp:6d}  {verdict.verdict:8}{finding:16}{verdict.latency_us:6.0f} us"
     if annotation is not None:
-        line += f"  {annotation.object_name or ''}"
+        line += f"  {printable(annotation.object_name or '', NAME_MAX)}"
         if annotation.slipped is not None:
             line += f" (was {'slip' if annotation.slipped else 'stable'})"
     return line.rstrip()

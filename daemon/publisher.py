@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import fcntl
 import math
-import os
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
 import zmq
 
+from daemon.socket_file import OccupiedError, SocketFile
+
 SUBSCRIBED = 1
 """First byte of a subscription message on an XPUB socket."""
-SUBSCRIPTION_MAX_BYTES = 1024
-"""A peer that sends more is no subscriber and is disconnected: a subscription is a topic prefix."""
+SUBSCRIPTION_MAX_BYTES = 128
+"""A peer that sends more is no subscriber and is disconnected. A topic has 40 bytes, a greeting
+with an identity of 80 bytes just fits."""
+SUBSCRIPTIONS_WAITING_MAX = 4
+"""Subscriptions of one peer that wait to be looked at; the rest waits in the peer."""
 LINGER_MS = 500
 """How long closing waits for subscribers to take what is still queued, ms."""
 
@@ -24,56 +27,90 @@ class PublishError(Exception):
     """The socket cannot be had: fix the endpoint or stop whoever holds it."""
 
 
+class Stop(Protocol):
+    """What ends waiting: its descriptor becomes readable."""
+
+    def fileno(self) -> int:
+        """Descriptor to wait on."""
+
+
 class Publisher:
     """Publishes two-frame messages `[topic, payload]`; never blocks the caller.
 
     A subscriber that falls behind by the high-water mark loses messages, and sees the gap in
     `seq`; it cannot delay anyone else.
+
+    What subscribers send is read by libzmq inside `send`. Repeated subscriptions and junk cost
+    nothing to speak of. Different subscriptions are all remembered until the peer goes, and libzmq
+    has no limit on their number: a peer that floods a daemon of 100 messages/s with topics of 120
+    bytes as fast as it can makes it grow by 20 MB/s and holds up a message by 0.2 s at worst. So
+    only those who may do that should be able to connect: keep the socket in a folder of yours.
     """
 
-    def __init__(self, endpoint: str, high_water_mark: int = 1000) -> None:
-        """Bind to `endpoint`. Raises `PublishError`."""
+    def __init__(self, endpoint: str, high_water_mark: int = 1000, *, waits: bool = False) -> None:
+        """Bind to `endpoint`. Raises `PublishError`.
+
+        `waits`: `wait_for_subscriber` will be used. libzmq then keeps what peers send later too,
+        without a limit: for a replay, not for a daemon.
+        """
         self.endpoint = endpoint
-        self.subscriptions = 0
-        self._lock = _lock(endpoint)
+        self._waits = waits
+        self._file = _socket_file(endpoint)
         self._context = zmq.Context(io_threads=1)
-        self._socket = self._context.socket(zmq.XPUB)
-        self._socket.linger = LINGER_MS
-        self._socket.sndhwm = high_water_mark
-        self._socket.maxmsgsize = SUBSCRIPTION_MAX_BYTES
         try:
-            self._socket.bind(endpoint)
+            self._socket = self._bound(high_water_mark)
         except zmq.ZMQError as error:
             self.close()
             raise PublishError(f"cannot publish on {endpoint}: {error.strerror}") from error
+
+    def _bound(self, high_water_mark: int) -> zmq.Socket[bytes]:
+        bound = self._context.socket(zmq.XPUB if self._waits else zmq.PUB)
+        bound.linger = LINGER_MS
+        bound.sndhwm = high_water_mark
+        bound.rcvhwm = SUBSCRIPTIONS_WAITING_MAX
+        bound.maxmsgsize = SUBSCRIPTION_MAX_BYTES
+        bound.ipv6 = "[" in self.endpoint
+        if self._file is None:
+            bound.bind(self.endpoint)
+        else:
+            # Left to itself libzmq would first remove whatever is at the path.
+            bound.setsockopt(zmq.USE_FD, self._file.listener.fileno())
+            bound.bind(self.endpoint)
+            self._file.listener.detach()
+        return bound
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Hand one message to ZeroMQ."""
         self._socket.send_multipart((topic, payload), flags=zmq.NOBLOCK, copy=True)
 
-    def drain(self) -> None:
-        """Take in what subscribers have sent: (un)subscriptions are counted, the rest dropped."""
-        while self._socket.poll(0):
-            message = self._socket.recv(zmq.NOBLOCK)
-            if message[:1] in {b"\x00", b"\x01"}:
-                self.subscriptions += 1 if message[0] == SUBSCRIBED else -1
+    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+        """Wait until somebody subscribes.
 
-    def wait_for_subscriber(self, timeout_s: float) -> bool:
-        """Wait until somebody has subscribed; False if nobody has within `timeout_s` seconds."""
+        False if nobody has within `timeout_s` seconds or when `stop` becomes readable.
+        """
+        if not self._waits:
+            raise RuntimeError("the publisher was not made to wait")
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        if stop is not None:
+            poller.register(stop, zmq.POLLIN)
         deadline_s = time.monotonic() + timeout_s
-        while self.subscriptions < 1:
-            remaining_s = deadline_s - time.monotonic()
-            if remaining_s <= 0 or not self._socket.poll(math.ceil(remaining_s * 1e3)):
+        while True:
+            remaining_s = max(deadline_s - time.monotonic(), 0.0)
+            ready = [which for which, _ in poller.poll(math.ceil(remaining_s * 1e3))]
+            if ready != [self._socket]:
                 return False
-            self.drain()
-        return True
+            if self._socket.recv(zmq.NOBLOCK)[:1] == bytes([SUBSCRIBED]):
+                return True
+            if remaining_s == 0.0:
+                return False
 
     def close(self) -> None:
         """Close the socket and remove its file. May be called again."""
         self._context.destroy()
-        if self._lock is not None:
-            self._lock.release()
-            self._lock = None
+        if self._file is not None:
+            self._file.close()
+            self._file = None
 
     def __enter__(self) -> Self:
         return self
@@ -87,44 +124,12 @@ class Publisher:
         self.close()
 
 
-class _FileLock:
-    """Holds `<socket>.lock`, because binding would silently take a living socket's place."""
-
-    def __init__(self, socket_path: Path) -> None:
-        self._socket_path = socket_path
-        self._path = path = Path(f"{socket_path}.lock")
-        while True:
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            try:
-                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                os.close(self._descriptor)
-                raise
-            if self._is_still_there():
-                return
-            os.close(self._descriptor)  # its former holder removed it while we were opening it
-
-    def _is_still_there(self) -> bool:
-        try:
-            return self._path.stat().st_ino == os.fstat(self._descriptor).st_ino
-        except FileNotFoundError:
-            return False
-
-    def release(self) -> None:
-        self._socket_path.unlink(missing_ok=True)  # libzmq leaves it
-        self._path.unlink(missing_ok=True)
-        os.close(self._descriptor)
-
-
-def _lock(endpoint: str) -> _FileLock | None:
+def _socket_file(endpoint: str) -> SocketFile | None:
     if not endpoint.startswith("ipc://") or endpoint.startswith("ipc://@"):
         return None  # for TCP and abstract sockets the kernel refuses a second bind
-    path = Path(endpoint.removeprefix("ipc://"))
     try:
-        return _FileLock(path)
-    except BlockingIOError:
-        raise PublishError(
-            f"cannot publish on {endpoint}: another graspd publishes there"
-        ) from None
+        return SocketFile(Path(endpoint.removeprefix("ipc://")))
+    except OccupiedError as error:
+        raise PublishError(f"cannot publish on {endpoint}: {error}") from None
     except OSError as error:
-        raise PublishError(f"cannot publish on {endpoint}: {error.strerror}") from error
+        raise PublishError(f"cannot publish on {endpoint}: {error.strerror or error}") from error

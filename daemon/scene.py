@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import ipaddress
+import os
+import re
+import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -18,13 +22,27 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.scene_errors import lines_of
+from daemon.scene_errors import MESSAGE_MAX, lines_of
+from daemon.text import printable
+from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger
 
+StrOrPath = TypeVar("StrOrPath", str, Path)
+
+
+def _without_nul(value: StrOrPath) -> StrOrPath:
+    if "\0" in str(value):
+        raise ValueError("has a NUL character")
+    return value
+
+
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-FilePath = Annotated[Path, Field(strict=False)]
+Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+FilePath = Annotated[Path, Field(strict=False), AfterValidator(_without_nul)]
 """TOML has no paths: a string is taken."""
 
+SCENE_MAX_BYTES = 1 << 20
+"""A scene has a kilobyte; a larger file was named by mistake."""
 IPC_PATH_MAX_BYTES = 107
 """Longest path of a Unix socket on Linux (sun_path, less the closing NUL)."""
 
@@ -65,7 +83,7 @@ class ReplayFaultsSection(Section):
     """From this reading on the counts are those of the reading before it."""
     garbage_probability: Probability = 0.0
     """Chance per reading that the counts are random 16-bit values."""
-    wrong_counts: int = 0
+    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX)] = 0
     """Constant offset added to the counts."""
     slow_every: Annotated[int, Field(ge=1)] = 1
     """Only every n-th reading arrives."""
@@ -73,10 +91,14 @@ class ReplayFaultsSection(Section):
     """Readings arrive this much late, s."""
     intermittent_probability: Probability = 0.0
     """Chance that a reading is lost."""
-    fingers: Annotated[tuple[Finger, ...], Field(strict=False)] | None = None
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that stuck, garbage and wrong apply to; all unless given."""
     electrodes: (
-        Annotated[tuple[Annotated[int, Field(ge=1, le=24)], ...], Field(strict=False)] | None
+        Annotated[
+            tuple[Annotated[int, Field(ge=1, le=ELECTRODES)], ...],
+            Field(min_length=1, strict=False),
+        ]
+        | None
     ) = None
     """Electrodes 1..24 that stuck, garbage and wrong apply to; all unless given."""
     seed: Annotated[int, Field(ge=0)] = 0
@@ -109,7 +131,7 @@ class SpiTactile(Section):
     """`[tactile]` with `driver = "spi"`: a bridge on a serial line (deploy/bridge/PROTOCOL.md)."""
 
     driver: Literal["spi"]
-    port: Annotated[str, Field(min_length=1)]
+    port: Name
     """Serial port, best by its name in `/dev/serial/by-id/`, or a pyserial URL."""
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
@@ -123,9 +145,9 @@ class CanTactile(Section):
     """`[tactile]` with `driver = "can"`: sensors behind a CAN board (deploy/can/PROTOCOL.md)."""
 
     driver: Literal["can"]
-    interface: Annotated[str, Field(min_length=1)] = "socketcan"
+    interface: Name = "socketcan"
     """Name of a python-can interface."""
-    channel: Annotated[str, Field(min_length=1)] = "can0"
+    channel: Name = "can0"
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
     ) = None
@@ -149,14 +171,25 @@ class PalmTactile(Section):
     """`[tactile]` with `driver = "palm"`: status packets of the hand's palm."""
 
     driver: Literal["palm"]
-    source: Annotated[str, Field(min_length=1)]
+    source: Name
     """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
+    only_from: str | None = None
+    """IP address of the relay, if packets of no other may be heard."""
+    heed_finger_bits: bool = True
+    """False for a palm that does not set the bits which say that a finger's data is valid."""
 
     @field_validator("source")
     @classmethod
     def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
         base: Path = (info.context or {}).get("base", Path())
         return source if "://" in source else str(base / source)
+
+    @field_validator("only_from")
+    @classmethod
+    def _is_an_address(cls, address: str | None) -> str | None:
+        if address is not None:
+            ipaddress.ip_address(address)
+        return address
 
 
 Tactile = Annotated[
@@ -183,7 +216,7 @@ class StreamJoints(Section):
     """`[joints]` with `driver = "stream"`: joint angles from elsewhere (deploy/wire/JOINTS.md)."""
 
     driver: Literal["stream"]
-    source: Annotated[str, Field(pattern=r"^udp://")]
+    source: Annotated[Name, Field(pattern=r"^udp://")]
     """`udp://ADDRESS:PORT` to listen on."""
 
 
@@ -194,7 +227,7 @@ Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]
 class Model(Section):
     """`[model]`: which network judges."""
 
-    name: str | None = None
+    name: Name | None = None
     """A model of the zoo; `cnn1` when neither name nor path is given."""
     path: FilePath | None = None
     """A model file of your own, relative to the scene file."""
@@ -260,6 +293,8 @@ class Scene(Section):
             without = [finger for finger in fingers if finger not in tactile.sensors]
             if without or len(set(tactile.sensors)) != len(tactile.sensors):
                 raise ValueError("tactile.sensors must name every finger of hand.fingers once")
+            if isinstance(tactile, CanTactile) and tactile.format == "sweep_fd":
+                raise ValueError("tactile.sensors is for syntouch: frames of sweep_fd say whose")
         if isinstance(tactile, CanTactile) and tactile.format == "syntouch" and len(fingers) > 3:
             raise ValueError("tactile.format syntouch carries three sensors, hand.fingers has more")
         if isinstance(self.joints, PalmJoints) and not isinstance(tactile, PalmTactile):
@@ -282,17 +317,26 @@ def check_endpoint(endpoint: str) -> None:
     scheme, separator, address = endpoint.partition("://")
     if not separator or scheme not in {"ipc", "tcp"}:
         raise ValueError("must start with ipc:// or tcp://")
-    if scheme == "ipc":
-        if not address or len(address.encode()) > IPC_PATH_MAX_BYTES:
-            raise ValueError(f"needs a path of 1 to {IPC_PATH_MAX_BYTES} bytes after ipc://")
-        return
-    host, separator, port = address.rpartition(":")
-    if not separator or not port.isascii() or not port.isdigit() or not 0 < int(port) < 65536:
+    _without_nul(endpoint)
+    if scheme == "tcp":
+        _check_tcp(address)
+    elif address in {"", "@"} or len(address.encode()) > IPC_PATH_MAX_BYTES:
+        raise ValueError(f"needs a path of 1 to {IPC_PATH_MAX_BYTES} bytes after ipc://")
+    elif address.startswith("*"):
+        raise ValueError("needs a path that subscribers can know, not '*'")
+
+
+def _check_tcp(address: str) -> None:
+    host, _, port = address.rpartition(":")
+    if not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
         raise ValueError("needs a port of 1 to 65535, as in tcp://127.0.0.1:5555")
     try:
-        loopback = ipaddress.ip_address(host.strip("[]")).is_loopback
+        if host.startswith("[") and host.endswith("]"):
+            loopback = ipaddress.IPv6Address(host[1:-1]) == ipaddress.IPv6Address("::1")
+        else:
+            loopback = ipaddress.IPv4Address(host).is_loopback
     except ValueError:
-        raise ValueError(f"needs an IP address, not '{host}'") from None
+        raise ValueError(f"needs an IP address, 127.0.0.1 or [::1], not '{host}'") from None
     if not loopback:
         raise ValueError(f"{host} is not a loopback address; anyone could listen")
 
@@ -300,16 +344,29 @@ def check_endpoint(endpoint: str) -> None:
 def load(path: Path) -> Scene:
     """Read a scene file. Raises `SceneError`, whose text has one line per mistake."""
     try:
-        text = path.read_bytes().decode()
+        text = _read(path).decode()
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from error
     try:
         data = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{path}: not TOML: {error}") from error
+    except RecursionError as error:
+        raise SceneError(f"{path}: not TOML that can be read: nested too deeply") from error
+    except ValueError as error:  # TOMLDecodeError, and Python's own limit on long numbers
+        raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error
     return parse(data, path)
+
+
+def _read(path: Path) -> bytes:
+    """The content of a regular file of bounded size, without waiting for anything else."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise SceneError(f"{path}: cannot read the scene: not a regular file")
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        content = file.read(SCENE_MAX_BYTES + 1)
+    if len(content) > SCENE_MAX_BYTES:
+        raise SceneError(f"{path}: larger than {SCENE_MAX_BYTES} bytes, not a scene")
+    return content
 
 
 def parse(data: Mapping[str, Any], path: Path) -> Scene:

@@ -10,20 +10,33 @@ from typing import get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from daemon.text import printable
+
 Section = type[BaseModel]
+
+LINES_MAX = 20
+"""Whoever has made more mistakes has named the wrong file."""
+SHOWN_MAX = 80
+"""Characters of a key or value that are shown."""
+MESSAGE_MAX = 320
+"""Characters of an explanation that may have such a value in it."""
 
 
 def lines_of(error: ValidationError, scene: Section, path: Path) -> list[str]:
-    """Lines for everything that pydantic found wrong in a scene of this class."""
+    """Lines for what pydantic found wrong in a scene of this class, the first twenty in full."""
     mistakes = error.errors(include_url=False)
     inner = {mistake["loc"][:depth] for mistake in mistakes for depth in range(len(mistake["loc"]))}
     # A wrong item also makes its list wrong; only the item is worth a line.
-    return [_line(path, scene, mistake) for mistake in mistakes if mistake["loc"] not in inner]
+    single = [mistake for mistake in mistakes if mistake["loc"] not in inner]
+    lines = [_line(path, scene, mistake) for mistake in single[:LINES_MAX]]
+    if len(single) > LINES_MAX:
+        lines.append(f"{path}: and {len(single) - LINES_MAX} more")
+    return lines
 
 
 def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
     keys, section = _place(scene, tuple(mistake["loc"]))
-    key = ".".join(keys) or "scene"
+    key = printable(".".join(keys) or "scene", SHOWN_MAX)
     if mistake["type"] == "extra_forbidden":
         return f"{path}: {key}: no such key{_suggestion(keys[-1], section)}"
     if mistake["type"] == "missing":
@@ -33,11 +46,21 @@ def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
     if mistake["type"] == "union_tag_invalid":
         context = mistake["ctx"]
         known = context["expected_tags"].replace("'", "")
-        return f"{path}: {key}.driver: no driver '{context['tag']}'; there are: {known}"
+        tag = printable(context["tag"], SHOWN_MAX)
+        return f"{path}: {key}.driver: no driver '{tag}'; there are: {known}"
     message = mistake["msg"].removeprefix("Value error, ").replace("tuple", "list")
+    message = printable(message, MESSAGE_MAX)
     given = mistake["input"]
-    shown = "" if isinstance(given, dict | BaseModel) else f" (is {given!r})"
+    shown = "" if isinstance(given, dict | BaseModel) else f" (is {_shown(given)})"
     return f"{path}: {key}: {message[0].lower()}{message[1:]}{shown}"
+
+
+def _shown(value: object) -> str:
+    """As Python would write it, cut: `repr` of a long number fails, of a deep list too."""
+    try:
+        return printable(repr(value), SHOWN_MAX)
+    except (ValueError, RecursionError):
+        return "too large to show"
 
 
 def _place(scene: Section, location: tuple[int | str, ...]) -> tuple[list[str], Section | None]:

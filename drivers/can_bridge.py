@@ -16,12 +16,19 @@ from typing import Any, Final, Self
 import can
 
 from drivers.base import DriverError, LinkError, Reading
-from drivers.can_bus import STAMPED_INTERFACES, CanBus
+from drivers.can_bus import STAMPED_INTERFACES, CanBus, Stamped
 from drivers.can_decoders import CanCounters, make_decoder
 from drivers.can_formats import SWEEP_BASE_ID, CanFormat
-from drivers.can_frames import ERROR, REMOTE, CanFrame, describe_error, is_bus_off, is_overflow
+from drivers.can_frames import (
+    ERROR,
+    LOST,
+    REMOTE,
+    CanFrame,
+    describe_error,
+    is_bus_off,
+    is_overflow,
+)
 from drivers.link import Link, LinkState
-from drivers.sweep import ARRIVAL_JITTER_NS, READING_JITTER_NS
 
 POLL_NS: Final = 1_000_000
 """How often a bus without a descriptor is asked for frames, ns."""
@@ -30,6 +37,10 @@ REST_MAX_NS: Final = 15_000_000
 """Where a reading takes many frames, waking for each costs more than the frames. The kernel keeps
 them meanwhile: the loop rests until so long before the reading should be complete, and never longer
 than a quarter of what the kernel's usual buffer holds, ns."""
+SILENCE_PERIODS: Final = 10
+"""Readings that may be missing before the link is down."""
+SILENCE_MIN_NS: Final = 100_000_000
+"""Shortest silence that is one, ns: above what an adapter or a busy host holds back."""
 RATE_WINDOW_NS: Final = 1_000_000_000
 """Frames per second are counted over this time, ns."""
 FD_CLOCK_HZ: Final = 80_000_000
@@ -42,7 +53,8 @@ class CanBridgeDriver:
     The constructor raises `ValueError` for an argument out of range. `open` raises `DriverError`
     only where no later try can succeed, such as an interface that python-can does not have;
     otherwise the driver tries again until the bus is there. A bus that fails is closed, opened
-    again, and counted; a sweep that was cut through by that is dropped.
+    again, and counted; a sweep that was cut through by that is dropped. A bus without a frame of
+    ours for ten periods, 100 ms at least, is `GREETING` until one comes.
     """
 
     name = "can"
@@ -55,6 +67,7 @@ class CanBridgeDriver:
         channel: str,
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
+        sensors: Sequence[str] | None = None,
         format: str = CanFormat.SYNTOUCH,  # noqa: A002 (the key of the scene)
         arbitration_id: int | None = None,
         sequence: str = "interleaved",
@@ -67,27 +80,29 @@ class CanBridgeDriver:
     ) -> None:
         """Describe the bus; nothing is opened yet.
 
-        `fingers`: with `syntouch` the board's sensors in turn, three at most. `format`: a
-        `CanFormat`. `arbitration_id`: of the samples, or of finger 0 (`ff`) of the sweep frames;
-        above 0x7FF it has 29 bits. None accepts every frame that has the right form, which is
-        for bring-up only, except with `sweep_fd`, where it stands for 0x5B0. `sequence`: a key
-        of `drivers.sweep.SEQUENCES` (`syntouch` only). `data_length`: bytes of a sample frame
-        where the board pads it. `bitrate` and `data_bitrate`, bit/s: not with socketcan, where
-        they belong to `ip link`. `bus_options`: further arguments of python-can's bus.
+        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
+        three at most, the same unless given; a board may have more sensors than fingers are wanted
+        (`syntouch` only: sweep frames say whose they are). `format`: a `CanFormat`.
+        `arbitration_id`: of the samples, or of finger 0 (`ff`) of the sweep frames; above 0x7FF it
+        has 29 bits. None takes the id of the first sound sample until the link is lost, which is
+        for bring-up only, except with `sweep_fd`, where it stands for 0x5B0. `sequence`: a key of
+        `drivers.sweep.SEQUENCES` (`syntouch` only). `data_length`: bytes of a sample frame where
+        the board pads it. `bitrate` and `data_bitrate`, bit/s: not with socketcan, where they
+        belong to `ip link`. `bus_options`: further arguments of python-can's bus.
         """
         self._format = CanFormat(format)
         if self._format is CanFormat.SWEEP_FD and arbitration_id is None:
             arbitration_id = SWEEP_BASE_ID
-        self._stamped = stamped = interface in STAMPED_INTERFACES
+        self._stamped = interface in STAMPED_INTERFACES
         self.counters = CanCounters()
         self._make_decoder = functools.partial(
             make_decoder,
             self._format,
             fingers,
+            sensors=sensors,
             arbitration_id=arbitration_id,
             sequence=sequence,
             data_length=data_length,
-            jitter_ns=ARRIVAL_JITTER_NS if stamped else READING_JITTER_NS,
         )
         self._decoder = self._make_decoder(counters=self.counters)
         options = _bus_options(interface, self._format, bitrate, data_bitrate)
@@ -97,7 +112,8 @@ class CanBridgeDriver:
         self._clock = clock
         self._where = f"{interface} {channel}, {self._format}"
         self._link = Link(self.name, clock)
-        self._accepted_at_opening = 0
+        self._accepted = 0
+        self._silent_at_ns = 0
         self._poll_due_ns = 0
         self._resting_until_ns: int | None = None
         self._window_start_ns = 0
@@ -127,6 +143,8 @@ class CanBridgeDriver:
         known = {"bus": self._where, "link": str(self._link.state)}
         if self.last_error is not None:
             known["last error"] = self.last_error
+        if self._decoder.arbitration_id is not None:
+            known["arbitration id"] = f"{self._decoder.arbitration_id:#x}"
         if self._link.state is LinkState.UP:
             known["frames"] = f"{self.frames_per_s:.0f} /s"
         return known
@@ -136,6 +154,7 @@ class CanBridgeDriver:
         self.close()
         self.counters = CanCounters()
         self._decoder = self._make_decoder(counters=self.counters)
+        self._accepted = 0
         self._resting_until_ns = None
         self._link = Link(self.name, self._clock)
         self.last_error = None
@@ -162,7 +181,7 @@ class CanBridgeDriver:
         return None if self._resting_until_ns is not None else self._bus.fileno()
 
     def due_ns(self) -> int | None:
-        """When to open again, or to poll a bus without a descriptor."""
+        """When to open again, to notice silence, or to poll a bus without a descriptor."""
         if self._link.state is LinkState.CLOSED:
             return None
         if self._link.state is LinkState.WAITING:
@@ -171,7 +190,7 @@ class CanBridgeDriver:
             return self._resting_until_ns
         if self._bus.more or self._bus.fileno() is None:
             return self._poll_due_ns
-        return None
+        return self._silent_at_ns if self._link.state is LinkState.UP else None
 
     def read_ready(self) -> Sequence[Reading]:
         """Readings that are complete now. Raises `DriverError` only if no try can ever succeed."""
@@ -179,22 +198,47 @@ class CanBridgeDriver:
             raise RuntimeError("the CAN bridge is not open")
         if self._link.state is LinkState.WAITING and not self._is_time_to_open():
             return ()
-        readings: list[Reading] = []
-        trouble = None
         frames = self._bus.drain()
-        for frame, t_ns in frames:
-            if frame.flags & (ERROR | REMOTE):
-                trouble = self._take_special(frame) or trouble
-            else:
-                readings += self._decoder.push(frame, t_ns)
-        self._count(len(frames))
-        accepted = self.counters.accepted_frames > self._accepted_at_opening
-        if self._link.state is LinkState.GREETING and accepted:
-            self._link.up(self._where)
+        readings, trouble = self._take(frames)
+        self._count(frames)
+        self._mind_silence()
         trouble = self._bus.failure or trouble
         if trouble is not None:
             self._lose(trouble)
         return readings
+
+    def _take(self, frames: Sequence[Stamped]) -> tuple[list[Reading], str | None]:
+        """The readings that frames complete, and why the link is lost, if it is."""
+        readings: list[Reading] = []
+        trouble = None
+        for frame, t_ns, until_ns in frames:
+            if not frame.flags & (ERROR | REMOTE | LOST):
+                readings += self._decoder.push(frame, t_ns, until_ns)
+                continue
+            trouble = self._take_special(frame) or trouble
+            if frame.flags & LOST or is_overflow(frame):
+                readings += self._decoder.cut()
+        return readings, trouble
+
+    def _mind_silence(self) -> None:
+        """Up with the first frame of ours, and down when there was none for too long."""
+        now_ns = self._clock()
+        if self.counters.accepted_frames > self._accepted:
+            self._accepted = self.counters.accepted_frames
+            self._silent_at_ns = now_ns + self._silence_ns()
+            if self._link.state is LinkState.GREETING:
+                self._link.up(self._where)
+        elif (
+            self._link.state is LinkState.UP and now_ns >= self._silent_at_ns and not self._bus.more
+        ):
+            self.last_error = f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms"
+            self._decoder.interrupt()
+            self._link.failed(f"{self._where}: {self.last_error}")
+            self._link.greeting()
+            self.counters.link_losses = self._link.losses
+
+    def _silence_ns(self) -> int:
+        return max(SILENCE_PERIODS * (self._decoder.period_ns or 0), SILENCE_MIN_NS)
 
     def _is_time_to_open(self) -> bool:
         """Whether the link is open after a try that was due."""
@@ -214,7 +258,6 @@ class CanBridgeDriver:
             raise
         else:
             self._link.greeting()
-            self._accepted_at_opening = self.counters.accepted_frames
             self._poll_due_ns = self._clock()
 
     def _lose(self, why: str) -> None:
@@ -228,8 +271,8 @@ class CanBridgeDriver:
 
     def _take_special(self, frame: CanFrame) -> str | None:
         """Count a remote or error frame; why the link is lost, if it is."""
-        if frame.flags & REMOTE:
-            self.counters.remote_frames += 1
+        if frame.flags & (REMOTE | LOST):
+            self.counters.remote_frames += bool(frame.flags & REMOTE)
             return None
         self.counters.error_frames += 1
         self.counters.controller_overflows += is_overflow(frame)
@@ -239,7 +282,8 @@ class CanBridgeDriver:
         self.counters.bus_off += 1
         return "bus-off"
 
-    def _count(self, frames: int) -> None:
+    def _count(self, stamped: Sequence[Stamped]) -> None:
+        frames = sum(not frame.flags & LOST for frame, _, _ in stamped)
         now_ns = self._clock()
         self._poll_due_ns = now_ns + (0 if self._bus.more else POLL_NS)
         self._resting_until_ns = self._rest(now_ns)

@@ -4,13 +4,16 @@ python-can's `recv` costs several times what the frame itself costs, so on `sock
 own socket is read instead. Its arrival stamps are wall time, which can step. They are turned into
 monotonic time by the distance of the two clocks at the moment of reading, so that only a step
 between arrival and reading can falsify them: forward makes a frame look old, backward as if it
-had just come. Interfaces whose stamps are not wall time of the arrival are stamped when read.
+had just come. Where the stamps are not wall time of the arrival, a frame is as old as it can be: it
+came after the last moment at which the bus had nothing more to read.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
+import select
 import socket
 import stat
 import struct
@@ -25,6 +28,7 @@ from drivers.can_frames import (
     ERROR,
     EXTENDED,
     FD,
+    LOST,
     REMOTE,
     CanFrame,
     unpack_frame,
@@ -51,8 +55,37 @@ _OPTIONS: Final[dict[str, dict[str, Any]]] = {
     "virtual": {"rx_queue_size": 16384},
 }
 
-Stamped = tuple[CanFrame, int]
-"""A frame and the monotonic time, ns, when it arrived."""
+_PACKAGES: Final = {"serial": "pyserial"}
+"""Packages whose names are not those of their modules."""
+_MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
+
+Stamped = tuple[CanFrame, int, int]
+"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
+interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
+
+
+def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+    """A bus of python-can. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+    if interface not in can.VALID_INTERFACES:
+        known = "socketcan, slcan, udp_multicast, virtual"
+        raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
+    try:
+        if interface == "socketcan":
+            socket.if_nametoindex(channel)
+        return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
+    except (NotImplementedError, ImportError) as error:
+        raise DriverError(_what_is_missing(interface, error)) from error
+    except Exception as error:
+        raise LinkError(f"cannot open {interface} {channel}: {error}") from error
+
+
+def _what_is_missing(interface: str, error: Exception) -> str:
+    missing = _MISSING_MODULE.search(str(error))
+    if missing is None:
+        return f"python-can's interface {interface!r} does not work here: {error}"
+    name = missing[1] or missing[2]
+    name = _PACKAGES.get(name, name)
+    return f"python-can's interface {interface!r} needs the package {name}: pip install {name}"
 
 
 class CanBus:
@@ -83,25 +116,14 @@ class CanBus:
         self._socket: socket.socket | None = None
         self._fileno: int | None = None
         self._drops_seen = 0
+        self._idle_ns = 0
 
     def open(self) -> None:
         """Take the bus. Raises `LinkError`, or `DriverError` if no later try can succeed."""
         self.close()
         self.failure = None
-        try:
-            if self._interface == "socketcan":
-                socket.if_nametoindex(self._channel)
-            bus = can.Bus(
-                channel=self._channel,
-                interface=self._interface,
-                ignore_config=True,
-                **self._options,
-            )
-        except NotImplementedError as error:
-            raise DriverError(f"python-can has no {self._interface!r} here: {error}") from error
-        except Exception as error:
-            raise LinkError(f"cannot open {self._interface} {self._channel}: {error}") from error
-        self._bus = bus
+        self._idle_ns = self._clock()
+        self._bus = bus = open_bus(self._interface, self._channel, self._options)
         self._fileno = _fileno(bus)
         if self._fileno is not None:
             _enlarge_buffer(self._fileno)
@@ -181,30 +203,46 @@ class CanBus:
                     seconds, nanoseconds = _TIMESPEC.unpack(data)
                     t_ns = min(seconds * 1_000_000_000 + nanoseconds + ahead_ns, now_ns)
                 elif kind == SO_RXQ_OVFL and len(data) == _DROPS.size:
-                    self._count_drops(*_DROPS.unpack(data))
+                    (total,) = _DROPS.unpack(data)
+                    self._count_drops(total, frames)
             frame = unpack_frame(record)
             if frame is None:
                 self._malformed += 1
             else:
-                frames.append((frame, t_ns))
+                frames.append((frame, t_ns, t_ns))
 
-    def _count_drops(self, total: int) -> None:
-        """The kernel reports a running sum of 32 bits per socket."""
-        self._kernel_drops += (total - self._drops_seen) % (1 << 32)
+    def _count_drops(self, total: int, frames: list[Stamped]) -> None:
+        """The kernel reports a running sum of 32 bits per socket, with the frame after the loss."""
+        dropped = (total - self._drops_seen) % (1 << 32)
+        if dropped:
+            now_ns = self._clock()
+            frames.append((CanFrame(0, b"", LOST), now_ns, now_ns))
+        self._kernel_drops += dropped
         self._drops_seen = total
 
     def _drain_bus(self, bus: can.BusABC, frames: list[Stamped]) -> None:
+        if not self._stamped:
+            self._drain_unstamped(bus, frames)
+            return
         now_ns = self._clock()
         ahead_ns = now_ns - self._wall_clock()
         for _ in range(FRAMES_PER_DRAIN):
             message = bus.recv(timeout=0)
             if message is None:
                 return
-            if not self._stamped:
-                now_ns = t_ns = self._clock()
-            else:
-                t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
-            frames.append((_frame_of(message), t_ns))
+            t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
+            frames.append((_frame_of(message), t_ns, t_ns))
+
+    def _drain_unstamped(self, bus: can.BusABC, frames: list[Stamped]) -> None:
+        since_ns = self._idle_ns
+        for _ in range(FRAMES_PER_DRAIN):
+            before_ns = self._clock()
+            message = bus.recv(timeout=0)
+            if message is not None:
+                frames.append((_frame_of(message), since_ns, self._clock()))
+            elif not _has_more(self._fileno):
+                self._idle_ns = before_ns
+                return
 
 
 def _fileno(bus: can.BusABC) -> int | None:
@@ -214,6 +252,15 @@ def _fileno(bus: can.BusABC) -> int | None:
     except Exception:  # noqa: BLE001 (python-can lets any exception through)
         return None
     return descriptor if descriptor >= 0 else None
+
+
+def _has_more(descriptor: int | None) -> bool:
+    """Whether a descriptor is readable: slcan takes an adapter's own words for the end."""
+    if descriptor is None:
+        return False
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return any(event & select.POLLIN for _, event in poll.poll(0))
 
 
 def _enlarge_buffer(descriptor: int) -> None:

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
+import numpy as np
+
 from drivers.base import FINGERS, ElectrodeFault, TactileReading
+from drivers.biotac import decode_words
 from drivers.can_formats import (
     CanFormat,
     Reject,
@@ -23,7 +26,7 @@ from drivers.can_frames import (
     CanFrame,
 )
 from drivers.frame_sweep import FrameSweeps
-from drivers.sweep import ARRIVAL_JITTER_NS, SEQUENCES, SampleSweeps, SweepCounters
+from drivers.sweep import SEQUENCES, SampleSweeps, SweepCounters
 
 _ABSENT, _REPEATED, _OVERRUN = (
     int(SweepStatus.ABSENT),
@@ -42,7 +45,8 @@ class CanCounters(SweepCounters):
     accepted_frames: int = 0
     """Of these, samples or sweep frames of our sensors, before duplicates and losses."""
     foreign_frames: int = 0
-    """Frames with another arbitration id; without a configured id, frames of another form."""
+    """Frames with another arbitration id than the configured or the latched one; until an id is
+    latched, frames that are no sound sample."""
     remote_frames: int = 0
     error_frames: int = 0
     """Frames in which the controller reports trouble on the bus."""
@@ -55,7 +59,7 @@ class CanCounters(SweepCounters):
     malformed_frames: int = 0
     """Our arbitration id, contents that the format forbids."""
     stuck_ticks: int = 0
-    """Sweep frames of a new sweep with the tick of the sweep before."""
+    """Sweep frames of a new sweep with the tick of the sweep before; their words are `HELD`."""
     overruns: int = 0
     """Sweep frames that report a sweep that began late."""
     controller_overflows: int = 0
@@ -81,8 +85,20 @@ class CanDecoder(Protocol):
     def expected_ns(self) -> int | None:
         """When the next reading should be complete, monotonic ns, where many frames make one."""
 
-    def push(self, frame: CanFrame, t_ns: int) -> Sequence[TactileReading]:
-        """Take a data frame received at `t_ns`; the readings that it completes, oldest first."""
+    @property
+    def arbitration_id(self) -> int | None:
+        """Whose frames are taken; None while any would be."""
+
+    def push(
+        self, frame: CanFrame, t_ns: int, until_ns: int | None = None
+    ) -> Sequence[TactileReading]:
+        """Take a data frame received at `t_ns`; the readings that it completes, oldest first.
+
+        With `until_ns` it was received at any time between the two.
+        """
+
+    def cut(self) -> Sequence[TactileReading]:
+        """Frames were lost here: the readings that end with that."""
 
     def interrupt(self) -> None:
         """The link broke."""
@@ -96,20 +112,29 @@ def make_decoder(
     arbitration_id: int | None,
     sequence: str,
     data_length: int | None,
-    jitter_ns: int = ARRIVAL_JITTER_NS,
+    sensors: Sequence[str] | None = None,
 ) -> CanDecoder:
     """The decoder of a format. Raises `ValueError` for arguments that do not fit it.
 
-    `jitter_ns`: how late a frame may be stamped, ns.
+    `fingers`: rows of a reading. `sensors`: fingers in the order of a sample's words, the same
+    unless given (`syntouch` only).
     """
-    if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
-        raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
+    for names in (fingers, sensors if sensors is not None else fingers):
+        if not names or len(set(names)) != len(names) or not set(names) <= set(FINGERS):
+            raise ValueError(f"fingers {list(names)} are not different ones of {list(FINGERS)}")
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:
         raise ValueError(f"arbitration_id {arbitration_id} is not in 0..{EXTENDED_ID_MAX:#x}")
     if frame_format is CanFormat.SYNTOUCH:
         return SynTouchDecoder(
-            len(fingers), arbitration_id, sequence, data_length, counters, jitter_ns
+            fingers,
+            fingers if sensors is None else sensors,
+            arbitration_id,
+            sequence,
+            data_length,
+            counters,
         )
+    if sensors is not None:
+        raise ValueError("sensors is for the format syntouch; sweep frames say whose they are")
     if data_length is not None:
         raise ValueError("data_length is for the format syntouch; sweep frames have 64 bytes")
     return SweepFrameDecoder(fingers, arbitration_id, counters)
@@ -120,21 +145,25 @@ class SynTouchDecoder:
 
     def __init__(
         self,
-        fingers: int,
+        fingers: Sequence[str],
+        sensors: Sequence[str],
         arbitration_id: int | None,
         sequence: str,
         data_length: int | None,
         counters: CanCounters,
-        jitter_ns: int,
     ) -> None:
         if sequence not in SEQUENCES:
             raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
-        self._fingers = fingers
-        self._length = sample_length(fingers, data_length)
+        if not set(fingers) <= set(sensors):
+            raise ValueError(f"fingers {list(fingers)} are not all of {list(sensors)}")
+        self._sensors = len(sensors)
+        self._length = sample_length(len(sensors), data_length)
+        self._configured = arbitration_id is not None
         self._id = arbitration_id
         self._flags = _id_flags(arbitration_id)
         self._counters = counters
-        self._sweeps = SampleSweeps(fingers, SEQUENCES[sequence], counters, jitter_ns)
+        rows = [sensors.index(finger) for finger in fingers]
+        self._sweeps = SampleSweeps(len(sensors), SEQUENCES[sequence], counters, rows)
 
     @property
     def period_ns(self) -> int | None:
@@ -146,7 +175,14 @@ class SynTouchDecoder:
         """When the next reading should be complete, monotonic ns; None while not known."""
         return self._sweeps.expected_ns
 
-    def push(self, frame: CanFrame, t_ns: int) -> Sequence[TactileReading]:
+    @property
+    def arbitration_id(self) -> int | None:
+        """The configured id, or the first heard with a sound sample since the link broke."""
+        return self._id
+
+    def push(
+        self, frame: CanFrame, t_ns: int, until_ns: int | None = None
+    ) -> Sequence[TactileReading]:
         """Take a data frame received at `t_ns`; the readings that it completes, oldest first."""
         identifier = self._id
         if identifier is not None and (
@@ -157,16 +193,27 @@ class SynTouchDecoder:
         if frame.flags & FD:
             _count_reject(self._counters, Reject.CONTENT, identifier)
             return ()
-        sample = parse_sample(frame.data, self._fingers, self._length)
+        sample = parse_sample(frame.data, self._sensors, self._length)
         if isinstance(sample, Reject):
             _count_reject(self._counters, sample, identifier)
             return ()
+        if identifier is None:
+            if not _is_sound(sample.words):
+                self._counters.foreign_frames += 1
+                return ()
+            self._id, self._flags = frame.arbitration_id, frame.flags & EXTENDED
         self._counters.accepted_frames += 1
-        return self._sweeps.push(sample.channel, sample.words, t_ns)
+        return self._sweeps.push(sample.channel, sample.words, t_ns, until_ns)
+
+    def cut(self) -> Sequence[TactileReading]:
+        """Frames were lost here: the sweep at hand ends."""
+        return self._sweeps.cut()
 
     def interrupt(self) -> None:
-        """The link broke."""
+        """The link broke: what comes next may be another board."""
         self._sweeps.interrupt()
+        if not self._configured:
+            self._id = None
 
 
 class SweepFrameDecoder:
@@ -179,7 +226,7 @@ class SweepFrameDecoder:
         if base_id is not None and _id_flags(base_id) != self._flags:
             raise ValueError(f"arbitration_id {base_id:#x}: the fingers' ids are of two kinds")
         self._counters = counters
-        self._sweeps = FrameSweeps(len(fingers), counters)
+        self._sweeps = FrameSweeps(len(fingers), counters, list(self._rows))
         self._ticks: dict[int, tuple[int, int]] = {}
 
     @property
@@ -192,7 +239,14 @@ class SweepFrameDecoder:
         """None: three frames a sweep are no reason to rest."""
         return None
 
-    def push(self, frame: CanFrame, t_ns: int) -> Sequence[TactileReading]:
+    @property
+    def arbitration_id(self) -> int | None:
+        """That of finger 0."""
+        return self._base
+
+    def push(
+        self, frame: CanFrame, t_ns: int, until_ns: int | None = None
+    ) -> Sequence[TactileReading]:
         """Take a data frame received at `t_ns`; the readings that it completes, oldest first."""
         base, counters = self._base, self._counters
         expected: int | None = None
@@ -210,21 +264,33 @@ class SweepFrameDecoder:
             _count_reject(counters, Reject.CONTENT, base)
             return ()
         counters.accepted_frames += 1
-        self._mind_tick(sweep.finger, sweep.sequence, sweep.tick_us)
+        stands = self._tick_stands(sweep.finger, sweep.sequence, sweep.tick_us)
         counters.overruns += bool(sweep.status & _OVERRUN)
         faults = _MISSING if sweep.status & _ABSENT else 0
-        faults |= _HELD if sweep.status & _REPEATED else 0
-        return self._sweeps.push(row, sweep.sequence, sweep.words, faults, t_ns)
+        faults |= _HELD if stands or sweep.status & _REPEATED else 0
+        return self._sweeps.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
+
+    def cut(self) -> Sequence[TactileReading]:
+        """Nothing: sweep frames are numbered, so a loss shows by itself."""
+        return ()
 
     def interrupt(self) -> None:
         """The link broke."""
         self._sweeps.interrupt()
 
-    def _mind_tick(self, finger: int, sequence: int, tick_us: int) -> None:
+    def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:
+        """Whether another sweep of a finger has ended at the same time: nothing was sampled."""
         before = self._ticks.get(finger)
-        if before is not None and before[1] == tick_us and before[0] != sequence:
-            self._counters.stuck_ticks += 1
+        stands = before is not None and before[1] == tick_us and before[0] != sequence
+        self._counters.stuck_ticks += stands
         self._ticks[finger] = (sequence, tick_us)
+        return stands
+
+
+def _is_sound(words: bytes) -> bool:
+    """Whether some word is a count, and every other one that of a sensor that is not there."""
+    _, faults = decode_words(np.frombuffer(words, dtype=">u2").astype(np.uint16))
+    return not (faults & ~np.uint8(_MISSING)).any() and not faults.all()
 
 
 def _id_flags(identifier: int | None) -> int:

@@ -49,9 +49,11 @@ class FrameFlag(IntFlag):
     ERROR = 4
     """Made by the controller: the id holds error classes."""
     FD = 8
+    LOST = 16
+    """No frame: at this place frames were lost."""
 
 
-EXTENDED, REMOTE, ERROR, FD = 1, 2, 4, 8
+EXTENDED, REMOTE, ERROR, FD, LOST = 1, 2, 4, 8, 16
 """`FrameFlag` as plain integers: an IntFlag costs a microsecond per operation."""
 
 

@@ -69,6 +69,9 @@ class PalmDriver:
     the relay's IP address, if no other may be heard. Without `heed_finger_bits` the packet's
     `tactile_valid` is ignored, for a palm that does not set it (Shadow's own driver ignores it).
 
+    Packets must come as the palm makes them, one a millisecond. Of a relay that sends them in
+    batches longer than 10 ms, rounds are flagged or counted as missed that were not.
+
     The constructor raises `ValueError` for an argument out of range. `open` raises `LinkError` if
     it cannot listen, `RecordingError` for a file that holds no packets and `CalibrationError` for
     a calibration with mistakes. `read_ready` raises `RecordingError` only.

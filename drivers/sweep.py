@@ -5,13 +5,16 @@ to, only its place in the known order of the sequence and the time between sampl
 
 - An electrode earlier in the order starts a new sweep, unless it is a copy of what this sweep has
   (duplicated) or one that this sweep lacks and just passed by (reordered, up to `REORDER_MAX`).
-- A sample that comes later than its place in the order explains starts a new sweep too.
+- A sample that comes later than its place in the order explains starts a new sweep too: the
+  samples of one reading are never further apart than a sweep takes and three quarters of a period.
 - A sweep that is lost as a whole is found by time alone.
+- Where samples are known to be lost, nobody knows how many: the sweep at hand ends there.
 
 What cannot be told apart: a sample of which the data is damaged so that it names another valid
-channel; a loss of exactly one sweep's worth of samples before the period is known; copies that
-come more than `REORDER_MAX` electrodes late, which count as a new sweep. In none of these is an
-electrode shifted or filled from memory: what a sweep did not receive is `MISSING` in it.
+channel; a sender that stalls in the middle of a sweep from the loss of whole sweeps' worth of
+samples, so that both break the sweep; copies that come more than `REORDER_MAX` electrodes late,
+which count as a new sweep. In none of these is an electrode shifted or filled from memory: what a
+sweep did not receive is `MISSING` in it.
 """
 
 from __future__ import annotations
@@ -49,17 +52,14 @@ PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5
 """The period is the median of the last 15 and known after 5."""
 NEXT_SWEEP_PERIODS: Final = 0.75
-"""A sample this much later than its place explains, in periods, is of another sweep. Losing a
-whole sweep's worth of samples in a row is rarer than a late one, hence more than a half."""
+"""A sample this much later than its place explains, in periods, is of another sweep. Samples of
+whole sweeps that are lost make it one period or more: a sweep broken without need is flagged, two
+sweeps in one reading would not be."""
+SLOT_MIN_NS: Final = 100_000
+"""Least time between samples, ns: a frame with three words takes 103 bits at 1 Mbit/s. While the
+period is not known, it is taken for that of the fastest board."""
 ARRIVAL_JITTER_NS: Final = 5_000_000
-READING_JITTER_NS: Final = 50_000_000
-"""Lateness, ns, that means nothing: where frames are stamped as they arrive, and where they are
-stamped when the loop gets to read them, which may stall."""
-SUCCESSOR_PATIENCE: Final = 4
-"""The very next electrode may come so many times later than any other: it is of another sweep only
-if the samples of whole sweeps were lost and not one more or less, while senders do stall."""
-SILENCE_NS: Final = 200_000_000
-"""While the period is not known: after this long, ns, a sample is of another sweep."""
+"""A sweep that comes less than this late, ns, tells of no missed one."""
 OUTAGE_NS: Final = 2_000_000_000
 """After this long, ns, nobody knows how many sweeps were made: it counts as one missed."""
 
@@ -75,17 +75,25 @@ class SweepCounters(DriverCounters):
     duplicate_frames: int = 0
     """Frames that came again; the copy is dropped."""
     reordered_frames: int = 0
-    """Frames that came after their successor and in time for their sweep."""
+    """Frames that came after their successor and in time for their sweep; of sweep frames, those
+    of a finger after one with a higher number."""
     late_frames: int = 0
     """Frames that came when their sweep was over; dropped."""
     unsynchronised_frames: int = 0
-    """Frames dropped after opening until a sweep began."""
+    """Frames dropped after opening, or after a known loss, until a sweep began."""
+    untimed_frames: int = 0
+    """Samples dropped because nobody knows when they came: the loop stalled, and the bus does not
+    stamp them."""
     unexpected_channels: int = 0
     """Samples of a channel that the configured sequence does not have."""
     interrupted_sweeps: int = 0
     """Sweeps dropped because the link broke in the middle."""
+    cut_sweeps: int = 0
+    """Sweeps ended in the middle because frames were known to be lost there."""
     restarts: int = 0
-    """Times that the device's sweep counter started anew."""
+    """Times that the device's sweep counter or clock started anew."""
+    contradicting_frames: int = 0
+    """Frames with the number of the sweep at hand and another tick; dropped."""
     parity_words: int = 0
     """Response words with a byte of even parity."""
     error_words: int = 0
@@ -146,12 +154,14 @@ class SampleSweeps:
 
     def __init__(
         self,
-        fingers: int,
+        sensors: int,
         sequence: Sequence[int],
         counters: SweepCounters,
-        jitter_ns: int = ARRIVAL_JITTER_NS,
+        rows: Sequence[int] | None = None,
     ) -> None:
-        """`sequence`: channels in order. `jitter_ns`: how late a sample may be stamped, ns.
+        """`sensors`: words of a sample. `sequence`: channels in order.
+
+        `rows`: which sensor, from 0, is which row of a reading; each in its turn unless given.
 
         Raises `ValueError` unless E1 to E24 are in the sequence once each.
         """
@@ -162,9 +172,10 @@ class SampleSweeps:
         self._others = frozenset(sequence) - set(electrodes)
         self._electrodes = np.array(electrodes, dtype=np.intp) - E1
         self._position = [sequence.index(channel) / len(sequence) for channel in electrodes]
-        self._jitter_ns = jitter_ns
-        self._fingers = fingers
-        self._width = 2 * fingers
+        self._samples = len(sequence)
+        self._sensors = sensors
+        self._rows = np.arange(sensors) if rows is None else np.array(rows, dtype=np.intp)
+        self._width = 2 * sensors
         self._readings = ReadingMaker(counters)
         self._counters = counters
         self._buffer = bytearray(ELECTRODES * self._width)
@@ -175,6 +186,7 @@ class SampleSweeps:
         self._have = 0
         self._last = -1
         self._t_ns = 0
+        self._origin_ns = 0.0
         self._finished = False
 
     @property
@@ -191,28 +203,43 @@ class SampleSweeps:
         left = 1.0 if self._finished else self._position[-1] - self._position[self._last]
         return self._t_ns + round(left * period_ns)
 
-    def push(self, channel: int, words: bytes, t_ns: int) -> Sequence[TactileReading]:
+    def push(
+        self, channel: int, words: bytes, t_ns: int, until_ns: int | None = None
+    ) -> Sequence[TactileReading]:
         """Take one sample, received at `t_ns`; the readings that it completes, oldest first.
 
-        `words` holds each finger's response word in turn, two bytes each.
+        `words` holds each sensor's response word in turn, two bytes each. With `until_ns` the
+        sample came at any time from `t_ns` to then; too wide a doubt makes it useless.
         """
         place = self._place.get(channel)
         if place is None:
             self._counters.unexpected_channels += channel not in self._others
             return ()
+        if until_ns is None:
+            until_ns = t_ns
+        elif until_ns - t_ns >= self._lateness_ns():
+            return self._untimed(place, t_ns)
         if not self._synchronised and not self._starts(place):
             self._counters.unsynchronised_frames += 1
             return ()
-        if self._ahead(place, t_ns):
+        if self._ahead(place, until_ns):
             if self._is_tail_of_previous(place):
                 self._counters.late_frames += 1
                 return ()
             return self._store(place, words, t_ns)
-        if self._repeats(place, words, t_ns):
+        if self._repeats(place, words, t_ns, until_ns):
             return ()
         finished = self._finish()
         self._begin()
         return (*finished, *self._store(place, words, t_ns))
+
+    def cut(self) -> Sequence[TactileReading]:
+        """Samples were lost, nobody knows how many: end the sweep at hand, wait for another."""
+        self._counters.cut_sweeps += not self._finished and self._have != 0
+        finished = self._finish()
+        self._synchronised = False
+        self._begin()
+        return finished
 
     def interrupt(self) -> None:
         """The link broke: drop the sweep at hand, wait for the beginning of another."""
@@ -233,26 +260,34 @@ class SampleSweeps:
         self._t_ns = 0
         self._finished = False
 
-    def _ahead(self, place: int, t_ns: int) -> bool:
-        """Whether a sample is of this sweep and the furthest so far."""
-        return place > self._last and not self._is_next_sweep(place, t_ns)
+    def _untimed(self, place: int, t_ns: int) -> Sequence[TactileReading]:
+        """A sample without a time ends the sweep at hand; the period is learned all the same."""
+        self._counters.untimed_frames += 1
+        finished = self._finish()
+        self._begin()
+        if place == ELECTRODES - 1:
+            self._learn(t_ns)
+        return finished
 
-    def _is_next_sweep(self, place: int, t_ns: int) -> bool:
-        """Whether a sample comes too late to be of this sweep."""
+    def _ahead(self, place: int, until_ns: int) -> bool:
+        """Whether a sample is of this sweep and the furthest so far."""
+        return place > self._last and not self._is_next_sweep(place, until_ns)
+
+    def _is_next_sweep(self, place: int, until_ns: int) -> bool:
+        """Whether a sample may have come too late to be of this sweep."""
         if self._last < 0:
             return False
-        gap_ns = t_ns - self._t_ns
         period_ns = self._readings.period_ns
         if period_ns is None:
-            return gap_ns > SILENCE_NS
-        advance = self._position[place] - self._position[self._last]
-        tolerance_ns = self._tolerance_ns(period_ns)
-        if place == self._last + 1:
-            tolerance_ns *= SUCCESSOR_PATIENCE
-        return gap_ns - advance * period_ns >= tolerance_ns
+            advance = max(place - self._last, 0)
+            return until_ns - self._t_ns - advance * SLOT_MIN_NS >= self._lateness_ns()
+        due_ns = self._origin_ns + self._position[place] * period_ns
+        return until_ns - due_ns >= self._lateness_ns()
 
-    def _tolerance_ns(self, period_ns: int) -> float:
-        return max(NEXT_SWEEP_PERIODS * period_ns, self._jitter_ns)
+    def _lateness_ns(self) -> float:
+        """How late a sample must be to be of another sweep, ns."""
+        period_ns = self._readings.period_ns or self._samples * SLOT_MIN_NS
+        return NEXT_SWEEP_PERIODS * period_ns
 
     def _is_tail_of_previous(self, place: int) -> bool:
         """Whether one of the last electrodes comes just after the sweep that lacked it."""
@@ -262,9 +297,9 @@ class SampleSweeps:
             and not self._previous_had >> place & 1
         )
 
-    def _repeats(self, place: int, words: bytes, t_ns: int) -> bool:
+    def _repeats(self, place: int, words: bytes, t_ns: int, until_ns: int) -> bool:
         """Deal with a sample that stays in this sweep: a copy or a late one. False: a new sweep."""
-        if self._last - place > REORDER_MAX or self._is_next_sweep(place, t_ns):
+        if self._last - place > REORDER_MAX or self._is_next_sweep(place, until_ns):
             return False
         if not self._have >> place & 1:
             if self._finished:
@@ -280,6 +315,8 @@ class SampleSweeps:
         return True
 
     def _store(self, place: int, words: bytes, t_ns: int) -> Sequence[TactileReading]:
+        begun_ns = t_ns - self._position[place] * (self._readings.period_ns or 0)
+        self._origin_ns = begun_ns if self._last < 0 else min(self._origin_ns, begun_ns)
         self._last = place
         self._put(place, words, t_ns)
         if place < ELECTRODES - 1:
@@ -299,10 +336,10 @@ class SampleSweeps:
         self._finished = True
         self._mind_time()
         self._previous_had = self._have
-        words = np.zeros((self._fingers, ELECTRODES), dtype=np.uint16)
-        came = np.frombuffer(self._buffer, dtype=">u2").reshape(ELECTRODES, self._fingers)
-        words[:, self._electrodes] = came.T
-        marks = np.zeros((self._fingers, ELECTRODES), dtype=np.uint8)
+        words = np.zeros((len(self._rows), ELECTRODES), dtype=np.uint16)
+        came = np.frombuffer(self._buffer, dtype=">u2").reshape(ELECTRODES, self._sensors)
+        words[:, self._electrodes] = came.T[self._rows]
+        marks = np.zeros(words.shape, dtype=np.uint8)
         lost = ELECTRODES - self._have.bit_count()
         if lost:
             places = [place for place in range(ELECTRODES) if not self._have >> place & 1]
@@ -318,12 +355,16 @@ class SampleSweeps:
             gap_ns = start_ns - self._previous_start_ns
             if gap_ns > OUTAGE_NS:
                 self._readings.miss(1)
-            elif period_ns and gap_ns - period_ns >= self._tolerance_ns(period_ns):
+            elif period_ns and gap_ns - period_ns >= max(self._lateness_ns(), ARRIVAL_JITTER_NS):
                 self._readings.miss(round(gap_ns / period_ns) - 1)
         self._previous_start_ns = start_ns
-        complete = self._last == ELECTRODES - 1
-        if complete and self._previous_end_ns is not None:
-            gap_ns = self._t_ns - self._previous_end_ns
-            if 0 < gap_ns <= OUTAGE_NS:
-                self._readings.learn(gap_ns)
-        self._previous_end_ns = self._t_ns if complete else None
+        if self._last == ELECTRODES - 1:
+            self._learn(self._t_ns)
+        else:
+            self._previous_end_ns = None
+
+    def _learn(self, end_ns: int) -> None:
+        """A sweep ended at `end_ns`, and maybe the one before it ended right before."""
+        if self._previous_end_ns is not None and 0 < end_ns - self._previous_end_ns <= OUTAGE_NS:
+            self._readings.learn(end_ns - self._previous_end_ns)
+        self._previous_end_ns = end_ns

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import sys
 from pathlib import Path
 from typing import get_args
 
 from daemon import assembly, scene
+from daemon.text import complain, printable
 from drivers.base import DriverError
 from models.contract import Finger, ModelError
 from models.runtime import TactileModel
@@ -28,33 +30,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check everything that can be checked without publishing; 0 if `graspd run` would start."""
+    """Check the scene, its model and its files; 0 if the scene is right.
+
+    Whether devices and socket are there is for `graspd doctor`.
+    """
     try:
         wanted = scene.load(args.scene)
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
         _try_drivers(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 2
     parts = {"in": _what_is_in(wanted, model), "left_out": _what_is_left_out(wanted)}
     if args.json:
         sys.stdout.write(json.dumps({"scene": str(args.scene), **parts}) + "\n")
         return 0
-    sys.stdout.write(f"{args.scene}: fine\n")
+    sys.stdout.write(f"{printable(str(args.scene))}: fine\n")
     for title, entries in (("in", parts["in"]), ("left out", parts["left_out"])):
         sys.stdout.write(f"{title}\n")
         for key, value in entries.items():
-            sys.stdout.write(f"  {key:9} {value}\n")
+            sys.stdout.write(f"  {key:9} {printable(value)}\n")
     return 0
 
 
 def _try_drivers(wanted: scene.Scene) -> None:
-    for driver in assembly.build_drivers(wanted):
-        try:
-            driver.open()
-        finally:
-            driver.close()
+    """Construct them all, and open what reads nothing but files: those are part of the scene."""
+    tactile, joints = wanted.tactile, wanted.joints
+    driver, *_ = assembly.build_drivers(wanted)
+    is_file = isinstance(tactile, scene.PalmTactile) and "://" not in tactile.source
+    if isinstance(tactile, scene.ReplayTactile) or is_file:
+        with contextlib.closing(driver):
+            assembly.open_driver(driver)
+    if isinstance(joints, scene.PalmJoints):
+        from drivers.hall_calibration import load_calibration
+
+        load_calibration(joints.calibration)
 
 
 def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:

@@ -4,17 +4,26 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import http.client
+import signal
 import sys
-import urllib.error
 import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 
+from daemon.text import complain, printable
 from models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
 
 MAX_BYTES = 16 * 2**20
 """No file of the set has more than 1 MB; an endless answer is cut here."""
 TIMEOUT_S = 30.0
-
+"""A server that sends nothing for so long is given up, s."""
+FETCH_MAX_S = 120.0
+"""And so is one that has not sent a whole file after so long, s."""
+MESSAGE_MAX = 320
+"""Characters of an error, which may quote what the server sent."""
 
 UPSTREAM = "https://raw.githubusercontent.com/3dperceptionlab/biotacsp-stability-set-v2/master"
 """Where GitHub serves the files of `models.bts3.REPOSITORY`."""
@@ -36,39 +45,77 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Get every file that is not there yet; 0 when all are there and right."""
-    try:
-        args.to.mkdir(parents=True, exist_ok=True)
-        for file in TABLES:
-            target = args.to / f"{file.name}.csv"
-            if target.exists() and _digest(target.read_bytes()) == file.sha256:
-                sys.stdout.write(f"{target}: is there\n")
-                continue
-            content = _from_folder(args.folder, file) if args.folder else _fetch(args.url, file)
-            _store(content, target)
-            sys.stdout.write(f"{target}: {file.rows} grasps\n")
-    except (DataError, OSError) as error:
-        sys.stderr.write(f"graspd: {error}\n")
-        return 1
+    for file in TABLES:
+        try:
+            said = _get(args, file)
+        except (DataError, OSError) as error:
+            complain(error)
+            return 1
+        sys.stdout.write(printable(said) + "\n")
     sys.stdout.write(f"licence: {LICENCE}; please cite\n  " + "\n  ".join(CITATIONS) + "\n")
     return 0
+
+
+def _get(args: argparse.Namespace, file: TableFile) -> str:
+    """Get one file unless it is there; what became of it."""
+    target: Path = args.to / f"{file.name}.csv"
+    args.to.mkdir(parents=True, exist_ok=True)
+    if target.exists():
+        if not target.is_file():
+            raise DataError(f"{target}: is there and is no regular file")
+        if _digest(_read(target)) == file.sha256:
+            return f"{target}: is there"
+    content = _from_folder(args.folder, file) if args.folder else fetch(args.url, file)
+    _store(content, target)
+    return f"{target}: {file.rows} grasps"
 
 
 def _from_folder(folder: Path, file: TableFile) -> bytes:
     for name in (f"{file.name}.csv", file.upstream_name):
         if (folder / name).is_file():
-            return _checked((folder / name).read_bytes(), file, str(folder / name))
+            return _checked(_read(folder / name), file, str(folder / name))
     raise DataError(f"{folder}: has neither {file.name}.csv nor {file.upstream_name}")
 
 
-def _fetch(base: str, file: TableFile) -> bytes:
+def fetch(base: str, file: TableFile, limit_s: float = FETCH_MAX_S) -> bytes:
+    """The file from below an address, checked, within `limit_s` seconds. Raises `DataError`.
+
+    In the main thread only.
+    """
     address = f"{base.rstrip('/')}/{file.upstream_name}"
     if not address.startswith(("https://", "http://")):
         raise DataError(f"{address}: only http and https addresses can be fetched")
     try:
-        with urllib.request.urlopen(address, timeout=TIMEOUT_S) as answer:
-            return _checked(answer.read(MAX_BYTES), file, address)
-    except (urllib.error.URLError, TimeoutError) as error:
-        raise DataError(f"{address}: {error}; or copy the files and use --from DIR") from error
+        with _at_most(limit_s), urllib.request.urlopen(address, timeout=TIMEOUT_S) as answer:
+            content: bytes = answer.read(MAX_BYTES)
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        why = printable(str(error) or type(error).__name__, MESSAGE_MAX)
+        raise DataError(f"{address}: {why}; or copy the files and use --from DIR") from error
+    return _checked(content, file, address)
+
+
+@contextmanager
+def _at_most(limit_s: float) -> Iterator[None]:
+    """Raise `TimeoutError` after so long, whatever a server sends meanwhile.
+
+    The timeout of a socket begins anew with every byte, in the head of an answer too.
+    """
+
+    def give_up(_number: int, _frame: FrameType | None) -> None:
+        raise TimeoutError(f"took longer than {limit_s:g} s")
+
+    former = signal.signal(signal.SIGALRM, give_up)
+    left_s, interval_s = signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, left_s, interval_s)
+        signal.signal(signal.SIGALRM, former)
+
+
+def _read(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(MAX_BYTES)
 
 
 def _checked(content: bytes, file: TableFile, source: str) -> bytes:
@@ -83,5 +130,7 @@ def _digest(content: bytes) -> str:
 
 def _store(content: bytes, target: Path) -> None:
     partial = target.with_suffix(".partial")
-    partial.write_bytes(content)
+    partial.unlink(missing_ok=True)  # one of an earlier try, or something that cannot be written
+    with partial.open("xb") as file:
+        file.write(content)
     partial.replace(target)

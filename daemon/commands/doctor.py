@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from daemon import assembly, scene
+from daemon.arguments import within
 from daemon.diagnosis import (
     ElectrodeStatistics,
     Finding,
@@ -23,10 +24,12 @@ from daemon.diagnosis import (
     counter_findings,
     rate_finding,
 )
-from drivers.base import Driver, DriverError, TactileReading
+from daemon.text import complain, printable
+from drivers.base import Driver, LinkError, TactileReading
 from models.contract import ModelError
 
 LISTEN_S = 3.0
+LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
 WAIT_S = 0.02
 """Longest sleep between two looks at a driver, s."""
 ARPHRD_CAN = "280"
@@ -34,7 +37,11 @@ ARPHRD_CAN = "280"
 GROUPS = {"spi": "dialout"}
 """Group that a driver's device belongs to on Debian and Ubuntu."""
 BRIDGE_NAME = "graspd"
-"""Part of the USB product name of a bridge; only such ports are greeted unasked."""
+BRIDGE_VENDOR = 0x2E8A
+"""Raspberry Pi, whose Pico the bridge's sketch is for. Only ports of this vendor, or with the name
+above in their description, are greeted unasked: other devices may not like it."""
+DESCRIBED = {("clock", "not trusted"): Level.WARNING}
+"""What a driver says of its device that is not fine."""
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
 
 
@@ -44,13 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scene", type=Path, nargs="?", help="scene whose devices, model and socket are looked at"
     )
     parser.add_argument(
-        "--listen", type=float, default=LISTEN_S, metavar="S", help="listen so long (default: 3)"
+        "--listen",
+        type=within(LISTEN_MIN_S, LISTEN_MAX_S),
+        default=LISTEN_S,
+        metavar="S",
+        help="listen so long (default: 3)",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine; 0 if nothing is wrong, 1 if something is, 2 if the scene cannot be read."""
+    """Examine; 0 if nothing is wrong, 1 if something is, 2 if the scene or its files are wrong."""
     report: dict[str, Any] = {}
     findings: list[Finding] = []
     try:
@@ -59,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             findings += _scene(scene.load(args.scene), report, args.listen)
     except scene.SceneError as error:
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 2
     if args.json:
         report["findings"] = [dataclasses.asdict(finding) for finding in findings]
@@ -76,11 +87,12 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
     findings = []
     ports = [port for port in list_ports.comports() if port.vid is not None]
     for port in ports:
-        if BRIDGE_NAME in f"{port.product} {port.manufacturer}".lower():
+        named = BRIDGE_NAME in f"{port.product} {port.manufacturer}".lower()
+        if named or port.vid == BRIDGE_VENDOR:
             findings += _port(port.device, report, listen_s)
         else:
             what = f"serial port {port.device}: {port.description}"
-            findings.append(Finding(Level.OK, what, "not greeted: no graspd bridge by its name"))
+            findings.append(Finding(Level.OK, what, "not greeted: to ask it, name it in a scene"))
     interfaces = can_interfaces(Path("/sys/class/net"))
     findings += interfaces
     if not ports and not interfaces:
@@ -133,10 +145,10 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
     statistics = ElectrodeStatistics(wanted.hand.fingers)
     try:
         for driver in drivers:
-            driver.open()
+            assembly.open_driver(driver)
         seconds = _collect(drivers, statistics, listen_s)
         described = {driver.name: driver.describe() for driver in drivers}
-    except DriverError as error:
+    except LinkError as error:
         return [Finding(Level.ERROR, str(error))]
     finally:
         for driver in drivers:
@@ -146,7 +158,8 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
         device = described[driver.name]
         report[driver.name] = {"device": device, "counters": driver.counters.as_dict()}
         findings += [
-            Finding(Level.OK, f"{driver.name}: {key} {value}") for key, value in device.items()
+            Finding(DESCRIBED.get((key, value), Level.OK), f"{driver.name}: {key} {value}")
+            for key, value in device.items()
         ]
     tactile = drivers[0]
     findings.append(rate_finding(tactile.name, statistics.readings, seconds, tactile.period_ns))
@@ -203,7 +216,7 @@ def _in_group(name: str) -> bool:
 def _print(report: dict[str, Any], findings: list[Finding]) -> None:
     for finding in findings:
         advice = f"  -> {finding.advice}" if finding.advice else ""
-        sys.stdout.write(f"{MARKS[finding.level]}{finding.what}{advice}\n")
+        sys.stdout.write(f"{MARKS[finding.level]}{printable(finding.what + advice)}\n")
     electrodes = report.get("electrodes", {})
     if report.get("readings"):
         heads = "".join(f"{finger + ': mean, sd, faulty':>26}" for finger in electrodes)

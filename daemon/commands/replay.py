@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from contextlib import ExitStack
 from pathlib import Path
 
 from daemon import assembly, scene
+from daemon.arguments import positive, within
 from daemon.printer import Printer
 from daemon.publisher import Publisher, PublishError
 from daemon.reporter import Reporter
 from daemon.service import Service
 from daemon.stop import StopSignal
+from daemon.text import complain
 from drivers.base import DriverError
 from drivers.replay import DEMO_RECORDING
 from models.contract import ModelError
 
 MAX_AGE_MS = 1000.0
 """Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
+
+WAIT_MAX_S = 3600
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,12 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--speed",
-        type=_positive,
+        type=positive,
         metavar="FACTOR",
         help="pace at this factor of real time (default: as fast as possible)",
     )
     parser.add_argument(
-        "--rate", type=_positive, default=100.0, metavar="HZ", help="readings/s of a grasp table"
+        "--rate", type=positive, default=100.0, metavar="HZ", help="readings/s of a grasp table"
     )
     parser.add_argument("--loop", action="store_true", help="start again at the end, for ever")
     parser.add_argument(
@@ -52,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--wait",
-        type=_positive,
+        type=within(0, WAIT_MAX_S),
         metavar="S",
         help="with --publish: start when somebody has subscribed, fail after S seconds",
     )
@@ -63,18 +66,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when the recordings were played to their end."""
+    if args.wait is not None and args.publish is None:
+        complain("--wait is for subscribers: it needs --publish")
+        return 2
     try:
-        return _replay(args)
+        with StopSignal() as stop:
+            return _replay(args, stop)
     except (scene.SceneError, ModelError, DriverError) as error:
         sys.stdout.flush()
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 2
     except PublishError as error:
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 1
 
 
-def _replay(args: argparse.Namespace) -> int:
+def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     wanted = _scene(args)
     model = assembly.load_model(wanted)
     wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
@@ -82,22 +89,20 @@ def _replay(args: argparse.Namespace) -> int:
     drivers = assembly.build_drivers(wanted)
     printer = Printer(as_json=args.json, prompt=args.speed is not None)
     with ExitStack() as stack:
-        stop = stack.enter_context(StopSignal())
         publisher = None
-        if args.publish:
-            publisher = stack.enter_context(Publisher(args.publish))
+        if args.publish is not None:
+            publisher = stack.enter_context(Publisher(args.publish, waits=args.wait is not None))
         for driver in drivers:
             stack.callback(driver.close)
-            driver.open()
-        if publisher is not None and args.wait and not publisher.wait_for_subscriber(args.wait):
-            raise PublishError(f"nobody subscribed to {args.publish} within {args.wait:g} s")
+            assembly.open_driver(driver)
+        if publisher is not None and args.wait is not None:
+            _wait(publisher, args.wait, stop)
         service = Service(
             drivers,
             pipeline,
             Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
             stop,
             max_age_ns=wanted.max_age_ns,
-            publisher=publisher,
             listener=printer.verdict,
         )
         try:
@@ -105,6 +110,12 @@ def _replay(args: argparse.Namespace) -> int:
         finally:
             printer.summary()
     return 0 if stop.received is None else 128 + stop.received
+
+
+def _wait(publisher: Publisher, timeout_s: float, stop: StopSignal) -> None:
+    """Raises `PublishError` if nobody subscribes in time."""
+    if not publisher.wait_for_subscriber(timeout_s, stop) and stop.received is None:
+        raise PublishError(f"nobody subscribed to {publisher.endpoint} within {timeout_s:g} s")
 
 
 def _scene(args: argparse.Namespace) -> scene.Scene:
@@ -123,13 +134,6 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
         "gate": {"max_age_ms": MAX_AGE_MS},
     }
     return scene.parse(data, Path("command line"))
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
 
 
 def _endpoint(text: str) -> str:

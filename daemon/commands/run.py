@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from daemon.publisher import Publisher, PublishError
 from daemon.reporter import Reporter
 from daemon.service import Service
 from daemon.stop import StopSignal
+from daemon.text import complain
 from drivers.base import DriverError, RecordingError
 from models.contract import ModelError
 
@@ -29,26 +29,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording."""
     try:
-        _run(scene.load(args.scene), Printer(as_json=False, prompt=True) if args.print else None)
+        with StopSignal() as stop:
+            printer = Printer(as_json=False, prompt=True) if args.print else None
+            _run(scene.load(args.scene), printer, stop)
     except (scene.SceneError, ModelError, RecordingError) as error:
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 2
     except (PublishError, DriverError) as error:
-        sys.stderr.write(f"graspd: {error}\n")
+        complain(error)
         return 1
     return 0
 
 
-def _run(wanted: scene.Scene, printer: Printer | None) -> None:
+def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None:
     model = assembly.load_model(wanted)
     pipeline = assembly.build_pipeline(wanted, model)
     drivers = assembly.build_drivers(wanted)
     with ExitStack() as stack:
-        stop = stack.enter_context(StopSignal())
         publisher = stack.enter_context(Publisher(wanted.endpoint, wanted.publish.high_water_mark))
         for driver in drivers:
             stack.callback(driver.close)
-            driver.open()
+            assembly.open_driver(driver)
         log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
         service = Service(
             drivers,
@@ -56,7 +57,6 @@ def _run(wanted: scene.Scene, printer: Printer | None) -> None:
             Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
             stop,
             max_age_ns=wanted.max_age_ns,
-            publisher=publisher,
             listener=printer.verdict if printer else None,
         )
         try:

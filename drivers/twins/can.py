@@ -12,8 +12,9 @@ from typing import Any, Final, Self
 
 import can
 
-from drivers.base import ELECTRODES, FINGERS
+from drivers.base import ELECTRODES, FINGERS, DriverError, LinkError
 from drivers.biotac import E1, E24, PAC, PDC, TAC, TDC, encode_word
+from drivers.can_bus import open_bus
 from drivers.can_formats import (
     SWEEP_BASE_ID,
     SWEEP_VERSION,
@@ -68,6 +69,8 @@ class CanTwin:
     ) -> None:
         self._format = CanFormat(format)
         is_sweep = self._format is CanFormat.SWEEP_FD
+        if interface not in can.VALID_INTERFACES:
+            raise ValueError(f"python-can has no interface {interface!r}")
         if sequence not in SEQUENCES:
             raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
         if not 0.0 < rate_hz <= 1000.0:
@@ -108,11 +111,14 @@ class CanTwin:
         return self._injector.injected
 
     def open(self) -> None:
-        """Take the bus. Raises what python-can raises."""
+        """Take the bus. Raises `LinkError`, also where a package is missing."""
         self.close()
-        self._bus = can.Bus(
-            channel=self._channel, interface=self._interface, ignore_config=True, **self._options
-        )
+        try:
+            self._bus = open_bus(self._interface, self._channel, self._options)
+        except LinkError:
+            raise
+        except DriverError as error:
+            raise LinkError(str(error)) from error
 
     def close(self) -> None:
         """Let go of the bus."""

@@ -31,11 +31,13 @@ class JointTwin:
         rate_hz: float = RATE_HZ,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
     ) -> None:
-        """Raises `ValueError` for a rate that is not positive, and for bursts, which it lacks."""
+        """Raises `ValueError` for a rate that is not positive and for a fault that it lacks."""
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
-        if faults.burst_frames != 1:
-            raise ValueError("the joint stream has no bursts")
+        if faults.burst_frames != 1 or faults.one_byte_at_a_time:
+            raise ValueError("the joint stream has no bursts and no single bytes")
+        if faults.dead_electrodes or faults.unplugged_fingers:
+            raise ValueError("the joint stream has no electrodes")
         self._names = tuple(names)
         self._rate_hz = rate_hz
         self._injector = LinkFaultInjector(faults)

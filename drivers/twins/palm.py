@@ -67,7 +67,12 @@ class PalmTwin:
         sensors: Sequence[int] = SENSORS_AT_REST,
         seed: int = 0,
     ) -> None:
-        """`sensors` are the raw words that joints rest at."""
+        """`sensors` are the raw words that joints rest at.
+
+        Raises `ValueError` for a fault that datagrams cannot have.
+        """
+        if faults.one_byte_at_a_time:
+            raise ValueError("datagrams are not sent byte by byte")
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
         self._palm = palm

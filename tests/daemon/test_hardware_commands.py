@@ -155,6 +155,8 @@ def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:
         (["twin", "spi", "--drop", "2"], "drop_probability is 2.0, must be in 0..1"),
         (["twin", "spi", "--dead", "th"], "'th' is no electrode"),
         (["twin", "palm", "--to", "nowhere"], "nowhere"),
+        (["twin", "palm", "--one-byte-at-a-time"], "datagrams are not sent byte by byte"),
+        (["twin", "joints", "--unplugged", "mf"], "the joint stream has no electrodes"),
         (["twin", "spi", "--recording", "absent.csv"], "absent.csv"),
         (["doctor", "absent.toml"], "absent.toml: cannot read the scene"),
     ],

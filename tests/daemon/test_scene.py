@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
@@ -9,7 +10,16 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from daemon.scene import ReplayTactile, Scene, SceneError, load
+from daemon.scene import (
+    SCENE_MAX_BYTES,
+    ReplayFaultsSection,
+    ReplayTactile,
+    Scene,
+    SceneError,
+    check_endpoint,
+    load,
+)
+from drivers.faults import ReplayFaults
 
 GOOD = """
 [tactile]
@@ -75,6 +85,28 @@ def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
         (GOOD + "[publish]\nendpoint = 'tcp://robot:5'", "publish.endpoint", "IP address"),
         (GOOD + "[publish]\nendpoint = 'udp://127.0.0.1:5'", "publish.endpoint", "ipc://"),
         (GOOD + f"[publish]\nendpoint = 'ipc://{'x' * 108}'", "publish.endpoint", "107 bytes"),
+        (GOOD + "[publish]\nendpoint = 'tcp://[::2]:5'", "publish.endpoint", "loopback"),
+        (GOOD + "[publish]\nendpoint = 'tcp://::1:5'", "publish.endpoint", "IP address"),
+        (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1]:5'", "publish.endpoint", "IP address"),
+        (GOOD + "[publish]\nendpoint = 'tcp://*:5'", "publish.endpoint", "IP address"),
+        (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1:*'", "publish.endpoint", "port"),
+        (GOOD + "[publish]\nendpoint = 'tcp://127.0.0.1:0'", "publish.endpoint", "port"),
+        (
+            GOOD + f"[publish]\nendpoint = 'tcp://127.0.0.1:{'9' * 5000}'",
+            "publish.endpoint",
+            "port",
+        ),
+        (GOOD + "[publish]\nendpoint = 'ipc://*'", "publish.endpoint", "not '*'"),
+        (GOOD + "[publish]\nendpoint = 'ipc://@'", "publish.endpoint", "needs a path"),
+        (GOOD + '[publish]\nendpoint = "ipc:///tmp/\\u0000"', "publish.endpoint", "NUL"),
+        (GOOD + '[model]\npath = "\\u0000.onnx"', "model.path", "NUL"),
+        (GOOD + '[model]\nname = "cnn1\\u0000"', "model.name", "NUL"),
+        (GOOD + "[model]\nname = ''", "model.name", "at least 1"),
+        (
+            "[tactile]\ndriver = 'replay'\nrecordings = [\"a\\u0000\"]",
+            "tactile.recordings.0",
+            "NUL",
+        ),
         (GOOD + "[tactile.faults]\nslow_every = 0", "tactile.faults.slow_every", "greater"),
         (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, not in hand.fingers"),
         (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
@@ -104,6 +136,10 @@ def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:
         (b"[tactile\n", "not TOML"),
         (b"a = 1\na = 2\n", "not TOML"),
         (b"\xff\xfe\x00", "not a text file"),
+        (b"a = " + b"[" * 20_000, "not TOML that can be read: nested too deeply"),
+        (b"a = " + b"9" * 5000, "not TOML: Exceeds the limit"),
+        (b"[" + b"a" * 10_000 + b"]\n[" + b"a" * 10_000 + b"]", r"not TOML: .{320}$"),
+        (b"#" * (SCENE_MAX_BYTES + 1), "larger than 1048576 bytes"),
     ],
 )
 def test_what_is_not_toml_is_said_in_one_line(tmp_path: Path, content: bytes, says: str) -> None:
@@ -112,6 +148,90 @@ def test_what_is_not_toml_is_said_in_one_line(tmp_path: Path, content: bytes, sa
     with pytest.raises(SceneError, match=says) as error:
         load(path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("kind", ["fifo", "device", "folder"])
+def test_only_a_regular_file_is_read(tmp_path: Path, kind: str) -> None:
+    path = {"fifo": tmp_path / "fifo", "device": Path("/dev/zero"), "folder": tmp_path}[kind]
+    if kind == "fifo":
+        os.mkfifo(path)
+    with pytest.raises(SceneError, match="cannot read the scene: not a regular file"):
+        load(path)
+
+
+def test_of_many_mistakes_twenty_are_told(tmp_path: Path) -> None:
+    path = write(tmp_path, GOOD + "".join(f"wrong{number} = 1\n" for number in range(1000)))
+    with pytest.raises(SceneError) as error:
+        load(path)
+    *lines, last = str(error.value).splitlines()
+    assert len(lines) == 20
+    assert last == f"{path}: and 980 more"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        GOOD + f"loop = '{'x' * 100_000}'",
+        GOOD + f"{'x' * 100_000} = 1",
+        GOOD + f"loop = {'[' * 100}{']' * 100}",
+        GOOD + f"seed = -0x{'f' * 5000}",
+        f"[tactile]\ndriver = '{'x' * 100_000}'",
+        GOOD + f"[publish]\nendpoint = 'tcp://{'x' * 100_000}:1'",
+    ],
+)
+def test_a_long_value_is_cut(tmp_path: Path, text: str) -> None:
+    path = write(tmp_path, text)
+    with pytest.raises(SceneError) as error:
+        load(path)
+    assert len(str(error.value)) < len(str(path)) + 600
+
+
+def test_control_characters_are_shown_and_not_sent(tmp_path: Path) -> None:
+    escape = '"\\u001b[2J\\n\\u202e"'
+    texts = [f"loop = {escape}", f"{escape} = 1", f"[publish]\nendpoint = {escape}"]
+    for text in [*(GOOD + text for text in texts), f"[tactile]\ndriver = {escape}"]:
+        with pytest.raises(SceneError) as error:
+            load(write(tmp_path, text))
+        assert str(error.value).isprintable()
+        assert "\\x1b[2J\\n\\u202e" in str(error.value)
+
+
+FAULTS: dict[str, list[float | list[int]]] = {
+    "wrong_counts": [4096, -4096, 99999],
+    "fingers": [[]],
+    "electrodes": [[], [0], [25]],
+    "off_from": [-1],
+    "stuck_from": [0],
+    "slow_every": [0],
+    "seed": [-1],
+    "delayed_s": [-0.1, 3600.1],
+    "garbage_probability": [-0.1, 1.1],
+    "intermittent_probability": [-0.1, 1.1],
+}
+
+
+@pytest.mark.parametrize("key", FAULTS)
+def test_faults_that_the_replay_refuses_are_mistakes_of_the_scene(tmp_path: Path, key: str) -> None:
+    for value in FAULTS[key]:
+        given = tuple(value) if isinstance(value, list) else value
+        with pytest.raises(ValueError, match=key):
+            ReplayFaults(**{key: given})  # type: ignore[arg-type]
+        path = write(tmp_path, GOOD + f"[tactile.faults]\n{key} = {value}")
+        with pytest.raises(SceneError, match=rf"tactile\.faults\.{key}"):
+            load(path)
+
+
+def test_faults_at_the_limit_are_taken_by_both() -> None:
+    limits = {"wrong_counts": -4095, "electrodes": (1, 24), "fingers": ("ff",), "delayed_s": 3600.0}
+    ReplayFaults(**ReplayFaultsSection.model_validate(limits).model_dump())
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["ipc:///run/graspd/right.ipc", "ipc://@graspd", "tcp://127.8.9.1:65535", "tcp://[::1]:5555"],
+)
+def test_an_endpoint_of_this_computer_is_taken(endpoint: str) -> None:
+    check_endpoint(endpoint)
 
 
 def test_a_missing_file_is_said_in_one_line(tmp_path: Path) -> None:
@@ -163,6 +283,15 @@ def test_every_driver_has_a_scene(tmp_path: Path, text: str) -> None:
             "scene",
             "joints.driver palm needs tactile.driver palm",
         ),
+        (CAN + "sensors = ['th', 'ff']", "scene", "tactile.sensors must name every finger"),
+        (
+            CAN + "format = 'sweep_fd'\nsensors = ['th', 'ff', 'mf']",
+            "scene",
+            "tactile.sensors is for syntouch",
+        ),
+        (SPI.replace("/dev/ttyACM0", "") + "", "tactile.port", "at least 1"),
+        (PALM + "only_from = 'the-relay'", "tactile.only_from", "does not appear to be an IPv4"),
+        (PALM + "heed_finger_bits = 1", "tactile.heed_finger_bits", "valid boolean"),
         (PALM + "[joints]\ndriver = 'palm'", "joints.calibration", "is missing"),
         (PALM + "[joints]\ndriver = 'stream'\nsource = 'tcp://x'", "joints.source", "pattern"),
         (PALM + "[joints]\ndriver = 'ros'", "joints.driver", "there are: palm, stream"),

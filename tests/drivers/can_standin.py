@@ -15,10 +15,12 @@ from drivers.can_bridge import CanBridgeDriver
 from drivers.can_bus import SO_TIMESTAMPNS
 from drivers.can_formats import encode_sample
 from drivers.can_frames import CanFrame, pack_frame
-from drivers.twins.can import SAMPLE_ID
+from drivers.twins.can import SAMPLE_ID, CanTwin
+from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps import Counts, GeneratedContact
-from tests.drivers.can_words import samples
+from tests.drivers.can_words import Clock, samples
 
+MS = 1_000_000
 CHANNELS = itertools.count()
 LOOPBACK = "lo"
 """The driver looks for the interface before python-can does; this one is always there."""
@@ -78,6 +80,27 @@ class ScriptedBus:
             raise self.shutdown_error
 
 
+class FailingBus:
+    """A bus whose `recv` fails once `failure` is set, as when an adapter is unplugged."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+        self.failure: BaseException | None = None
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        received = self.bus.recv(timeout)
+        if received is None and self.failure is not None:
+            failure, self.failure = self.failure, None
+            raise failure
+        return received
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        self.bus.shutdown()
+
+
 Opener = Callable[[], object]
 
 
@@ -119,3 +142,68 @@ def message(data: bytes = b"", identifier: int = SAMPLE_ID, **options: bool) -> 
 
 def sweep_messages(sweep: int = 0) -> list[can.Message]:
     return [message(encode_sample(channel, words)) for channel, words, _ in samples(sweep)]
+
+
+def sweep_of_frames(sweep: int) -> list[CanFrame]:
+    return [
+        CanFrame(SAMPLE_ID, encode_sample(channel, words)) for channel, words, _ in samples(sweep)
+    ]
+
+
+class TwinLink:
+    """Driver and twins on one virtual bus and one clock that tests move, sweep by sweep."""
+
+    def __init__(self, frame_format: str, sequence: str = "electrodes") -> None:
+        self.clock = Clock()
+        self.where, self.format, self.sequence = channel(), frame_format, sequence
+        self.driver = bridge(
+            self.where, frame_format, sequence=sequence, clock=self.clock, wall_clock=self.clock
+        )
+        self.readings: list[TactileReading] = []
+        self.sweeps_sent = 65_500
+        """The number of sweep frames wraps in the middle of the longer tests."""
+
+    def send(self, counts: Sequence[Counts], faults: LinkFaults = LinkFaults()) -> CanTwin:  # noqa: B008
+        """Send sweeps at 100 Hz; the frames of each arrive at once."""
+        twin = CanTwin(
+            "virtual",
+            self.where,
+            iter(counts),
+            format=self.format,
+            sequence=self.sequence,
+            first_sweep=self.sweeps_sent,
+            faults=faults,
+            bus_options={"preserve_timestamps": True},
+            clock=self.clock,
+        )
+        self.sweeps_sent += len(counts)
+        with twin:
+            for _ in counts:
+                self.clock.now_ns += 10 * MS
+                twin.send_sweep()
+                self.readings += tactile(self.driver.read_ready())
+            twin.flush()
+            self.readings += tactile(self.driver.read_ready())
+        assert twin.unsent == 0
+        return twin
+
+    def half(self, counts: Counts) -> int:
+        """Send the first half of a sweep; its frames."""
+        options = {"preserve_timestamps": True}
+        twin = CanTwin(
+            "virtual",
+            self.where,
+            iter([counts]),
+            format=self.format,
+            sequence=self.sequence,
+            first_sweep=self.sweeps_sent,
+            bus_options=options,
+            clock=self.clock,
+        )
+        self.clock.now_ns += 10 * MS
+        self.sweeps_sent += 1
+        with twin:
+            frames = twin.next_frames()
+            for frame in frames[: len(frames) // 2]:
+                twin._put(frame)
+        return len(frames) // 2

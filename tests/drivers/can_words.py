@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from drivers.base import TactileReading
 from drivers.biotac import E1
 from drivers.can_decoders import CanCounters
-from drivers.sweep import ARRIVAL_JITTER_NS, SEQUENCES, SampleSweeps
+from drivers.sweep import SEQUENCES, SampleSweeps
 
 FINGERS = 3
 SLOT_NS = 227_000
@@ -63,11 +63,9 @@ def samples(sweep: int, sequence: str = "electrodes", start_ns: int = 0) -> list
     ]
 
 
-def assembler(
-    sequence: str = "electrodes", jitter_ns: int = ARRIVAL_JITTER_NS
-) -> tuple[SampleSweeps, CanCounters]:
+def assembler(sequence: str = "electrodes") -> tuple[SampleSweeps, CanCounters]:
     counters = CanCounters()
-    return SampleSweeps(FINGERS, SEQUENCES[sequence], counters, jitter_ns), counters
+    return SampleSweeps(FINGERS, SEQUENCES[sequence], counters), counters
 
 
 def concatenated(sweeps: Sequence[Sequence[Sample]]) -> list[Sample]:

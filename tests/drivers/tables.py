@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from drivers.base import RecordingError
+from drivers.recording import Recording, Row, read_lines
 
 FINGERS = ("ff", "mf", "th")
 ELECTRODES = [f"{finger}_biotac_{number}" for finger in FINGERS for number in range(1, 25)]
@@ -58,3 +62,18 @@ def write(folder: Path, content: bytes, name: str = "grasps.csv") -> Path:
     path = folder / name
     path.write_bytes(content)
     return path
+
+
+PATH = Path("grasps.csv")
+
+
+def rows_of(content: bytes, fingers: Sequence[str] = FINGERS, *, strict: bool = False) -> list[Row]:
+    lines = read_lines(PATH, io.BytesIO(content))
+    return list(Recording(PATH, lines, fingers, strict=strict))
+
+
+def rows_or_message(content: bytes) -> list[Row] | str:
+    try:
+        return rows_of(content)
+    except RecordingError as error:
+        return str(error)

@@ -13,9 +13,15 @@ from tests.drivers.can_words import FINGERS, assert_true, truth, word
 MISSING = ElectrodeFault.MISSING
 
 
-def push(sweeps: FrameSweeps, row: int, sweep: int, t_ns: int = 0) -> list[TactileReading]:
+TICK_US = 10_000
+
+
+def push(
+    sweeps: FrameSweeps, row: int, sweep: int, t_ns: int = 0, tick_us: int | None = None
+) -> list[TactileReading]:
     words = b"".join(word(int(count)) for count in truth(sweep)[row])
-    return list(sweeps.push(row, sweep % (1 << 16), words, 0, t_ns))
+    tick_us = sweep * TICK_US if tick_us is None else tick_us
+    return list(sweeps.push(row, sweep % (1 << 16), tick_us % (1 << 32), words, 0, t_ns))
 
 
 def frame_sweeps() -> tuple[FrameSweeps, CanCounters]:
@@ -23,8 +29,11 @@ def frame_sweeps() -> tuple[FrameSweeps, CanCounters]:
     return FrameSweeps(FINGERS, counters), counters
 
 
-def whole(sweeps: FrameSweeps, sweep: int, t_ns: int = 0) -> list[TactileReading]:
-    return [reading for row in range(FINGERS) for reading in push(sweeps, row, sweep, t_ns)]
+def whole(
+    sweeps: FrameSweeps, sweep: int, t_ns: int = 0, tick_us: int | None = None
+) -> list[TactileReading]:
+    pushed = [push(sweeps, row, sweep, t_ns, tick_us) for row in range(FINGERS)]
+    return [reading for readings in pushed for reading in readings]
 
 
 def test_frames_of_all_fingers_make_a_reading_in_any_order() -> None:
@@ -89,17 +98,97 @@ def test_a_sequence_that_starts_anew_is_followed(sequence: int, t_ns: int) -> No
 def test_a_device_that_says_the_same_sweep_again_after_an_outage_has_started_anew() -> None:
     sweeps, counters = frame_sweeps()
     whole(sweeps, 0)
-    (reading,) = whole(sweeps, 0, OUTAGE_NS + 1)
+    (reading,) = whole(sweeps, 0, OUTAGE_NS + 1, tick_us=77)
     assert reading.t_ns == OUTAGE_NS + 1
     assert counters.restarts == 1
+
+
+def test_a_copy_is_a_copy_however_late_it_comes() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 0)
+    assert whole(sweeps, 0, OUTAGE_NS + 1) == []
+    assert (counters.duplicate_frames, counters.restarts) == (FINGERS, 0)
+
+
+PERIOD_NS = 10_000_000
+
+
+def running(sweeps: FrameSweeps, sweep: int) -> int:
+    """Sweeps up to before `sweep`, on time; when that is due, ns."""
+    for before in range(sweep - 8, sweep):
+        whole(sweeps, before, before * PERIOD_NS)
+    return sweep * PERIOD_NS
+
+
+@pytest.mark.parametrize("is_known", [True, False], ids=["period known", "period unknown"])
+@pytest.mark.parametrize("tick_stuck", [False, True], ids=["tick", "stuck tick"])
+@pytest.mark.parametrize("down_ns", [PERIOD_NS, 3 * PERIOD_NS, 300_000_000])
+def test_a_board_that_was_reset_never_completes_the_sweep_at_hand(
+    *, is_known: bool, tick_stuck: bool, down_ns: int
+) -> None:
+    """One finger of sweep 8 comes before the reset, then the numbers begin again at 0."""
+    sweeps, counters = frame_sweeps()
+    now_ns = running(sweeps, 8) if is_known else 8 * PERIOD_NS
+    if not is_known:
+        whole(sweeps, 7, 7 * PERIOD_NS)
+    readings = push(sweeps, 0, 8, now_ns, tick_us=80_000)
+    now_ns += down_ns
+    for again in range(20):
+        tick_us = 80_000 if tick_stuck else 1_000 + 10_000 * again
+        counts = again + 100
+        for row in range(FINGERS):
+            words = b"".join(word(int(count)) for count in truth(counts)[row])
+            faults = ElectrodeFault.HELD if tick_stuck else 0  # as the decoder says
+            readings += sweeps.push(row, again, tick_us, words, faults, now_ns)
+        now_ns += PERIOD_NS
+    for reading in readings:
+        sound = reading.faults == 0
+        fits = [n for n in range(130) if (truth(n)[sound] == reading.counts[sound]).all()]
+        assert fits, "a reading has fingers of two sweeps"
+    assert tick_stuck or not readings[-1].faults.any()
+    assert tick_stuck or counters.restarts + counters.contradicting_frames > 0
+
+
+def test_a_finger_that_was_lacking_for_two_periods_is_of_another_sweep() -> None:
+    sweeps, counters = frame_sweeps()
+    due_ns = running(sweeps, 9)
+    push(sweeps, 0, 9, due_ns)
+    push(sweeps, 1, 9, due_ns)
+    (before,) = push(sweeps, 2, 9, due_ns + 2 * PERIOD_NS + 1)
+    assert (before.faults[2] == MISSING).all()
+    assert not before.faults[:2].any()
+    (after,) = push(sweeps, 0, 10, due_ns + 3 * PERIOD_NS)
+    assert (after.faults[:2] == MISSING).all()
+    assert counters.restarts == 1
+
+
+def test_a_frame_with_the_number_at_hand_and_another_tick_is_dropped() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 2)
+    push(sweeps, 0, 3)
+    assert push(sweeps, 1, 3, tick_us=31_000) == push(sweeps, 1, 3, tick_us=29_000) == []
+    assert push(sweeps, 2, 3) == []
+    (reading,) = push(sweeps, 0, 4)
+    assert (reading.faults[1] == MISSING).all()
+    assert counters.contradicting_frames == 2
+
+
+def test_a_tick_that_runs_backwards_is_a_new_start_and_its_wrap_is_none() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 10, tick_us=(1 << 32) - 5)
+    whole(sweeps, 11, tick_us=(1 << 32) + 9_995)
+    assert counters.restarts == 0
+    (reading,) = whole(sweeps, 14, tick_us=17)
+    assert not reading.faults.any()
+    assert (counters.restarts, counters.missed_readings) == (1, 1)
 
 
 def test_finger_faults_hold_for_all_its_electrodes() -> None:
     sweeps, counters = frame_sweeps()
     words = word(2602) * 24
-    sweeps.push(0, 0, words, ElectrodeFault.MISSING, 0)
-    sweeps.push(1, 0, words, ElectrodeFault.HELD, 0)
-    (reading,) = sweeps.push(2, 0, words, 0, 0)
+    sweeps.push(0, 0, 0, words, ElectrodeFault.MISSING, 0)
+    sweeps.push(1, 0, 0, words, ElectrodeFault.HELD, 0)
+    (reading,) = sweeps.push(2, 0, 0, words, 0, 0)
     assert (reading.faults[0] == ElectrodeFault.MISSING).all()
     assert not reading.counts[0].any()
     assert (reading.faults[1] == ElectrodeFault.HELD).all()

@@ -10,13 +10,7 @@ import pytest
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.biotac import PAC, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE
 from drivers.can_decoders import CanCounters
-from drivers.sweep import (
-    OUTAGE_NS,
-    PERIODS_NEEDED,
-    READING_JITTER_NS,
-    SEQUENCES,
-    SampleSweeps,
-)
+from drivers.sweep import OUTAGE_NS, PERIODS_NEEDED, SEQUENCES, SampleSweeps
 from tests.drivers.can_words import (
     FINGERS,
     SLOT_NS,
@@ -117,22 +111,6 @@ def test_sweeps_lost_as_a_whole_are_found_by_time(sequence: str, lost: int) -> N
     assert counters.faulty_readings == 0
 
 
-@pytest.mark.parametrize("at", [0, 3, 12, 23])
-def test_a_sweeps_worth_of_lost_samples_is_found_by_time(at: int) -> None:
-    """Several sweeps, cut in the middle of one and taken up in the middle of another."""
-    sweeps, counters = assembler()
-    stream = concatenated([samples(n) for n in range(20)])
-    start = 8 * 24 + at
-    readings = feed(sweeps, stream[:start] + stream[start + 6 * 24 :])
-    numbered = {reading.seq: reading for reading in readings}
-    for sweep in (*range(8), *range(15, 20)):
-        assert_true(numbered[sweep], sweep)
-        assert not numbered[sweep].faults.any()
-    for sweep in set(numbered) & {8, 14}:
-        assert_true(numbered[sweep], sweep)
-    assert counters.lost_frames == (24 if at else 0)
-
-
 @pytest.mark.parametrize("at", range(24))
 def test_a_duplicated_sample_is_dropped(at: int) -> None:
     sweeps, counters = assembler()
@@ -215,17 +193,6 @@ def test_an_outage_counts_as_one_missed_reading() -> None:
     assert counters.missed_readings == 1
 
 
-def test_a_stall_of_the_reader_breaks_no_sweep_where_frames_are_stamped_when_read() -> None:
-    sweeps, counters = assembler(jitter_ns=READING_JITTER_NS)
-    stream = concatenated([samples(n) for n in range(20)])
-    stall = slice(15 * 24 + 7, 18 * 24)
-    stalled_ns = stream[stall.stop][2]
-    stream[stall] = [(channel, words, stalled_ns) for channel, words, _ in stream[stall]]
-    readings = feed(sweeps, stream)
-    assert len(readings) == 20
-    assert counters.faulty_readings == 0
-
-
 def test_frames_that_come_in_bursts_make_the_same_readings() -> None:
     sweeps, counters = assembler("interleaved")
     stream = concatenated([samples(n, "interleaved") for n in range(40)])
@@ -236,16 +203,6 @@ def test_frames_that_come_in_bursts_make_the_same_readings() -> None:
     for sweep, reading in enumerate(readings):
         assert_true(reading, sweep)
     assert counters.faulty_readings == counters.missed_readings == 0
-
-
-def test_the_very_next_sample_may_come_late_from_a_sender_that_stalls() -> None:
-    sweeps, counters = assembler()
-    stream = concatenated([samples(n) for n in range(10)])
-    at = 8 * 24 + 5
-    stream[at:] = [(channel, words, t_ns + 15_000_000) for channel, words, t_ns in stream[at:]]
-    readings = feed(sweeps, stream)
-    assert len(readings) == 10
-    assert counters.faulty_readings == 0
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,81 @@
+"""The standard streams of the process, which may be closed, full, broken or not UTF-8."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
+
+FAILED = 1
+
+
+def guarded(command: Callable[[], int]) -> int:
+    """Run a command whose standard output may fail, and return its exit code.
+
+    0 if whoever read the output has gone, as in `graspd replay | head`: nothing is wrong. 1 and
+    one line on stderr if it cannot be written. A failure of anything else is not touched. What
+    the output's encoding lacks is written as an escape sequence.
+    """
+    raw = _take_over()
+    try:
+        try:
+            code = command()
+        except (SystemExit, KeyboardInterrupt):
+            sys.stdout.flush()
+            raise
+        sys.stdout.flush()
+    except OSError as error:
+        if error is not raw.failure:
+            raise
+        _discard(raw)
+        if isinstance(error, BrokenPipeError):
+            return 0
+        sys.stderr.write(f"graspd: cannot write to standard output: {error.strerror}\n")
+        return FAILED
+    return code
+
+
+class _Raw(io.FileIO):
+    """A descriptor that remembers why it could not be written."""
+
+    failure: OSError | None = None
+
+    def write(self, data: ReadableBuffer, /) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            self.failure = error
+            raise
+
+
+def _take_over() -> _Raw:
+    """Put streams of ours in place of `sys.stdout` and, where it is closed, `sys.stderr`."""
+    former = sys.stdout
+    if isinstance(former, io.TextIOWrapper):
+        descriptor = former.fileno()
+        encoding, at_once = former.encoding, former.line_buffering or former.write_through
+    else:
+        # Closed: nothing else may get its descriptor, and writing must fail.
+        descriptor = os.open(os.devnull, os.O_RDONLY)
+        encoding, at_once = "utf-8", False
+    raw = _Raw(descriptor, "wb", closefd=False)
+    sys.stdout = io.TextIOWrapper(
+        io.BufferedWriter(raw), encoding, "backslashreplace", line_buffering=at_once
+    )
+    if not isinstance(sys.stderr, io.TextIOWrapper):
+        sys.stderr = io.TextIOWrapper(
+            io.FileIO(os.open(os.devnull, os.O_WRONLY), "wb"), "utf-8", line_buffering=True
+        )
+    return raw
+
+
+def _discard(raw: _Raw) -> None:
+    """Let go of what is still in the buffer, so that the interpreter does not try it again."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, raw.fileno())
+    os.close(nowhere)

@@ -1,0 +1,178 @@
+"""`graspd data`: what is fetched is right or refused, whatever a server does."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import http.server
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.commands.data import DataError, fetch
+from models.bts3 import TABLES
+from tests.daemon.processes import graspd
+
+
+class QuietHandler(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002, ANN401 - its signature
+        pass
+
+
+@pytest.fixture
+def mirror(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    """A folder served over HTTP on the loopback address."""
+    folder = tmp_path / "mirror"
+    folder.mkdir()
+    handler = functools.partial(QuietHandler, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield folder, f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+        thread.join()
+
+
+def test_data_is_fetched_and_checked(
+    bts3_dir: Path, mirror: tuple[Path, str], tmp_path: Path
+) -> None:
+    folder, address = mirror
+    for table in TABLES:
+        (folder / table.upstream_name).write_bytes((bts3_dir / f"{table.name}.csv").read_bytes())
+    result = graspd("data", "--to", tmp_path / "data", "--url", address)
+    assert result.returncode == 0, result.stderr
+    for table in TABLES:
+        content = (tmp_path / "data" / f"{table.name}.csv").read_bytes()
+        assert hashlib.sha256(content).hexdigest() == table.sha256
+    again = graspd("data", "--to", tmp_path / "data", "--url", "http://127.0.0.1:9")
+    assert again.returncode == 0
+    assert again.stdout.count("is there") == 3
+
+
+def test_data_from_a_folder_is_checked(bts3_dir: Path, tmp_path: Path) -> None:
+    assert graspd("data", "--to", tmp_path, "--from", bts3_dir).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "palm_45.csv",
+        "palm_down.csv",
+        "palm_side.csv",
+    ]
+
+
+def test_data_that_was_changed_is_refused(mirror: tuple[Path, str], tmp_path: Path) -> None:
+    folder, address = mirror
+    (folder / TABLES[0].upstream_name).write_text("object,slipped\n")
+    result = graspd("data", "--to", tmp_path / "data", "--url", address)
+    assert result.returncode == 1
+    assert "SHA-256 differs" in result.stderr
+    assert list((tmp_path / "data").iterdir()) == []
+
+
+def test_data_that_is_not_there_is_said(mirror: tuple[Path, str], tmp_path: Path) -> None:
+    result = graspd("data", "--to", tmp_path / "data", "--url", mirror[1])
+    assert result.returncode == 1
+    assert "404" in result.stderr
+    result = graspd("data", "--to", tmp_path / "data", "--from", tmp_path)
+    assert result.returncode == 1
+    assert "has neither" in result.stderr
+
+
+@contextmanager
+def served(answer: Callable[[socket.socket], None]) -> Iterator[str]:
+    """Address of a server that treats its one client like that."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            client, _ = listener.accept()
+            with client:
+                client.recv(65536)
+                answer(client)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        thread.join()
+
+
+HEAD = b"HTTP/1.1 200 OK\r\n"
+ANSWERS = {
+    "nothing": b"",
+    "no status line": b"SSH-2.0-server\r\n\r\n",
+    "broken chunks": HEAD + b"Transfer-Encoding: chunked\r\n\r\nzz\r\n",
+    "half a chunk": HEAD + b"Transfer-Encoding: chunked\r\n\r\nff\r\nabc",
+    "half a file": HEAD + b"Content-Length: 1000\r\n\r\nabc",
+    "an endless head": HEAD + b"A: b\r\n" * 1000,
+    "a long line": HEAD + b"A" * 100_000,
+    "another address": b"HTTP/1.1 302 Found\r\nLocation: http://[x\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("kind", ANSWERS)
+def test_an_answer_that_is_no_answer_is_one_line(tmp_path: Path, kind: str) -> None:
+    with served(lambda client: client.sendall(ANSWERS[kind])) as address:
+        result = graspd("data", "--to", tmp_path / "data", "--url", address)
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"graspd: {address}/")
+    assert list((tmp_path / "data").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["http://a b", "http://[x", "http://[::1", "http://127.0.0.1:port", "http://", "http://\udcff"],
+)
+def test_an_address_that_is_none_is_one_line(tmp_path: Path, address: str) -> None:
+    result = graspd("data", "--to", tmp_path, "--url", address)
+    assert result.returncode == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("graspd: http:/")
+
+
+@pytest.mark.parametrize("head", [HEAD, HEAD + b"Content-Length: 1000\r\n\r\n"])
+def test_a_server_that_drips_is_given_up(head: bytes) -> None:
+    def drip(client: socket.socket) -> None:
+        client.sendall(head)
+        try:
+            for _ in range(1000):
+                client.sendall(b"a")
+                time.sleep(0.02)
+        except OSError:
+            pass  # given up
+
+    with served(drip) as address:
+        start_s = time.monotonic()
+        with pytest.raises(DataError, match=r"took longer than 0\.3 s; or copy the files"):
+            fetch(address, TABLES[0], limit_s=0.3)
+        assert time.monotonic() - start_s < 5
+
+
+@pytest.mark.parametrize("kind", ["fifo", "folder"])
+def test_what_is_no_file_is_not_replaced(tmp_path: Path, kind: str) -> None:
+    target = tmp_path / f"{TABLES[0].name}.csv"
+    if kind == "fifo":
+        os.mkfifo(target)
+    else:
+        target.mkdir()
+    result = graspd("data", "--to", tmp_path, "--from", tmp_path)
+    assert result.returncode == 1
+    assert result.stderr == f"graspd: {target}: is there and is no regular file\n"
+    assert not target.is_file()
+
+
+def test_a_fifo_in_the_way_of_the_partial_file_is_no_trap(bts3_dir: Path, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / f"{TABLES[0].name}.partial")
+    assert graspd("data", "--to", tmp_path, "--from", bts3_dir).returncode == 0
+    assert len(list(tmp_path.iterdir())) == len(TABLES)
+
+
+def test_a_target_that_is_no_folder_is_said(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    result = graspd("data", "--to", tmp_path / "file", "--from", tmp_path)
+    assert result.returncode == 1
+    assert len(result.stderr.splitlines()) == 1

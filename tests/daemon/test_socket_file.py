@@ -1,0 +1,165 @@
+"""Who may publish at a path, and that nothing else there is ever lost."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon.publisher import Publisher, PublishError
+from daemon.socket_file import SocketFile
+
+
+def dead_socket(path: Path) -> None:
+    """What a killed daemon leaves."""
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(path))
+        listener.listen()
+
+
+def link_to_a_file(path: Path) -> None:
+    path.with_name("kept").write_text("kept")
+    path.symlink_to("kept")
+
+
+OTHERS: dict[str, Callable[[Path], object]] = {
+    "file": lambda path: path.write_text("kept"),
+    "empty file": Path.touch,
+    "folder": Path.mkdir,
+    "fifo": os.mkfifo,
+    "link": link_to_a_file,
+    "link to nothing": lambda path: path.symlink_to("absent"),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_what_is_no_socket_is_left_as_it_is(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "v"
+    OTHERS[kind](path)
+    before = {each.name: each.lstat() for each in tmp_path.iterdir()}
+    with pytest.raises(PublishError, match="v is there and is no socket") as error:
+        Publisher(f"ipc://{path}")
+    assert "\n" not in str(error.value)
+    after = {each.name: each.lstat() for each in tmp_path.iterdir()}
+    assert {name: status.st_ino for name, status in after.items()} == {
+        name: status.st_ino for name, status in before.items()
+    }
+    if kind in ("file", "link"):
+        assert path.read_text() == "kept"
+
+
+@pytest.mark.parametrize("kind", [socket.SOCK_STREAM, socket.SOCK_DGRAM, socket.SOCK_SEQPACKET])
+def test_a_socket_that_somebody_listens_on_is_theirs(tmp_path: Path, kind: int) -> None:
+    path = tmp_path / "v"
+    with socket.socket(socket.AF_UNIX, kind) as theirs:
+        theirs.bind(str(path))
+        if kind != socket.SOCK_DGRAM:
+            theirs.listen(0)
+        with pytest.raises(PublishError, match="v is the socket of another program that runs"):
+            Publisher(f"ipc://{path}")
+        assert [each.name for each in tmp_path.iterdir()] == ["v"]
+
+
+def test_a_socket_with_a_full_queue_is_somebodys(tmp_path: Path) -> None:
+    path = tmp_path / "v"
+    with socket.socket(socket.AF_UNIX) as theirs, socket.socket(socket.AF_UNIX) as client:
+        theirs.bind(str(path))
+        theirs.listen(0)
+        client.connect(str(path))
+        with pytest.raises(PublishError, match="another program"):
+            Publisher(f"ipc://{path}")
+
+
+def test_a_second_graspd_on_the_same_path_is_refused(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint):
+        with pytest.raises(PublishError, match="another graspd"):
+            Publisher(endpoint)
+        assert sorted(each.name for each in tmp_path.iterdir()) == ["v", "v.lock"]
+
+
+def test_a_socket_left_by_a_killed_daemon_is_taken_over(tmp_path: Path) -> None:
+    dead_socket(tmp_path / "v")
+    (tmp_path / "v.lock").touch()
+    with Publisher(f"ipc://{tmp_path}/v"), socket.socket(socket.AF_UNIX) as client:
+        client.connect(str(tmp_path / "v"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_closing_leaves_no_file_and_may_be_repeated(tmp_path: Path) -> None:
+    publisher = Publisher(f"ipc://{tmp_path}/v")
+    assert (tmp_path / "v").is_socket()
+    assert stat.S_IMODE((tmp_path / "v.lock").stat().st_mode) == 0o600
+    publisher.close()
+    publisher.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["file", "socket"])
+def test_closing_leaves_what_was_put_there_meanwhile(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "v"
+    with Publisher(f"ipc://{path}"):
+        path.unlink()
+        if kind == "file":
+            path.write_text("kept")
+        else:
+            dead_socket(path)
+    assert [each.name for each in tmp_path.iterdir()] == ["v"]
+
+
+LOCKS: dict[str, Callable[[Path], object]] = {
+    "link": lambda path: path.symlink_to(path.with_name("target")),
+    "folder": Path.mkdir,
+    "fifo": os.mkfifo,
+    "file with something in it": lambda path: path.write_text("kept"),
+}
+
+
+@pytest.mark.parametrize("kind", LOCKS)
+def test_a_lock_file_that_is_not_ours_is_left_as_it_is(tmp_path: Path, kind: str) -> None:
+    lock = tmp_path / "v.lock"
+    LOCKS[kind](lock)
+    with pytest.raises(PublishError, match="cannot publish on ipc://") as error:
+        Publisher(f"ipc://{tmp_path}/v")
+    assert "\n" not in str(error.value)
+    assert [each.name for each in tmp_path.iterdir()] == ["v.lock"]
+    assert lock.is_symlink() or lock.stat().st_mode
+    if kind.startswith("file"):
+        assert lock.read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    ("path", "says"),
+    [
+        ("absent/v", "No such file or directory"),
+        ("file/v", "Not a directory"),
+        (".", "is there and is no socket"),
+        ("x" * 200, "AF_UNIX path too long"),
+    ],
+)
+def test_a_path_where_no_socket_can_be_is_one_line(tmp_path: Path, path: str, says: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(PublishError, match=says) as error:
+        Publisher(f"ipc://{tmp_path}/{path}")
+    assert "\n" not in str(error.value)
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_folder_that_cannot_be_written_is_one_line() -> None:
+    # Nobody may make files there, not even root.
+    with pytest.raises(PublishError, match=r"cannot publish on ipc:///proc/graspd: \w"):
+        Publisher("ipc:///proc/graspd")
+
+
+def test_a_bind_that_fails_leaves_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_self: SocketFile) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(SocketFile, "_bind", fail)
+    with pytest.raises(PublishError, match="No space left"):
+        Publisher(f"ipc://{tmp_path}/v")
+    assert list(tmp_path.iterdir()) == []
