@@ -60,7 +60,7 @@ def test_a_recording_arrives_count_for_count(frame_format: str, sequence: str) -
     folder = data_dir()
     path = folder / "untouched" / "untouched.csv" if folder is not None else None
     if path is None or not path.exists():
-        pytest.skip("the recording untouched.csv is neither in ../shared/data nor in $GRASPD_DATA")
+        pytest.skip("the recording untouched.csv is not there: set $GRASPD_DATA")
     counts = list(recorded_counts(path))
     assert len(counts) == 977
     link = TwinLink(frame_format, sequence)

@@ -90,7 +90,7 @@ def test_every_count_arrives_over_udp(palm: Palm, can_record: bool) -> None:
 def test_a_real_recording_plays_count_for_count() -> None:
     folder = data_dir()
     if folder is None:
-        pytest.skip("the real recordings are neither in ../shared/data nor in $GRASPD_DATA")
+        pytest.skip("the real recordings are not there: set $GRASPD_DATA")
     recorded = list(recorded_counts(folder / "untouched" / "untouched.csv"))
     twin = PalmTwin(recorded)
     readings = []

@@ -255,7 +255,7 @@ def test_a_hand_sampled_at_100_hz_repeats_two_of_seven_and_the_driver_none() -> 
 def test_the_real_hand_has_the_same_signature() -> None:
     folder = data_dir()
     if folder is None:
-        pytest.skip("the real recordings are neither in ../shared/data nor in $GRASPD_DATA")
+        pytest.skip("the real recordings are not there: set $GRASPD_DATA")
     counts = np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
     for pair in PAIRS[2:-1]:
         stale = (counts[1:, :, pair] == counts[:-1, :, pair]).all(axis=(1, 2))
