@@ -32,6 +32,7 @@ COMMANDS = {
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
 WRONG = 2
+LOGGERS = ("graspd", "daemon", "drivers", "models")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,7 +61,9 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
             module.add_arguments(command)
             run = module.run
     args = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.INFO, format="graspd: %(levelname)s: %(message)s")
+    logging.basicConfig(level=logging.WARNING, format="graspd: %(levelname)s: %(message)s")
+    for ours in LOGGERS:  # libraries speak up only when something is wrong
+        logging.getLogger(ours).setLevel(logging.INFO)
     if run is None:
         parser.error(f"'{args.command}' must come first")
     return functools.partial(run, args)

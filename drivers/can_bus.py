@@ -16,7 +16,6 @@ import re
 import select
 import socket
 import stat
-import struct
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -33,6 +32,7 @@ from drivers.can_frames import (
     CanFrame,
     unpack_frame,
 )
+from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
 
 FRAMES_PER_DRAIN: Final = 512
 """Frames taken at once, some 100 ms of a full bus, so that the loop gets its turn."""
@@ -40,13 +40,6 @@ RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """Asked of the kernel for sockets; the usual 208 KiB hold 60 ms at 4400 frames/s."""
 STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
 """Interfaces of python-can whose time stamps are wall time of the arrival on this host."""
-
-SO_TIMESTAMPNS: Final = 35
-SO_RXQ_OVFL: Final = 40
-"""Socket options of Linux that the socket module does not name (asm-generic/socket.h)."""
-_TIMESPEC: Final = struct.Struct("@ll")
-_DROPS: Final = struct.Struct("@I")
-_ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_DROPS.size)
 
 _OPTIONS: Final[dict[str, dict[str, Any]]] = {
     # Its defaults wait: 2 s after opening, 1 ms in every read.
@@ -193,17 +186,17 @@ class CanBus:
         ahead_ns = now_ns - self._wall_clock()
         for _ in range(FRAMES_PER_DRAIN):
             record, ancillary, _flags, _sender = raw.recvmsg(
-                CANFD_FRAME.size, _ANCILLARY_BYTES, socket.MSG_DONTWAIT
+                CANFD_FRAME.size, ANCILLARY_BYTES, socket.MSG_DONTWAIT
             )
             t_ns = now_ns
             for level, kind, data in ancillary:
                 if level != socket.SOL_SOCKET:
                     continue
-                if kind == SO_TIMESTAMPNS and len(data) == _TIMESPEC.size:
-                    seconds, nanoseconds = _TIMESPEC.unpack(data)
+                if kind == SO_TIMESTAMPNS and len(data) == TIMESPEC.size:
+                    seconds, nanoseconds = TIMESPEC.unpack(data)
                     t_ns = min(seconds * 1_000_000_000 + nanoseconds + ahead_ns, now_ns)
-                elif kind == SO_RXQ_OVFL and len(data) == _DROPS.size:
-                    (total,) = _DROPS.unpack(data)
+                elif kind == SO_RXQ_OVFL and len(data) == DROPS.size:
+                    (total,) = DROPS.unpack(data)
                     self._count_drops(total, frames)
             frame = unpack_frame(record)
             if frame is None:

@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-import struct
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from drivers.base import LinkError
+from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
 
 SCHEME = "udp://"
 RECEIVE_BUFFER_BYTES: Final = 128 * 1024
 """Asked of the kernel, which doubles it: about 0.2 s of palm packets while the loop is away. What
 waits longer is too old to judge, and a full buffer drops the newest."""
 
-_SO_TIMESTAMPNS: Final = 35
-_SO_RXQ_OVFL: Final = 40
-"""Linux numbers (asm-generic/socket.h), which Python's socket module does not name."""
-_TIMESPEC: Final = struct.Struct("@ll")
-_DROPS: Final = struct.Struct("@I")
-_ANCILLARY_BYTES: Final = socket.CMSG_SPACE(_TIMESPEC.size) + socket.CMSG_SPACE(_DROPS.size)
 _NS_PER_S: Final = 1_000_000_000
 
 Sender = tuple[str, int]
@@ -84,8 +78,8 @@ class DatagramReceiver:
         try:
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
             self._socket.bind((endpoint.address, endpoint.port))
         except OSError as error:
             self._socket.close()
@@ -110,7 +104,7 @@ class DatagramReceiver:
         for _ in range(most):
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(
-                    self._bytes_max + 1, _ANCILLARY_BYTES
+                    self._bytes_max + 1, ANCILLARY_BYTES
                 )
             except BlockingIOError:
                 return
@@ -126,9 +120,9 @@ class DatagramReceiver:
         for level, kind, value in ancillary:
             if level != socket.SOL_SOCKET:
                 continue
-            if kind == _SO_TIMESTAMPNS and len(value) == _TIMESPEC.size:
-                seconds, rest_ns = _TIMESPEC.unpack(value)
+            if kind == SO_TIMESTAMPNS and len(value) == TIMESPEC.size:
+                seconds, rest_ns = TIMESPEC.unpack(value)
                 age_ns = max(0, time.time_ns() - seconds * _NS_PER_S - rest_ns)
-            elif kind == _SO_RXQ_OVFL and len(value) == _DROPS.size:
-                (self.dropped,) = _DROPS.unpack(value)
+            elif kind == SO_RXQ_OVFL and len(value) == DROPS.size:
+                (self.dropped,) = DROPS.unpack(value)
         return age_ns

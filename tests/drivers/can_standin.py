@@ -12,9 +12,9 @@ import pytest
 
 from drivers.base import Reading, TactileReading
 from drivers.can_bridge import CanBridgeDriver
-from drivers.can_bus import SO_TIMESTAMPNS
 from drivers.can_formats import encode_sample
 from drivers.can_frames import CanFrame, pack_frame
+from drivers.kernel_stamps import SO_TIMESTAMPNS
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps import Counts, GeneratedContact

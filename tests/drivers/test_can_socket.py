@@ -15,9 +15,9 @@ from drivers.can_bridge import (
     REST_MAX_NS,
     CanBridgeDriver,
 )
-from drivers.can_bus import SO_RXQ_OVFL
 from drivers.can_formats import CanFormat
 from drivers.can_frames import CanFrame, FrameFlag, pack_frame
+from drivers.kernel_stamps import SO_RXQ_OVFL
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from tests.drivers.can_standin import (

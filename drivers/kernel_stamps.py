@@ -1,0 +1,17 @@
+"""What the kernel tells beside a received datagram or frame: when it came, how many were lost."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from typing import Final
+
+SO_TIMESTAMPNS: Final = 35
+SO_RXQ_OVFL: Final = 40
+"""Socket options of Linux that the socket module does not name (asm-generic/socket.h)."""
+TIMESPEC: Final = struct.Struct("@ll")
+"""Ancillary data of `SO_TIMESTAMPNS`: wall time, seconds and ns."""
+DROPS: Final = struct.Struct("@I")
+"""Ancillary data of `SO_RXQ_OVFL`: dropped since the socket was opened, wrapping at 2**32."""
+ANCILLARY_BYTES: Final = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(DROPS.size)
+"""Room for both."""
