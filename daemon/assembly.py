@@ -20,9 +20,10 @@ from daemon.scene import (
 )
 from drivers.base import Driver, DriverError, LinkError
 from models import zoo
+from models.contract import ModelError
 from models.runtime import TactileModel
 
-DEFAULT_MODEL = "cnn1"
+DEFAULT_MODEL = "small-session"
 
 Clock = Callable[[], int]
 """Gives monotonic ns."""
@@ -40,10 +41,41 @@ def load_model(scene: Scene) -> TactileModel:
     return TactileModel(model_path(scene))
 
 
-def build_pipeline(scene: Scene, model: TactileModel, clock: Clock = time.monotonic_ns) -> Pipeline:
-    """The judge of this scene. Raises `ModelError` if the model does not fit the hand."""
-    limits = Limits(max_age_ns=scene.max_age_ns, slip_threshold=scene.model.slip_threshold)
-    return Pipeline(model, scene.hand.fingers, limits, clock)
+def build_pipeline(
+    scene: Scene,
+    model: TactileModel,
+    clock: Clock = time.monotonic_ns,
+    *,
+    learns: bool = True,
+) -> Pipeline:
+    """The judge of this scene, whose session `learns` from the grasps or stays what it is.
+
+    Raises `ModelError` if the model does not fit the hand or never is right as often as wanted.
+    """
+    limits = Limits(
+        max_age_ns=scene.max_age_ns,
+        slip_threshold=scene.model.slip_threshold,
+        min_confidence=min_confidence(model, scene.model.min_accuracy),
+    )
+    return Pipeline(model, scene.hand.fingers, limits, clock, learns=learns)
+
+
+def min_confidence(model: TactileModel, min_accuracy: float | None) -> float:
+    """From which confidence on the model's verdicts are right as often as wanted; 0 for None.
+
+    By the accuracy-coverage curve of its contract, measured on objects that were left out. Raises
+    `ModelError` if they never are.
+    """
+    if min_accuracy is None:
+        return 0.0
+    reached = [step for step in model.contract.confidence if step.accuracy >= min_accuracy]
+    if not reached:
+        best = max((step.accuracy for step in model.contract.confidence), default=0.0)
+        raise ModelError(
+            f"{model.path}: model.min_accuracy {min_accuracy:g} is more than the model reaches, "
+            f"{best:.3f} at best"
+        )
+    return min(step.confidence for step in reached)
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:

@@ -27,7 +27,10 @@ COMMANDS = {
     "twin": ("daemon.commands.twin", "stand in for a bridge, a CAN board or a palm"),
     "data": ("daemon.commands.data", "get the real grasp recordings"),
     "schema": ("daemon.commands.schema", "print the JSON Schema of the messages"),
+    "models": ("daemon.commands.models", "list the models and show their cards"),
+    "session": ("daemon.commands.session", "show, reset or seed what is known of the sensors"),
     "train": ("models.training.command", "train and export a model (extra: train)"),
+    "evaluate": ("models.training.evaluate", "measure how good systems are (extra: train)"),
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
@@ -74,7 +77,7 @@ def _load(command: str, module: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
-        if command != "train" or package in {"daemon", "drivers", "models"}:
+        if not module.startswith("models.training.") or package in {"daemon", "drivers", "models"}:
             raise
         sys.stderr.write(
             f"graspd: {command} needs the package '{package}': run pip install '.[train]' in the "

@@ -6,6 +6,7 @@ import json
 import sys
 import time
 
+from daemon.judge.pipeline import Judgement
 from daemon.judge.verdict import Verdict
 from daemon.summary import Summary
 from daemon.text import printable
@@ -36,6 +37,12 @@ class Printer:
         sys.stdout.write(line + "\n")
         if self._prompt:
             sys.stdout.flush()
+
+    def without_session(self, judgement: Judgement, reading: TactileReading) -> None:
+        """Count what would have been judged without session calibration."""
+        annotation = reading.annotation
+        slipped = annotation.slipped if annotation else None
+        self._summary.without_session.add(judgement.outcome, judgement.reasons, slipped)
 
     def summary(self) -> None:
         """Write the summary of everything since the start."""

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import Protocol
 
 from daemon.judge.pipeline import Judgement
+from daemon.judge.session import SessionCalibration
 from daemon.judge.verdict import (
     OUTCOME_CODE,
     Outcome,
@@ -48,6 +49,7 @@ class Reporter:
         self.latency = LatencyHistogram()
         self.outcomes: Counter[Outcome] = Counter()
         self.reasons: Counter[Reason] = Counter()
+        self._repaired: Counter[str] = Counter()
         self._verdict_topic = f"verdict.{hand}".encode()
         self._status_topic = f"status.{hand}".encode()
         self._model = model
@@ -87,6 +89,8 @@ class Reporter:
             reasons=list(judgement.reasons),
             age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
             latency_us=latency_us,
+            repaired=list(judgement.repaired),
+            session_calibrated=judgement.session_calibrated,
             silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
@@ -98,9 +102,16 @@ class Reporter:
         self.latency.add(latency_us)
         self.outcomes[judgement.outcome] += 1
         self.reasons.update(judgement.reasons)
+        self._repaired.update(judgement.repaired)
         return message, payload
 
-    def status(self, state: State, readings_hz: float, drivers: dict[str, dict[str, int]]) -> None:
+    def status(
+        self,
+        state: State,
+        readings_hz: float,
+        drivers: dict[str, dict[str, int]],
+        session: SessionCalibration | None = None,
+    ) -> None:
         """Send one status message."""
         message = Status(
             boot_id=self._boot_id,
@@ -112,6 +123,9 @@ class Reporter:
             verdicts={outcome: self.outcomes[outcome] for outcome in Outcome},
             reasons=dict(self.reasons),
             drivers=drivers,
+            repaired=dict(self._repaired),
+            session_grasps=None if session is None else session.grasps,
+            session_calibrated=None if session is None else session.calibrated,
             latency_us={
                 "p50": self.latency.quantile_us(0.5),
                 "p99": self.latency.quantile_us(0.99),

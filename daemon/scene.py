@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ipaddress
 import os
-import re
 import stat
 import tomllib
 from collections.abc import Mapping
@@ -22,6 +21,7 @@ from pydantic import (
     model_validator,
 )
 
+from daemon.endpoint import check_endpoint
 from daemon.scene_errors import MESSAGE_MAX, lines_of
 from daemon.text import printable
 from drivers.base import COUNT_MAX, ELECTRODES
@@ -43,8 +43,10 @@ FilePath = Annotated[Path, Field(strict=False), AfterValidator(_without_nul)]
 
 SCENE_MAX_BYTES = 1 << 20
 """A scene has a kilobyte; a larger file was named by mistake."""
-IPC_PATH_MAX_BYTES = 107
-"""Longest path of a Unix socket on Linux (sun_path, less the closing NUL)."""
+
+
+STATE_DIRECTORY = Path("/var/lib/graspd")
+"""Where a service keeps its state (file-hierarchy(7))."""
 
 
 class SceneError(Exception):
@@ -233,6 +235,8 @@ class Model(Section):
     """A model file of your own, relative to the scene file."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """`p_slip` from here on is slip."""
+    min_accuracy: Annotated[float, Field(gt=0.5, lt=1.0)] | None = None
+    """Verdicts must be right this often, by the model's card; less sure ones become `unknown`."""
 
     @field_validator("path")
     @classmethod
@@ -245,6 +249,25 @@ class Model(Section):
         if self.name is not None and self.path is not None:
             raise ValueError("give either name or path, not both")
         return self
+
+
+class Session(Section):
+    """`[session]`: where a session model keeps what it knows of today's sensors."""
+
+    keep: bool | None = None
+    """False: begin a new session at every start, and write nothing. Unless given, kept for live
+    sensors and not for recordings."""
+    learn: bool | None = None
+    """Whether every reading counts as a grasp of the session. Unless given, yes for recordings, and
+    no for live sensors: most of their readings are of an open hand, so seed the session instead."""
+    file: FilePath | None = None
+    """`/var/lib/graspd/<hand>.session.json` unless given; relative to the scene file."""
+
+    @field_validator("file")
+    @classmethod
+    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        base: Path = (info.context or {}).get("base", Path())
+        return None if path is None else base / path
 
 
 class Gate(Section):
@@ -279,6 +302,7 @@ class Scene(Section):
     tactile: Tactile
     joints: Joints | None = None
     model: Model = Model()
+    session: Session = Session()
     gate: Gate = Gate()
     publish: Publish = Publish()
 
@@ -307,38 +331,28 @@ class Scene(Section):
         return self.publish.endpoint or f"ipc:///run/graspd/{self.hand.name}.ipc"
 
     @property
+    def session_path(self) -> Path:
+        """Where the session is kept."""
+        return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
+
+    @property
+    def keeps_session(self) -> bool:
+        """Whether the session outlives the daemon."""
+        if self.session.keep is None:
+            return not isinstance(self.tactile, ReplayTactile)
+        return self.session.keep
+
+    @property
+    def session_learns(self) -> bool:
+        """Whether readings are taken into the session."""
+        if self.session.learn is None:
+            return isinstance(self.tactile, ReplayTactile)
+        return self.session.learn
+
+    @property
     def max_age_ns(self) -> int:
         """Age limit of a reading, ns."""
         return round(self.gate.max_age_ms * 1e6)
-
-
-def check_endpoint(endpoint: str) -> None:
-    """Raise ValueError unless ZeroMQ can bind here and only this computer can connect."""
-    scheme, separator, address = endpoint.partition("://")
-    if not separator or scheme not in {"ipc", "tcp"}:
-        raise ValueError("must start with ipc:// or tcp://")
-    _without_nul(endpoint)
-    if scheme == "tcp":
-        _check_tcp(address)
-    elif address in {"", "@"} or len(address.encode()) > IPC_PATH_MAX_BYTES:
-        raise ValueError(f"needs a path of 1 to {IPC_PATH_MAX_BYTES} bytes after ipc://")
-    elif address.startswith("*"):
-        raise ValueError("needs a path that subscribers can know, not '*'")
-
-
-def _check_tcp(address: str) -> None:
-    host, _, port = address.rpartition(":")
-    if not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
-        raise ValueError("needs a port of 1 to 65535, as in tcp://127.0.0.1:5555")
-    try:
-        if host.startswith("[") and host.endswith("]"):
-            loopback = ipaddress.IPv6Address(host[1:-1]) == ipaddress.IPv6Address("::1")
-        else:
-            loopback = ipaddress.IPv4Address(host).is_loopback
-    except ValueError:
-        raise ValueError(f"needs an IP address, 127.0.0.1 or [::1], not '{host}'") from None
-    if not loopback:
-        raise ValueError(f"{host} is not a loopback address; anyone could listen")
 
 
 def load(path: Path) -> Scene:

@@ -34,15 +34,20 @@ class Service:
         *,
         max_age_ns: int,
         listener: Listener | None = None,
+        chore: Callable[[], None] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns."""
+        """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
+
+        `chore` is done once a second, before each status.
+        """
         self._drivers = drivers
         self._tactile = drivers[0]
         self._pipeline = pipeline
         self._reporter = reporter
         self._stop = stop
         self._listener = listener
+        self._chore = chore
         self._clock = clock
         self._max_age_ns = max_age_ns
         self._state = State.RUNNING
@@ -119,12 +124,15 @@ class Service:
         return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
 
     def _send_status(self) -> None:
+        if self._chore is not None:
+            self._chore()
         now_ns = self._clock()
         elapsed_s = max(now_ns - self._status_at_ns, 1) / 1e9
         self._reporter.status(
             self._state,
             self._readings_since_status / elapsed_s,
             {driver.name: driver.counters.as_dict() for driver in self._drivers},
+            self._pipeline.session,
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from daemon.judge.verdict import Outcome, Reason, Verdict
 from daemon.latency import LatencyHistogram
 
 
-class Summary:
-    """Collects verdicts in constant memory. Slip is the positive class, as in the paper."""
+class Tally:
+    """Outcomes, their reasons, and how they compare with how the lifts ended."""
 
     def __init__(self) -> None:
         self.outcomes: Counter[Outcome] = Counter()
@@ -18,22 +19,20 @@ class Summary:
         self.confusion: Counter[tuple[bool, bool]] = Counter()
         """(recorded slip, judged slip) of the judged grasps whose outcome was recorded."""
         self.labelled = 0
-        self.latency = LatencyHistogram()
 
-    def add(self, verdict: Verdict, slipped: bool | None) -> None:
+    def add(self, outcome: Outcome, reasons: Iterable[Reason], slipped: bool | None) -> None:
         """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
-        self.outcomes[verdict.verdict] += 1
-        self.reasons.update(verdict.reasons)
-        self.latency.add(verdict.latency_us)
+        self.outcomes[outcome] += 1
+        self.reasons.update(reasons)
         if slipped is not None:
             self.labelled += 1
-            if verdict.valid:
-                self.confusion[slipped, verdict.verdict is Outcome.SLIP] += 1
+            if outcome is not Outcome.UNKNOWN:
+                self.confusion[slipped, outcome is Outcome.SLIP] += 1
 
     def scores(self) -> dict[str, float] | None:
         """Accuracy, precision, recall and F1 over judged, labelled grasps; None if there are none.
 
-        A score whose denominator is zero is left out.
+        Slip is the positive class, as in the paper. A score whose denominator is zero is left out.
         """
         hit, miss = self.confusion[True, True], self.confusion[True, False]
         false_alarm, rest = self.confusion[False, True], self.confusion[False, False]
@@ -48,14 +47,57 @@ class Summary:
         }
         return {name: part / whole for name, (part, whole) in fractions.items() if whole}
 
-    def as_dict(self, wall_s: float) -> dict[str, Any]:
-        """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""
+    def as_dict(self) -> dict[str, Any]:
+        """Everything as JSON-ready values."""
         return {
             "verdicts": {outcome.value: self.outcomes[outcome] for outcome in Outcome},
             "reasons": {reason.value: number for reason, number in self.reasons.items()},
             "labelled": self.labelled,
             "judged_and_labelled": self.confusion.total(),
             "scores": self.scores(),
+        }
+
+    def counts(self) -> str:
+        """How often each outcome came, for people."""
+        return ", ".join(f"{self.outcomes[outcome]} {outcome}" for outcome in Outcome)
+
+    def lines(self) -> Iterator[str]:
+        """Reasons and scores, for people."""
+        if self.reasons:
+            given = ", ".join(f"{number} {reason}" for reason, number in self.reasons.most_common())
+            yield f"unknown because: {given}"
+        scores = self.scores()
+        if scores is not None:
+            yield (
+                f"against {self.confusion.total()} recorded outcomes (slip positive): "
+                + ", ".join(f"{name} {100 * value:.1f} %" for name, value in scores.items())
+            )
+
+
+class Summary:
+    """Collects verdicts in constant memory."""
+
+    def __init__(self) -> None:
+        self.tally = Tally()
+        self.without_session = Tally()
+        """The same readings without session calibration; empty where that was not tried."""
+        self.repaired = 0
+        """Verdicts made with at least one repaired electrode."""
+        self.latency = LatencyHistogram()
+
+    def add(self, verdict: Verdict, slipped: bool | None) -> None:
+        """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
+        self.tally.add(verdict.verdict, verdict.reasons, slipped)
+        self.repaired += verdict.valid and bool(verdict.repaired)
+        self.latency.add(verdict.latency_us)
+
+    def as_dict(self, wall_s: float) -> dict[str, Any]:
+        """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""
+        compared = bool(self.without_session.outcomes)
+        return {
+            **self.tally.as_dict(),
+            "repaired": self.repaired,
+            "without_session": self.without_session.as_dict() if compared else None,
             "latency_us": {
                 "p50": self.latency.quantile_us(0.5),
                 "p99": self.latency.quantile_us(0.99),
@@ -66,18 +108,13 @@ class Summary:
 
     def lines(self, wall_s: float) -> list[str]:
         """The same for people."""
-        total = self.outcomes.total()
-        counts = ", ".join(f"{self.outcomes[outcome]} {outcome}" for outcome in Outcome)
-        lines = [f"{total} verdicts in {wall_s:.2f} s: {counts}"]
-        if self.reasons:
-            given = ", ".join(f"{number} {reason}" for reason, number in self.reasons.most_common())
-            lines.append(f"unknown because: {given}")
-        scores = self.scores()
-        if scores is not None:
-            lines.append(
-                f"against {self.confusion.total()} recorded outcomes (slip positive): "
-                + ", ".join(f"{name} {100 * value:.1f} %" for name, value in scores.items())
-            )
+        total = self.tally.outcomes.total()
+        lines = [f"{total} verdicts in {wall_s:.2f} s: {self.tally.counts()}", *self.tally.lines()]
+        if self.repaired:
+            lines.append(f"{self.repaired} of them with repaired electrodes")
+        if self.without_session.outcomes:
+            lines.append(f"without session calibration: {self.without_session.counts()}")
+            lines += [f"  {line}" for line in self.without_session.lines()]
         lines.append(
             f"reading to verdict: p50 {self.latency.quantile_us(0.5):.0f} us, "
             f"p99 {self.latency.quantile_us(0.99):.0f} us, max {self.latency.max_us:.0f} us"

@@ -127,6 +127,10 @@ class Driver(Protocol):
     def period_ns(self) -> int | None:
         """Nominal time between tactile readings, ns, or None while it is not known."""
 
+    @property
+    def serials(self) -> dict[str, str]:
+        """Serial number of each finger's sensor, by finger, as far as they are known by now."""
+
     def describe(self) -> dict[str, str]:
         """What is known about the device, for people: versions, serials, why a link is down."""
 

@@ -138,6 +138,11 @@ class CanBridgeDriver:
         """Time between readings, ns, as measured; None until it is known."""
         return self._decoder.period_ns
 
+    @property
+    def serials(self) -> dict[str, str]:
+        """No frame carries them."""
+        return {}
+
     def describe(self) -> dict[str, str]:
         """Bus, link, and how much it brings, for people."""
         known = {"bus": self._where, "link": str(self._link.state)}

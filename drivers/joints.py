@@ -76,6 +76,11 @@ class JointStreamDriver:
         """The port that is listened on, or None."""
         return None if self._link is None else self._link.port
 
+    @property
+    def serials(self) -> dict[str, str]:
+        """There are no tactile sensors."""
+        return {}
+
     def describe(self) -> dict[str, str]:
         """Source, link, who is heard; after `close` as it was then."""
         return self._described if self._link is None else self._link.describe()

@@ -138,6 +138,11 @@ class PalmDriver:
         """The port that is listened on, or None."""
         return None if self._link is None else self._link.port
 
+    @property
+    def serials(self) -> dict[str, str]:
+        """The palm does not pass them on in its samples."""
+        return {}
+
     def describe(self) -> dict[str, str]:
         """Source, link, which palm is heard from whom; after `close` as it was then."""
         if self._link is not None:

@@ -129,6 +129,11 @@ class ReplayDriver:
         self._seq = 0
         self._released = 0
 
+    @property
+    def serials(self) -> dict[str, str]:
+        """A recording does not tell."""
+        return {}
+
     def describe(self) -> dict[str, str]:
         """Which recordings are played."""
         return {"recordings": ", ".join(map(str, self._paths))}

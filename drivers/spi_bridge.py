@@ -94,6 +94,7 @@ class SpiBridgeDriver:
         if baud < 1:
             raise ValueError(f"baud is {baud}, must be positive")
         self._sensors = tuple(map(list(sensors).index, fingers))
+        self._fingers = tuple(fingers)
         self._clock = clock
         self._line = SerialLine(port, baud)
         self._nonce = clock() % NONCES
@@ -145,6 +146,15 @@ class SpiBridgeDriver:
         counters.bad_cobs, counters.bad_crc = frames.bad_cobs, frames.bad_crc
         counters.too_long, counters.link_losses = frames.too_long, self._link.losses
         return counters
+
+    @property
+    def serials(self) -> dict[str, str]:
+        """By finger, from the last HELLO; without the sensors that did not answer."""
+        if self.hello is None:
+            return {}
+        found = self.hello.serials
+        known = zip(self._fingers, self._sensors, strict=True)
+        return {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
     def describe(self) -> dict[str, str]:
         """Port, link, and what the bridge last said of itself, for people."""

@@ -16,8 +16,9 @@ from models.layout import ELECTRODES
 METADATA_KEY = "graspd"
 CLASSES = ("stable", "slip")
 """Order of the two probabilities that every model returns."""
-INPUT_NAME = "tactile_image"
 OUTPUT_NAME = "probability"
+FEATURES_PER_FINGER = ELECTRODES + 2
+"""Of a session model: 24 z-values, the finger's mean and its spread."""
 
 Finger = Literal["ff", "mf", "rf", "lf", "th"]
 """First, middle, ring, little finger, thumb."""
@@ -38,10 +39,13 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Error of the training recipe, measured on data that was left out. Slip is positive."""
+    """Error of the training recipe, measured on data that was left out. Slip is positive.
+
+    Mean and standard deviation over the folds.
+    """
 
     protocol: str
-    """`cv`: stratified cross-validation, mean and standard deviation over the folds."""
+    """`cv`: known objects; `unknown`, `objects`: others; `session`: others on another day."""
     folds: int
     f1_mean: Fraction
     f1_std: Fraction
@@ -67,21 +71,85 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A reading with a larger root-mean-square whitened deviation was never seen."""
 
 
-class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that must agree between a model and whoever feeds it."""
+class ImageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="image"):
+    """The model takes tactile images."""
 
-    version: Literal[1]
-    name: str
     layout: str
     fill: str
     normalisation: str
-    composition: Literal["channels"]
+    composition: Literal["channels", "horizontal", "vertical"]
+    """How the fingers' images stand together (paper, section II-C)."""
+
+
+class VectorInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="vector"):
+    """The model takes the counts, z-scored per finger over its 24 electrodes."""
+
+
+class CountsInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="counts"):
+    """The model takes the counts as they are: whatever is done to them is inside its graph."""
+
+
+class Sharpness(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How far a verdict may be trusted while a session is young."""
+
+    grasps: Annotated[float, msgspec.Meta(ge=0.0)]
+    """From so many grasps' worth of statistics on."""
+    temperature: Annotated[float, msgspec.Meta(gt=0.0)]
+    """The margin (log-odds of slip) is divided by this; as measured on a session left out."""
+
+
+class SessionInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="session"):
+    """The model takes features standardised by the session's own, unlabelled grasps.
+
+    Features, 26 per finger: first every finger's 24 z-values, then every finger's mean, then every
+    finger's spread, counts. What the session has not shown yet is filled in by the training's
+    statistics, which weigh `prior_grasps` grasps.
+    """
+
+    mean: tuple[float, ...]
+    """Training mean of each feature."""
+    spread: tuple[Annotated[float, msgspec.Meta(gt=0.0)], ...]
+    """Training standard deviation of each feature, within a session."""
+    clip: Annotated[float, msgspec.Meta(gt=0.0)]
+    """Standardised features are clipped to +- this."""
+    prior_grasps: Annotated[float, msgspec.Meta(gt=0.0)]
+    """Weight of the training's statistics, grasps."""
+    calibrated_from: Annotated[float, msgspec.Meta(ge=0.0)]
+    """Grasps' worth of statistics from which on the session counts as calibrated."""
+    sharpness: tuple[Sharpness, ...]
+    """Ascending in `grasps`, from 0."""
+
+
+Input = ImageInput | VectorInput | CountsInput | SessionInput
+"""What a model is fed with; in JSON told apart by `type`."""
+
+
+class ConfidenceStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One point of the accuracy-coverage curve, measured on data that was left out."""
+
+    confidence: Fraction
+    """Judging only where max(p_slip, 1 - p_slip) reaches this ..."""
+    accuracy: Fraction
+    """... so many verdicts were right ..."""
+    coverage: Fraction
+    """... and so many grasps were judged."""
+
+
+class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Everything that must agree between a model and whoever feeds it."""
+
+    version: Literal[2]
+    name: str
+    input: Input
     fingers: tuple[Finger, ...]
-    """Order of the image's channels."""
+    """Order of the fingers in the input."""
     classes: tuple[str, ...]
     seed: int
     datasets: tuple[Dataset, ...]
-    measured: MeasuredError
+    measured: tuple[MeasuredError, ...]
+    """By protocol; at least one."""
+    confidence: tuple[ConfidenceStep, ...]
+    """Ascending in `confidence`; empty if it was not measured."""
     seen: SeenCounts
 
     def to_json(self) -> str:
@@ -111,9 +179,24 @@ def _check(contract: ModelContract) -> None:
             raise ModelError("model contract is wrong: seen counts are not (fingers, 24)")
     if [len(row) for row in seen.whitening] != list(range(1, ELECTRODES * len(fingers) + 1)):
         raise ModelError("model contract is wrong: whitening is not a triangle over all electrodes")
+    if any(row[-1] <= 0.0 for row in seen.whitening):
+        raise ModelError("model contract is wrong: whitening has no inverse")
+    if not contract.measured:
+        raise ModelError("model contract is wrong: states no measured error")
+    if isinstance(contract.input, SessionInput):
+        _check_session(contract.input, len(fingers))
     if any(
         low > high
         for rows in zip(seen.low, seen.high, strict=True)
         for low, high in zip(*rows, strict=True)
     ):
         raise ModelError("model contract is wrong: a lowest count is above the highest")
+
+
+def _check_session(session: SessionInput, fingers: int) -> None:
+    width = fingers * FEATURES_PER_FINGER
+    if not len(session.mean) == len(session.spread) == width:
+        raise ModelError(f"model contract is wrong: session statistics are not of {width} features")
+    starts = [step.grasps for step in session.sharpness]
+    if not starts or starts[0] != 0.0 or starts != sorted(set(starts)):
+        raise ModelError("model contract is wrong: sharpness does not ascend from 0 grasps")

@@ -1,4 +1,4 @@
-"""Loading an ONNX model and running it on one tactile image, with nothing allocated per run."""
+"""Loading an ONNX model and running it on one reading, with nothing allocated per run."""
 
 from __future__ import annotations
 
@@ -11,14 +11,12 @@ import onnxruntime as ort
 from numpy.typing import NDArray
 
 from models.contract import (
-    INPUT_NAME,
     METADATA_KEY,
     OUTPUT_NAME,
     ModelContract,
     ModelError,
 )
-from models.layout import LAYOUTS
-from models.tactile_image import Fill, Normalisation, TactileImager
+from models.inputs import InputBuilder, builder
 
 MAX_MODEL_BYTES = 256 * 2**20
 """A larger file is no model of this kind: the published CNN1 has 12 MB."""
@@ -29,8 +27,8 @@ WARM_UP_RUNS = 20
 class TactileModel:
     """One model, loaded and warm, with its input and output bound to fixed buffers.
 
-    Write an image into `image` (shape (12, 11, fingers) for D1, float32) with `imager.build`, then
-    call `run`.
+    Write an input into `input` (float32, shape `inputs.shape`) with `inputs.build`, then call
+    `run`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -40,14 +38,14 @@ class TactileModel:
         self.sha256 = hashlib.sha256(data).hexdigest()
         self._session = _session(path, data)
         self.contract = _contract(path, self._session)
-        self.imager = _imager(path, self.contract)
-        _check_signature(path, self._session, self.imager.shape)
-        self._batch = np.zeros((1, *self.imager.shape), dtype=np.float32)
-        self.image: NDArray[np.float32] = self._batch[0]
+        self.inputs = _inputs(path, self.contract)
+        _check_signature(path, self._session, self.inputs)
+        self._batch = np.zeros((1, *self.inputs.shape), dtype=np.float32)
+        self.input: NDArray[np.float32] = self._batch[0]
         self._probability = np.zeros((1, 2), dtype=np.float32)
         self._binding = self._session.io_binding()
         self._binding.bind_input(
-            INPUT_NAME, "cpu", 0, np.float32, self._batch.shape, self._batch.ctypes.data
+            self.inputs.name, "cpu", 0, np.float32, self._batch.shape, self._batch.ctypes.data
         )
         self._binding.bind_output(
             OUTPUT_NAME, "cpu", 0, np.float32, (1, 2), self._probability.ctypes.data
@@ -56,7 +54,7 @@ class TactileModel:
             self.run()
 
     def run(self) -> tuple[float, float]:
-        """Probabilities (stable, slip) of the image in `image`. Raises `ModelError`."""
+        """Probabilities (stable, slip) of what is in `input`. Raises `ModelError`."""
         try:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's exceptions share no narrower base
@@ -106,27 +104,26 @@ def _contract(path: Path, session: ort.InferenceSession) -> ModelContract:
         raise ModelError(f"{path}: {error}") from error
 
 
-def _imager(path: Path, contract: ModelContract) -> TactileImager:
+def _inputs(path: Path, contract: ModelContract) -> InputBuilder:
     try:
-        layout = LAYOUTS[contract.layout]
-        fill = Fill(contract.fill)
-        normalisation = Normalisation(contract.normalisation)
-    except (KeyError, ValueError) as error:
-        raise ModelError(f"{path}: asks for an image that is not known: {error}") from error
-    return TactileImager(len(contract.fingers), layout, fill, normalisation)
+        return builder(contract.input, len(contract.fingers))
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
 
 
-def _check_signature(path: Path, session: ort.InferenceSession, shape: tuple[int, ...]) -> None:
+def _check_signature(path: Path, session: ort.InferenceSession, wanted: InputBuilder) -> None:
     inputs = {node.name: node for node in session.get_inputs()}
     outputs = {node.name: node for node in session.get_outputs()}
-    if set(inputs) != {INPUT_NAME} or OUTPUT_NAME not in outputs:
+    if set(inputs) != {wanted.name} or OUTPUT_NAME not in outputs:
         raise ModelError(
             f"{path}: has inputs {sorted(inputs)} and outputs {sorted(outputs)}, "
-            f"not {INPUT_NAME} and {OUTPUT_NAME}"
+            f"not {wanted.name} and {OUTPUT_NAME}"
         )
-    node = inputs[INPUT_NAME]
-    if node.type != "tensor(float)" or tuple(node.shape[1:]) != shape:
-        raise ModelError(f"{path}: takes {node.type} {node.shape}, its contract says {shape}")
+    node = inputs[wanted.name]
+    if node.type != "tensor(float)" or tuple(node.shape[1:]) != wanted.shape:
+        raise ModelError(
+            f"{path}: takes {node.type} {node.shape}, its contract says {wanted.shape}"
+        )
     node = outputs[OUTPUT_NAME]
     if node.type != "tensor(float)" or tuple(node.shape[1:]) != (2,):
         raise ModelError(f"{path}: returns {node.type} {node.shape}, not float (N, 2)")

@@ -17,18 +17,19 @@ class SeenCheck:
     """
 
     def __init__(self, seen: SeenCounts) -> None:
-        self._low = np.array(seen.low, dtype=np.int32) - seen.margin
-        self._high = np.array(seen.high, dtype=np.int32) + seen.margin
+        self._low = np.array(seen.low, dtype=np.float64) - seen.margin
+        self._high = np.array(seen.high, dtype=np.float64) + seen.margin
         self._centre = np.array(seen.centre).ravel()
         size = len(self._centre)
         self._whitening = np.zeros((size, size))
         self._whitening[np.tril_indices(size)] = [value for row in seen.whitening for value in row]
         self._square_max = seen.distance_max**2 * size
 
-    def never_seen(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    def never_seen(self, counts: NDArray[np.generic]) -> NDArray[np.bool_]:
         """Shape (N,): True for each of the counts (N, fingers, 24) that was never seen."""
-        outside = ((counts < self._low) | (counts > self._high)).any(axis=(1, 2))
-        deviations = (counts.reshape(len(counts), -1) - self._centre) @ self._whitening
+        values = counts.astype(np.float64)
+        outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
+        deviations = (values.reshape(len(values), -1) - self._centre) @ self._whitening
         squares: NDArray[np.float64] = np.einsum("ne,ne->n", deviations, deviations)
         # Not (square <= limit), so that a value that is not finite counts as never seen.
         never: NDArray[np.bool_] = outside | ~(squares <= self._square_max)

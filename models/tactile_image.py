@@ -37,6 +37,17 @@ class Normalisation(StrEnum):
     """The 24 electrodes: what the paper says (section II-B)."""
 
 
+class Composition(StrEnum):
+    """How the images of the fingers stand together (paper, section II-C)."""
+
+    CHANNELS = "channels"
+    """One behind the other: height x width x fingers."""
+    HORIZONTAL = "horizontal"
+    """Side by side: height x (fingers * width) x 1."""
+    VERTICAL = "vertical"
+    """Below one another: (fingers * height) x width x 1."""
+
+
 def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
     """Linear part of the filling: shape (pixels, 25), pixels in row-major order.
 
@@ -61,11 +72,13 @@ def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
 
 
 class TactileImager:
-    """Builds normalised tactile images, fingers as channels, without allocating per reading.
+    """Builds normalised tactile images without allocating an image per reading.
 
     The arithmetic is float64 on integers below 2**12, so an image differs from the exact one by
     less than 1e-9 before it is rounded to float32.
     """
+
+    name = "tactile_image"
 
     def __init__(
         self,
@@ -73,21 +86,34 @@ class TactileImager:
         layout: Layout = D1,
         fill: Fill = Fill.NEIGHBOUR_MEAN,
         normalisation: Normalisation = Normalisation.FILLED_IMAGE,
+        composition: Composition = Composition.CHANNELS,
     ) -> None:
-        self.shape = (*layout.shape, fingers)
+        height, width = layout.shape
+        # The fingers' images in `shape` seen as (height, width, fingers): split, then transposed.
+        match composition:
+            case Composition.CHANNELS:
+                self.shape: tuple[int, int, int] = (height, width, fingers)
+                self._split, self._axes = self.shape, (0, 1, 2)
+            case Composition.HORIZONTAL:
+                self.shape = (height, fingers * width, 1)
+                self._split, self._axes = (height, fingers, width), (0, 2, 1)
+            case Composition.VERTICAL:
+                self.shape = (fingers * height, width, 1)
+                self._split, self._axes = (fingers, height, width), (1, 2, 0)
+        self._planes = (height, width, fingers)
         matrix = fill_matrix(layout, fill)
         self._needs_maximum = fill is Fill.LEAST_CONTACT
-        width = ELECTRODES + 1 if self._needs_maximum else ELECTRODES
-        matrix = matrix[:, :width]
+        terms = ELECTRODES + 1 if self._needs_maximum else ELECTRODES
+        matrix = matrix[:, :terms]
         if normalisation is Normalisation.FILLED_IMAGE:
             weights = matrix.mean(axis=0)
         else:
-            weights = np.zeros(width)
+            weights = np.zeros(terms)
             weights[:ELECTRODES] = 1.0 / ELECTRODES
         # Row sums are one, so taking the weighted mean off each row centres the image.
         self._centre = matrix - weights
         self._spread_over_image = normalisation is Normalisation.FILLED_IMAGE
-        self._counts = np.zeros((width, fingers))
+        self._counts = np.zeros((terms, fingers))
         self._pixels = np.zeros((matrix.shape[0], fingers))
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -112,10 +138,10 @@ class TactileImager:
             spread = electrodes.std(axis=0)
         judgeable = spread >= SPREAD_FLOOR_COUNTS
         scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
-        flat_out = out.reshape(pixels.shape)
-        np.multiply(pixels, scale, out=flat_out, casting="same_kind")
+        planes = out.reshape(self._split).transpose(self._axes)
+        np.multiply(pixels.reshape(self._planes), scale, out=planes, casting="same_kind")
         if not judgeable.all():
-            flat_out[:, ~judgeable] = 0.0
+            planes[..., ~judgeable] = 0.0
         return spread
 
     def build_batch(
@@ -126,7 +152,7 @@ class TactileImager:
         Runs `build` on each reading, so training sees bit for bit what the daemon sees.
         """
         images = np.empty((len(counts), *self.shape), dtype=np.float32)
-        spreads = np.empty((len(counts), self.shape[2]))
+        spreads = np.empty((len(counts), self._planes[2]))
         for index, reading in enumerate(counts):
             spreads[index] = self.build(reading, images[index])
         return images, spreads

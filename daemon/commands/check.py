@@ -12,7 +12,7 @@ from typing import get_args
 from daemon import assembly, scene
 from daemon.text import complain, printable
 from drivers.base import DriverError
-from models.contract import Finger, ModelError
+from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 TACTILE_SECTIONS = (
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
         return 2
-    parts = {"in": _what_is_in(wanted, model), "left_out": _what_is_left_out(wanted)}
+    parts = {"in": _what_is_in(wanted, model), "left_out": _what_is_left_out(wanted, model)}
     if args.json:
         sys.stdout.write(json.dumps({"scene": str(args.scene), **parts}) + "\n")
         return 0
@@ -70,21 +70,36 @@ def _try_drivers(wanted: scene.Scene) -> None:
 
 def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
     contract = model.contract
-    measured = contract.measured
+    figures = ", ".join(
+        f"{measured.protocol} {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
+        for measured in contract.measured
+    )
     parts = {
         "hand": f"{wanted.hand.name}: {', '.join(wanted.hand.fingers)}",
         "tactile": _section(wanted.tactile),
         "model": (
-            f"{contract.name} ({model.sha256[:12]}): F1 {100 * measured.f1_mean:.1f} +- "
-            f"{100 * measured.f1_std:.1f} % ({measured.protocol}), slip from p_slip "
-            f"{wanted.model.slip_threshold:g} on"
+            f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
+            f"{wanted.model.slip_threshold:g} on{_rejects(wanted, model)}"
         ),
         "gate": f"{wanted.gate.mode} reading, not older than {wanted.gate.max_age_ms:g} ms",
         "publish": f"verdict.{wanted.hand.name}, status.{wanted.hand.name} on {wanted.endpoint}",
     }
     if wanted.joints is not None:
         parts["joints"] = _section(wanted.joints)
+    if isinstance(contract.input, SessionInput):
+        parts["session"] = _session(wanted, contract.input)
     return parts
+
+
+def _rejects(wanted: scene.Scene, model: TactileModel) -> str:
+    confidence = assembly.min_confidence(model, wanted.model.min_accuracy)
+    return f", unknown below a confidence of {confidence:.2f}" if confidence else ""
+
+
+def _session(wanted: scene.Scene, needs: SessionInput) -> str:
+    kept = f"kept in {wanted.session_path}" if wanted.keeps_session else "not kept"
+    learns = "by the readings" if wanted.session_learns else "by `graspd session seed`"
+    return f"calibrated {learns}, from {needs.calibrated_from:g} grasps on, {kept}"
 
 
 def _section(section: scene.Section) -> str:
@@ -94,13 +109,15 @@ def _section(section: scene.Section) -> str:
     return f"{driver}: " + ", ".join(f"{key} {value}" for key, value in options.items())
 
 
-def _what_is_left_out(wanted: scene.Scene) -> dict[str, str]:
+def _what_is_left_out(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
     left_out = {}
     drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
     others = [driver for driver in drivers if driver != wanted.tactile.driver]
     left_out["drivers"] = f"{', '.join(others)}: not imported"
     if wanted.joints is None:
         left_out["joints"] = "no joint code"
+    if not isinstance(model.contract.input, SessionInput):
+        left_out["session"] = f"{model.contract.name} needs no session calibration"
     without = [name for name in get_args(Finger) if name not in wanted.hand.fingers]
     if without:
         left_out["fingers"] = f"{', '.join(without)}: no channel in image or network"

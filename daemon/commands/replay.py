@@ -9,20 +9,26 @@ from pathlib import Path
 
 from daemon import assembly, scene
 from daemon.arguments import positive, within
+from daemon.endpoint import check_endpoint
+from daemon.judge.pipeline import Pipeline
+from daemon.judge.verdict import Verdict
 from daemon.printer import Printer
 from daemon.publisher import Publisher, PublishError
 from daemon.reporter import Reporter
-from daemon.service import Service
+from daemon.service import Listener, Service
+from daemon.session_file import SessionFileError, load, statistics_of
 from daemon.stop import StopSignal
 from daemon.text import complain
-from drivers.base import DriverError
+from drivers.base import DriverError, TactileReading
 from drivers.replay import DEMO_RECORDING
 from models.contract import ModelError
+from models.runtime import TactileModel
 
 MAX_AGE_MS = 1000.0
 """Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
 
 WAIT_MAX_S = 3600
+RUNNING, OFF = "running", "off"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,6 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--strict", action="store_true", help="stop at the first value that is not a count"
     )
     parser.add_argument(
+        "--session",
+        default=RUNNING,
+        metavar="HOW",
+        help=f"what a session model is calibrated by: '{RUNNING}' (default) by the grasps as they "
+        f"come, '{OFF}' by nothing, or the file of a kept session",
+    )
+    parser.add_argument(
         "--publish", type=_endpoint, metavar="ENDPOINT", help="publish too, as `graspd run` does"
     )
     parser.add_argument(
@@ -72,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         with StopSignal() as stop:
             return _replay(args, stop)
-    except (scene.SceneError, ModelError, DriverError) as error:
+    except (scene.SceneError, ModelError, DriverError, SessionFileError) as error:
         sys.stdout.flush()
         complain(error)
         return 2
@@ -85,9 +98,12 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     wanted = _scene(args)
     model = assembly.load_model(wanted)
     wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
-    pipeline = assembly.build_pipeline(wanted, model)
+    pipeline = _pipeline(wanted, model, args.session)
     drivers = assembly.build_drivers(wanted)
     printer = Printer(as_json=args.json, prompt=args.speed is not None)
+    listener: Listener = printer.verdict
+    if pipeline.session is not None and args.session != OFF:
+        listener = _Comparison(wanted, printer).verdict
     with ExitStack() as stack:
         publisher = None
         if args.publish is not None:
@@ -103,13 +119,46 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
             stop,
             max_age_ns=wanted.max_age_ns,
-            listener=printer.verdict,
+            listener=listener,
         )
         try:
             service.run()
         finally:
             printer.summary()
     return 0 if stop.received is None else 128 + stop.received
+
+
+def _pipeline(wanted: scene.Scene, model: TactileModel, session: str) -> Pipeline:
+    """The judge; a session model's begins with the kept session if `session` is a file.
+
+    Raises `SessionFileError` if that is no session of this hand.
+    """
+    pipeline = assembly.build_pipeline(wanted, model, learns=session != OFF)
+    if session in (RUNNING, OFF):
+        return pipeline
+    if pipeline.session is None:
+        raise ModelError(f"the model {model.contract.name} keeps no session")
+    path = Path(session)
+    kept = load(path)
+    if kept is None:
+        raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
+    pipeline.session.restore(statistics_of(kept, wanted.hand.fingers))
+    return pipeline
+
+
+class _Comparison:
+    """Judges every reading once more without session calibration, for the summary alone."""
+
+    def __init__(self, wanted: scene.Scene, printer: Printer) -> None:
+        model = assembly.load_model(wanted)
+        self._pipeline = assembly.build_pipeline(wanted, model, learns=False)
+        self._printer = printer
+
+    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Print the verdict and count what it would have been."""
+        self._printer.verdict(verdict, payload, reading)
+        if reading is not None:
+            self._printer.without_session(self._pipeline.judge(reading), reading)
 
 
 def _wait(publisher: Publisher, timeout_s: float, stop: StopSignal) -> None:
@@ -138,7 +187,7 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
 
 def _endpoint(text: str) -> str:
     try:
-        scene.check_endpoint(text)
+        check_endpoint(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text}: {error}") from error
     return text

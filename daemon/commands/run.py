@@ -6,16 +6,21 @@ import argparse
 import logging
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from daemon import assembly, scene
+from daemon.judge.pipeline import Pipeline
 from daemon.printer import Printer
 from daemon.publisher import Publisher, PublishError
 from daemon.reporter import Reporter
 from daemon.service import Service
 from daemon.stop import StopSignal
 from daemon.text import complain
-from drivers.base import DriverError, RecordingError
+from drivers.base import Driver, DriverError, RecordingError
 from models.contract import ModelError
+
+if TYPE_CHECKING:
+    from daemon.session_keeper import SessionKeeper
 
 log = logging.getLogger("graspd")
 
@@ -43,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None:
     model = assembly.load_model(wanted)
-    pipeline = assembly.build_pipeline(wanted, model)
+    pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session_learns)
     drivers = assembly.build_drivers(wanted)
     with ExitStack() as stack:
         publisher = stack.enter_context(Publisher(wanted.endpoint, wanted.publish.high_water_mark))
@@ -51,6 +56,7 @@ def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None
             stack.callback(driver.close)
             assembly.open_driver(driver)
         log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
+        keeper = _keeper(wanted, pipeline, drivers[0], stack)
         service = Service(
             drivers,
             pipeline,
@@ -58,9 +64,30 @@ def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None
             stop,
             max_age_ns=wanted.max_age_ns,
             listener=printer.verdict if printer else None,
+            chore=None if keeper is None else keeper.mind,
         )
         try:
             service.run()
         finally:
+            if keeper is not None:
+                keeper.save()
             if printer is not None:
                 printer.summary()
+
+
+def _keeper(
+    wanted: scene.Scene, pipeline: Pipeline, tactile: Driver, stack: ExitStack
+) -> SessionKeeper | None:
+    """Who keeps the session; None if model or scene need none, or if there is no place for it."""
+    if pipeline.session is None or not wanted.keeps_session:
+        return None
+    from daemon.session_file import SessionFile, SessionFileError
+    from daemon.session_keeper import SessionKeeper
+
+    try:
+        file = SessionFile(wanted.session_path)
+    except SessionFileError as error:
+        log.warning("%s; every start begins a new session", error)
+        return None
+    stack.callback(file.close)
+    return SessionKeeper(pipeline.session, wanted.hand.fingers, tactile, file)

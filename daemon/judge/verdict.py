@@ -48,6 +48,8 @@ class Reason(StrEnum):
     SATURATED = "saturated"
     FLAT = "flat"
     NEVER_SEEN = "never-seen"
+    ELECTRODES_BROKEN = "electrodes-broken"
+    LOW_CONFIDENCE = "low-confidence"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
 
@@ -64,6 +66,8 @@ ADVICE: dict[Reason, str] = {
     Reason.SATURATED: "electrodes at 0 or 4095: a dead electrode or far too much force",
     Reason.FLAT: "all electrodes of a finger read the same: the sensor is not working",
     Reason.NEVER_SEEN: "counts outside everything the model was trained on: retrain or recalibrate",
+    Reason.ELECTRODES_BROKEN: "too many electrodes to repair: check finger and plug",
+    Reason.LOW_CONFIDENCE: "too close to call for min_accuracy: grasp again",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
 }
@@ -96,6 +100,11 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """From `t_mono_ns` to publishing, ms."""
     latency_us: Duration
     """From the driver handing the reading over to encoding this message, us."""
+    repaired: Annotated[list[str], msgspec.Meta(max_length=120)] = []
+    """Electrodes that were replaced by what the others let expect, such as `ff_7` (1 to 24)."""
+    session_calibrated: bool | None = None
+    """False: the session's grasps are too few yet, so the verdict is less sure; null: the model
+    needs none."""
     silence_ms: Duration
     """If no message comes for longer than this, take the grasp for unknown."""
     model: str
@@ -130,6 +139,12 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """Reasons given since start; only those that occurred."""
     drivers: dict[str, dict[str, Count]]
     """Counters of each driver, by driver name."""
+    repaired: Annotated[dict[str, Count], msgspec.Meta(max_length=120)] = {}
+    """How often each electrode was repaired since start; only those that were."""
+    session_grasps: Count | None = None
+    """Grasps by which the session is calibrated; null: the model needs none."""
+    session_calibrated: bool | None = None
+    """Whether they are enough."""
     latency_us: dict[Literal["p50", "p99", "max"], Duration]
     """Reading to publish since start; all zero before the first verdict."""
     model: str

@@ -27,9 +27,17 @@ class Reliability:
     """Mean negative log-likelihood, nats: what the temperature is fitted to."""
 
 
-def fit_temperature(logits: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
-    """The T that makes softmax(logits / T) most likely. Logits (N, 2) must be of unseen data."""
-    margin = logits[:, 1] - logits[:, 0]
+def margins_of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Log-odds of slip (N,) of logits (N, 2), order (stable, slip), or of margins (N,)."""
+    return values if values.ndim == 1 else values[:, 1] - values[:, 0]
+
+
+def fit_temperature(values: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
+    """The T that makes sigmoid(margin / T) most likely, of logits (N, 2) or margins (N,).
+
+    They must be of unseen data.
+    """
+    margin = margins_of(values)
     low, high = np.log(TEMPERATURE_RANGE)
     for _ in range(HALVINGS):
         middle = (low + high) / 2.0
@@ -39,20 +47,23 @@ def fit_temperature(logits: NDArray[np.float64], slipped: NDArray[np.bool_]) -> 
     return float(np.exp((low + high) / 2.0))
 
 
-def p_slip(logits: NDArray[np.float64], temperature: float = 1.0) -> NDArray[np.float64]:
-    """Slip probability (N,) of logits (N, 2), order (stable, slip)."""
-    return _sigmoid((logits[:, 1] - logits[:, 0]) / temperature)
+def p_slip(values: NDArray[np.float64], temperature: float = 1.0) -> NDArray[np.float64]:
+    """Slip probability (N,) of logits (N, 2), order (stable, slip), or of margins (N,)."""
+    return _sigmoid(margins_of(values) / temperature)
 
 
 def cross_fitted_p_slip(
-    logits: NDArray[np.float64], slipped: NDArray[np.bool_], fold_of: NDArray[np.int64]
+    values: NDArray[np.float64], slipped: NDArray[np.bool_], fold_of: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Slip probability (N,), each fold's by the temperature that the other folds give."""
-    probability = np.empty(len(logits))
+    """Slip probability (N,), each fold's by the temperature that the other folds give.
+
+    Of logits (N, 2) or margins (N,).
+    """
+    probability = np.empty(len(values))
     for fold in np.unique(fold_of):
         inside = fold_of == fold
-        temperature = fit_temperature(logits[~inside], slipped[~inside])
-        probability[inside] = p_slip(logits[inside], temperature)
+        temperature = fit_temperature(values[~inside], slipped[~inside])
+        probability[inside] = p_slip(values[inside], temperature)
     return probability
 
 

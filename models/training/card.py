@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from models.bts3 import CITATIONS, LICENCE, REPOSITORY
-from models.contract import Dataset, ModelContract
-from models.training.calibration import Reliability
+from models.contract import ModelContract
+from models.training.broken import Study
 from models.training.export import Parity
-from models.training.networks import NetworkConfig
-from models.training.protocols import CrossValidation, Repeatability, Scores
-from models.training.recipe import Recipe
+from models.training.metrics import CurvePoint, Fraction, Spread
+from models.training.summary import ObjectFigures, Summary, Variant
+from models.training.system import System, plain
 
-LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "torch")
-AVERAGED = ("accuracy", "precision", "recall", "f1", "auc")
+LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 
 WEAK_POINTS = (
-    "In `cv` the objects are known. New objects do worse: the paper gives F1 87.7 for CNN1.",
     "The data is of one hand and 41 objects, lifted in one way.",
-    "One broken electrode that nobody notices is enough to turn a verdict.",
+    "A wrong electrode that keeps within what its neighbours allow is not noticed.",
 )
 
 
@@ -45,60 +45,52 @@ class Data(msgspec.Struct, frozen=True):
     """Files that differ from the published ones: licence and sources above are not theirs."""
 
 
-class Spread(msgspec.Struct, frozen=True):
-    """Mean and population standard deviation over the folds."""
+class Measured(msgspec.Struct, frozen=True):
+    """One protocol: every figure is a fraction, slip positive, mean and spread over the folds."""
 
-    mean: float
-    std: float
-
-
-class Validation(msgspec.Struct, frozen=True):
-    """Cross-validation; every figure is a fraction, slip positive."""
-
-    summary: dict[str, Spread]
-    folds: tuple[Scores, ...]
+    folds: int
+    train_grasps: float
+    test_grasps: float
+    spreads: dict[str, Spread]
+    temperature: float
+    """Makes these margins probabilities; Brier score and the like are cross-fitted."""
+    confusion: tuple[tuple[int, int], tuple[int, int]]
+    """Rows stable, slip as it was; columns as it was judged."""
+    palms: dict[str, Fraction]
+    objects: dict[str, ObjectFigures]
+    accuracy_at_coverage: dict[str, float]
+    thresholds: dict[str, CurvePoint | None]
+    """By wanted accuracy: from which confidence on."""
+    calibrated_by: dict[str, Spread]
+    """F1 by how the session was calibrated; empty where no session is left out."""
 
     @classmethod
-    def of(cls, validation: CrossValidation) -> Validation:
-        """Summarise the folds."""
-        summary = {name: Spread(*validation.mean_std(name)) for name in AVERAGED}
-        return cls(summary, validation.folds)
-
-
-class Calibration(msgspec.Struct, frozen=True):
-    """The temperature in the file, fitted on the out-of-fold logits."""
-
-    temperature: float
-    before: Reliability
-    after: Reliability
-    how: str = (
-        "measured on the out-of-fold logits; after: each fold by the temperature that the other "
-        "folds give; ECE with 15 equal bins over the verdict's probability"
-    )
+    def of(cls, summary: Summary) -> Measured:
+        """The part of a summary that a user asks for."""
+        main: Variant = summary.main
+        several = summary.variants if len(summary.variants) > 1 else {}
+        return cls(
+            folds=summary.folds,
+            train_grasps=summary.train_grasps,
+            test_grasps=summary.test_grasps,
+            spreads=main.spreads,
+            temperature=main.temperature,
+            confusion=main.confusion,
+            palms=main.palms,
+            objects=main.objects,
+            accuracy_at_coverage=main.coverages,
+            thresholds=main.thresholds,
+            calibrated_by={name: variant.spreads["f1"] for name, variant in several.items()},
+        )
 
 
 class NeverSeen(msgspec.Struct, frozen=True):
     """Fraction of readings that the contract's `seen` refuses."""
 
-    held_out_fold: float
-    """Grasps of a fold, by what the other folds look like."""
     held_out_object: float | None
     """Grasps of an object, by the other objects; None if there is only one."""
     made_up: dict[str, float]
     """Readings that no hand ever made, by the way they were made up."""
-
-
-class NewSession(msgspec.Struct, frozen=True):
-    """The model on the same objects in a later session, with another palm pose."""
-
-    file: Dataset
-    scores: Scores | None
-    """None if one class is missing."""
-    reliability: Reliability
-    never_seen: float
-    """Fraction of its grasps that the contract's `seen` refuses."""
-    scores_of_rest: Scores | None
-    """Figures of the grasps that are not refused."""
 
 
 class Card(msgspec.Struct, frozen=True):
@@ -108,34 +100,59 @@ class Card(msgspec.Struct, frozen=True):
     contract: ModelContract
     """Word for word what stands in the file."""
     file: ModelFile
+    parameters: int
+    """How many numbers the model consists of."""
     data: Data
-    network: NetworkConfig
-    trained_parameters: int
-    recipe: Recipe
-    cross_validation: Validation
-    calibration: Calibration
+    system: dict[str, Any]
+    """Its configuration."""
+    protocols: dict[str, Measured]
+    temperature: float
+    """In the file, fitted on the margins of `calibrated_by`: grasps that were not trained on."""
+    calibrated_by: str
+    broken: Study
+    """What broken electrodes cost, and what is left of that after their repair."""
     never_seen: NeverSeen
-    new_session: NewSession | None
-    repeatability: Repeatability
+    same_seed_same_margins: bool
+    """Training the first fold again gave bit-identical margins."""
     command: str
     """Makes the file again, byte for byte on a machine of the same kind."""
     made_with: dict[str, str]
     weak_points: tuple[str, ...]
 
 
-def weak_points(session: NewSession | None) -> tuple[str, ...]:
-    """What a user must know, with the figures of the later session where it was judged."""
-    if session is None or session.scores is None:
-        return WEAK_POINTS
-    text = (
-        f"In a later session ({session.file.name}: same objects, other palm pose, drifted sensors) "
-        f"F1 is {100 * session.scores.f1:.1f} %: it still ranks (AUC {session.scores.auc:.2f}), "
-        "its zero has moved. What looks unlike the training data is refused: "
-        f"{100 * session.never_seen:.1f} % of these grasps"
-    )
-    if session.scores_of_rest is not None:
-        text += f"; on the rest F1 is {100 * session.scores_of_rest.f1:.1f} %"
-    return (f"{text}.", *WEAK_POINTS)
+def weak_points(summaries: Sequence[Summary]) -> tuple[str, ...]:
+    """What a user must know, with the figures that were measured."""
+    texts = []
+    for summary in summaries:
+        f1 = 100 * summary.main.spreads["f1"].mean
+        if summary.protocol.startswith("objects"):
+            worst = min(summary.main.objects.items(), key=lambda item: item[1].share.accuracy)
+            texts.append(
+                f"New objects do worse than known ones: F1 {f1:.1f} %; the worst is {worst[0]}, "
+                f"of which {100 * worst[1].share.accuracy:.0f} % are judged rightly."
+            )
+        elif summary.protocol == "session" and len(summary.variants) > 1:
+            none = 100 * summary.variants["none"].spreads["f1"].mean
+            texts.append(
+                f"On another day it needs the session's grasps: F1 {none:.1f} % without any, "
+                f"{f1:.1f} % with fifty."
+            )
+        elif summary.protocol == "session":
+            auc = summary.main.spreads["auc"].mean
+            texts.append(
+                f"On another day (palm_45: same hand, other palm pose, drifted sensors) F1 is "
+                f"{f1:.1f} %: it still ranks (AUC {auc:.2f}), its zero has moved. What looks "
+                "unlike the training data is refused."
+            )
+    return (*texts, *WEAK_POINTS)
+
+
+def configuration(system: System) -> dict[str, Any]:
+    """Everything that decides the result, JSON-ready."""
+    return {name: plain(getattr(system, name)) for name in ("input", "estimator", "recipe")} | {
+        "augmentation": plain(system.augmentation),
+        "tables": list(system.tables),
+    }
 
 
 def made_with() -> dict[str, str]:

@@ -14,18 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as ProgressBar
 
 from models.training.card import Card
-from models.training.datasets import (
-    DatasetError,
-    Grasps,
-    read_new_session,
-    read_whole,
-    unpublished,
-)
+from models.training.datasets import DatasetError, Grasps, read_all, unpublished
 from models.training.export import ExportError
+from models.training.folds import TooFewGraspsError
 from models.training.making import EXTRA_TRAININGS, Order, make
-from models.training.networks import NETWORKS
-from models.training.protocols import TooFewGraspsError
-from models.training.recipe import Progress, Recipe
+from models.training.systems import SYSTEMS
 
 EXIT_OK, EXIT_BUG, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 MAX_SEED = 2**32 - 1
@@ -34,16 +27,23 @@ MAX_SEED = 2**32 - 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
-    parser.add_argument("model", choices=sorted(NETWORKS), help="network to train")
+    parser.add_argument("model", choices=sorted(SYSTEMS), metavar="MODEL", help=_models())
     parser.add_argument(
         "--data",
         type=Path,
         required=True,
         metavar="DIR",
-        help="folder with palm_down.csv and palm_side.csv; palm_45.csv, if there, is judged too",
+        help="folder with palm_down.csv, palm_side.csv and, for some models, palm_45.csv",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="folder for the result (default: runs/MODEL)"
+    )
+    parser.add_argument(
+        "--results",
+        type=Path,
+        metavar="DIR",
+        help="folder of finished trainings, which are not run again; `graspd evaluate` shares it "
+        "(default: trainings in --out)",
     )
     parser.add_argument(
         "--seed", type=_whole(0, MAX_SEED), default=0, metavar="N", help="default: 0"
@@ -52,26 +52,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--folds", type=_whole(2, 1000), default=10, metavar="N", help="default: 10"
     )
     parser.add_argument(
-        "--epochs", type=_whole(1, 10_000), default=Recipe().epochs, metavar="N", help="default: 20"
+        "--jobs", type=_whole(1, 256), default=1, metavar="N", help="trainings at once (default: 1)"
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress bar")
 
 
 def run(args: argparse.Namespace) -> int:
     """Train, measure, export. Returns 0, 1 (export failed), 2 (data or folder), 130 (Ctrl-C)."""
-    order = Order(NETWORKS[args.model], Recipe(epochs=args.epochs), args.folds, args.seed)
+    order = Order(SYSTEMS[args.model], args.folds, args.seed, args.jobs)
     out: Path = args.out or Path("runs") / args.model
     started_s = time.monotonic()
     try:
-        grasps = read_whole(args.data)
-        new_session = read_new_session(args.data)
-        _warn_of_other_data(grasps, new_session)
+        grasps = read_all(args.data)
+        _check_tables(order, grasps, args.data)
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
-        with _progress_bar(order, hidden=args.quiet) as on_epoch:
-            card = make(order, grasps, new_session, out, on_epoch)
+        results = args.results or out / "trainings"
+        with _progress_bar(order, grasps, hidden=args.quiet) as on_done:
+            card = make(order, grasps, out, results, on_done)
     except KeyboardInterrupt:
-        sys.stderr.write("graspd train: interrupted\n")
+        sys.stderr.write("graspd train: interrupted; the same command goes on from here\n")
         return EXIT_INTERRUPTED
     except OSError as error:
         return _fail(f"{error.filename or out}: {error.strerror or error}", EXIT_INPUT)
@@ -83,6 +83,10 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
+def _models() -> str:
+    return f"one of {', '.join(SYSTEMS)}"
+
+
 def _whole(low: int, high: int) -> Callable[[str], int]:
     def parse(text: str) -> int:
         if text.isascii() and text.isdigit() and len(text) <= 10 and low <= int(text) <= high:
@@ -92,9 +96,13 @@ def _whole(low: int, high: int) -> Callable[[str], int]:
     return parse
 
 
-def _warn_of_other_data(grasps: Grasps, new_session: Grasps | None) -> None:
-    files = grasps.files if new_session is None else grasps.files + new_session.files
-    for name in unpublished(files):
+def _check_tables(order: Order, grasps: Grasps, folder: Path) -> None:
+    """Raise `DatasetError` if a table is missing; warn of tables that are not the published."""
+    there = {file.name for file in grasps.files}
+    for table in order.system.tables:
+        if table not in there:
+            raise DatasetError(folder / f"{table}.csv", f"is missing, {order.system.name} needs it")
+    for name in unpublished(grasps.files):
         sys.stderr.write(
             f"graspd train: warning: {name}.csv is not the published table; the figures are of "
             "this data only\n"
@@ -102,38 +110,29 @@ def _warn_of_other_data(grasps: Grasps, new_session: Grasps | None) -> None:
 
 
 @contextmanager
-def _progress_bar(order: Order, *, hidden: bool) -> Iterator[Progress]:
+def _progress_bar(order: Order, grasps: Grasps, *, hidden: bool) -> Iterator[Callable[[], None]]:
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("epochs, left"),
+        TextColumn("trainings, left"),
         TimeRemainingColumn(),
     )
-    trainings = order.folds + EXTRA_TRAININGS
+    total = len(order.jobs(grasps)) + EXTRA_TRAININGS
     with ProgressBar(
         *columns, console=console, disable=hidden or not console.is_terminal, transient=True
     ) as bar:
-        task = bar.add_task(f"training 1 of {trainings}", total=order.epochs)
-        done = 0
-
-        def on_epoch() -> None:
-            nonlocal done
-            done += 1
-            training = min(done // order.recipe.epochs + 1, trainings)
-            bar.update(task, completed=done, description=f"training {training} of {trainings}")
-
-        yield on_epoch
+        task = bar.add_task(order.system.name, total=total)
+        yield lambda: bar.advance(task)
 
 
 def _summary(card: Card, path: Path, seconds: float) -> str:
-    measured = card.contract.measured
-    return (
-        f"{path}: F1 {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} % over "
-        f"{measured.folds} folds, accuracy {100 * measured.accuracy_mean:.1f} %, "
-        f"{seconds:.0f} s\n"
+    figures = ", ".join(
+        f"{measured.protocol} F1 {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
+        for measured in card.contract.measured
     )
+    return f"{path}: {figures}, {seconds:.0f} s\n"
 
 
 def _fail(problem: str, code: int) -> int:

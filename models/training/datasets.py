@@ -8,7 +8,8 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-from collections.abc import Sequence
+import json
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +59,35 @@ class Grasps:
     def __len__(self) -> int:
         return len(self.slipped)
 
+    @property
+    def table_of(self) -> NDArray[np.int64]:
+        """Shape (N,): index in `files` of the file that each grasp comes from."""
+        return np.repeat(np.arange(len(self.files)), [file.rows for file in self.files])
+
+    def rows(self, indices: NDArray[np.int64]) -> Grasps:
+        """Only these grasps, indices ascending; the files keep their digests, not their rows."""
+        kept = np.bincount(self.table_of[indices], minlength=len(self.files))
+        return Grasps(
+            self.counts[indices],
+            self.slipped[indices],
+            tuple(self.objects[index] for index in indices),
+            tuple(
+                Dataset(file.name, file.sha256, int(rows))
+                for file, rows in zip(self.files, kept, strict=True)
+            ),
+        )
+
+    def of_tables(self, tables: Collection[str]) -> Grasps:
+        """Only the grasps of these tables."""
+        wanted = [index for index, file in enumerate(self.files) if file.name in tables]
+        return self.rows(np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64))
+
+    def digest(self) -> str:
+        """SHA-256, hexadecimal, of what a result may depend on."""
+        text = json.dumps([self.objects, [(file.name, file.rows) for file in self.files]])
+        parts = (self.counts.tobytes(), self.slipped.tobytes(), text.encode())
+        return hashlib.sha256(b"".join(parts)).hexdigest()
+
 
 def read_table(path: Path) -> Grasps:
     """Read one grasp table. Raises `DatasetError` with file, line and column."""
@@ -100,6 +130,12 @@ def read_new_session(folder: Path) -> Grasps | None:
     """The later session, palm_45.csv; None if the folder lacks it. Raises `DatasetError`."""
     path = folder / f"{NEW_SESSION}.csv"
     return read_table(path) if path.exists() else None
+
+
+def read_all(folder: Path) -> Grasps:
+    """*Whole*, then the later session if the folder has it. Raises `DatasetError`."""
+    whole, later = read_whole(folder), read_new_session(folder)
+    return whole if later is None else concatenate([whole, later])
 
 
 def concatenate(parts: Sequence[Grasps]) -> Grasps:

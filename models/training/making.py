@@ -3,154 +3,204 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
-from models.bts3 import FINGERS
-from models.contract import CLASSES, ModelContract
-from models.layout import D1
-from models.seen import SeenCheck
-from models.tactile_image import Fill, Normalisation, TactileImager
+from models.bts3 import FINGERS, NEW_SESSION
+from models.contract import (
+    CLASSES,
+    ConfidenceStep,
+    Input,
+    MeasuredError,
+    ModelContract,
+    SessionInput,
+    Sharpness,
+)
 from models.training import card as cards
-from models.training.calibration import cross_fitted_p_slip, fit_temperature, p_slip, reliability
+from models.training import jobs
+from models.training.broken import broken_study
 from models.training.datasets import Grasps, unpublished
-from models.training.export import OPSET, Parity, export
-from models.training.networks import NetworkConfig, parameter_count
-from models.training.protocols import (
-    CrossValidation,
-    Scores,
-    cross_validate,
-    measure_repeatability,
-    score,
-)
-from models.training.recipe import Progress, Recipe, logits, train
-from models.training.seen import (
-    held_out_never_seen,
-    made_up_never_seen,
-    seen_counts,
-)
+from models.training.export import Parity, SessionStandards, export
+from models.training.graphs import OPSET
+from models.training.jobs import Job, JobResult
+from models.training.protocols import Protocol
+from models.training.seen import held_out_never_seen, made_up_never_seen, seen_counts
+from models.training.standards import PRIOR_GRASPS, RUNNING
+from models.training.summary import Summary, summarise
+from models.training.sweep import sweep
+from models.training.system import SessionFeatures, System
+from models.training.trained import Trained, train
 
-FILL = Fill.NEIGHBOUR_MEAN
-NORMALISATION = Normalisation.FILLED_IMAGE
-WHAT = (
-    "Says from the tactile image of one reading, taken after the fingers closed and before the "
-    "lift, whether the object will stay (stable) or slip."
-)
-EXTRA_TRAININGS = 3
-"""Beside the folds: two for the repeatability, one for the model itself."""
+CALIBRATED_FROM = 20
+"""Grasps from which on a session counts as calibrated: later ones gain two points at most."""
+EXTRA_TRAININGS = 2
+"""Beside the folds: one for the repeatability, one for the model itself. The study of broken
+electrodes, three more, comes last."""
 
 
 @dataclass(frozen=True, slots=True)
 class Order:
     """What to make."""
 
-    network: NetworkConfig
-    recipe: Recipe
+    system: System
     folds: int
     seed: int
+    processes: int = 1
 
-    @property
-    def epochs(self) -> int:
-        """Epochs of all trainings together."""
-        return (self.folds + EXTRA_TRAININGS) * self.recipe.epochs
+    def protocols(self, grasps: Grasps) -> tuple[Protocol, ...]:
+        """By what it is measured: `cv` first; the second, with new objects, calibrates it."""
+        if NEW_SESSION not in {file.name for file in grasps.files}:
+            return ("cv", "objects-whole")
+        objects: Protocol = "objects" if NEW_SESSION in self.system.tables else "objects-whole"
+        return ("cv", objects, "session")
+
+    def jobs(self, grasps: Grasps) -> list[Job]:
+        """Every training that is judged."""
+        return [
+            Job(self.system, protocol, self.seed, fold, self.folds)
+            for protocol in self.protocols(grasps)
+            for fold in range(self.folds)
+        ]
 
     @property
     def command(self) -> str:
         """The command line that repeats it."""
-        return (
-            f"graspd train {self.network.name} --data DIR --seed {self.seed} "
-            f"--folds {self.folds} --epochs {self.recipe.epochs}"
-        )
+        return f"graspd train {self.system.name} --data DIR --seed {self.seed} --folds {self.folds}"
 
 
 def make(
-    order: Order,
-    grasps: Grasps,
-    new_session: Grasps | None,
-    out: Path,
-    on_epoch: Progress | None = None,
+    order: Order, grasps: Grasps, out: Path, results: Path, on_done: Callable[[], None]
 ) -> cards.Card:
-    """Write `<name>.onnx` and `<name>.json` into the folder `out`.
+    """Write `<name>.onnx` and `<name>.json` into the folder `out`; trainings are kept in `results`.
 
-    Raises `TooFewGraspsError` if the grasps are too few for the folds, `ExportError` if the file
-    does not judge as the network does, `OSError` if the folder cannot be written.
+    `grasps` are all tables that there are. Raises `TooFewGraspsError` if they are too few for the
+    folds, `ExportError` if the file does not judge as the system does, `OSError` if a folder
+    cannot be written.
     """
-    config, recipe, seed = order.network, order.recipe, order.seed
-    images, slipped = _images(grasps), grasps.slipped
-    validation = cross_validate(
-        config, images, slipped, recipe, folds=order.folds, seed=seed, on_epoch=on_epoch
+    wanted = order.jobs(grasps)
+    found = sweep(wanted, grasps, results, processes=order.processes, on_done=on_done)
+    summaries = _summaries(order, grasps, found)
+    again = jobs.run(wanted[0], grasps)
+    on_done()
+    trained = train(order.system, grasps.of_tables(order.system.tables), order.seed)
+    on_done()
+    contract = _contract(order, trained, summaries)
+    path = out / f"{order.system.name}.onnx"
+    temperature = summaries[1].main.temperature
+    parity = export(
+        trained.fitted, temperature, contract, trained.grasps.counts, path, _sessions(trained)
     )
-    repeatability = measure_repeatability(
-        config, images, slipped, recipe, validation, seed=seed, on_epoch=on_epoch
-    )
-    calibration = _calibration(validation, slipped)
-    network = train(config, images, slipped, recipe, seed=seed, on_epoch=on_epoch)
-    contract = _contract(order, grasps, validation)
-    path = out / f"{config.name}.onnx"
-    parity = export(network, calibration.temperature, contract, grasps.counts, path)
-    session = _judge_new_session(network, calibration.temperature, contract, new_session)
     card = cards.Card(
-        what=f"{WHAT} Network: Conv{config.filters} - FC{config.hidden}.",
+        what=order.system.description,
         contract=contract,
         file=_file(path, parity),
+        parameters=trained.fitted.parameters,
         data=cards.Data(not_published=tuple(unpublished(grasps.files))),
-        network=config,
-        trained_parameters=parameter_count(network),
-        recipe=recipe,
-        cross_validation=cards.Validation.of(validation),
-        calibration=calibration,
-        never_seen=cards.NeverSeen(
-            held_out_fold=held_out_never_seen(grasps.counts, validation.fold_of),
-            held_out_object=_held_out_object(grasps),
-            made_up=made_up_never_seen(grasps.counts, contract.seen, seed),
-        ),
-        new_session=session,
-        repeatability=repeatability,
+        system=cards.configuration(order.system),
+        protocols={summary.protocol: cards.Measured.of(summary) for summary in summaries},
+        temperature=temperature,
+        calibrated_by=summaries[1].protocol,
+        broken=broken_study(order.system, trained.grasps, order.seed),
+        never_seen=_never_seen(trained, contract, order.seed),
+        same_seed_same_margins=_same(found[0], again),
         command=order.command,
         made_with=cards.made_with(),
-        weak_points=cards.weak_points(session),
+        weak_points=cards.weak_points(summaries),
     )
     cards.write(card, path.with_suffix(".json"))
     return card
 
 
-def _images(grasps: Grasps) -> NDArray[np.float32]:
-    imager = TactileImager(len(FINGERS), D1, FILL, NORMALISATION)
-    return imager.build_batch(grasps.counts)[0]
+def _summaries(order: Order, grasps: Grasps, found: list[JobResult]) -> list[Summary]:
+    return [
+        summarise(
+            order.system,
+            protocol,
+            {order.seed: found[index * order.folds : (index + 1) * order.folds]},
+            grasps,
+        )
+        for index, protocol in enumerate(order.protocols(grasps))
+    ]
 
 
-def _held_out_object(grasps: Grasps) -> float | None:
-    objects = np.array(grasps.objects)
-    return held_out_never_seen(grasps.counts, objects) if len(set(grasps.objects)) > 1 else None
-
-
-def _calibration(validation: CrossValidation, slipped: NDArray[np.bool_]) -> cards.Calibration:
-    fitted = cross_fitted_p_slip(validation.logits, slipped, validation.fold_of)
-    return cards.Calibration(
-        temperature=fit_temperature(validation.logits, slipped),
-        before=reliability(p_slip(validation.logits), slipped),
-        after=reliability(fitted, slipped),
-    )
-
-
-def _contract(order: Order, grasps: Grasps, validation: CrossValidation) -> ModelContract:
+def _contract(order: Order, trained: Trained, summaries: list[Summary]) -> ModelContract:
     return ModelContract(
-        version=1,
-        name=order.network.name,
-        layout=D1.name,
-        fill=FILL,
-        normalisation=NORMALISATION,
-        composition="channels",
+        version=2,
+        name=order.system.name,
+        input=_input(order.system, trained, summaries),
         fingers=FINGERS,
         classes=CLASSES,
         seed=order.seed,
-        datasets=grasps.files,
-        measured=validation.measured(),
-        seen=seen_counts(grasps.counts),
+        datasets=tuple(file for file in trained.grasps.files if file.rows),
+        measured=tuple(map(_measured, summaries)),
+        confidence=tuple(
+            ConfidenceStep(point.confidence, point.accuracy, point.coverage)
+            for point in reversed(summaries[1].main.curve)
+        ),
+        seen=seen_counts(_mapped(trained), trained.looks.margin),
+    )
+
+
+def _measured(summary: Summary) -> MeasuredError:
+    f1, accuracy = summary.main.spreads["f1"], summary.main.spreads["accuracy"]
+    return MeasuredError(
+        summary.protocol, summary.folds, f1.mean, f1.std, accuracy.mean, accuracy.std
+    )
+
+
+def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
+    if not isinstance(system.input, SessionFeatures):
+        return system.input
+    if trained.standards is None:
+        raise ValueError("a session system was trained without standards")
+    prior = trained.standards.prior
+    return SessionInput(
+        mean=tuple(prior.mean.tolist()),
+        spread=tuple(prior.spread.tolist()),
+        clip=system.input.clip,
+        prior_grasps=PRIOR_GRASPS,
+        calibrated_from=CALIBRATED_FROM,
+        sharpness=_sharpness(summaries),
+    )
+
+
+def _sharpness(summaries: list[Summary]) -> tuple[Sharpness, ...]:
+    """How much less sure a young session is than the calibrated model, never more sure."""
+    base = summaries[1].main.temperature
+    later = next((s for s in summaries if s.protocol == "session"), None)
+    if later is None:
+        return (Sharpness(0.0, 1.0),)
+    steps: list[Sharpness] = []
+    for age in reversed(later.variants[RUNNING].ages):
+        least = steps[-1].temperature if steps else 1.0
+        steps.append(Sharpness(float(age.grasps_before), max(least, age.temperature / base)))
+    return tuple(reversed(steps))
+
+
+def _sessions(trained: Trained) -> SessionStandards | None:
+    """For the parity check: every grasp standardised by its own table, as in training."""
+    if trained.standards is None:
+        return None
+    standards = trained.standards.each(trained.grasps.table_of)
+    return SessionStandards(standards.mean, standards.spread)
+
+
+def _mapped(trained: Trained) -> NDArray[np.float64]:
+    grasps = trained.grasps
+    return trained.looks.to_training(grasps.counts, grasps.table_of)
+
+
+def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> cards.NeverSeen:
+    objects = np.array(trained.grasps.objects)
+    counts, margin = _mapped(trained), trained.looks.margin
+    several = len(set(trained.grasps.objects)) > 1
+    return cards.NeverSeen(
+        held_out_object=held_out_never_seen(counts, objects, margin) if several else None,
+        made_up=made_up_never_seen(counts, contract.seen, seed),
     )
 
 
@@ -159,21 +209,7 @@ def _file(path: Path, parity: Parity) -> cards.ModelFile:
     return cards.ModelFile(hashlib.sha256(data).hexdigest(), len(data), OPSET, parity)
 
 
-def _judge_new_session(
-    network: nn.Module, temperature: float, contract: ModelContract, session: Grasps | None
-) -> cards.NewSession | None:
-    if session is None:
-        return None
-    values, slipped = logits(network, _images(session)), session.slipped
-    refused = SeenCheck(contract.seen).never_seen(session.counts)
-    return cards.NewSession(
-        file=session.files[0],
-        scores=_score_if_both(values, slipped),
-        reliability=reliability(p_slip(values, temperature), slipped),
-        never_seen=float(refused.mean()),
-        scores_of_rest=_score_if_both(values[~refused], slipped[~refused]),
+def _same(one: JobResult, other: JobResult) -> bool:
+    return all(
+        np.array_equal(margins, other.margins[name]) for name, margins in one.margins.items()
     )
-
-
-def _score_if_both(values: NDArray[np.float64], slipped: NDArray[np.bool_]) -> Scores | None:
-    return score(values, slipped) if len(np.unique(slipped)) == 2 else None

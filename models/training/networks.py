@@ -1,37 +1,79 @@
-"""The networks of the paper as PyTorch modules, made from a configuration."""
+"""The networks of the paper, and narrower ones, as PyTorch modules made from a configuration."""
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from models.contract import FEATURES_PER_FINGER
+from models.layout import D1, ELECTRODES
+from models.tactile_image import Fill, fill_matrix
+
 IMAGE_SHAPE = (12, 11, 3)
 """Height, width, fingers of the D1 image."""
 KERNEL = 3
-"""Side of every convolution, pixels."""
+"""Side of the first convolution, pixels."""
+POOL = 2
+"""Side and stride of a maximum pooling, pixels."""
 NORM_EPSILON = 1e-3
 """Keras' default: the published networks were trained with it."""
 
 
 @dataclass(frozen=True, slots=True)
-class NetworkConfig:
-    """Size of a network: convolution - batch norm - ReLU - dense - batch norm - ReLU - dense(2)."""
+class SecondConvolution:
+    """A convolution after the first one and its pooling (valid)."""
 
-    name: str
+    filters: int = 64
+    kernel: int = 1
+    """Side, pixels: the authors' notebooks have 1, the table of the paper has 3."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """A convolutional network: convolution(s), one hidden dense layer, two classes.
+
+    It takes images, or features whose first 24 values per finger become a D1 image inside the
+    network while the rest joins the hidden layer's inputs.
+    """
+
     filters: int
-    """Filters of the 3 x 3 convolution (valid, no bias)."""
+    """Filters of the first convolution, 3 x 3, valid."""
     hidden: int
     """Units of the hidden dense layer."""
-    image_shape: tuple[int, int, int] = IMAGE_SHAPE
+    pool: bool = False
+    """2 x 2 maximum pooling after the first convolution; an odd row or column is left out."""
+    second: SecondConvolution | None = None
+    dropout: float = 0.0
+    """Fraction of values left out in training, before and after the hidden layer."""
+    batch_norm: bool = True
+    """After each convolution and after the hidden layer; a convolution then needs no bias."""
 
 
-CNN1 = NetworkConfig("cnn1", filters=32, hidden=1024)
+@dataclass(frozen=True, slots=True)
+class DenseConfig:
+    """A network of dense layers only, on a vector or on features."""
+
+    hidden: tuple[int, ...]
+    """Units of each hidden layer."""
+    dropout: float = 0.0
+    """Fraction of values left out in training, after each hidden layer."""
+    batch_norm: bool = True
+
+
+AnyNetwork = NetworkConfig | DenseConfig
+
+CNN0 = NetworkConfig(filters=32, hidden=128)
+CNN1 = NetworkConfig(filters=32, hidden=1024)
 """The best network of the paper: Conv32 - FC1024."""
-NETWORKS = {config.name: config for config in (CNN1,)}
+CNN2 = NetworkConfig(filters=32, hidden=1024, pool=True)
+CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolution())
+NETWORKS = {"cnn0": CNN0, "cnn1": CNN1, "cnn2": CNN2, "cnn3": CNN3}
+"""The networks of the paper's table III."""
 
 
 class ChannelsFirst(nn.Module):
@@ -42,26 +84,58 @@ class ChannelsFirst(nn.Module):
         return images.permute(0, 3, 1, 2)
 
 
-def build(config: NetworkConfig) -> nn.Sequential:
+class FeatureImages(nn.Module):
+    """Values of the electrodes (N, fingers * 24) to filled D1 images (N, fingers, 12, 11)."""
+
+    fill: torch.Tensor
+
+    def __init__(self, fingers: int) -> None:
+        super().__init__()
+        matrix = fill_matrix(D1, Fill.NEIGHBOUR_MEAN)[:, :ELECTRODES]
+        self.register_buffer("fill", torch.tensor(matrix.T, dtype=torch.float32))
+        self._fingers = fingers
+
+    def forward(self, values: torch.Tensor) -> torch.Tensor:
+        """Fill the pixels between the electrodes with their neighbours' mean."""
+        pixels = values.reshape(-1, self._fingers, ELECTRODES) @ self.fill
+        return pixels.reshape(-1, self._fingers, *D1.shape)
+
+
+class Beside(nn.Module):
+    """Looks at the first features through its layers and lays the rest beside the result."""
+
+    def __init__(self, look: nn.Sequential, first: int) -> None:
+        super().__init__()
+        self.look = look
+        self.first = first
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        """Features (N, M) to (N, seen + M - first)."""
+        seen = self.look(features[:, : self.first])
+        return torch.cat((seen, features[:, self.first :]), dim=1)
+
+
+def build(config: AnyNetwork, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Sequential:
     """A network with fresh weights from torch's global random state.
 
-    Takes float32 images (N, *image_shape), returns logits (N, 2) in the order (stable, slip).
-    Weights are Glorot-uniform and biases zero, as Keras starts them.
+    Takes float32 inputs (N, *shape), images or features, returns logits (N, 2) in the order
+    (stable, slip). Weights are Glorot-uniform and biases zero, as Keras starts them. Raises
+    `ValueError` if the network does not fit the shape.
     """
-    height, width, fingers = config.image_shape
-    pixels = (height - KERNEL + 1) * (width - KERNEL + 1)
-    network = nn.Sequential(
-        ChannelsFirst(),
-        nn.Conv2d(fingers, config.filters, KERNEL, bias=False),
-        nn.BatchNorm2d(config.filters, eps=NORM_EPSILON),
-        nn.ReLU(),
-        nn.Flatten(),
-        nn.Linear(config.filters * pixels, config.hidden),
-        nn.BatchNorm1d(config.hidden, eps=NORM_EPSILON),
-        nn.ReLU(),
-        nn.Linear(config.hidden, 2),
-    )
-    for layer in network:
+    match config:
+        case NetworkConfig():
+            look, width = _look(config, tuple(shape))
+            layers = [*look, *_drop(config), *_dense(width, config.hidden, config.batch_norm)]
+            layers += _drop(config)
+            width = config.hidden
+        case DenseConfig():
+            (width,) = shape
+            layers = []
+            for units in config.hidden:
+                layers += [*_dense(width, units, config.batch_norm), *_drop(config)]
+                width = units
+    network = nn.Sequential(*layers, nn.Linear(width, 2))
+    for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
             if layer.bias is not None:
@@ -80,18 +154,93 @@ def for_inference(network: nn.Sequential, temperature: float) -> nn.Sequential:
     Batch norm goes into the layer before it, the temperature into the last layer: a linear layer
     divided by T gives `softmax(logits / T)`.
     """
-    layers: list[nn.Module] = []
-    for layer in copy.deepcopy(network).eval():
-        if isinstance(layer, nn.BatchNorm2d) and isinstance(layers[-1], nn.Conv2d):
-            layers[-1] = fuse_conv_bn_eval(layers[-1], layer)
-        elif isinstance(layer, nn.BatchNorm1d) and isinstance(layers[-1], nn.Linear):
-            layers[-1] = fuse_linear_bn_eval(layers[-1], layer)
-        else:
-            layers.append(layer)
-    last = layers[-1]
-    if not isinstance(last, nn.Linear):
-        raise TypeError(f"a network ends in a linear layer, not {type(last).__name__}")
+    layers = _folded(copy.deepcopy(network).eval())
+    last = _last(layers)
     with torch.no_grad():
         last.weight.div_(temperature)
         last.bias.div_(temperature)
     return nn.Sequential(*layers, nn.Softmax(dim=1)).eval()
+
+
+def for_margin(network: nn.Sequential) -> nn.Sequential:
+    """A copy that returns log-odds of slip (N, 1), folded like `for_inference`."""
+    layers = _folded(copy.deepcopy(network).eval())
+    last = _last(layers)
+    margin = nn.Linear(last.in_features, 1)
+    with torch.no_grad():
+        margin.weight.copy_(last.weight[1:] - last.weight[:1])
+        margin.bias.copy_(last.bias[1:] - last.bias[:1])
+    return nn.Sequential(*layers[:-1], margin).eval()
+
+
+def _look(config: NetworkConfig, shape: tuple[int, ...]) -> tuple[list[nn.Module], int]:
+    """Layers that turn an input into the values before the hidden layer, and their number."""
+    if len(shape) == 3:
+        layers, width = _convolutions(config, (shape[0], shape[1]), shape[2])
+        return [ChannelsFirst(), *layers], width
+    (features,) = shape
+    fingers, extra = divmod(features, FEATURES_PER_FINGER)
+    if extra:
+        fingers, extra = divmod(features, ELECTRODES)
+    if extra:
+        raise ValueError(f"{features} features are not those of whole fingers")
+    layers, width = _convolutions(config, D1.shape, fingers)
+    layers = [FeatureImages(fingers), *layers]
+    first = fingers * ELECTRODES
+    if first == features:
+        return layers, width
+    return [Beside(nn.Sequential(*layers), first)], width + features - first
+
+
+def _convolutions(
+    config: NetworkConfig, size: tuple[int, int], channels: int
+) -> tuple[list[nn.Module], int]:
+    height, width = (side - KERNEL + 1 for side in size)
+    layers = _convolution(channels, config.filters, KERNEL, config.batch_norm)
+    channels = config.filters
+    if config.pool:
+        layers.append(nn.MaxPool2d(POOL))
+        height, width = height // POOL, width // POOL
+    if config.second is not None:
+        kernel = config.second.kernel
+        layers += _convolution(channels, config.second.filters, kernel, config.batch_norm)
+        height, width, channels = height - kernel + 1, width - kernel + 1, config.second.filters
+    if height < 1 or width < 1:
+        raise ValueError(f"an image of {size[0]} x {size[1]} is too small for the network")
+    return [*layers, nn.Flatten()], channels * height * width
+
+
+def _convolution(inputs: int, filters: int, kernel: int, batch_norm: bool) -> list[nn.Module]:
+    norm = [nn.BatchNorm2d(filters, eps=NORM_EPSILON)] if batch_norm else []
+    return [nn.Conv2d(inputs, filters, kernel, bias=not batch_norm), *norm, nn.ReLU()]
+
+
+def _dense(inputs: int, units: int, batch_norm: bool) -> list[nn.Module]:
+    norm = [nn.BatchNorm1d(units, eps=NORM_EPSILON)] if batch_norm else []
+    return [nn.Linear(inputs, units), *norm, nn.ReLU()]
+
+
+def _drop(config: AnyNetwork) -> list[nn.Module]:
+    return [nn.Dropout(config.dropout)] if config.dropout > 0.0 else []
+
+
+def _folded(network: nn.Sequential) -> list[nn.Module]:
+    """The layers with batch norm folded and dropout left out. Changes the network given."""
+    layers: list[nn.Module] = []
+    for layer in network:
+        if isinstance(layer, nn.BatchNorm2d) and isinstance(layers[-1], nn.Conv2d):
+            layers[-1] = fuse_conv_bn_eval(layers[-1], layer)
+        elif isinstance(layer, nn.BatchNorm1d) and isinstance(layers[-1], nn.Linear):
+            layers[-1] = fuse_linear_bn_eval(layers[-1], layer)
+        elif isinstance(layer, Beside):
+            layers.append(Beside(nn.Sequential(*_folded(layer.look)), layer.first))
+        elif not isinstance(layer, nn.Dropout):
+            layers.append(layer)
+    return layers
+
+
+def _last(layers: list[nn.Module]) -> nn.Linear:
+    last = layers[-1]
+    if not isinstance(last, nn.Linear):
+        raise TypeError(f"a network ends in a linear layer, not {type(last).__name__}")
+    return last

@@ -1,166 +1,127 @@
-"""How the error of a recipe is measured. `cv` is the paper's: 10-fold, stratified, on *Whole*."""
+"""What is trained on and what is judged: the splits that every figure stands on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
-from sklearn.model_selection import StratifiedKFold
 
-from models.contract import MeasuredError
-from models.training.calibration import p_slip
-from models.training.networks import NetworkConfig
-from models.training.recipe import Progress, Recipe, logits, train
+from models.bts3 import NEW_SESSION, WHOLE
+from models.training.datasets import Grasps
+from models.training.folds import TooFewGraspsError, folds_of, object_folds
 
-
-class TooFewGraspsError(ValueError):
-    """The data cannot be cut into that many folds: take fewer folds or more data."""
-
-
-@dataclass(frozen=True, slots=True)
-class Scores:
-    """Figures of one test set as fractions, slip positive."""
-
-    grasps: int
-    accuracy: float
-    precision: float
-    recall: float
-    f1: float
-    auc: float
-    """Area under the ROC curve: does it rank, whatever the threshold."""
+Protocol = Literal[
+    "cv", "unknown", "objects", "objects-whole", "session", "cv-palm-down", "cv-palm-side"
+]
+PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
+STANDARD: tuple[Protocol, ...] = ("cv", "unknown", "objects", "objects-whole", "session")
+"""What is evaluated unless asked for otherwise."""
+ABOUT: dict[Protocol, str] = {
+    "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
+    "unknown": "the paper's 8 objects left out of palm_down + palm_side",
+    "objects": "objects left out in groups, palm_down + palm_side + palm_45",
+    "objects-whole": "objects left out in groups, palm_down + palm_side",
+    "session": "palm_45 by palm_down + palm_side, its objects left out in groups",
+    "cv-palm-down": "stratified folds of palm_down alone",
+    "cv-palm-side": "stratified folds of palm_side alone",
+}
+UNKNOWN_OBJECTS = frozenset(
+    ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case", "train")
+)
+"""Left out by the authors' notebooks: 485 of 2549 grasps. The paper's text counts 6 objects."""
+FOLDS = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CrossValidation:
-    """Result of the `cv` protocol."""
+class Split:
+    """One training and the grasps that it is judged by: indices of rows, ascending."""
 
-    folds: tuple[Scores, ...]
-    fold_of: NDArray[np.int64]
-    """Shape (N,): the fold in which each grasp was left out."""
-    logits: NDArray[np.float64]
-    """Shape (N, 2), order (stable, slip): of each grasp by the network that never saw it."""
-
-    def mean_std(self, name: str) -> tuple[float, float]:
-        """Mean and (population) standard deviation of one of the scores over the folds."""
-        values = np.array([getattr(fold, name) for fold in self.folds])
-        return float(values.mean()), float(values.std())
-
-    def measured(self) -> MeasuredError:
-        """The figures that go into a model's contract."""
-        f1_mean, f1_std = self.mean_std("f1")
-        accuracy_mean, accuracy_std = self.mean_std("accuracy")
-        return MeasuredError("cv", len(self.folds), f1_mean, f1_std, accuracy_mean, accuracy_std)
+    name: str
+    train: NDArray[np.int64]
+    test: NDArray[np.int64]
+    calibration: NDArray[np.int64] | None = None
+    """Grasps of the test's own session, but of other objects, whose labels nobody looks at."""
 
 
-@dataclass(frozen=True, slots=True)
-class Repeatability:
-    """How much of a training is the seed's and how much the machine's, on the first fold."""
+def splits(protocol: Protocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
+    """The splits of a protocol. `unknown` has one, whatever the seed: only the training differs.
 
-    same_seed_same_logits: bool
-    """Training again with the same seed and threads gave bit-identical logits."""
-    one_thread_largest_difference: float
-    """Of a slip probability, when trained on one thread."""
-    one_thread_f1_change: float
-
-
-def score(values: NDArray[np.float64], slipped: NDArray[np.bool_]) -> Scores:
-    """Figures of logits (N, 2) against labels (N,) that hold both classes."""
-    margin = values[:, 1] - values[:, 0]
-    verdict = margin > 0.0
-    precision, recall, f1, _ = precision_recall_fscore_support(
-        slipped, verdict, average="binary", zero_division=0.0
-    )
-    return Scores(
-        grasps=len(slipped),
-        accuracy=float(accuracy_score(slipped, verdict)),
-        precision=float(precision),
-        recall=float(recall),
-        f1=float(f1),
-        auc=float(roc_auc_score(slipped, margin)),
-    )
-
-
-def folds_of(slipped: NDArray[np.bool_], folds: int, seed: int) -> NDArray[np.int64]:
-    """Fold of each grasp, shape (N,): stratified, shuffled with the seed.
-
-    Raises `TooFewGraspsError` if a class has fewer grasps than there are folds.
+    Raises `TooFewGraspsError` if the data do not have the tables, objects or grasps for it.
     """
-    fewest = min(int(slipped.sum()), int((~slipped).sum()))
-    if fewest < folds:
-        raise TooFewGraspsError(
-            f"{folds} folds need {folds} grasps of each class, one has {fewest}"
-        )
-    split = StratifiedKFold(folds, shuffle=True, random_state=seed)
-    fold_of = np.empty(len(slipped), dtype=np.int64)
-    for fold, (_, test) in enumerate(split.split(np.zeros((len(slipped), 1)), slipped)):
-        fold_of[test] = fold
-    return fold_of
+    return _MAKERS[protocol](grasps, seed, folds)
 
 
-def fold_seed(seed: int, fold: int) -> int:
-    """Seed of the training of one fold: another start for each, so the spread holds that too."""
-    return int(np.random.SeedSequence([seed, fold]).generate_state(1)[0])
+def _stratified(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
+    def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+        rows = _rows(grasps, *tables)
+        return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
+
+    return make
 
 
-def cross_validate(
-    config: NetworkConfig,
-    images: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
-    recipe: Recipe,
-    *,
-    folds: int,
-    seed: int,
-    on_epoch: Progress | None = None,
-) -> CrossValidation:
-    """Train `folds` networks, each judged on what it never saw. Raises `TooFewGraspsError`."""
-    fold_of = folds_of(slipped, folds, seed)
-    out_of_fold = np.empty((len(slipped), 2))
-    scores = []
+def _grouped(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
+    def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+        rows = _rows(grasps, *tables)
+        return _leave_out(rows, _object_folds(grasps, rows, folds, seed), folds)
+
+    return make
+
+
+def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
+    rows = _rows(grasps, *WHOLE)
+    out = np.array([grasps.objects[row] in UNKNOWN_OBJECTS for row in rows])
+    if not out.any() or out.all():
+        raise TooFewGraspsError("the data lack the objects that the paper leaves out")
+    return [Split("unknown objects", rows[~out], rows[out])]
+
+
+def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+    """The same groups of objects leave both days: trained without, tested on the later day."""
+    whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
+    rows = np.concatenate((whole, later))
+    fold_of = _object_folds(grasps, rows, folds, seed)
+    of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]
+    made = []
     for fold in range(folds):
-        test = fold_of == fold
-        network = train(
-            config,
-            images[~test],
-            slipped[~test],
-            recipe,
-            seed=fold_seed(seed, fold),
-            on_epoch=on_epoch,
-        )
-        out_of_fold[test] = logits(network, images[test], recipe.threads)
-        scores.append(score(out_of_fold[test], slipped[test]))
-    return CrossValidation(tuple(scores), fold_of, out_of_fold)
+        test = later[of_later == fold]
+        if not len(test):
+            raise TooFewGraspsError(f"{NEW_SESSION} has no grasp of the objects of fold {fold}")
+        name = f"fold {fold}"
+        made.append(Split(name, whole[of_whole != fold], test, later[of_later != fold]))
+    return made
 
 
-def measure_repeatability(
-    config: NetworkConfig,
-    images: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
-    recipe: Recipe,
-    validation: CrossValidation,
-    *,
-    seed: int,
-    on_epoch: Progress | None = None,
-) -> Repeatability:
-    """Train the first fold of a cross-validation again, then once more on a single thread."""
-    test = validation.fold_of == 0
-    first = validation.logits[test]
+_MAKERS: dict[Protocol, Callable[[Grasps, int, int], list[Split]]] = {
+    "cv": _stratified(*WHOLE),
+    "unknown": _unknown,
+    "objects": _grouped(*WHOLE, NEW_SESSION),
+    "objects-whole": _grouped(*WHOLE),
+    "session": _session,
+    "cv-palm-down": _stratified(WHOLE[0]),
+    "cv-palm-side": _stratified(WHOLE[1]),
+}
 
-    def again(threads: int) -> NDArray[np.float64]:
-        network = train(
-            config,
-            images[~test],
-            slipped[~test],
-            replace(recipe, threads=threads),
-            seed=fold_seed(seed, 0),
-            on_epoch=on_epoch,
-        )
-        return logits(network, images[test], threads)
 
-    same, alone = again(recipe.threads), again(1)
-    return Repeatability(
-        same_seed_same_logits=bool(np.array_equal(first, same)),
-        one_thread_largest_difference=float(np.abs(p_slip(first) - p_slip(alone)).max()),
-        one_thread_f1_change=score(alone, slipped[test]).f1 - validation.folds[0].f1,
-    )
+def _rows(grasps: Grasps, *tables: str) -> NDArray[np.int64]:
+    """Indices of the grasps of these tables, all of which must be there."""
+    names = [file.name for file in grasps.files]
+    for table in tables:
+        if table not in names:
+            raise TooFewGraspsError(f"the data lack {table}")
+    wanted = [index for index, name in enumerate(names) if name in tables]
+    return np.flatnonzero(np.isin(grasps.table_of, wanted)).astype(np.int64)
+
+
+def _object_folds(
+    grasps: Grasps, rows: NDArray[np.int64], folds: int, seed: int
+) -> NDArray[np.int64]:
+    return object_folds([grasps.objects[row] for row in rows], folds, seed)
+
+
+def _leave_out(rows: NDArray[np.int64], fold_of: NDArray[np.int64], folds: int) -> list[Split]:
+    return [
+        Split(f"fold {fold}", rows[fold_of != fold], rows[fold_of == fold]) for fold in range(folds)
+    ]

@@ -10,13 +10,25 @@ import numpy as np
 
 from daemon.judge.pipeline import Limits, Pipeline
 from drivers.base import DriverCounters, DriverError, Reading, TactileReading
-from models.contract import Dataset, Finger, MeasuredError, ModelContract, ModelError, SeenCounts
+from models.contract import (
+    Dataset,
+    Finger,
+    ImageInput,
+    MeasuredError,
+    ModelContract,
+    ModelError,
+    SeenCounts,
+)
 from models.runtime import TactileModel
 from models.tactile_image import TactileImager
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 MS = 1_000_000
 LOW, HIGH, MARGIN = 1000, 3000, 250
+
+
+WIDE = 1e-6
+"""Inverse of a spread so large that no count is far from any other."""
 
 
 def seen_box(fingers: int) -> SeenCounts:
@@ -26,24 +38,22 @@ def seen_box(fingers: int) -> SeenCounts:
         high=((HIGH,) * 24,) * fingers,
         margin=MARGIN,
         centre=((2000.0,) * 24,) * fingers,
-        whitening=tuple((0.0,) * (row + 1) for row in range(24 * fingers)),
+        whitening=tuple((0.0,) * row + (WIDE,) for row in range(24 * fingers)),
         distance_max=1.0,
     )
 
 
 def contract(fingers: tuple[Finger, ...] = FINGERS) -> ModelContract:
     return ModelContract(
-        version=1,
+        version=2,
         name="fake",
-        layout="D1",
-        fill="neighbour-mean",
-        normalisation="filled-image",
-        composition="channels",
+        input=ImageInput("D1", "neighbour-mean", "filled-image", "channels"),
         fingers=fingers,
         classes=("stable", "slip"),
         seed=0,
         datasets=(Dataset("none", "0" * 64, 1),),
-        measured=MeasuredError("cv", 10, 0.9, 0.01, 0.9, 0.01),
+        measured=(MeasuredError("cv", 10, 0.9, 0.01, 0.9, 0.01),),
+        confidence=(),
         seen=seen_box(len(fingers)),
     )
 
@@ -56,8 +66,8 @@ class FakeModel:
         self.path = Path("fake.onnx")
         self.sha256 = "0123456789abcdef" * 4
         self.contract = contract()
-        self.imager = TactileImager(3)
-        self.image = np.zeros(self.imager.shape, dtype=np.float32)
+        self.inputs = TactileImager(3)
+        self.input = np.zeros(self.inputs.shape, dtype=np.float32)
         self.runs = 0
 
     def run(self) -> tuple[float, float]:
@@ -86,6 +96,7 @@ def pipeline(
         Limits(
             max_age_ns=int(limits.get("max_age_ns", 100 * MS)),
             slip_threshold=limits.get("slip_threshold", 0.5),
+            min_confidence=limits.get("min_confidence", 0.0),
         ),
         clock,
     )
@@ -113,6 +124,10 @@ class FakeDriver:
     @property
     def exhausted(self) -> bool:
         return self.ends and not self.queue
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return {}
 
     def describe(self) -> dict[str, str]:
         return {"made": "by the test"}

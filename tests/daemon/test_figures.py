@@ -70,10 +70,10 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
         for _ in range(number):
             summary.add(verdict(outcome), slipped)
     # By hand: precision 8/9, recall 8/10, F1 their harmonic mean, accuracy 17/20.
-    assert summary.scores() == pytest.approx(
+    assert summary.tally.scores() == pytest.approx(
         {"accuracy": 0.85, "precision": 8 / 9, "recall": 0.8, "f1": 2 / (9 / 8 + 10 / 8)}
     )
-    assert summary.labelled == 23
+    assert summary.tally.labelled == 23
     assert summary.as_dict(1.0)["judged_and_labelled"] == 20
     assert summary.as_dict(1.0)["reasons"] == {"stale": 3}
 
@@ -81,11 +81,11 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
 def test_no_labels_means_no_scores() -> None:
     summary = Summary()
     summary.add(verdict(Outcome.STABLE), None)
-    assert summary.scores() is None
+    assert summary.tally.scores() is None
     assert not any("recorded" in line for line in summary.lines(1.0))
 
 
 def test_a_score_without_a_denominator_is_left_out() -> None:
     summary = Summary()
     summary.add(verdict(Outcome.STABLE), False)
-    assert summary.scores() == {"accuracy": 1.0}
+    assert summary.tally.scores() == {"accuracy": 1.0}

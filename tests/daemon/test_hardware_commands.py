@@ -32,11 +32,15 @@ TWINS: dict[str, list[str]] = {
 PORT = 45931
 
 
+MODEL = "cnn1"
+"""Its verdict on a reading does not depend on what came before."""
+
+
 def scene_for(kind: str, folder: Path) -> Path:
     scene = folder / "scene.toml"
     scene.write_text(
         f"[tactile]\n{SCENES[kind].format(folder=folder, port=PORT)}\n"
-        f'[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        f'[model]\nname = "{MODEL}"\n[publish]\nendpoint = "ipc://{folder}/graspd"\n'
     )
     return scene
 
@@ -54,7 +58,7 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def replayed() -> list[float | None]:
-    result = graspd("replay", "--json")
+    result = graspd("replay", "--json", "--model", MODEL)
     return [json.loads(line)["p_slip"] for line in result.stdout.splitlines()]
 
 

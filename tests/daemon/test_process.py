@@ -100,7 +100,14 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("package", ["torch", "rich"])
 def test_a_missing_extra_is_asked_for_from_the_source_and_from_no_index(package: str) -> None:
-    code = f"import sys; sys.modules[{package!r}] = None"
+    code = (
+        "import sys, importlib.abc\n"
+        "class Absent(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        f"        if name.split('.')[0] == {package!r}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Absent())"
+    )
     result = python(code, "train", "cnn1", "--data", "absent")
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()

@@ -27,17 +27,19 @@ def demo_rows() -> list[dict[str, str]]:
 def test_replay_without_arguments_judges_the_demo_recording() -> None:
     result = graspd("replay")
     assert result.returncode == 0, result.stderr
-    *verdicts, blank, counts, scores, latency = result.stdout.splitlines()
+    lines = result.stdout.splitlines()
+    blank = lines.index("")
+    verdicts, summary = lines[:blank], lines[blank + 1 :]
     assert len(verdicts) == len(demo_rows())
-    assert blank == ""
-    assert counts.startswith(f"{len(verdicts)} verdicts in ")
-    assert "recorded outcomes (slip positive): accuracy" in scores
-    assert latency.startswith("reading to verdict: p50 ")
+    assert summary[0].startswith(f"{len(verdicts)} verdicts in ")
+    assert any("recorded outcomes (slip positive): accuracy" in line for line in summary)
+    assert any(line.startswith("without session calibration: ") for line in summary)
+    assert summary[-1].startswith("reading to verdict: p50 ")
     assert all("synthetic" in line for line in verdicts)
 
 
 def test_replay_json_gives_one_valid_verdict_per_real_grasp(bts3_dir: Path) -> None:
-    result = graspd("replay", bts3_dir / "palm_down.csv", "--json")
+    result = graspd("replay", bts3_dir / "palm_down.csv", "--json", "--model", "cnn1")
     assert result.returncode == 0, result.stderr
     lines = result.stdout.splitlines()
     assert len(lines) == 1276
@@ -130,14 +132,14 @@ def replace_cell(text: str) -> str:
 @pytest.mark.parametrize(
     "text", ["nan", "-1", "4096", "1e9", "text", "", "2602.5", "inf", "0x10", "1_000"]
 )
-def test_a_value_that_is_no_count_makes_that_grasp_unknown(tmp_path: Path, text: str) -> None:
+def test_a_value_that_is_no_count_is_repaired_and_said(tmp_path: Path, text: str) -> None:
     recording = tmp_path / "grasps.csv"
     recording.write_text(replace_cell(text))
     result = graspd("replay", recording, "--json")
     assert result.returncode == 0, result.stderr
     first, second, *_ = (json.loads(line) for line in result.stdout.splitlines())
-    assert (first["verdict"], first["reasons"]) == ("unknown", ["not-a-count"])
-    assert second["reasons"] == []
+    assert (first["valid"], first["repaired"]) == (True, ["ff_1"])
+    assert "ff_1" not in second["repaired"]
     strict = graspd("replay", recording, "--strict", "--json")
     assert strict.returncode == 2
     assert f"{recording}, line 2, column ff_biotac_1: " in strict.stderr.splitlines()[-1]

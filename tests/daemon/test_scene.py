@@ -10,13 +10,13 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel, ValidationError
 
+from daemon.endpoint import check_endpoint
 from daemon.scene import (
     SCENE_MAX_BYTES,
     ReplayFaultsSection,
     ReplayTactile,
     Scene,
     SceneError,
-    check_endpoint,
     load,
 )
 from drivers.faults import ReplayFaults

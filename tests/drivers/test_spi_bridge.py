@@ -46,6 +46,7 @@ def test_a_sweep_becomes_a_reading_by_slot_and_sensor(rig: Rig) -> None:
     assert described["board"] == "b"
     assert described["sensors"] == "BTSP-1, BTSP-1, BTSP-1"
     assert described["sequence"] == "24 samples at 100.0 Hz"
+    assert rig.driver.serials == dict.fromkeys(("ff", "mf", "th"), "BTSP-1")
     assert described["clock"] == "trusted"
     assert reading.seq == 0
     assert not reading.faults.any()

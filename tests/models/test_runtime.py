@@ -22,11 +22,11 @@ def test_the_answer_is_two_probabilities_that_follow_the_image() -> None:
     random = np.random.default_rng(0)
     answers = []
     for _ in range(5):
-        model.image[...] = random.normal(size=model.image.shape)
+        model.input[...] = random.normal(size=model.input.shape)
         answers.append(model.run())
         assert sum(answers[-1]) == pytest.approx(1.0, abs=1e-6)
     assert len(set(answers)) == 5
-    model.image[...] = 0.0
+    model.input[...] = 0.0
     assert model.run() == model.run()
 
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from models.contract import ModelContract, ModelError, SeenCounts
+from models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
 from models.seen import SeenCheck
 from tests.daemon.fakes import contract
 
@@ -15,10 +15,15 @@ def diagonal(size: int, value: float) -> tuple[tuple[float, ...], ...]:
     return tuple((0.0,) * row + (value,) for row in range(size))
 
 
-def seen(spread: float = 0.0, distance_max: float = 2.5) -> SeenCounts:
+def seen(spread: float = 1e-6, distance_max: float = 2.5) -> SeenCounts:
     row = ((2000,) * 24,) * 3
     centre = ((2000.0,) * 24,) * 3
     return SeenCounts(row, row, 250, centre, diagonal(72, spread), distance_max)
+
+
+def session(**changes: object) -> dict[str, object]:
+    sound = SessionInput((0.0,) * 78, (1.0,) * 78, 3.0, 1.0, 20.0, (Sharpness(0.0, 1.0),))
+    return {"type": "session"} | msgspec.to_builtins(msgspec.structs.replace(sound, **changes))  # type: ignore[no-any-return]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +44,7 @@ def test_the_distance_is_the_root_mean_square_deviation(off: int, refused: bool)
 
 
 def test_the_triangle_is_read_row_by_row() -> None:
-    rows = [list(row) for row in diagonal(72, 0.0)]
+    rows = [list(row) for row in diagonal(72, 1e-6)]
     rows[5][2] = 1.0  # electrode 5 weighs on the third deviation
     crossed = msgspec.structs.replace(seen(), whitening=tuple(map(tuple, rows)))
     counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
@@ -55,8 +60,16 @@ def test_the_triangle_is_read_row_by_row() -> None:
         ({"fingers": ("ff", "mf")}, "not \\(fingers, 24\\)"),
         ({"fingers": ()}, "not different ones"),
         ({"fingers": ("ff", "mf", "toe")}, "toe"),
-        ({"version": 2}, "version"),
-        ({"composition": "horizontal"}, "composition"),
+        ({"version": 1}, "version"),
+        ({"input": {"type": "image", "layout": "D1"}}, "input"),
+        ({"input": {"type": "sound"}}, "input"),
+        ({"measured": []}, "no measured error"),
+        ({"input": session(mean=(0.0,) * 77)}, "78 features"),
+        ({"input": session(spread=(0.0,) * 78)}, "spread"),
+        ({"input": session(sharpness=())}, "ascend from 0"),
+        ({"input": session(sharpness=(Sharpness(5.0, 1.0),))}, "ascend from 0"),
+        ({"input": session(sharpness=(Sharpness(0.0, 1.0),) * 2)}, "ascend from 0"),
+        ({"seen": msgspec.to_builtins(seen(spread=0.0))}, "no inverse"),
         ({"classes": ("slip", "stable")}, "classes"),
         ({"unheard_of": 1}, "unheard_of"),
         ({"seen": msgspec.to_builtins(seen()) | {"whitening": [[1.0]]}}, "triangle"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 from models.bts3 import TABLES
 from models.training.datasets import (
     DatasetError,
+    concatenate,
+    read_all,
     read_new_session,
     read_table,
     read_whole,
@@ -167,3 +170,44 @@ def test_a_table_with_other_bytes_is_known_as_not_published(tmp_path: Path) -> N
     for name in ("palm_down", "palm_side"):
         write_table(tmp_path / f"{name}.csv", *separable_counts(6))
     assert unpublished(read_whole(tmp_path).files) == ["palm_down", "palm_side"]
+
+
+def test_all_tables_know_which_grasp_is_theirs(bts3_dir: Path) -> None:
+    grasps = read_all(bts3_dir)
+    assert len(grasps) == 1276 + 1273 + 2133
+    assert np.bincount(grasps.table_of).tolist() == [1276, 1273, 2133]
+    assert [file.name for file in grasps.files] == ["palm_down", "palm_side", "palm_45"]
+
+
+def test_without_a_later_session_all_is_whole(tmp_path: Path) -> None:
+    for name in ("palm_down", "palm_side"):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6))
+    assert len(read_all(tmp_path)) == 12
+
+
+def test_some_rows_keep_counts_labels_objects_and_tables_together(tmp_path: Path) -> None:
+    for seed, name in enumerate(("palm_down", "palm_side")):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
+    whole = read_whole(tmp_path)
+    some = whole.rows(np.array([1, 5, 7]))
+    assert np.array_equal(some.counts, whole.counts[[1, 5, 7]])
+    assert some.slipped.tolist() == [True, True, True]
+    assert some.table_of.tolist() == [0, 0, 1]
+    assert [file.rows for file in some.files] == [2, 1]
+    assert some.digest() != whole.digest()
+    assert whole.rows(np.arange(12)).digest() == whole.digest()
+
+
+def test_the_digest_of_grasps_is_of_counts_labels_objects_and_tables(tmp_path: Path) -> None:
+    for seed, name in enumerate(("palm_down", "palm_side")):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
+    down, side = (read_table(tmp_path / f"{name}.csv") for name in ("palm_down", "palm_side"))
+    digests = {
+        concatenate([down, side]).digest(),
+        concatenate([side, down]).digest(),
+        dataclasses.replace(down, slipped=~down.slipped).digest(),
+        dataclasses.replace(down, objects=("cup",) * 6).digest(),
+        dataclasses.replace(down, counts=down.counts + np.uint16(1)).digest(),
+        down.digest(),
+    }
+    assert len(digests) == 6

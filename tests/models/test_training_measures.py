@@ -18,7 +18,8 @@ from models.training.calibration import (
     p_slip,
     reliability,
 )
-from models.training.protocols import TooFewGraspsError, folds_of, score
+from models.training.folds import TooFewGraspsError, folds_of
+from models.training.metrics import score
 from models.training.seen import (
     held_out_never_seen,
     made_up_never_seen,
@@ -33,6 +34,16 @@ def test_the_temperature_that_made_the_labels_is_found(true_temperature: float) 
     chance = 1.0 / (1.0 + np.exp((logits[:, 0] - logits[:, 1]) / true_temperature))
     slipped = random.random(40_000) < chance
     assert fit_temperature(logits, slipped) == pytest.approx(true_temperature, rel=0.03)
+
+
+def test_margins_and_logits_give_the_same_calibration() -> None:
+    random = np.random.default_rng(4)
+    logits, slipped = random.normal(size=(200, 2)), random.random(200) < 0.5
+    margins = logits[:, 1] - logits[:, 0]
+    fold_of = np.arange(200) % 4
+    assert fit_temperature(margins, slipped) == fit_temperature(logits, slipped)
+    ours, theirs = (cross_fitted_p_slip(each, slipped, fold_of) for each in (margins, logits))
+    assert np.array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize(("sign", "end"), [(1.0, 0.05), (-1.0, 20.0)])

@@ -1,40 +1,41 @@
-"""The network, its training and its export."""
+"""The networks: sizes, shapes, order of axes, folding for inference."""
 
 from __future__ import annotations
-
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 pytest.importorskip("torch", reason="the train extra is not installed")
-pytest.importorskip("onnx", reason="the train extra is not installed")
 
-import onnxruntime as ort
 import torch
 from torch import nn
 
-from models.contract import ModelContract
-from models.runtime import TactileModel
+from models.layout import D1
 from models.tactile_image import TactileImager
-from models.training import export as export_module
-from models.training.datasets import Grasps
-from models.training.export import ExportError, export
-from models.training.making import Order, make
 from models.training.networks import (
+    CNN0,
     CNN1,
+    CNN2,
+    CNN3,
+    Beside,
+    DenseConfig,
     NetworkConfig,
+    SecondConvolution,
     build,
     for_inference,
+    for_margin,
     parameter_count,
 )
-from models.training.recipe import Recipe, logits, reproducible, train
+from models.training.recipe import logits, reproducible
 from tests.models.training_samples import separable_counts
 
-TINY = NetworkConfig("tiny", filters=4, hidden=16)
-QUICK = Recipe(epochs=4, threads=1)
+TINY = NetworkConfig(filters=4, hidden=16)
+DEEP = NetworkConfig(
+    filters=4, hidden=8, pool=True, second=SecondConvolution(5, kernel=3), dropout=0.4
+)
+PLAIN = NetworkConfig(filters=4, hidden=8, batch_norm=False)
+IMAGE, FEATURES, VECTOR = (12, 11, 3), (78,), (72,)
 
 
 @pytest.fixture(scope="module")
@@ -42,27 +43,71 @@ def images() -> NDArray[np.float32]:
     return TactileImager(3).build_batch(separable_counts(160)[0])[0]
 
 
-@pytest.fixture(scope="module")
-def slipped() -> NDArray[np.bool_]:
-    return separable_counts(160)[1]
+def _unsettled(config: NetworkConfig | DenseConfig, shape: tuple[int, ...]) -> nn.Sequential:
+    """A network in evaluation mode, no parameter of which has its neutral value."""
+    with reproducible(seed=3):
+        network = build(config, shape)
+        for layer in network.modules():
+            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
+                nn.init.uniform_(layer.weight, 0.5, 2.0)
+                nn.init.normal_(layer.bias)
+                assert layer.running_mean is not None
+                assert layer.running_var is not None
+                nn.init.normal_(layer.running_mean)
+                nn.init.uniform_(layer.running_var, 0.5, 2.0)
+            elif isinstance(layer, nn.Conv2d | nn.Linear) and layer.bias is not None:
+                nn.init.normal_(layer.bias)
+    return network.eval()
 
 
-@pytest.fixture(scope="module")
-def trained(images: NDArray[np.float32], slipped: NDArray[np.bool_]) -> nn.Sequential:
-    return train(TINY, images, slipped, QUICK, seed=1)
+@pytest.mark.parametrize(
+    ("config", "shape", "parameters"),
+    [
+        (CNN1, IMAGE, 2_955_170),  # the published network
+        # convolution + its norm + hidden layer + its norm + last layer, by hand
+        (CNN0, IMAGE, 864 + 64 + (2880 * 128 + 128) + 256 + 258),
+        (CNN2, IMAGE, 864 + 64 + (640 * 1024 + 1024) + 2048 + 2050),
+        (CNN3, IMAGE, 864 + 64 + (32 * 64 + 128) + (1280 * 1024 + 1024) + 2048 + 2050),
+        (
+            NetworkConfig(32, 1024, pool=True, second=SecondConvolution(64, kernel=3)),
+            IMAGE,
+            864 + 64 + (32 * 64 * 9 + 128) + (384 * 1024 + 1024) + 2048 + 2050,
+        ),
+        (CNN0, (12, 33, 1), 288 + 64 + (10 * 31 * 32 * 128 + 128) + 256 + 258),
+        (CNN0, (36, 11, 1), 288 + 64 + (34 * 9 * 32 * 128 + 128) + 256 + 258),
+        (CNN0, (6, 5, 3), 864 + 64 + (4 * 3 * 32 * 128 + 128) + 256 + 258),
+        (CNN0, (4, 7, 3), 864 + 64 + (2 * 5 * 32 * 128 + 128) + 256 + 258),
+        (NetworkConfig(16, 64), FEATURES, 432 + 32 + (1446 * 64 + 64) + 128 + 130),
+        (NetworkConfig(8, 32), VECTOR, 216 + 16 + (720 * 32 + 32) + 64 + 66),
+        (NetworkConfig(8, 32, batch_norm=False), IMAGE, 216 + 8 + (720 * 32 + 32) + 66),
+        (DenseConfig((64, 32)), FEATURES, (78 * 64 + 64) + 128 + (64 * 32 + 32) + 64 + 66),
+    ],
+)
+def test_a_network_has_the_parameters_of_its_layers(
+    config: NetworkConfig | DenseConfig, shape: tuple[int, ...], parameters: int
+) -> None:
+    network = build(config, shape).eval()
+    assert parameter_count(network) == parameters
+    assert network(torch.zeros(2, *shape)).shape == (2, 2)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    counts, slipped = separable_counts(80)
-    grasps = Grasps(counts, slipped, ("ball",) * 80, ())
-    out = tmp_path_factory.mktemp("made")
-    make(Order(TINY, Recipe(epochs=2, threads=1), folds=2, seed=4), grasps, None, out)
-    return out / "tiny.onnx"
-
-
-def test_cnn1_has_the_parameters_of_the_published_network() -> None:
-    assert parameter_count(build(CNN1)) == 2_955_170
+@pytest.mark.parametrize(
+    ("config", "shape", "problem"),
+    [
+        (
+            NetworkConfig(4, 8, pool=True, second=SecondConvolution(kernel=3)),
+            (4, 7, 3),
+            "too small",
+        ),
+        (TINY, (2, 5, 3), "too small"),
+        (TINY, (77,), "not those of whole fingers"),
+    ],
+)
+def test_a_network_that_does_not_fit_its_input_is_refused(
+    config: NetworkConfig, shape: tuple[int, ...], problem: str
+) -> None:
+    with pytest.raises(ValueError, match=problem):
+        build(config, shape)
 
 
 def test_weights_start_as_in_keras() -> None:
@@ -109,109 +154,92 @@ def test_rows_and_columns_are_not_swapped(images: NDArray[np.float32]) -> None:
     assert np.array_equal(seen, images[:, 0:10, 1:10, 2])
 
 
-def test_a_tiny_training_learns_what_can_be_separated(
-    trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
-    counts, labels = separable_counts(100, seed=8)
-    unseen = TactileImager(3).build_batch(counts)[0]
-    assert ((logits(trained, images).argmax(axis=1) == 1) == slipped).all()
-    assert ((logits(trained, unseen).argmax(axis=1) == 1) == labels).all()
+def _convolve(planes: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Valid correlation of (channels, h, w) with (filters, channels, k, k), by loops."""
+    side = weights.shape[-1]
+    height, width = planes.shape[1] - side + 1, planes.shape[2] - side + 1
+    out = np.empty((len(weights), height, width))
+    for row in range(height):
+        for column in range(width):
+            window = planes[:, row : row + side, column : column + side]
+            out[:, row, column] = np.tensordot(weights, window, 3)
+    return out
 
 
-def _weights(network: nn.Sequential) -> list[float]:
-    return [value for tensor in network.state_dict().values() for value in tensor.ravel().tolist()]
+def _normed(
+    values: NDArray[np.float64], tensors: dict[str, NDArray[np.float64]], name: str
+) -> NDArray[np.float64]:
+    """Batch norm, then ReLU."""
+    aside = (-1, *(1,) * (values.ndim - 1))
+    mean, variance = tensors[f"{name}.running_mean"], tensors[f"{name}.running_var"]
+    scale = tensors[f"{name}.weight"] / np.sqrt(variance + 1e-3)
+    shifted = (values - mean.reshape(aside)) * scale.reshape(aside)
+    return np.maximum(shifted + tensors[f"{name}.bias"].reshape(aside), 0.0)
 
 
-def test_the_same_seed_gives_the_same_weights_and_another_gives_others(
-    trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
-    torch.manual_seed(99)  # the state around a training does not matter
-    assert _weights(train(TINY, images, slipped, QUICK, seed=1)) == _weights(trained)
-    assert _weights(train(TINY, images, slipped, QUICK, seed=2)) != _weights(trained)
+def test_a_deep_network_computes_what_its_layers_say(images: NDArray[np.float32]) -> None:
+    """The same in numpy: convolution, norm, ReLU, pooling, convolution, norm, ReLU, dense."""
+    network = _unsettled(DEEP, IMAGE)
+    tensors = {name: tensor.double().numpy() for name, tensor in network.state_dict().items()}
+    expected = []
+    for image in images[:5]:
+        seen = _normed(_convolve(image.transpose(2, 0, 1), tensors["1.weight"]), tensors, "2")
+        assert seen.shape == (4, 10, 9)
+        pooled = seen[:, :10, :8].reshape(4, 5, 2, 4, 2).max(axis=(2, 4))
+        seen = _normed(_convolve(pooled, tensors["5.weight"]), tensors, "6")
+        hidden = tensors["10.weight"] @ seen.ravel() + tensors["10.bias"]
+        hidden = _normed(hidden, tensors, "11")
+        expected.append(tensors["14.weight"] @ hidden + tensors["14.bias"])
+    assert logits(network, images[:5]) == pytest.approx(np.array(expected), rel=1e-4, abs=1e-4)
 
 
-def test_training_leaves_torch_as_it_was(
-    images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
-    threads, state = torch.get_num_threads(), torch.random.get_rng_state()
-    train(TINY, images, slipped, Recipe(epochs=1, threads=threads + 1), seed=1)
-    assert torch.get_num_threads() == threads
-    assert not torch.are_deterministic_algorithms_enabled()
-    assert torch.equal(torch.random.get_rng_state(), state)
+def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
+    """The image is filled here by loops: twice the mean of the known neighbours."""
+    features = np.random.default_rng(5).normal(size=(3, 78)).astype(np.float32)
+    network = _unsettled(NetworkConfig(filters=4, hidden=8), FEATURES)
+    beside = network[0]
+    assert isinstance(beside, Beside)
+    front = beside.look[0](torch.from_numpy(features[:, :72])).numpy()
+    assert front.shape == (3, 3, 12, 11)
+    for finger in range(3):
+        image = np.full((12, 11), np.nan)
+        image[list(D1.rows), list(D1.columns)] = features[1, 24 * finger : 24 * finger + 24]
+        for _ in range(2):
+            known = image.copy()
+            for row, column in np.argwhere(np.isnan(known)):
+                window = known[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+                if not np.isnan(window).all():
+                    image[row, column] = np.nanmean(window)
+        assert front[1, finger] == pytest.approx(image, abs=1e-5)
+    laid = beside(torch.from_numpy(features)).detach().numpy()
+    assert laid.shape == (3, 4 * 90 + 6)
+    assert np.array_equal(laid[:, -6:], features[:, 72:])
 
 
-def test_every_epoch_is_reported(images: NDArray[np.float32], slipped: NDArray[np.bool_]) -> None:
-    epochs: list[None] = []
-    train(TINY, images, slipped, QUICK, seed=1, on_epoch=lambda: epochs.append(None))
-    assert len(epochs) == 4
-
-
-@pytest.mark.parametrize("grasps", [0, 1])
-def test_training_on_less_than_two_grasps_is_refused(
-    grasps: int, images: NDArray[np.float32], slipped: NDArray[np.bool_]
-) -> None:
-    with pytest.raises(ValueError, match=f"cannot train on {grasps} grasps"):
-        train(TINY, images[:grasps], slipped[:grasps], QUICK, seed=1)
-
-
-@pytest.mark.parametrize("temperature", [0.5, 1.0, 2.5])
+@pytest.mark.parametrize(
+    ("config", "shape"),
+    [
+        (DEEP, IMAGE),
+        (PLAIN, IMAGE),
+        (NetworkConfig(4, 8, dropout=0.5), FEATURES),
+        (DenseConfig((9, 5), dropout=0.5), VECTOR),
+        (DenseConfig((9,), batch_norm=False), FEATURES),
+    ],
+)
+@pytest.mark.parametrize("temperature", [0.5, 2.5])
 def test_folding_batch_norm_and_temperature_changes_no_probability(
-    trained: nn.Sequential, images: NDArray[np.float32], temperature: float
+    config: NetworkConfig | DenseConfig, shape: tuple[int, ...], temperature: float
 ) -> None:
-    folded = for_inference(trained, temperature)
-    assert not any("Norm" in type(layer).__name__ for layer in folded)
-    scaled = np.exp(logits(trained, images) / temperature)
-    expected = scaled / scaled.sum(axis=1, keepdims=True)
-    assert np.abs(logits(folded, images) - expected).max() < 1e-5
-    assert len(trained) == 9, "the trained network itself must stay as it is"
-
-
-def test_the_file_takes_any_number_of_images(made: Path, images: NDArray[np.float32]) -> None:
-    session = ort.InferenceSession(made, providers=["CPUExecutionProvider"])
-    (taken,), (given,) = session.get_inputs(), session.get_outputs()
-    assert (taken.name, taken.type, taken.shape[1:]) == (
-        "tactile_image",
-        "tensor(float)",
-        [12, 11, 3],
+    inputs = np.random.default_rng(6).normal(size=(50, *shape)).astype(np.float32)
+    network = _unsettled(config, shape)
+    layers = len(network)
+    folded = for_inference(network, temperature)
+    assert not any(
+        word in type(layer).__name__ for layer in folded.modules() for word in ("Norm", "Drop")
     )
-    assert (given.name, given.type, given.shape[1:]) == ("probability", "tensor(float)", [2])
-    model = TactileModel(made)
-    for number in (1, 2, 7):
-        (together,) = session.run(None, {"tactile_image": images[:number]})
-        assert together.shape == (number, 2)
-        for image, row in zip(images, together, strict=False):
-            model.image[...] = image
-            assert model.run() == pytest.approx(tuple(row), abs=1e-6)
-
-
-def test_the_file_is_one_and_tells_nothing_of_the_machine(made: Path) -> None:
-    assert sorted(path.name for path in made.parent.iterdir()) == ["tiny.json", "tiny.onnx"]
-    for path in made.parent.iterdir():
-        text = path.read_bytes().decode("latin-1")
-        for trace in (str(Path(__file__).parents[2]), str(Path.home()), "site-packages", ".py"):
-            assert trace not in text
-        assert not re.search(r"/(tmp|home|usr|work|root)/", text)
-
-
-def test_the_same_order_makes_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    counts, slipped = separable_counts(80)
-    grasps = Grasps(counts, slipped, ("ball",) * 80, ())
-    make(Order(TINY, Recipe(epochs=2, threads=1), folds=2, seed=4), grasps, None, tmp_path)
-    for name in ("tiny.onnx", "tiny.json"):
-        assert (tmp_path / name).read_bytes() == made.with_name(name).read_bytes()
-
-
-def test_a_file_that_judges_otherwise_is_not_written(
-    made: Path, trained: nn.Sequential, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def warmer(network: nn.Sequential, temperature: float) -> nn.Sequential:
-        return for_inference(network, temperature * 1.01)
-
-    monkeypatch.setattr(export_module, "for_inference", warmer)
-    path = tmp_path / "tiny.onnx"
-    path.write_bytes(b"the file before")
-    contract: ModelContract = TactileModel(made).contract
-    with pytest.raises(ExportError, match="differs from the network"):
-        export(trained, 1.0, contract, separable_counts(40)[0], path)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["tiny.onnx"]
-    assert path.read_bytes() == b"the file before"
+    scaled = np.exp(logits(network, inputs) / temperature)
+    expected = scaled / scaled.sum(axis=1, keepdims=True)
+    assert np.abs(logits(folded, inputs) - expected).max() < 1e-5
+    assert len(network) == layers, "the trained network itself must stay as it is"
+    stable, slip = logits(network, inputs).T
+    assert logits(for_margin(network), inputs)[:, 0] == pytest.approx(slip - stable, abs=1e-4)

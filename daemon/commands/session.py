@@ -1,0 +1,129 @@
+"""`graspd session show|reset|seed SCENE`: what the daemon knows of today's sensors."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from daemon import assembly, scene
+from daemon.judge.pipeline import Pipeline
+from daemon.session_file import KeptSession, SessionFile, SessionFileError, load
+from daemon.text import complain, printable
+from drivers.base import DriverError, TactileReading
+from models.contract import ModelError, SessionInput
+from models.runtime import TactileModel
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    for action, text in (
+        ("show", "say how many grasps are known, of which sensors, since when"),
+        ("reset", "forget the session: after a sensor was refilled or exchanged"),
+        ("seed", "start the session from recorded grasps; needs no labels"),
+    ):
+        command = actions.add_parser(action, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        command.add_argument("scene", type=Path, help="scene file (TOML)")
+        if action == "show":
+            command.add_argument("--json", action="store_true", help="one JSON object on stdout")
+        if action == "seed":
+            command.add_argument(
+                "recordings",
+                nargs="+",
+                type=Path,
+                metavar="RECORDING",
+                help="grasp tables (CSV): twenty grasps of different objects or more",
+            )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do it. Returns 0, or 2 if scene, model, recording or the kept session is wrong."""
+    try:
+        wanted = scene.load(args.scene)
+        model = assembly.load_model(wanted)
+        if not isinstance(model.contract.input, SessionInput):
+            raise ModelError(f"the model {model.contract.name} keeps no session")
+        if args.action == "show":
+            _show(wanted, model.contract.input, as_json=args.json)
+        elif args.action == "reset":
+            _reset(wanted)
+        else:
+            _seed(wanted, model, args.recordings)
+    except (scene.SceneError, ModelError, DriverError, SessionFileError) as error:
+        complain(error)
+        return 2
+    return 0
+
+
+def _show(wanted: scene.Scene, needs: SessionInput, *, as_json: bool) -> None:
+    path = wanted.session_path
+    kept = load(path)
+    if as_json:
+        known = None if kept is None else msgspec.to_builtins(kept)
+        calibrated = kept is not None and kept.statistics.grasps >= needs.calibrated_from
+        document = {"file": str(path), "calibrated": calibrated, "session": known}
+        sys.stdout.write(json.dumps(document) + "\n")
+        return
+    sys.stdout.write("\n".join(_lines(path, kept, needs)) + "\n")
+
+
+def _lines(path: Path, kept: KeptSession | None, needs: SessionInput) -> Iterator[str]:
+    if kept is None:
+        yield f"{printable(str(path))}: no session is kept"
+        return
+    grasps = kept.statistics.grasps
+    state = "calibrated" if grasps >= needs.calibrated_from else "not calibrated yet"
+    yield f"{printable(str(path))}: {grasps} grasps, {state} (from {needs.calibrated_from:g} on)"
+    saved = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(kept.saved_at))
+    yield f"  saved    {saved}"
+    for finger in kept.fingers:
+        yield f"  {finger:8} sensor {printable(kept.serials.get(finger, 'of unknown serial'))}"
+
+
+def _reset(wanted: scene.Scene) -> None:
+    with SessionFile(wanted.session_path) as file:
+        was_kept = file.remove()
+    where = printable(str(wanted.session_path))
+    sys.stdout.write(f"{where}: {'forgotten' if was_kept else 'no session was kept'}\n")
+
+
+def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
+    """Judge the recordings as the daemon does, and keep the session that comes out."""
+    pipeline = assembly.build_pipeline(wanted, model)
+    session = pipeline.session
+    if session is None:
+        raise ModelError(f"the model {model.contract.name} keeps no session")
+    with SessionFile(wanted.session_path) as file:
+        kept = file.load()
+        read = _take_in(wanted, recordings, pipeline)
+        if not session.grasps:
+            raise DriverError(f"none of the {read} readings can be used")
+        serials = {} if kept is None else kept.serials
+        file.save(session.state(), wanted.hand.fingers, serials)
+    where = printable(str(wanted.session_path))
+    sys.stdout.write(f"{where}: {session.grasps} grasps of {read} readings taken in\n")
+
+
+def _take_in(wanted: scene.Scene, recordings: list[Path], pipeline: Pipeline) -> int:
+    replay = scene.ReplayTactile(
+        driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
+    )
+    (driver,) = assembly.build_drivers(
+        wanted.model_copy(update={"tactile": replay, "joints": None})
+    )
+    read = 0
+    with contextlib.closing(driver):
+        assembly.open_driver(driver)
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                if isinstance(reading, TactileReading):
+                    pipeline.judge(reading)
+                    read += 1
+    return read

@@ -1,0 +1,77 @@
+"""Session calibration: what this session's grasps look like, and how much is known of it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.contract import SessionInput
+from models.inputs import SessionBuilder, raw_features
+from models.session import SessionState, SessionStatistics
+
+
+class SessionCalibration:
+    """Keeps the statistics of the session's unlabelled grasps, and a model's input up to them."""
+
+    def __init__(
+        self,
+        wanted: SessionInput,
+        inputs: SessionBuilder,
+        counts_mean: NDArray[np.float64],
+        counts_spread: NDArray[np.float64],
+    ) -> None:
+        """Start with the training's statistics: `wanted`, and of the counts (fingers, 24)."""
+        self._wanted = wanted
+        self._inputs = inputs
+        self._shape = counts_mean.shape
+        self._statistics = SessionStatistics(
+            np.concatenate((wanted.mean, counts_mean.ravel())),
+            np.concatenate((wanted.spread, counts_spread.ravel())),
+            wanted.prior_grasps,
+        )
+        self._settle()
+
+    @property
+    def grasps(self) -> int:
+        """Grasps of this session that were taken in."""
+        return self._statistics.grasps
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether they are enough for what the model's card says."""
+        return self.grasps >= self._wanted.calibrated_from
+
+    @property
+    def temperature(self) -> float:
+        """What the margin of a verdict must be divided by, with so few grasps."""
+        steps = self._wanted.sharpness
+        return next(step.temperature for step in reversed(steps) if step.grasps <= self.grasps)
+
+    def observe(self, counts: NDArray[np.generic]) -> None:
+        """Take in the counts (fingers, 24) of a grasp that was judged, or could have been."""
+        values = np.concatenate((raw_features(counts), counts.ravel()))
+        if self._statistics.observe(values):
+            self._settle()
+
+    def reset(self) -> None:
+        """A sensor was exchanged: start again."""
+        self._statistics.reset()
+        self._settle()
+
+    def state(self) -> SessionState:
+        """To be kept for `restore`."""
+        return self._statistics.state()
+
+    def restore(self, state: SessionState) -> None:
+        """Go on from what was kept. Raises `ValueError` if it is of other fingers."""
+        self._statistics.restore(state)
+        self._settle()
+
+    def _settle(self) -> None:
+        features = len(self._wanted.mean)
+        mean, spread = self._statistics.mean, self._statistics.spread
+        self._inputs.use(mean[:features], spread[:features])
+        self.counts_mean = mean[features:].reshape(self._shape)
+        """Of each electrode in this session, shape (fingers, 24)."""
+        self.counts_spread = spread[features:].reshape(self._shape)
+        """Standard deviation of each electrode in this session, shape (fingers, 24)."""

@@ -1,0 +1,87 @@
+"""Keeps the session of a running daemon: restores it, saves it, drops it with the sensor."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+
+from daemon.judge.session import SessionCalibration
+from daemon.session_file import SessionFile, SessionFileError, exchanged, statistics_of
+from drivers.base import Driver
+
+log = logging.getLogger("graspd")
+
+SAVE_PERIOD_NS = 10_000_000_000
+"""What a power cut may cost: the grasps of ten seconds."""
+
+
+class SessionKeeper:
+    """Looks after one session from time to time; never raises for a file that cannot be had."""
+
+    def __init__(
+        self,
+        session: SessionCalibration,
+        fingers: Sequence[str],
+        tactile: Driver,
+        file: SessionFile,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Restore what `file` has; a new session, and a warning, if that is none of this hand."""
+        self._session = session
+        self._fingers = tuple(fingers)
+        self._tactile = tactile
+        self._file = file
+        self._clock = clock
+        self._serials: dict[str, str] = {}
+        self._restore()
+        self._saved_grasps = session.grasps
+        self._save_due_ns = clock() + SAVE_PERIOD_NS
+        self._warned = False
+
+    def mind(self) -> None:
+        """Once a second: has a sensor been exchanged? And save if it is time."""
+        self._mind_serials()
+        if self._clock() >= self._save_due_ns:
+            self.save()
+
+    def save(self) -> None:
+        """Save if there is anything new; one warning if that cannot be done."""
+        self._save_due_ns = self._clock() + SAVE_PERIOD_NS
+        if self._session.grasps == self._saved_grasps:
+            return
+        try:
+            self._file.save(self._session.state(), self._fingers, self._serials)
+        except SessionFileError as error:
+            if not self._warned:
+                log.warning("%s; the next start begins a new session", error)
+            self._warned = True
+        else:
+            self._saved_grasps = self._session.grasps
+            self._warned = False
+
+    def _restore(self) -> None:
+        try:
+            kept = self._file.load()
+            if kept is None:
+                return
+            self._session.restore(statistics_of(kept, self._fingers))
+        except (SessionFileError, ValueError) as error:
+            log.warning("%s; a new session begins", error)
+            return
+        self._serials = dict(kept.serials)
+        log.info("session of %d grasps restored from %s", self._session.grasps, self._file.path)
+
+    def _mind_serials(self) -> None:
+        serials = self._tactile.serials
+        changed = exchanged(self._serials, serials)
+        if changed:
+            log.warning(
+                "new sensor on %s: the session's %d grasps no longer count",
+                ", ".join(changed),
+                self._session.grasps,
+            )
+            self._session.reset()
+            self._saved_grasps = -1
+            self._save_due_ns = self._clock()
+        self._serials.update(serials)

@@ -1,0 +1,175 @@
+"""From counts to what a model takes: an image, a vector, or features of a session."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.contract import (
+    FEATURES_PER_FINGER,
+    CountsInput,
+    ImageInput,
+    Input,
+    ModelError,
+    SessionInput,
+    VectorInput,
+)
+from models.layout import ELECTRODES, LAYOUTS
+from models.tactile_image import (
+    SPREAD_FLOOR_COUNTS,
+    Composition,
+    Fill,
+    Normalisation,
+    TactileImager,
+)
+
+
+class InputBuilder(Protocol):
+    """Makes the input of one kind of model, one reading at a time or many."""
+
+    @property
+    def name(self) -> str:
+        """Of the model's input."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of one reading's input."""
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Write the input of counts (fingers, 24) into `out` and return each finger's spread.
+
+        A finger whose spread, counts, is below `SPREAD_FLOOR_COUNTS` must not be judged.
+        """
+
+    def build_batch(
+        self, counts: NDArray[np.generic]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24)."""
+
+
+def builder(wanted: Input, fingers: int) -> InputBuilder:
+    """The builder of what a contract asks for. Raises `ModelError` for what is not known."""
+    match wanted:
+        case ImageInput():
+            try:
+                return TactileImager(
+                    fingers,
+                    LAYOUTS[wanted.layout],
+                    Fill(wanted.fill),
+                    Normalisation(wanted.normalisation),
+                    Composition(wanted.composition),
+                )
+            except (KeyError, ValueError) as error:
+                raise ModelError(f"asks for an image that is not known: {error}") from error
+        case VectorInput():
+            return VectorBuilder(fingers)
+        case CountsInput():
+            return CountsBuilder(fingers)
+        case SessionInput():
+            features = SessionBuilder(fingers, wanted.clip)
+            features.use(np.array(wanted.mean), np.array(wanted.spread))
+            return features
+
+
+class VectorBuilder:
+    """The counts as one vector, z-scored per finger over its 24 electrodes (paper, III-D)."""
+
+    name = "tactile_vector"
+
+    def __init__(self, fingers: int) -> None:
+        self.shape = (fingers * ELECTRODES,)
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Write the vector into `out`; see `InputBuilder`."""
+        z, _, spread = _z_scores(counts.astype(np.float64))
+        out[...] = z.reshape(self.shape)
+        return spread
+
+    def build_batch(
+        self, counts: NDArray[np.generic]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Vectors of many readings; see `InputBuilder`."""
+        z, _, spread = _z_scores(counts.astype(np.float64))
+        return z.reshape(len(counts), *self.shape).astype(np.float32), spread
+
+
+class CountsBuilder:
+    """The counts as one vector, untouched."""
+
+    name = "tactile_counts"
+
+    def __init__(self, fingers: int) -> None:
+        self.shape = (fingers * ELECTRODES,)
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Write the counts into `out`; see `InputBuilder`."""
+        out[...] = counts.reshape(self.shape)
+        return _z_scores(counts.astype(np.float64))[2]
+
+    def build_batch(
+        self, counts: NDArray[np.generic]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Vectors of many readings; see `InputBuilder`."""
+        flat = counts.reshape(len(counts), *self.shape).astype(np.float32)
+        return flat, _z_scores(counts.astype(np.float64))[2]
+
+
+class SessionBuilder:
+    """Features of a reading, standardised by what `use` was told, then clipped."""
+
+    name = "session_features"
+
+    def __init__(self, fingers: int, clip: float) -> None:
+        self.shape = (fingers * FEATURES_PER_FINGER,)
+        self._clip = clip
+        self._mean = np.zeros(self.shape)
+        self._scale = np.ones(self.shape)
+
+    def use(self, mean: NDArray[np.float64], spread: NDArray[np.float64]) -> None:
+        """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero."""
+        self._mean = mean
+        self._scale = 1.0 / spread
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Write the features into `out`; see `InputBuilder`."""
+        features, spread = _features(counts.astype(np.float64))
+        out[...] = self._standardise(features)
+        return spread
+
+    def build_batch(
+        self, counts: NDArray[np.generic]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Features of many readings; see `InputBuilder`."""
+        features, spread = _features(counts.astype(np.float64))
+        return self._standardise(features).astype(np.float32), spread
+
+    def _standardise(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+        standard: NDArray[np.float64] = (features - self._mean) * self._scale
+        return np.clip(standard, -self._clip, self._clip, out=standard)
+
+
+def raw_features(counts: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Features before standardising, shape (..., fingers * 26), of counts (..., fingers, 24)."""
+    return _features(counts.astype(np.float64))[0]
+
+
+def _features(counts: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    z, mean, spread = _z_scores(counts)
+    flat = z.reshape(*z.shape[:-2], -1)
+    return np.concatenate((flat, mean, spread), axis=-1), spread
+
+
+def _z_scores(
+    counts: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Z-values, means and (population) spreads of each finger; all zero where it is flat."""
+    mean = counts.mean(axis=-1)
+    centred = counts - mean[..., np.newaxis]
+    spread: NDArray[np.float64] = np.sqrt(
+        np.einsum("...e,...e->...", centred, centred) / ELECTRODES
+    )
+    judgeable = spread >= SPREAD_FLOOR_COUNTS
+    scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
+    return centred * scale[..., np.newaxis], mean, spread

@@ -1,0 +1,49 @@
+"""More tactile images from few: flips and small rotations, as published (paper, section III-E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import rotate
+
+COPIES = 4
+"""What is left of each grasp: itself, flipped both ways, rotated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Augmentation:
+    """Flip left-right, flip up-down, rotate: four times the images."""
+
+    rotation_deg: float = 10.0
+    """Each image is rotated by this angle, to the left or to the right at random."""
+
+
+def augment(
+    images: NDArray[np.float32],
+    slipped: NDArray[np.bool_],
+    augmentation: Augmentation,
+    seed: int,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Images (N, height, width, fingers) and labels (N,) to (4 N, ...) and (4 N,).
+
+    In this order: as they are, flipped left-right, flipped up-down, rotated. A rotated image keeps
+    its size; what comes in from outside repeats the nearest edge. Raises `ValueError` if these are
+    no images.
+    """
+    if images.ndim != 4:
+        raise ValueError(f"only images can be flipped and rotated, not inputs {images.shape[1:]}")
+    rotated = _rotated(images, augmentation.rotation_deg, seed)
+    return (
+        np.concatenate((images, images[:, :, ::-1], images[:, ::-1], rotated)),
+        np.tile(slipped, COPIES),
+    )
+
+
+def _rotated(images: NDArray[np.float32], angle_deg: float, seed: int) -> NDArray[np.float32]:
+    left = np.random.default_rng(seed).integers(2, size=len(images)).astype(np.bool_)
+    rotated = np.empty_like(images)
+    for chosen, angle in ((left, angle_deg), (~left, -angle_deg)):
+        rotated[chosen] = rotate(images[chosen], angle, axes=(2, 1), reshape=False, mode="nearest")
+    return rotated

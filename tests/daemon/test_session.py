@@ -1,0 +1,250 @@
+"""A session's calibration: taken in, kept, restored, dropped with the sensor."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.session import SessionCalibration
+from daemon.session_file import SessionFile, SessionFileError, exchanged, load
+from daemon.session_keeper import SAVE_PERIOD_NS, SessionKeeper
+from models.contract import SessionInput, Sharpness
+from models.inputs import SessionBuilder, raw_features
+from tests.daemon.fakes import Clock, FakeDriver
+
+FINGERS = ("ff", "mf", "th")
+SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
+
+
+def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
+    return np.random.default_rng(seed).integers(500, 3500, (number, 3, 24), dtype=np.uint16)
+
+
+def calibration(builder: SessionBuilder | None = None) -> SessionCalibration:
+    wanted = SessionInput((0.0,) * 78, (1.0,) * 78, 3.0, 1.0, 20.0, SHARPNESS)
+    return SessionCalibration(
+        wanted, builder or SessionBuilder(3, 3.0), np.full((3, 24), 2000.0), np.full((3, 24), 300.0)
+    )
+
+
+def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
+    for reading in counts(number, seed):
+        session.observe(reading)
+
+
+def test_the_input_follows_the_session() -> None:
+    builder = SessionBuilder(3, 3.0)
+    session = calibration(builder)
+    observe(session, 200)
+    raw = raw_features(counts(200))
+    # The prior weighs one grasp in two hundred: the session's own statistics, nearly.
+    fresh = counts(10, seed=1)
+    expected = np.clip((raw_features(fresh) - raw.mean(axis=0)) / raw.std(axis=0), -3.0, 3.0)
+    np.testing.assert_allclose(builder.build_batch(fresh)[0], expected, atol=0.5)
+    np.testing.assert_allclose(session.counts_mean, counts(200).mean(axis=0), rtol=0.02)
+    np.testing.assert_allclose(session.counts_spread, counts(200).std(axis=0), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("grasps", "temperature", "calibrated"),
+    [(0, 3.0, False), (4, 3.0, False), (5, 2.0, False), (19, 2.0, False), (20, 1.0, True)],
+)
+def test_a_young_session_is_less_sure(grasps: int, temperature: float, calibrated: bool) -> None:
+    session = calibration()
+    observe(session, grasps)
+    assert session.grasps == grasps
+    assert session.temperature == temperature
+    assert session.calibrated is calibrated
+
+
+class SensorDriver(FakeDriver):
+    """A driver that knows its sensors."""
+
+    known: dict[str, str] = {}  # noqa: RUF012 - set by the test
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return self.known
+
+
+def sensors(**serials: str) -> SensorDriver:
+    driver = SensorDriver([], Clock())
+    driver.known = serials
+    return driver
+
+
+def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
+    clock, first = Clock(), calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(first, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        observe(first, 30)
+        keeper.mind()
+        assert load(file.path) is None  # not every second
+        clock.now_ns += SAVE_PERIOD_NS
+        keeper.mind()
+    second = calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        SessionKeeper(second, FINGERS, sensors(), file, clock)
+    assert second.state() == first.state()
+    assert second.calibrated
+
+
+def test_an_exchanged_sensor_ends_the_session(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock, session = Clock(), calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper.mind()
+        observe(session, 30)
+        keeper.save()
+    again = calibration()
+    driver = sensors()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
+        keeper.mind()
+        assert again.grasps == 30  # nothing is known of the sensors yet
+        driver.known = {"ff": "A", "mf": "B", "th": "C"}
+        keeper.mind()
+        assert again.grasps == 30
+        driver.known = {"ff": "A", "mf": "X", "th": "C"}
+        keeper.mind()
+        assert again.grasps == 0
+        assert "new sensor on mf" in caplog.text
+        kept = file.load()
+    assert kept is not None
+    assert kept.statistics.grasps == 0
+    assert kept.serials["mf"] == "X"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "fingers"),
+    [
+        ({}, {}, []),
+        ({}, {"ff": "A"}, []),
+        ({"ff": "A"}, {}, []),
+        ({"ff": "A"}, {"ff": "A"}, []),
+        ({"ff": "A", "th": "B"}, {"ff": "C", "th": "B"}, ["ff"]),
+    ],
+)
+def test_only_a_sensor_that_is_known_to_differ_is_another(
+    before: dict[str, str], now: dict[str, str], fingers: list[str]
+) -> None:
+    assert exchanged(before, now) == fingers
+
+
+def test_two_daemons_do_not_keep_one_session(tmp_path: Path) -> None:
+    in_use = pytest.raises(SessionFileError, match="in use by another graspd")
+    with SessionFile(tmp_path / "right.json"), in_use:
+        SessionFile(tmp_path / "right.json")
+    SessionFile(tmp_path / "right.json").close()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[]", b"\xff\xfe", b'{"version":2}', b"null", b"{}" * 1000, b"x" * (2 << 20)],
+)
+def test_what_is_no_session_is_one_line_and_a_new_session(
+    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "right.json"
+    path.write_bytes(content)
+    with pytest.raises(SessionFileError) as error:
+        load(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    session = calibration()
+    with SessionFile(path) as file:
+        SessionKeeper(session, FINGERS, sensors(), file)
+    assert session.grasps == 0
+    assert "a new session begins" in caplog.text
+
+
+def test_a_session_of_other_fingers_begins_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other, session = calibration(), calibration()
+    observe(other, 9)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(other.state(), ("ff", "mf"), {})
+        SessionKeeper(session, FINGERS, sensors(), file)
+    assert "is of the fingers ff, mf, the hand has" in caplog.text
+    assert session.grasps == 0
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    state = calibration().state()
+    data = {"version": 1, "fingers": FINGERS, "serials": {}, "saved_at": 0.0}
+    path = tmp_path / "right.json"
+    statistics = msgspec.to_builtins(state)
+    text = msgspec.json.encode(data | {"statistics": statistics}).decode()
+    path.write_text(text.replace('"squares":[0.0', '"squares":[-1.0', 1))
+    with pytest.raises(SessionFileError, match="not a session"):
+        load(path)
+
+
+def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SessionFileError, match="No such file or directory"):
+        SessionFile(tmp_path / "no" / "right.json")
+
+
+def test_a_full_disk_is_one_warning_and_no_crash(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, clock = calibration(), Clock()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+
+        def full(descriptor: int) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", full)
+        for seed in range(3):
+            observe(session, 3, seed)
+            clock.now_ns += SAVE_PERIOD_NS
+            keeper.mind()
+        assert caplog.text.count("No space left on device") == 1
+        monkeypatch.undo()
+        keeper.save()
+        kept = file.load()
+    assert kept is not None
+    assert kept.statistics.grasps == 9
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["right.json", "right.json.lock"]
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from daemon.session_file import SessionFile
+from tests.daemon.test_session import FINGERS, calibration, observe
+session = calibration()
+with SessionFile(Path(sys.argv[1])) as file:
+    while True:
+        observe(session, 1, session.grasps)
+        file.save(session.state(), FINGERS, {})
+        print(session.grasps, flush=True)
+"""
+
+
+def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None:
+    path = tmp_path / "right.json"
+    for _ in range(3):
+        with subprocess.Popen(
+            [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
+        ) as process:
+            if process.stdout is None:
+                raise RuntimeError("no pipe")
+            for _ in range(20):
+                process.stdout.readline()
+            process.send_signal(signal.SIGKILL)
+        kept = load(path)
+        assert kept is not None
+        assert kept.statistics.grasps >= 20

@@ -1,0 +1,155 @@
+"""Broken electrodes against plain linear algebra on the covariance matrix, and on real grasps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from models import zoo
+from models.contract import SeenCounts
+from models.electrodes import IMPLAUSIBLE, Electrodes
+from models.runtime import TactileModel
+from models.training.datasets import Grasps, read_table
+
+SHAPE = (3, 24)
+NOTHING = np.zeros(SHAPE, dtype=np.bool_)
+
+
+def correlated(seed: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64], SeenCounts]:
+    """Mean (72,) and covariance (72, 72) of made-up electrodes, and the contract's words for it."""
+    random = np.random.default_rng(seed)
+    mean = random.uniform(1500.0, 2500.0, 72)
+    mixing = random.normal(size=(72, 10)) * 120.0
+    covariance = mixing @ mixing.T + np.diag(random.uniform(10.0, 40.0, 72) ** 2)
+    whitening = np.linalg.cholesky(np.linalg.inv(covariance))
+    row = ((0,) * 24,) * 3
+    seen = SeenCounts(
+        row,
+        ((4095,) * 24,) * 3,
+        0,
+        tuple(tuple(finger) for finger in mean.reshape(SHAPE).tolist()),
+        tuple(tuple(line[: index + 1]) for index, line in enumerate(whitening.tolist())),
+        2.5,
+    )
+    return mean, covariance, seen
+
+
+def conditional(
+    mean: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+    values: NDArray[np.float64],
+    out: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and variance of the electrodes `out` given the rest, by the covariance's blocks."""
+    cross = covariance[np.ix_(out, ~out)] @ np.linalg.inv(covariance[np.ix_(~out, ~out)])
+    expected = mean[out] + cross @ (values[~out] - mean[~out])
+    variance = covariance[np.ix_(out, out)] - cross @ covariance[np.ix_(~out, out)]
+    return expected, np.diag(variance)
+
+
+@pytest.mark.parametrize("number", [1, 2, 7, 12, 24])
+def test_a_broken_electrode_is_repaired_by_its_conditional_mean(number: int) -> None:
+    mean, covariance, seen = correlated()
+    random = np.random.default_rng(number)
+    values = random.multivariate_normal(mean, covariance)
+    out = np.zeros(72, dtype=np.bool_)
+    out[random.permutation(72)[:number]] = True
+    repaired = Electrodes(seen).repaired(values.reshape(SHAPE), out.reshape(SHAPE)).ravel()
+    np.testing.assert_array_equal(repaired[~out], values[~out])
+    expected, _ = conditional(mean, covariance, values, out)
+    np.testing.assert_allclose(repaired[out], expected, rtol=1e-6)
+
+
+def test_mean_and_spread_of_the_training_are_those_of_the_contract() -> None:
+    mean, covariance, seen = correlated()
+    electrodes = Electrodes(seen)
+    np.testing.assert_allclose(electrodes.centre.ravel(), mean)
+    np.testing.assert_allclose(electrodes.spread.ravel(), np.sqrt(np.diag(covariance)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("deviations", "found"), [(0.98, False), (1.02, True), (-1.02, True)])
+def test_an_electrode_is_implausible_from_eight_conditional_deviations_on(
+    deviations: float, found: bool
+) -> None:
+    mean, covariance, seen = correlated()
+    out = np.zeros(72, dtype=np.bool_)
+    out[30] = True
+    values = mean.copy()
+    expected, variance = conditional(mean, covariance, values, out)
+    values[30] = expected[0] + deviations * IMPLAUSIBLE * np.sqrt(variance[0])
+    marked = Electrodes(seen).implausible(values.reshape(SHAPE), NOTHING, 12)
+    assert marked.sum() == found
+    assert marked.ravel()[30] == found
+
+
+def test_several_wrong_electrodes_are_found_although_each_hides_the_others() -> None:
+    mean, covariance, seen = correlated()
+    values = np.random.default_rng(5).multivariate_normal(mean, covariance)
+    wrong = [3, 4, 5, 40, 71]
+    values[wrong] += [700.0, 900.0, -800.0, 1200.0, -900.0]
+    marked = Electrodes(seen).implausible(values.reshape(SHAPE), NOTHING, 12)
+    assert np.flatnonzero(marked).tolist() == wrong
+
+
+def test_what_is_known_to_be_broken_is_not_looked_at() -> None:
+    mean, covariance, seen = correlated()
+    values = np.random.default_rng(6).multivariate_normal(mean, covariance).reshape(SHAPE)
+    broken = NOTHING.copy()
+    broken[1, 7] = True
+    electrodes = Electrodes(seen)
+    for reads in (0.0, 4095.0, 2000.0):
+        values[1, 7] = reads
+        np.testing.assert_array_equal(electrodes.implausible(values, broken, 12), broken)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 15),
+    st.sampled_from([1, 5, 13]),
+)
+def test_the_search_ends_and_never_forgets_what_is_known(
+    seed: int, known: int, at_most: int
+) -> None:
+    _, _, seen = correlated()
+    random = np.random.default_rng(seed)
+    values = random.uniform(0.0, 4095.0, SHAPE)
+    broken = (random.permutation(72) < known).reshape(SHAPE)
+    marked = Electrodes(seen).implausible(values, broken, at_most)
+    assert (marked | ~broken).all()
+    assert marked.sum() <= max(at_most, known)
+
+
+@pytest.fixture(scope="module")
+def side(bts3_dir: Path) -> Grasps:
+    return read_table(bts3_dir / "palm_side.csv")
+
+
+def test_a_stuck_electrode_of_a_real_grasp_is_found_and_hardly_any_sound_one(side: Grasps) -> None:
+    electrodes = Electrodes(TactileModel(zoo.find("cnn1")).contract.seen)
+    values = side.counts[::4].astype(np.float64)
+    alarms = [electrodes.implausible(reading, NOTHING, 13).any() for reading in values]
+    assert np.mean(alarms) < 0.12
+    values[:, 1, 9] = 0.0
+    found = [electrodes.implausible(reading, NOTHING, 13)[1, 9] for reading in values]
+    assert np.mean(found) > 0.95
+
+
+def test_a_repaired_electrode_of_a_real_grasp_is_nearer_than_its_mean(side: Grasps) -> None:
+    electrodes = Electrodes(TactileModel(zoo.find("cnn1")).contract.seen)
+    values = side.counts[::8].astype(np.float64)
+    errors, spreads = [], []
+    for place in range(0, 72, 5):
+        out = np.zeros(72, dtype=np.bool_)
+        out[place] = True
+        mask = out.reshape(SHAPE)
+        repaired = np.array([electrodes.repaired(reading, mask)[mask][0] for reading in values])
+        truth = values.reshape(-1, 72)[:, place]
+        errors.append(np.sqrt(np.mean((repaired - truth) ** 2)))
+        spreads.append(truth.std())
+    assert np.median(np.array(errors) / np.array(spreads)) < 0.6

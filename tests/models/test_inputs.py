@@ -1,0 +1,129 @@
+"""What models are fed with, against plain loops over the paper's definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from models.contract import (
+    CountsInput,
+    ImageInput,
+    Input,
+    ModelError,
+    SessionInput,
+    Sharpness,
+    VectorInput,
+)
+from models.inputs import SessionBuilder, VectorBuilder, builder, raw_features
+from models.layout import D1
+from models.tactile_image import Composition, TactileImager
+
+
+def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
+    return np.random.default_rng(seed).integers(5, 3975, (number, 3, 24), dtype=np.uint16)
+
+
+def test_the_vector_is_the_z_score_of_each_finger() -> None:
+    readings = counts(20)
+    vectors, spreads = VectorBuilder(3).build_batch(readings)
+    for reading, vector, spread in zip(readings, vectors, spreads, strict=True):
+        expected = [(finger - np.mean(finger)) / np.std(finger) for finger in reading]
+        np.testing.assert_allclose(vector, np.concatenate(expected), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(spread, [np.std(finger) for finger in reading])
+
+
+def test_features_are_z_scores_then_means_then_spreads() -> None:
+    reading = counts(1)[0]
+    features = raw_features(reading)
+    assert features.shape == (78,)
+    np.testing.assert_allclose(features[24:48], (reading[1] - reading[1].mean()) / reading[1].std())
+    np.testing.assert_allclose(features[72:75], reading.mean(axis=1))
+    np.testing.assert_allclose(features[75:78], reading.std(axis=1))
+
+
+def test_session_features_are_standardised_and_clipped() -> None:
+    readings = counts(50)
+    raw = raw_features(readings)
+    mean, spread = raw[:30].mean(axis=0), raw[:30].std(axis=0) / 2.0
+    made = SessionBuilder(3, clip=3.0)
+    made.use(mean, spread)
+    features, _ = made.build_batch(readings)
+    expected = np.clip((raw - mean) / spread, -3.0, 3.0)
+    np.testing.assert_allclose(features, expected, rtol=1e-6, atol=1e-6)
+    assert np.abs(features).max() == 3.0
+
+
+def session_input(clip: float = 3.0) -> SessionInput:
+    return SessionInput((0.0,) * 78, (1.0,) * 78, clip, 1.0, 20.0, (Sharpness(0.0, 1.0),))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "name", "shape"),
+    [
+        (ImageInput("D1", "neighbour-mean", "filled-image", "channels"), "image", (12, 11, 3)),
+        (ImageInput("D3", "least-contact", "electrodes", "channels"), "image", (4, 7, 3)),
+        (ImageInput("D1", "neighbour-mean", "filled-image", "horizontal"), "image", (12, 33, 1)),
+        (ImageInput("D2a", "neighbour-mean", "filled-image", "vertical"), "image", (18, 5, 1)),
+        (VectorInput(), "vector", (72,)),
+        (CountsInput(), "counts", (72,)),
+        (session_input(), "features", (78,)),
+    ],
+)
+def test_one_reading_is_fed_bit_for_bit_as_in_training(
+    wanted: Input, name: str, shape: tuple[int, ...]
+) -> None:
+    inputs = builder(wanted, 3)
+    assert inputs.name.endswith(name)
+    assert inputs.shape == shape
+    readings = counts(10)
+    batch, spreads = inputs.build_batch(readings)
+    assert batch.shape == (10, *shape)
+    out = np.empty(shape, dtype=np.float32)
+    for reading, expected, spread in zip(readings, batch, spreads, strict=True):
+        np.testing.assert_array_equal(inputs.build(reading, out), spread)
+        np.testing.assert_array_equal(out, expected)
+
+
+@pytest.mark.parametrize("wanted", [VectorInput(), session_input()])
+def test_a_flat_finger_has_no_spread_and_no_infinities(wanted: Input) -> None:
+    inputs = builder(wanted, 3)
+    reading = counts(1)[0]
+    reading[1] = 2000
+    out = np.empty(inputs.shape, dtype=np.float32)
+    assert inputs.build(reading, out)[1] == 0.0
+    assert np.isfinite(out).all()
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        ImageInput("D9", "neighbour-mean", "filled-image", "channels"),
+        ImageInput("D1", "zeros", "filled-image", "channels"),
+        ImageInput("D1", "neighbour-mean", "min-max", "channels"),
+    ],
+)
+def test_an_image_that_nobody_knows_is_refused(wanted: ImageInput) -> None:
+    with pytest.raises(ModelError, match="not known"):
+        builder(wanted, 3)
+
+
+@pytest.mark.parametrize(
+    ("composition", "axis"), [(Composition.HORIZONTAL, 1), (Composition.VERTICAL, 0)]
+)
+def test_fingers_stand_side_by_side_in_their_order(composition: Composition, axis: int) -> None:
+    readings = counts(5)
+    channels, _ = TactileImager(3, D1).build_batch(readings)
+    composed, _ = TactileImager(3, D1, composition=composition).build_batch(readings)
+    for image, expected in zip(composed, channels, strict=True):
+        fingers = [expected[:, :, finger] for finger in range(3)]
+        np.testing.assert_array_equal(image[:, :, 0], np.concatenate(fingers, axis=axis))
+
+
+def test_a_flat_finger_is_zero_in_every_composition() -> None:
+    reading = counts(1)
+    reading[0, 2] = 1000
+    for composition in Composition:
+        image, _ = TactileImager(3, D1, composition=composition).build_batch(reading)
+        assert np.isfinite(image).all()
+        assert (image == 0.0).sum() == 12 * 11

@@ -1,0 +1,144 @@
+"""Session statistics against plain numpy over all grasps, and against what could spoil them."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from models.session import HORIZON_GRASPS, SessionState, SessionStatistics
+
+WIDTH = 5
+
+
+def statistics(prior_grasps: float = 1.0) -> SessionStatistics:
+    return SessionStatistics(np.full(WIDTH, 10.0), np.full(WIDTH, 2.0), prior_grasps)
+
+
+def grasps(number: int, seed: int = 0, mean: float = 500.0) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).normal(mean, 30.0, (number, WIDTH))
+
+
+def observe(session: SessionStatistics, rows: NDArray[np.float64]) -> None:
+    for row in rows:
+        assert session.observe(row)
+
+
+def test_before_the_first_grasp_the_training_speaks() -> None:
+    session = statistics()
+    assert session.grasps == 0
+    np.testing.assert_array_equal(session.mean, np.full(WIDTH, 10.0))
+    np.testing.assert_array_equal(session.spread, np.full(WIDTH, 2.0))
+
+
+@pytest.mark.parametrize("number", [1, 2, 7, 100])
+@pytest.mark.parametrize("prior_grasps", [0.5, 1.0, 5.0])
+def test_running_statistics_are_those_of_all_grasps_and_the_prior(
+    number: int, prior_grasps: float
+) -> None:
+    session = statistics(prior_grasps)
+    rows = grasps(number)
+    observe(session, rows)
+    total = number + prior_grasps
+    mean = (rows.sum(axis=0) + prior_grasps * 10.0) / total
+    variance = (((rows - rows.mean(axis=0)) ** 2).sum(axis=0) + prior_grasps * 4.0) / total
+    np.testing.assert_allclose(session.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(session.spread, np.sqrt(variance), rtol=1e-12)
+
+
+def test_a_grasp_that_is_held_counts_once() -> None:
+    session = statistics()
+    observe(session, grasps(50))
+    held = np.full(WIDTH, 520.0)
+    random = np.random.default_rng(1)
+    counted = [session.observe(held + random.normal(0.0, 0.3, WIDTH)) for _ in range(1000)]
+    assert counted == [True] + [False] * 999
+    assert session.grasps == 51
+
+
+def test_one_object_handled_for_hours_is_forgotten_within_the_horizon() -> None:
+    session = statistics()
+    observe(session, grasps(20_000, mean=900.0))
+    observe(session, grasps(3 * int(HORIZON_GRASPS), seed=1))
+    # What is left of the old mean after three horizons is exp(-3) = 5 %.
+    np.testing.assert_allclose(session.mean, 500.0, atol=0.06 * 400.0 + 5.0)
+
+
+def test_what_is_not_finite_changes_nothing() -> None:
+    session = statistics()
+    observe(session, grasps(3))
+    mean = session.mean.copy()
+    for bad in (np.nan, np.inf, -np.inf):
+        row = np.full(WIDTH, 100.0)
+        row[2] = bad
+        assert not session.observe(row)
+    np.testing.assert_array_equal(session.mean, mean)
+
+
+def test_a_restored_session_goes_on_as_if_it_had_never_stopped() -> None:
+    whole, first, second = statistics(), statistics(), statistics()
+    rows = grasps(400)
+    observe(whole, rows)
+    observe(first, rows[:333])
+    kept = msgspec.json.encode(first.state())
+    second.restore(msgspec.json.decode(kept, type=SessionState))
+    observe(second, rows[333:])
+    assert second.grasps == 400
+    np.testing.assert_array_equal(second.mean, whole.mean)
+    np.testing.assert_array_equal(second.spread, whole.spread)
+
+
+def test_a_reset_session_is_a_new_one() -> None:
+    session = statistics()
+    observe(session, grasps(10))
+    session.reset()
+    assert session.state() == statistics().state()
+    np.testing.assert_array_equal(session.mean, statistics().mean)
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        SessionState(1.0, 1, (1.0,), (1.0,)),
+        SessionState(1.0, 1, (1.0,) * WIDTH, (1.0,) * (WIDTH + 1)),
+        SessionState(1.0, 1, (float("nan"),) * WIDTH, (1.0,) * WIDTH),
+    ],
+)
+def test_a_state_of_something_else_is_refused(state: SessionState) -> None:
+    session = statistics()
+    observe(session, grasps(4))
+    with pytest.raises(ValueError, match=r"is of|not finite"):
+        session.restore(state)
+    assert session.grasps == 4
+
+
+@pytest.mark.parametrize(("spread", "weight"), [(0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, 0.0)])
+def test_a_prior_without_spread_or_weight_is_refused(spread: float, weight: float) -> None:
+    with pytest.raises(ValueError, match="above zero"):
+        SessionStatistics(np.zeros(2), np.full(2, spread), weight)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=WIDTH, max_size=WIDTH), max_size=40)
+)
+def test_no_sequence_of_grasps_takes_the_spread_away(rows: list[list[float]]) -> None:
+    session = statistics()
+    for row in rows:
+        session.observe(np.array(row))
+    assert np.isfinite(session.mean).all()
+    # The prior alone leaves a share of its own spread: 2 * sqrt(1 / (n + 1)).
+    assert (session.spread >= 2.0 * np.sqrt(1.0 / (len(rows) + 1)) - 1e-9).all()
+
+
+def test_an_electrode_that_never_moves_leaves_numbers_that_can_be_divided_by() -> None:
+    session = statistics()
+    row = np.full(WIDTH, 2000.0)
+    for index in range(5000):
+        row[0] = index % 7
+        session.observe(row)
+    assert (session.spread > 0.05).all()
+    assert np.isfinite(session.mean).all()

@@ -1,0 +1,167 @@
+"""Figures against hand calculation, published tables and scikit-learn."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn", reason="the train extra is not installed")
+
+from sklearn.metrics import brier_score_loss, f1_score, log_loss
+
+from models.training.metrics import (
+    accuracy_at,
+    coverage_curve,
+    over_seeds,
+    paired_difference,
+    reject_threshold,
+    reliability_bins,
+    score,
+    wilson,
+)
+
+# Six verdicts, the surest first: right, right, wrong, right, wrong, right.
+PROBABILITY = np.array([0.99, 0.05, 0.90, 0.80, 0.30, 0.60])
+SLIPPED = np.array([True, False, False, True, True, True])
+
+
+def test_scores_agree_with_scikit_learn() -> None:
+    random = np.random.default_rng(2)
+    slipped = random.random(300) < 0.4
+    margins = random.normal(np.where(slipped, 1.0, -1.0), 2.0)
+    probability = 1.0 / (1.0 + np.exp(-margins / 2.0))
+    result = score(margins, slipped, probability)
+    assert result.f1 == pytest.approx(f1_score(slipped, margins > 0))
+    assert result.brier == pytest.approx(brier_score_loss(slipped, probability))
+    assert result.log_loss == pytest.approx(log_loss(slipped, probability))
+    # Area under the curve: the share of (slip, stable) pairs that are ranked right.
+    pairs = margins[slipped][:, None] > margins[~slipped][None, :]
+    assert result.auc == pytest.approx(pairs.mean())
+
+
+def test_logits_score_as_their_margins_do() -> None:
+    random = np.random.default_rng(2)
+    logits, slipped = random.normal(size=(50, 2)), random.random(50) < 0.5
+    assert score(logits, slipped) == score(logits[:, 1] - logits[:, 0], slipped)
+
+
+def test_one_class_alone_has_no_auc() -> None:
+    result = score(np.array([1.0, -1.0]), np.array([True, True]))
+    assert math.isnan(result.auc)
+    assert (result.accuracy, result.recall) == (0.5, 0.5)
+
+
+def test_spread_over_folds_and_error_over_seeds() -> None:
+    result = over_seeds([[0.8, 1.0], [0.6, 0.8]])
+    # Fold means 0.9 and 0.7; each seed's folds lie 0.1 off their mean; error 0.1 * sqrt(2/2).
+    assert result.mean == pytest.approx(0.8)
+    assert result.std == pytest.approx(0.1)
+    assert result.error == pytest.approx(0.1)
+    assert (result.seeds, result.folds) == (2, 2)
+
+
+def test_one_seed_has_no_error() -> None:
+    assert over_seeds([[0.8, 1.0]]).error is None
+
+
+def test_one_fold_per_seed_is_spread_over_the_trainings() -> None:
+    result = over_seeds([[0.8], [1.0]])
+    assert result.mean == pytest.approx(0.9)
+    assert result.std == pytest.approx(0.1)
+
+
+def test_a_fold_without_a_figure_is_left_out() -> None:
+    assert over_seeds([[0.8, math.nan, 0.6]]).mean == pytest.approx(0.7)
+
+
+def test_differences_of_overlapping_trainings_are_less_sure_than_they_look() -> None:
+    ours, theirs = [0.95, 0.93, 0.94, 0.96], [0.92, 0.92, 0.92, 0.92]
+    # Differences 3, 1, 2, 4 points: mean 2.5, variance 5/3. Ten folds: test/train = 1/9.
+    result = paired_difference(ours, theirs, 1.0 / 9.0)
+    assert result.mean == pytest.approx(0.025)
+    assert result.error == pytest.approx(math.sqrt((1 / 4 + 1 / 9) * 5 / 3) / 100)
+    naive = paired_difference(ours, theirs, 0.0).error
+    assert naive == pytest.approx(math.sqrt(5 / 3 / 4) / 100)
+    assert result.splits == 4
+
+
+def test_a_difference_on_one_split_has_no_error() -> None:
+    assert paired_difference([0.9], [0.8], 0.1).error is None
+
+
+@pytest.mark.parametrize(
+    ("right", "grasps", "low", "high"),
+    # Newcombe 1998, Statistics in Medicine 17, table I, method 3 (score without continuity
+    # correction): 81/263, 15/148, 0/20, 1/29.
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
+)
+def test_intervals_are_those_of_newcombes_table(
+    right: int, grasps: int, low: float, high: float
+) -> None:
+    result = wilson(right / grasps, grasps)
+    assert result.low == pytest.approx(low, abs=5e-5)
+    assert result.high == pytest.approx(high, abs=5e-5)
+
+
+def test_an_interval_holds_its_share_even_at_the_ends() -> None:
+    for grasps in range(1, 300):
+        for accuracy in (0.0, 1.0):
+            result = wilson(accuracy, grasps)
+            assert 0.0 <= result.low <= accuracy <= result.high <= 1.0
+
+
+def test_the_curve_of_six_verdicts_worked_out_by_hand() -> None:
+    curve = coverage_curve(PROBABILITY, SLIPPED, steps=6)
+    assert [point.confidence for point in curve] == pytest.approx(
+        [0.99, 0.95, 0.90, 0.80, 0.70, 0.60]
+    )
+    assert [point.accuracy for point in curve] == pytest.approx([1, 1, 2 / 3, 3 / 4, 3 / 5, 4 / 6])
+    assert [point.coverage for point in curve] == pytest.approx([n / 6 for n in range(1, 7)])
+
+
+def test_verdicts_of_the_same_confidence_are_judged_or_rejected_together() -> None:
+    probability = np.array([0.9, 0.9, 0.1, 0.6])
+    curve = coverage_curve(probability, np.array([True, True, True, True]), steps=4)
+    assert [point.coverage for point in curve] == [0.75, 1.0]
+    assert [point.accuracy for point in curve] == pytest.approx([2 / 3, 3 / 4])
+
+
+def test_accuracy_at_a_coverage_is_that_of_the_surest() -> None:
+    assert accuracy_at(PROBABILITY, SLIPPED, 0.5) == pytest.approx(2 / 3)
+    assert accuracy_at(PROBABILITY, SLIPPED, 1.0) == pytest.approx(4 / 6)
+    assert accuracy_at(PROBABILITY, SLIPPED, 0.0) == 1.0
+
+
+def test_a_threshold_rejects_as_little_as_the_wanted_accuracy_allows() -> None:
+    random = np.random.default_rng(8)
+    probability = random.random(4000)
+    slipped = random.random(4000) < probability  # calibrated
+    found = reject_threshold(probability, slipped, 0.9)
+    assert found is not None
+    confidence = np.maximum(probability, 1 - probability)
+    right = (probability > 0.5) == slipped
+    judged = confidence >= found.confidence
+    assert found.accuracy == pytest.approx(right[judged].mean())
+    assert found.coverage == pytest.approx(judged.mean())
+    assert found.accuracy >= 0.9
+    lower = [c for c in confidence if c < found.confidence]
+    assert all(right[confidence >= c].mean() < 0.9 for c in lower[:200])
+    # Confidences are uniform in 0.5..1, so 0.9 on average means judging from 0.8 on.
+    assert found.confidence == pytest.approx(0.8, abs=0.05)
+
+
+def test_a_few_lucky_verdicts_set_no_threshold() -> None:
+    assert reject_threshold(PROBABILITY, SLIPPED, 0.9) is None
+
+
+def test_reliability_bins_hold_every_grasp_once() -> None:
+    bins = reliability_bins(np.array([0.0, 0.01, 0.5, 1.0]), np.array([False, True, True, True]))
+    assert [number for _, _, number in bins] == [2, 1, 1]
+    assert bins[0][:2] == pytest.approx((0.005, 0.5))

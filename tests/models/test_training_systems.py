@@ -1,0 +1,139 @@
+"""The registry of systems: names, inputs, published figures, digests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("sklearn", reason="the train extra is not installed")
+
+from models.contract import CountsInput, ImageInput, VectorInput
+from models.training.classical import ForestConfig, MlpConfig, SvmConfig
+from models.training.networks import CNN1, build, parameter_count
+from models.training.recipe import PublishedRecipe, Recipe
+from models.training.systems import (
+    SYSTEMS,
+    BlendConfig,
+    DistilConfig,
+    Member,
+    Published,
+    SessionFeatures,
+    System,
+    digest,
+    epochs,
+    with_recipes,
+)
+
+PUBLISHED = {  # name: protocol, F1, its standard deviation, as printed in the paper
+    "cnn0-d1-least-contact": ("cv", 91.0, 1.4),
+    "cnn0-d2a-least-contact": ("cv", 89.7, 1.5),
+    "cnn0-d2b-least-contact": ("cv", 89.7, 1.5),
+    "cnn0-d3-least-contact": ("cv", 89.7, 1.4),
+    "cnn0": ("cv", 92.6, 1.7),
+    "cnn0-horizontal": ("cv", 92.1, 1.7),
+    "cnn0-vertical": ("cv", 92.3, 1.8),
+    "cnn1": ("cv", 94.2, 0.8),
+    "cnn1-faithful": ("cv", 94.2, 0.8),
+    "cnn2": ("cv", 92.0, 2.0),
+    "cnn3": ("cv", 92.2, 2.0),
+    "svm": ("cv", 88.0, 2.9),
+    "rf": ("cv", 92.6, 1.5),
+    "cnn1-augmented": ("unknown", 90.1, 0.4),
+}
+
+
+@pytest.mark.parametrize("name", sorted(PUBLISHED))
+def test_a_system_of_the_paper_states_its_published_figure(name: str) -> None:
+    protocol, mean, std = PUBLISHED[name]
+    figures = {figure.protocol: figure.f1 for figure in SYSTEMS[name].published}
+    assert figures[protocol] == (mean, std)  # type: ignore[index]
+
+
+def test_what_the_paper_says_of_unknown_objects_is_stated() -> None:
+    for name, f1 in (("cnn1", (87.7, 0.4)), ("rf", (90.2, 0.5))):
+        assert Published("unknown", f1) in SYSTEMS[name].published
+
+
+def test_each_system_has_its_name_and_one_sentence() -> None:
+    for name, system in SYSTEMS.items():
+        assert system.name == name
+        assert system.description.endswith(".")
+        assert "\n" not in system.description
+
+
+def test_inputs_are_those_that_the_names_promise() -> None:
+    for name, system in SYSTEMS.items():
+        if name.endswith("-session"):
+            assert isinstance(system.input, SessionFeatures)
+        elif name.endswith("-electrodes"):
+            assert isinstance(system.input, CountsInput)
+            assert system.standardise
+        elif isinstance(system.estimator, SvmConfig | MlpConfig | ForestConfig):
+            assert isinstance(system.input, VectorInput)
+        else:
+            assert isinstance(system.input, ImageInput)
+    d3 = SYSTEMS["cnn0-d3-least-contact"].input
+    assert d3 == ImageInput("D3", "least-contact", "filled-image", "channels")
+    horizontal = SYSTEMS["cnn0-horizontal"].input
+    assert horizontal == ImageInput("D1", "neighbour-mean", "filled-image", "horizontal")
+
+
+def test_the_small_session_network_has_at_most_a_hundred_thousand_parameters() -> None:
+    config = SYSTEMS["small-session"].estimator
+    assert not isinstance(config, SvmConfig)
+    assert parameter_count(build(config, (78,))) <= 100_000  # type: ignore[arg-type]
+
+
+def test_the_faithful_recipe_and_the_augmented_one_are_the_published_ones() -> None:
+    assert SYSTEMS["cnn1-faithful"].recipe == PublishedRecipe(
+        epochs=300, batch=32, learning_rate=1e-4, decay=0.005, l2=0.01
+    )
+    augmented = SYSTEMS["cnn1-augmented"]
+    assert augmented.recipe == PublishedRecipe(epochs=30, l2=0.015)
+    assert augmented.estimator == replace(CNN1, dropout=0.25)
+    assert augmented.augmentation is not None
+    assert augmented.augmentation.rotation_deg == 10.0
+
+
+def test_a_digest_tells_apart_what_gives_other_results_and_nothing_else() -> None:
+    cnn1 = SYSTEMS["cnn1"]
+    assert digest(cnn1) == digest(replace(cnn1, name="other", description="Another.", published=()))
+    others = [
+        replace(cnn1, recipe=Recipe(epochs=21)),
+        replace(cnn1, recipe=Recipe(input_noise=0.1)),
+        replace(cnn1, estimator=replace(CNN1, dropout=0.1)),
+        replace(cnn1, input=VectorInput()),
+        replace(cnn1, standardise=True),
+        replace(cnn1, estimator=SvmConfig(1.0, 0.1)),
+        replace(cnn1, estimator=BlendConfig((Member(CNN1, Recipe()),))),
+        replace(cnn1, estimator=BlendConfig((Member(CNN1, Recipe(), weight=2.0),))),
+    ]
+    assert len({digest(system) for system in (cnn1, *others)}) == len(others) + 1
+    assert len(digest(cnn1)) == 64
+
+
+def test_no_two_systems_are_the_same() -> None:
+    assert len({digest(system) for system in SYSTEMS.values()}) == len(SYSTEMS)
+
+
+def test_all_recipes_of_a_system_can_be_changed_at_once() -> None:
+    changed = with_recipes(SYSTEMS["distilled-session"], epochs=2, threads=3)
+    assert isinstance(changed.recipe, Recipe)
+    assert (changed.recipe.epochs, changed.recipe.threads) == (2, 3)
+    assert isinstance(changed.estimator, DistilConfig)
+    recipes = [member.recipe for member in changed.estimator.teacher.members if member.recipe]
+    assert recipes
+    assert all((recipe.epochs, recipe.threads) == (2, 3) for recipe in recipes)
+    assert with_recipes(SYSTEMS["svm"], epochs=2) == SYSTEMS["svm"]
+
+
+def test_epochs_are_those_of_all_networks_that_are_trained() -> None:
+    blend = BlendConfig((Member(SvmConfig(1.0, 0.1)), Member(CNN1, Recipe(epochs=7), copies=3)))
+    made = System("made", "Made up.", VectorInput(), blend)
+    distilled = replace(
+        made, estimator=DistilConfig(blend, CNN1, inner_folds=4), recipe=Recipe(epochs=5)
+    )
+    assert (epochs(SYSTEMS["cnn1"]), epochs(SYSTEMS["svm"])) == (20, 0)
+    assert (epochs(made), epochs(distilled)) == (21, 4 * 21 + 5)
