@@ -29,6 +29,12 @@ def bts3_dir() -> Path:
     return folder / "bts3"
 
 
+def pytest_collection_finish() -> None:
+    """Take what the imports made out of the garbage collector's sight: it runs after every test."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def nothing_is_left_behind() -> Iterator[None]:
     """Fail a test that leaves threads or descriptors behind."""

@@ -22,6 +22,9 @@ TACTILE_SECTIONS = (
     scene.PalmTactile,
 )
 
+COIN = 0.505
+"""Every verdict is as sure as this, to two digits: a threshold below refuses nothing."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -93,7 +96,7 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
 
 def _rejects(wanted: scene.Scene, model: TactileModel) -> str:
     confidence = assembly.min_confidence(model, wanted.model.min_accuracy)
-    return f", unknown below a confidence of {confidence:.2f}" if confidence else ""
+    return f", unknown below a confidence of {confidence:.2f}" if confidence > COIN else ""
 
 
 def _session(wanted: scene.Scene, needs: SessionInput) -> str:

@@ -22,6 +22,13 @@ TITLES = {
 }
 """What each protocol asks, for people."""
 
+SHOWN = {
+    "known objects": ("cv",),
+    "other objects": ("objects", "objects-whole"),
+    "another day": ("session",),
+}
+"""Columns of the list: the first of these protocols that a card has."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
@@ -46,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _listing(cards: dict[str, dict[str, Any]]) -> Iterator[str]:
-    shown = ("cv", "objects", "session")
-    yield f"{'':24}{'MB':>6}{'numbers':>10}" + "".join(f"{name:>14}" for name in shown) + "   F1, %"
+    titles = "".join(f"{title:>16}" for title in SHOWN)
+    yield f"{'F1, %':26}{'MB':>6}{'numbers':>10}{titles}"
     for name, card in cards.items():
         f1 = {
             measured["protocol"]: f"{100 * measured['f1_mean']:.1f} +- "
@@ -55,9 +62,10 @@ def _listing(cards: dict[str, dict[str, Any]]) -> Iterator[str]:
             for measured in card["contract"]["measured"]
         }
         default = " (default)" if name == DEFAULT_MODEL else ""
-        figures = "".join(f"{f1.get(protocol, '-'):>14}" for protocol in shown)
+        chosen = (next(filter(None, map(f1.get, group)), "-") for group in SHOWN.values())
+        figures = "".join(f"{text:>16}" for text in chosen)
         size = card["file"]["size_bytes"] / 1e6
-        yield f"{name + default:24}{size:6.1f}{card['parameters']:>10}{figures}"
+        yield f"{name + default:26}{size:6.1f}{card['parameters']:>10}{figures}"
     yield ""
     for name, card in cards.items():
         yield f"{name}: {card['what']}"

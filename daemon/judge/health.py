@@ -32,10 +32,11 @@ REPAIRABLE = int(
 """Bits of single electrodes. All others, known or not, speak against the whole reading."""
 
 BROKEN_MAX = 12
-"""Electrodes of a hand that may be repaired: twelve at random, repaired, cost 0.3 points of F1,
-eighteen 1.7 (cross-validated on the published grasps)."""
+"""Electrodes of a hand that may be repaired: twelve at random, repaired, cost `cnn1` 1.2 +- 0.3
+points of F1 and `small-session` 0.6 +- 0.2, eighteen 2.1 and 1.3 (grasps not trained on, `cv`)."""
 BROKEN_FINGER_MAX = 8
-"""Of one finger: eight of the first finger cost 0.8 points, twelve 2.1."""
+"""Of one finger: eight neighbours of the first finger, the worst place, cost 2.4 +- 0.8 and
+1.4 +- 0.5 points, twelve 4.3 and 2.8; of another finger eight cost 0.6 at most."""
 UNCHANGED_MAX = 16
 """Readings in a row in which a live electrode may keep its count. Its noise is 3 to 4 counts
 (standard deviation), so it keeps it about once in ten readings, 16 times in a row never; and all

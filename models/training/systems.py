@@ -61,6 +61,7 @@ COUNTS = CountsInput()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
+SHARP_SVM = Svm(c=5.0, gamma=0.02)
 SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
 SMALL_RECIPE = Recipe(epochs=20, weight_decay=1.0, input_noise=0.2)
 SESSION_SVM = Svm(c=3.0, gamma=0.003)
@@ -212,7 +213,15 @@ _ELECTRODES = (
         "svm-electrodes",
         "Support vector machine on counts, each electrode standardised by the training.",
         COUNTS,
-        Svm(c=3.0, gamma=0.01),
+        SHARP_SVM,
+        standardise=True,
+    ),
+    System(
+        "blend-electrodes",
+        "Mean of a support vector machine and two CNN0 on counts, each electrode standardised by "
+        "the training.",
+        COUNTS,
+        BlendConfig((Member(SHARP_SVM), Member(CNN0, CNN_RECIPE, copies=2))),
         standardise=True,
     ),
     System(

@@ -62,6 +62,18 @@ def test_a_quick_run_writes_summaries_and_table(
     assert "palm_45.csv is not the published table" in printed.err
 
 
+def test_a_quick_run_on_the_real_grasps_says_what_it_is(bts3_dir: Path, tmp_path: Path) -> None:
+    table = tmp_path / "RESULTS.md"
+    options = ["--data", str(bts3_dir), "--out", str(tmp_path / "out"), "--table", str(table)]
+    systems = ("cnn0", "rf", "svm", "svm-session")
+    protocols = ("--protocol", "cv", "--protocol", "session")
+    assert graspd_evaluate(*systems, *protocols, *options, "--quick", "--quiet") == 0
+    text = table.read_text()
+    assert "mean nothing" in text
+    for name in systems:
+        assert f"`{name}`" in text
+
+
 def test_what_is_finished_is_not_run_again(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
