@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -68,14 +69,15 @@ def min_confidence(model: TactileModel, min_accuracy: float | None) -> float:
     """
     if min_accuracy is None:
         return 0.0
-    reached = [step for step in model.contract.confidence if step.accuracy >= min_accuracy]
+    from_the_surest = reversed(model.contract.confidence)
+    reached = list(itertools.takewhile(lambda s: s.accuracy >= min_accuracy, from_the_surest))
     if not reached:
         best = max((step.accuracy for step in model.contract.confidence), default=0.0)
         raise ModelError(
             f"{model.path}: model.min_accuracy {min_accuracy:g} is more than the model reaches, "
             f"{best:.3f} at best"
         )
-    return min(step.confidence for step in reached)
+    return reached[-1].confidence
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:

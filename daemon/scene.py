@@ -230,7 +230,7 @@ class Model(Section):
     """`[model]`: which network judges."""
 
     name: Name | None = None
-    """A model of the zoo; `cnn1` when neither name nor path is given."""
+    """A model of the zoo; `small-session` when neither name nor path is given."""
     path: FilePath | None = None
     """A model file of your own, relative to the scene file."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5

@@ -39,7 +39,7 @@ class Service:
     ) -> None:
         """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
 
-        `chore` is done once a second, before each status.
+        `chore` is done before readings are judged, and once a second.
         """
         self._drivers = drivers
         self._tactile = drivers[0]
@@ -93,6 +93,8 @@ class Service:
         taken = False
         readings = [reading for driver in self._drivers for reading in driver.read_ready()]
         received_ns = self._clock()
+        if readings and self._chore is not None:
+            self._chore()
         for reading in readings:
             if not isinstance(reading, TactileReading):
                 continue  # the verdict does not depend on joints

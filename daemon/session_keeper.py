@@ -35,12 +35,12 @@ class SessionKeeper:
         self._clock = clock
         self._serials: dict[str, str] = {}
         self._restore()
-        self._saved_grasps = session.grasps
+        self._saved = self._what_is_known()
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._warned = False
 
     def mind(self) -> None:
-        """Once a second: has a sensor been exchanged? And save if it is time."""
+        """Before readings are judged: has a sensor been exchanged? And save if it is time."""
         self._mind_serials()
         if self._clock() >= self._save_due_ns:
             self.save()
@@ -48,7 +48,8 @@ class SessionKeeper:
     def save(self) -> None:
         """Save if there is anything new; one warning if that cannot be done."""
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
-        if self._session.grasps == self._saved_grasps:
+        known = self._what_is_known()
+        if known == self._saved:
             return
         try:
             self._file.save(self._session.state(), self._fingers, self._serials)
@@ -57,8 +58,11 @@ class SessionKeeper:
                 log.warning("%s; the next start begins a new session", error)
             self._warned = True
         else:
-            self._saved_grasps = self._session.grasps
+            self._saved = known
             self._warned = False
+
+    def _what_is_known(self) -> tuple[int, dict[str, str]]:
+        return self._session.grasps, dict(self._serials)
 
     def _restore(self) -> None:
         try:
@@ -82,6 +86,5 @@ class SessionKeeper:
                 self._session.grasps,
             )
             self._session.reset()
-            self._saved_grasps = -1
             self._save_due_ns = self._clock()
         self._serials.update(serials)

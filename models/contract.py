@@ -69,6 +69,8 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     covariance of all electrodes, fingers one after the other: row i has i + 1 values."""
     distance_max: Annotated[float, msgspec.Meta(gt=0.0)]
     """A reading with a larger root-mean-square whitened deviation was never seen."""
+    distance_min: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
+    """One with a smaller one neither: it is nobody's grasp, it is the mean of them all."""
 
 
 class ImageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="image"):
@@ -94,7 +96,7 @@ class Sharpness(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     grasps: Annotated[float, msgspec.Meta(ge=0.0)]
     """From so many grasps' worth of statistics on."""
-    temperature: Annotated[float, msgspec.Meta(gt=0.0)]
+    temperature: Annotated[float, msgspec.Meta(ge=1.0)]
     """The margin (log-odds of slip) is divided by this; as measured on a session left out."""
 
 

@@ -23,14 +23,28 @@ class SeenCheck:
         size = len(self._centre)
         self._whitening = np.zeros((size, size))
         self._whitening[np.tril_indices(size)] = [value for row in seen.whitening for value in row]
-        self._square_max = seen.distance_max**2 * size
+        self._electrodes = size
+        self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
 
-    def never_seen(self, counts: NDArray[np.generic]) -> NDArray[np.bool_]:
-        """Shape (N,): True for each of the counts (N, fingers, 24) that was never seen."""
+    def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:
+        """Shape (N,): True for each of the counts (N, fingers, 24) that was never seen.
+
+        So many electrodes of each were `repaired` by what the others let expect: they add nothing
+        to the distance, so it is taken over the others.
+        """
         values = counts.astype(np.float64)
         outside = ((values < self._low) | (values > self._high)).any(axis=(1, 2))
+        squares = self._squares(values, repaired)
+        # Not (square > limit), so that a value that is not finite counts as never seen.
+        within = (squares <= self._square_max) & (squares >= self._square_min)
+        never: NDArray[np.bool_] = outside | ~within
+        return never
+
+    def is_far(self, counts: NDArray[np.float64]) -> bool:
+        """Whether counts (fingers, 24) fit the training covariance; the ranges do not matter."""
+        return not self._squares(counts[np.newaxis], 0)[0] <= self._square_max
+
+    def _squares(self, values: NDArray[np.float64], repaired: int) -> NDArray[np.float64]:
         deviations = (values.reshape(len(values), -1) - self._centre) @ self._whitening
         squares: NDArray[np.float64] = np.einsum("ne,ne->n", deviations, deviations)
-        # Not (square <= limit), so that a value that is not finite counts as never seen.
-        never: NDArray[np.bool_] = outside | ~(squares <= self._square_max)
-        return never
+        return squares / (self._electrodes - repaired)

@@ -95,6 +95,8 @@ class SessionStatistics:
             raise ValueError(f"is of {len(mean)} values, not of {len(self._prior_mean)}")
         if not (np.isfinite(mean).all() and np.isfinite(squares).all()):
             raise ValueError("holds numbers that are not finite")
+        if state.weight != min(state.grasps, HORIZON_GRASPS):
+            raise ValueError(f"says that {state.grasps} grasps weigh {state.weight:g}")
         self.reset()
         self.grasps, self._weight = state.grasps, state.weight
         self._mean, self._squares = mean, squares

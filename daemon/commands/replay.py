@@ -142,7 +142,10 @@ def _pipeline(wanted: scene.Scene, model: TactileModel, session: str) -> Pipelin
     kept = load(path)
     if kept is None:
         raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
-    pipeline.session.restore(statistics_of(kept, wanted.hand.fingers))
+    try:
+        pipeline.session.restore(statistics_of(kept, wanted.hand.fingers))
+    except ValueError as error:
+        raise SessionFileError(f"{path}: {error}") from error
     return pipeline
 
 

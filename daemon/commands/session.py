@@ -13,12 +13,14 @@ from pathlib import Path
 import msgspec
 
 from daemon import assembly, scene
-from daemon.judge.pipeline import Pipeline
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.verdict import Reason
 from daemon.session_file import KeptSession, SessionFile, SessionFileError, load
 from daemon.text import complain, printable
 from drivers.base import DriverError, TactileReading
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
+from models.session import SessionState
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -101,29 +103,42 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     if session is None:
         raise ModelError(f"the model {model.contract.name} keeps no session")
     with SessionFile(wanted.session_path) as file:
-        kept = file.load()
-        read = _take_in(wanted, recordings, pipeline)
-        if not session.grasps:
-            raise DriverError(f"none of the {read} readings can be used")
-        serials = {} if kept is None else kept.serials
-        file.save(session.state(), wanted.hand.fingers, serials)
+        read = len(_judge(wanted, recordings, pipeline))
+        if not session.calibrated:
+            raise DriverError(
+                f"{session.grasps} grasps of {read} readings are too few, or they are no grasps"
+            )
+        _check(wanted, model, recordings, session.state())
+        # Of which sensors they are is not known before the daemon hears from them.
+        file.save(session.state(), wanted.hand.fingers, {})
     where = printable(str(wanted.session_path))
     sys.stdout.write(f"{where}: {session.grasps} grasps of {read} readings taken in\n")
 
 
-def _take_in(wanted: scene.Scene, recordings: list[Path], pipeline: Pipeline) -> int:
+def _check(
+    wanted: scene.Scene, model: TactileModel, recordings: list[Path], state: SessionState
+) -> None:
+    """Raise `DriverError` if the session does not know its own recordings again."""
+    pipeline = assembly.build_pipeline(wanted, model, learns=False)
+    if pipeline.session is not None:
+        pipeline.session.restore(state)
+    again = _judge(wanted, recordings, pipeline)
+    unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
+    if 2 * unlike > len(again):
+        raise DriverError(f"{unlike} of {len(again)} readings are unlike all grasps")
+
+
+def _judge(wanted: scene.Scene, recordings: list[Path], pipeline: Pipeline) -> list[Judgement]:
     replay = scene.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
     (driver,) = assembly.build_drivers(
         wanted.model_copy(update={"tactile": replay, "joints": None})
     )
-    read = 0
+    judgements: list[Judgement] = []
     with contextlib.closing(driver):
         assembly.open_driver(driver)
         while not driver.exhausted:
-            for reading in driver.read_ready():
-                if isinstance(reading, TactileReading):
-                    pipeline.judge(reading)
-                    read += 1
-    return read
+            readings = driver.read_ready()
+            judgements += [pipeline.judge(r) for r in readings if isinstance(r, TactileReading)]
+    return judgements

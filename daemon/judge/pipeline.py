@@ -97,13 +97,17 @@ class Pipeline:
             reasons.append(Reason.STALE)
         judgement = self._judgement(reading.t_ns, p_slip, reasons, self._repaired(findings))
         # Last, so that a grasp is judged by what came before it.
-        if self._learns and self.session is not None and findings.grasp is not None:
-            self.session.observe(findings.grasp)
+        if self._learns and Reason.STALE not in reasons:
+            self._learn(findings)
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
         return self._judgement(last_t_ns, None, [Reason.STALE])
+
+    def _learn(self, findings: Findings) -> None:
+        if self.session is not None and findings.grasp is not None:
+            self.session.observe(findings.grasp)
 
     def _infer(self, counts: NDArray[np.generic], reasons: list[Reason]) -> float | None:
         spread = self._model.inputs.build(counts, self._model.input)
@@ -119,8 +123,10 @@ class Pipeline:
             reasons.append(Reason.MODEL_FAILED)
             return None
         if self.session is not None:
-            p_slip = _softened(p_stable, p_slip, self.session.temperature)
-        if max(p_slip, 1.0 - p_slip) < self._limits.min_confidence:
+            threshold = self._limits.slip_threshold
+            p_slip = _softened(p_stable, p_slip, self.session.temperature, threshold)
+        confidence = p_slip if p_slip >= self._limits.slip_threshold else 1.0 - p_slip
+        if confidence < self._limits.min_confidence:
             reasons.append(Reason.LOW_CONFIDENCE)
         return p_slip
 
@@ -148,9 +154,13 @@ def _session(model: TactileModel) -> SessionCalibration | None:
     return SessionCalibration(wanted, inputs, training.centre, training.spread)
 
 
-def _softened(p_stable: float, p_slip: float, temperature: float) -> float:
-    """The slip probability with its log-odds divided by the temperature."""
+def _softened(p_stable: float, p_slip: float, temperature: float, threshold: float) -> float:
+    """The slip probability with its log-odds, counted from the threshold, over the temperature.
+
+    So it is less sure, and on the same side of the threshold as before.
+    """
     if temperature == 1.0 or not (0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0):
         return p_slip
     margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
-    return 1.0 / (1.0 + math.exp(-margin / temperature))
+    zero = math.log(threshold) - math.log1p(-threshold)
+    return 1.0 / (1.0 + math.exp(-(zero + (margin - zero) / temperature)))

@@ -9,6 +9,12 @@ from models.contract import SessionInput
 from models.inputs import SessionBuilder, raw_features
 from models.session import SessionState, SessionStatistics
 
+COUNT_MAX = 4095
+SPREAD_RATIOS = (0.2, 3.0)
+"""Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
+by 0.7 to 1.3 times from twenty grasps of the published tables on; those of a dead finger by 0.06
+times."""
+
 
 class SessionCalibration:
     """Keeps the statistics of the session's unlabelled grasps, and a model's input up to them."""
@@ -24,6 +30,7 @@ class SessionCalibration:
         self._wanted = wanted
         self._inputs = inputs
         self._shape = counts_mean.shape
+        self._training_spread = counts_spread
         self._statistics = SessionStatistics(
             np.concatenate((wanted.mean, counts_mean.ravel())),
             np.concatenate((wanted.spread, counts_spread.ravel())),
@@ -38,14 +45,14 @@ class SessionCalibration:
 
     @property
     def calibrated(self) -> bool:
-        """Whether they are enough for what the model's card says."""
-        return self.grasps >= self._wanted.calibrated_from
+        """Whether they are enough for what the model's card says, and can have been grasps."""
+        return self.grasps >= self._wanted.calibrated_from and not self.odd
 
     @property
     def temperature(self) -> float:
         """What the margin of a verdict must be divided by, with so few grasps."""
-        steps = self._wanted.sharpness
-        return next(step.temperature for step in reversed(steps) if step.grasps <= self.grasps)
+        steps, grasps = self._wanted.sharpness, 0 if self.odd else self.grasps
+        return next(step.temperature for step in reversed(steps) if step.grasps <= grasps)
 
     def observe(self, counts: NDArray[np.generic]) -> None:
         """Take in the counts (fingers, 24) of a grasp that was judged, or could have been."""
@@ -63,7 +70,10 @@ class SessionCalibration:
         return self._statistics.state()
 
     def restore(self, state: SessionState) -> None:
-        """Go on from what was kept. Raises `ValueError` if it is of other fingers."""
+        """Go on from what was kept. Raises `ValueError` if it cannot be of these counts."""
+        counts = np.array(state.mean[len(self._wanted.mean) :])
+        if ((counts < 0.0) | (counts > COUNT_MAX)).any():
+            raise ValueError("holds means that no counts have")
         self._statistics.restore(state)
         self._settle()
 
@@ -75,3 +85,8 @@ class SessionCalibration:
         """Of each electrode in this session, shape (fingers, 24)."""
         self.counts_spread = spread[features:].reshape(self._shape)
         """Standard deviation of each electrode in this session, shape (fingers, 24)."""
+        least, most = SPREAD_RATIOS
+        ratio = np.median(self.counts_spread / self._training_spread, axis=1)
+        enough = self.grasps >= self._wanted.calibrated_from
+        self.odd = enough and not bool(((ratio >= least) & (ratio <= most)).all())
+        """Whether what came cannot have been grasps: a finger that is dead or sees only noise."""

@@ -21,6 +21,9 @@ none of its business, and a young session's map is rough. 6 % of palm_45 are ref
 DISTANCE_MAX = 2.5
 """Largest root-mean-square whitened deviation still taken for seen: a held-out grasp has 0.8 at
 the median, and 1 % are above; readings made up of possible but unrelated counts all are."""
+DISTANCE_MIN = 0.33
+"""Smallest: of 3600 real grasps the nearest to the mean has 0.37; the mean itself, with the
+sensors' noise, 0.14 to 0.34."""
 NOISE_COUNTS = 5.0
 """Added to each electrode's spread, counts: the sensors' own noise (3 to 12 counts measured), so
 that two electrodes that always moved together may differ by it."""
@@ -45,6 +48,7 @@ def seen_counts(counts: NDArray[np.generic], margin: int = MARGIN_COUNTS) -> See
             tuple(map(_rounded, row[: index + 1])) for index, row in enumerate(whitening)
         ),
         distance_max=DISTANCE_MAX,
+        distance_min=DISTANCE_MIN,
     )
 
 

@@ -235,6 +235,18 @@ def test_a_verdict_that_is_not_sure_enough_is_unknown(
     assert (judgement.outcome is Outcome.UNKNOWN) is bool(reasons)
 
 
+@pytest.mark.parametrize(
+    ("p_slip", "reasons"),
+    [(0.05, ()), (0.1, ()), (0.15, (Reason.LOW_CONFIDENCE,)), (0.94, (Reason.LOW_CONFIDENCE,))],
+)
+def test_the_confidence_is_that_of_the_verdict_given(
+    p_slip: float, reasons: tuple[Reason, ...]
+) -> None:
+    clock = Clock()
+    judge = pipeline(FakeModel(p_slip), clock, slip_threshold=0.95, min_confidence=0.9)
+    assert judge.judge(reading(clock())).reasons == reasons
+
+
 @pytest.mark.parametrize("count", [LOW - MARGIN, HIGH + MARGIN])
 def test_counts_at_the_edge_of_what_was_seen_are_judged(count: int) -> None:
     clock = Clock()

@@ -6,18 +6,26 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.pipeline import Judgement, Limits, Pipeline
 from daemon.judge.session import SessionCalibration
+from daemon.judge.verdict import Outcome, Reason
 from daemon.session_file import SessionFile, SessionFileError, exchanged, load
 from daemon.session_keeper import SAVE_PERIOD_NS, SessionKeeper
+from drivers.base import ElectrodeFault, TactileReading
+from models import zoo
 from models.contract import SessionInput, Sharpness
 from models.inputs import SessionBuilder, raw_features
+from models.runtime import TactileModel
+from models.training.datasets import read_table
 from tests.daemon.fakes import Clock, FakeDriver
 
 FINGERS = ("ff", "mf", "th")
@@ -222,6 +230,7 @@ def test_a_full_disk_is_one_warning_and_no_crash(
 
 KILLED = """
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from daemon.session_file import SessionFile
 from tests.daemon.test_session import FINGERS, calibration, observe
@@ -248,3 +257,164 @@ def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None
         kept = load(path)
         assert kept is not None
         assert kept.statistics.grasps >= 20
+
+
+def session_pipeline(**options: bool) -> Pipeline:
+    model = TactileModel(zoo.find("small-session"))
+    limits = Limits(max_age_ns=10**18)
+    return Pipeline(model, FINGERS, limits, lambda: 0, **options)
+
+
+def judge(pipeline: Pipeline, rows: NDArray[np.generic], fault: int = 0) -> list[Judgement]:
+    faults = np.full((3, 24), fault, dtype=np.uint8)
+    return [
+        pipeline.judge(TactileReading(0, number, row.astype(np.uint16), faults))
+        for number, row in enumerate(rows)
+    ]
+
+
+def test_a_grasp_is_judged_by_what_came_before_it(bts3_dir: Path) -> None:
+    rows = read_table(bts3_dir / "palm_down.csv").counts[:30]
+    judgements = judge(session_pipeline(), rows)
+    (first,) = judge(session_pipeline(), rows[:1])
+    assert judgements[0].p_slip == first.p_slip
+    calibrated = [judgement.session_calibrated for judgement in judgements]
+    assert calibrated == sorted(calibrated, key=bool)
+    assert not calibrated[19]
+
+
+def test_a_session_that_does_not_learn_stays_what_it_is(bts3_dir: Path) -> None:
+    pipeline = session_pipeline(learns=False)
+    judge(pipeline, read_table(bts3_dir / "palm_down.csv").counts[:30])
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 0
+
+
+@pytest.mark.parametrize("fault", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF, 128])
+def test_a_session_learns_nothing_from_what_is_not_of_now(bts3_dir: Path, fault: int) -> None:
+    pipeline = session_pipeline()
+    judge(pipeline, read_table(bts3_dir / "palm_down.csv").counts[:30], fault)
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 0
+
+
+GARBAGE: dict[str, Callable[[np.random.Generator], NDArray[np.generic]]] = {
+    "any counts": lambda random: random.integers(1, 4095, (300, 3, 24)),
+    "an open hand": lambda random: 3000 + random.normal(0.0, 5.0, (300, 3, 24)),
+    "one level": lambda random: random.integers(1900, 2100, (300, 3, 24)),
+    "noise": lambda random: 2048 + random.normal(0.0, 150.0, (300, 3, 24)),
+}
+
+
+@pytest.mark.parametrize("what", GARBAGE)
+@pytest.mark.parametrize("grasps", [0, 100])
+def test_garbage_never_becomes_its_own_standard(bts3_dir: Path, what: str, grasps: int) -> None:
+    """Neither after real grasps nor from the start: nothing of it is ever called stable."""
+    pipeline = session_pipeline()
+    random = np.random.default_rng(1)
+    rows = read_table(bts3_dir / "palm_down.csv").counts
+    judge(pipeline, rows[random.permutation(len(rows))[:grasps]])
+    judgements = judge(pipeline, GARBAGE[what](random))
+    assert {judgement.outcome for judgement in judgements} == {Outcome.UNKNOWN}
+
+
+def test_a_drifted_session_is_refused_at_first_and_then_learned(bts3_dir: Path) -> None:
+    rows = read_table(bts3_dir / "palm_down.csv").counts.astype(np.int64)
+    rows = rows[np.random.default_rng(2).permutation(len(rows))[:300]]
+    rows[:, 0, :6] -= 400
+    rows = np.clip(rows, 1, 4094)
+    judgements = judge(session_pipeline(), rows)
+    judged = [judgement.outcome is not Outcome.UNKNOWN for judgement in judgements]
+    assert np.mean(judged[100:]) > 0.85
+
+
+@pytest.mark.parametrize("grasps", [0, 200])
+def test_a_finger_that_dies_is_never_judged_by_the_others(bts3_dir: Path, grasps: int) -> None:
+    random = np.random.default_rng(3)
+    rows = read_table(bts3_dir / "palm_down.csv").counts
+    rows = rows[random.permutation(len(rows))].astype(np.int64)
+    pipeline = session_pipeline()
+    judge(pipeline, rows[:grasps])
+    dead = rows[200:600].copy()
+    dead[:, 2] = 2048 + np.rint(random.normal(0.0, 3.5, dead[:, 2].shape)).astype(np.int64)
+    assert {judgement.outcome for judgement in judge(pipeline, dead)} == {Outcome.UNKNOWN}
+
+
+def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
+    random = np.random.default_rng(4)
+    rows = read_table(bts3_dir / "palm_down.csv").counts
+    rows = rows[random.permutation(len(rows))]
+    pipeline = session_pipeline()
+    judge(pipeline, rows[:200])
+    judgements = judge(pipeline, rows[200:600, [1, 2, 0]])
+    assert np.mean([judgement.outcome is Outcome.UNKNOWN for judgement in judgements]) > 0.95
+
+
+@pytest.mark.parametrize("name", ["cnn1", "small-session"])
+def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
+    model = TactileModel(zoo.find(name))
+    random = np.random.default_rng(5)
+    centre = np.array(model.contract.seen.centre)
+    pipeline = Pipeline(model, FINGERS, Limits(max_age_ns=10**18), lambda: 0, learns=False)
+    judgements = judge(pipeline, centre + random.normal(0.0, 2.0, (50, 3, 24)))
+    assert {judgement.outcome for judgement in judgements} == {Outcome.UNKNOWN}
+
+
+def test_a_session_learns_nothing_from_what_is_stale(bts3_dir: Path) -> None:
+    model = TactileModel(zoo.find("small-session"))
+    pipeline = Pipeline(model, FINGERS, Limits(max_age_ns=10**8), lambda: 10**10)
+    judgements = judge(pipeline, read_table(bts3_dir / "palm_down.csv").counts[:30])
+    assert {judgement.reasons[-1] for judgement in judgements} == {Reason.STALE}
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 0
+
+
+@pytest.mark.parametrize("threshold", [0.2, 0.5, 0.95])
+def test_a_young_session_is_less_sure_and_on_the_same_side(
+    bts3_dir: Path, threshold: float
+) -> None:
+    rows = read_table(bts3_dir / "palm_down.csv").counts[::20]
+    limits = Limits(max_age_ns=10**18, slip_threshold=threshold)
+    model = TactileModel(zoo.find("small-session"))
+    young = Pipeline(model, FINGERS, limits, lambda: 0, learns=False)
+    for judgement, row in zip(judge(young, rows), rows, strict=True):
+        if judgement.p_slip is None or judgement.repaired:
+            continue
+        model.inputs.build(row, model.input)
+        _, p_slip = model.run()
+        assert (p_slip >= threshold) is (judgement.outcome is Outcome.SLIP)
+        assert abs(judgement.p_slip - threshold) <= abs(p_slip - threshold) + 1e-6
+
+
+def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path) -> None:
+    clock = Clock()
+    seeded = calibration()
+    observe(seeded, 30)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(seeded.state(), FINGERS, {})
+        keeper = SessionKeeper(calibration(), FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper.mind()
+        keeper.save()
+        kept = file.load()
+        assert kept is not None
+        assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
+        later = calibration()
+        SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock).mind()
+    assert later.grasps == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"weight": 0.0}, "30 grasps weigh 0"),
+        ({"grasps": 1000}, "1000 grasps weigh 30"),
+        ({"mean": (0.0,) * 78 + (5000.0,) * 72}, "means that no counts have"),
+        ({"mean": (0.0,) * 77 + (2000.0,) * 72}, "is of 149 values"),
+    ],
+)
+def test_a_session_that_cannot_be_is_not_restored(change: dict[str, Any], says: str) -> None:
+    session, other = calibration(), calibration()
+    observe(other, 30)
+    with pytest.raises(ValueError, match=says):
+        session.restore(msgspec.structs.replace(other.state(), **change))
+    assert session.grasps == 0
