@@ -11,6 +11,7 @@ again, silence. See `drivers.palm_packet` and `drivers.palm_sweep`.
 
 from __future__ import annotations
 
+import dataclasses
 import ipaddress
 import time
 from collections.abc import Callable, Sequence
@@ -200,7 +201,9 @@ class PalmDriver:
     def due_ns(self) -> int | None:
         """When a round is about to end, silence is to be noticed, or a file's packet is due."""
         if self._link is None:
-            return None if self._file is None or self.exhausted else self._next_packet_ns
+            if self._file is None or self.exhausted:
+                return None
+            return self._next_packet_ns if self._realtime else self._clock()
         due_ns, now_ns = self._link.due_ns(), self._clock()
         if now_ns < self._attention_ns:
             return self._attention_ns if due_ns is None else min(due_ns, self._attention_ns)
@@ -228,14 +231,19 @@ class PalmDriver:
 
     def _play(self, file: PalmFile, readings: list[Reading]) -> None:
         now_ns = self._clock()
+        played: list[Reading] = []
         for _ in range(DRAIN_MAX):
-            if self.exhausted or self._next_packet_ns > now_ns:
-                return
+            if self.exhausted or (self._realtime and self._next_packet_ns > now_ns):
+                break
             data = file.next_packet()
             self.exhausted = not data
             if data:
-                self._take(data, now_ns, readings)
-            self._next_packet_ns += CYCLE_NS if self._realtime else 0
+                # A cycle apart as they were recorded, however late or early they are read.
+                self._take(data, self._next_packet_ns, played)
+            self._next_packet_ns += CYCLE_NS
+        if not self._realtime:
+            played = [dataclasses.replace(reading, t_ns=now_ns) for reading in played]
+        readings.extend(played)
 
     def _take(self, data: bytes, t_ns: int, readings: list[Reading]) -> None:
         packet = self._parser.parse(data)

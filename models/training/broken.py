@@ -42,7 +42,8 @@ class Broken:
     known: float
     """Flagged by the driver or at a rail, and repaired."""
     found: float
-    """Nobody says which: found by what the others let expect, and repaired."""
+    """Nobody says which, not even the rails: found by what the others let expect, and repaired. The
+    daemon refuses a reading with more than a few of these instead."""
     detected: float
     """Fraction of the broken electrodes that were found so."""
 

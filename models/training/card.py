@@ -23,6 +23,8 @@ LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2
 WEAK_POINTS = (
     "The data is of one hand and 41 objects, lifted in one way.",
     "A wrong electrode that keeps within what its neighbours allow is not noticed.",
+    "Readings are compared with the training's covariance: what varies like a grasp without being "
+    "one, such as hum on all electrodes, may be judged.",
 )
 
 
@@ -90,7 +92,7 @@ class NeverSeen(msgspec.Struct, frozen=True):
     held_out_object: float | None
     """Grasps of an object, by the other objects; None if there is only one."""
     made_up: dict[str, float]
-    """Readings that no hand ever made, by the way they were made up."""
+    """Readings that no hand ever made, by the way they were made up; before any repair."""
 
 
 class Card(msgspec.Struct, frozen=True):

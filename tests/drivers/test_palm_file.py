@@ -61,3 +61,17 @@ def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None
         PalmDriver(path).open()
     with pytest.raises(RecordingError, match=r"is not a file|cannot be opened"):
         PalmDriver(tmp_path).open()
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_file_that_is_read_late_has_lost_no_packet(tmp_path: Path, realtime: bool) -> None:
+    clock = Clock()
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(datagrams(40)))
+    readings = []
+    with PalmDriver(path, realtime=realtime, clock=clock) as driver:
+        while not driver.exhausted:
+            readings += tactile(driver.read_ready())
+            clock.now_ns += 500 * MS
+        assert driver.counters.lost_packets == 0
+    assert np.array_equal([reading.counts for reading in readings], rows(40))
