@@ -69,7 +69,7 @@ def test_a_twin_ends_with_its_counts_and_mends_its_link() -> None:
     faults = LinkFaults(disconnect_every_frames=30)
     where = channel()
     twin = CanTwin(
-        "virtual", where, iter(contact(2)), sequence="electrodes", faults=faults, rate_hz=1000.0
+        "virtual", where, iter(contact(2)), sequence="electrodes", faults=faults, rate_hz=25.0
     )
     with bridge(where) as driver, twin:
         twin.serve(threading.Event())
