@@ -35,7 +35,7 @@ from models.training.sweep import sweep
 from models.training.system import SessionFeatures, System
 from models.training.trained import Trained, train
 
-CALIBRATED_FROM = 20
+CALIBRATED_FROM = 20.0
 """Grasps from which on a session counts as calibrated: later ones gain two points at most."""
 EXTRA_TRAININGS = 2
 """Beside the folds: one for the repeatability, one for the model itself. The study of broken

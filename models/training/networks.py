@@ -72,8 +72,6 @@ CNN1 = NetworkConfig(filters=32, hidden=1024)
 """The best network of the paper: Conv32 - FC1024."""
 CNN2 = NetworkConfig(filters=32, hidden=1024, pool=True)
 CNN3 = NetworkConfig(filters=32, hidden=1024, pool=True, second=SecondConvolution())
-NETWORKS = {"cnn0": CNN0, "cnn1": CNN1, "cnn2": CNN2, "cnn3": CNN3}
-"""The networks of the paper's table III."""
 
 
 class ChannelsFirst(nn.Module):
