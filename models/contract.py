@@ -10,6 +10,8 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from models.layout import ELECTRODES
 
@@ -71,6 +73,16 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A reading with a larger root-mean-square whitened deviation was never seen."""
     distance_min: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
     """One with a smaller one neither: it is nobody's grasp, it is the mean of them all."""
+
+    def whitening_matrix(self) -> NDArray[np.float64]:
+        """L of `whitening`, shape (electrodes, electrodes), lower triangular, 1/counts.
+
+        That the rows are a triangle, `ModelContract.from_json` has checked.
+        """
+        size = len(self.whitening)
+        matrix = np.zeros((size, size))
+        matrix[np.tril_indices(size)] = [value for row in self.whitening for value in row]
+        return matrix
 
 
 class ImageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="image"):

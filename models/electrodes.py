@@ -24,9 +24,7 @@ class Electrodes:
 
     def __init__(self, seen: SeenCounts) -> None:
         self._centre = np.array(seen.centre).ravel()
-        size = len(self._centre)
-        whitening = np.zeros((size, size))
-        whitening[np.tril_indices(size)] = [value for row in seen.whitening for value in row]
+        whitening = seen.whitening_matrix()
         self._precision = whitening @ whitening.T
         self._limit_square = IMPLAUSIBLE**2 * np.diag(self._precision)
         self.centre = self._centre.reshape(np.shape(seen.centre))

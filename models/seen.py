@@ -20,10 +20,8 @@ class SeenCheck:
         self._low = np.array(seen.low, dtype=np.float64) - seen.margin
         self._high = np.array(seen.high, dtype=np.float64) + seen.margin
         self._centre = np.array(seen.centre).ravel()
-        size = len(self._centre)
-        self._whitening = np.zeros((size, size))
-        self._whitening[np.tril_indices(size)] = [value for row in seen.whitening for value in row]
-        self._electrodes = size
+        self._whitening = seen.whitening_matrix()
+        self._electrodes = len(self._centre)
         self._square_min, self._square_max = seen.distance_min**2, seen.distance_max**2
 
     def never_seen(self, counts: NDArray[np.generic], repaired: int = 0) -> NDArray[np.bool_]:

@@ -19,8 +19,9 @@ from models.training.trained import Trained, train
 FOLDS, JUDGED_FOLDS = 10, 3
 """Of ten stratified folds, three are judged: enough to tell one point from twenty."""
 NUMBERS = (1, 2, 4, 8, 12)
-BROKEN_MAX = 13
-"""So many are looked for at most."""
+LOOKED_FOR_MAX = 13
+"""Broken electrodes of a reading that are looked for at most: one more than the daemon repairs in a
+hand (`BROKEN_MAX` of `daemon.judge.health`, 12), for with so many it refuses the reading."""
 
 Breakage = Callable[[NDArray[np.generic], np.random.Generator], NDArray[np.generic]]
 KINDS: dict[str, Breakage] = {
@@ -107,7 +108,7 @@ class _Fold:
         values = self._trained.looks.to_training(counts, self._table_of)
         nothing = np.zeros(counts.shape[1:], dtype=np.bool_)
         return np.array(
-            [self._electrodes.implausible(reading, nothing, BROKEN_MAX) for reading in values]
+            [self._electrodes.implausible(reading, nothing, LOOKED_FOR_MAX) for reading in values]
         )
 
     def repair(self, counts: NDArray[np.generic], broken: NDArray[np.bool_]) -> NDArray[np.generic]:

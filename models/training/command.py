@@ -5,14 +5,9 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
-
+from models.training.arguments import progress_bar, whole
 from models.training.card import Card
 from models.training.datasets import DatasetError, Grasps, read_all, unpublished
 from models.training.export import ExportError
@@ -46,13 +41,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: trainings in --out)",
     )
     parser.add_argument(
-        "--seed", type=_whole(0, MAX_SEED), default=0, metavar="N", help="default: 0"
+        "--seed", type=whole(0, MAX_SEED), default=0, metavar="N", help="default: 0"
     )
+    parser.add_argument("--folds", type=whole(2, 1000), default=10, metavar="N", help="default: 10")
     parser.add_argument(
-        "--folds", type=_whole(2, 1000), default=10, metavar="N", help="default: 10"
-    )
-    parser.add_argument(
-        "--jobs", type=_whole(1, 256), default=1, metavar="N", help="trainings at once (default: 1)"
+        "--jobs", type=whole(1, 256), default=1, metavar="N", help="trainings at once (default: 1)"
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress bar")
 
@@ -68,8 +61,9 @@ def run(args: argparse.Namespace) -> int:
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
         results = args.results or out / "trainings"
-        with _progress_bar(order, grasps, hidden=args.quiet) as on_done:
-            card = make(order, grasps, out, results, on_done)
+        total = len(order.jobs(grasps)) + EXTRA_TRAININGS
+        with progress_bar(args.model, total, hidden=args.quiet) as on_job:
+            card = make(order, grasps, out, results, lambda: on_job(args.model))
     except KeyboardInterrupt:
         sys.stderr.write("graspd train: interrupted; the same command goes on from here\n")
         return EXIT_INTERRUPTED
@@ -87,15 +81,6 @@ def _models() -> str:
     return f"one of {', '.join(SYSTEMS)}"
 
 
-def _whole(low: int, high: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        if text.isascii() and text.isdigit() and len(text) <= 10 and low <= int(text) <= high:
-            return int(text)
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {low} to {high}")
-
-    return parse
-
-
 def _check_tables(order: Order, grasps: Grasps, folder: Path) -> None:
     """Raise `DatasetError` if a table is missing; warn of tables that are not the published."""
     there = {file.name for file in grasps.files}
@@ -107,24 +92,6 @@ def _check_tables(order: Order, grasps: Grasps, folder: Path) -> None:
             f"graspd train: warning: {name}.csv is not the published table; the figures are of "
             "this data only\n"
         )
-
-
-@contextmanager
-def _progress_bar(order: Order, grasps: Grasps, *, hidden: bool) -> Iterator[Callable[[], None]]:
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trainings, left"),
-        TimeRemainingColumn(),
-    )
-    total = len(order.jobs(grasps)) + EXTRA_TRAININGS
-    with ProgressBar(
-        *columns, console=console, disable=hidden or not console.is_terminal, transient=True
-    ) as bar:
-        task = bar.add_task(order.system.name, total=total)
-        yield lambda: bar.advance(task)
 
 
 def _summary(card: Card, path: Path, seconds: float) -> str:

@@ -5,15 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as ProgressBar
-
+from models.training.arguments import progress_bar, whole
 from models.training.campaign import Campaign, campaign, quickened
 from models.training.datasets import DatasetError, read_all, unpublished
 from models.training.folds import TooFewGraspsError
@@ -57,11 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder for results; what is there already is not run again (default: runs/evaluate)",
     )
     parser.add_argument(
-        "--seeds", type=_whole(1, 1000), metavar="N", help=f"split seeds (default: {SEEDS})"
+        "--seeds", type=whole(1, 1000), metavar="N", help=f"split seeds (default: {SEEDS})"
     )
     parser.add_argument(
         "--jobs",
-        type=_whole(1, MAX_PROCESSES),
+        type=whole(1, MAX_PROCESSES),
         default=1,
         metavar="N",
         help="processes on this machine (default: 1)",
@@ -140,7 +136,7 @@ def _evaluate(wanted: Campaign, args: argparse.Namespace) -> list[Summary]:
             sys.stdout.write(line_of(summary))
             sys.stdout.flush()
 
-    with _progress_bar(len(wanted.jobs), hidden=args.quiet) as on_job:
+    with progress_bar("starting", len(wanted.jobs), hidden=args.quiet) as on_job:
         return wanted.run(
             args.out,
             processes=args.jobs,
@@ -238,32 +234,6 @@ def _report_grid(
                     f"{best.name} {protocol}: best of {len(report)}, F1 {100 * best.f1.mean:.2f} "
                     f"+- {100 * best.f1.std:.1f} %\n"
                 )
-
-
-def _whole(low: int, high: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        if text.isascii() and text.isdigit() and len(text) <= 10 and low <= int(text) <= high:
-            return int(text)
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {low} to {high}")
-
-    return parse
-
-
-@contextmanager
-def _progress_bar(total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trainings, left"),
-        TimeRemainingColumn(),
-    )
-    with ProgressBar(
-        *columns, console=console, disable=hidden or not console.is_terminal, transient=True
-    ) as bar:
-        task = bar.add_task("starting", total=total)
-        yield lambda name: bar.update(task, advance=1, description=name)
 
 
 def _fail(problem: str, code: int) -> int:

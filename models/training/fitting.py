@@ -16,6 +16,7 @@ from models.training import graphs
 from models.training.augmentation import augment
 from models.training.calibration import fit_temperature
 from models.training.classical import (
+    ClassicalConfig,
     ClassicalModel,
     classical_margins,
     classical_size,
@@ -23,7 +24,7 @@ from models.training.classical import (
 )
 from models.training.networks import AnyNetwork, DenseConfig, NetworkConfig, parameter_count
 from models.training.recipe import AnyRecipe, Progress, logits, train
-from models.training.system import BlendConfig, DistilConfig, Member, System
+from models.training.system import BlendConfig, DistilConfig, System
 
 
 class Fitted(Protocol):
@@ -185,10 +186,8 @@ def fit(
         case DistilConfig() as distil:
             targets = _targets(distil, inputs, slipped, seed, on_epoch)
             return _fit_network(distil.student, system.recipe, inputs, targets, seed, on_epoch)
-        case NetworkConfig() | DenseConfig() as network:
-            return _fit_network(network, system.recipe, inputs, slipped, seed, on_epoch)
-        case classical:
-            return FittedClassical(fit_classical(classical, inputs, slipped, seed))
+        case single:
+            return _fit_single(single, system.recipe, inputs, slipped, seed, on_epoch)
 
 
 def _fit_network(
@@ -216,7 +215,7 @@ def _fit_blend(
     total = sum(member.weight for member in blend.members)
     fitted, factors = [], []
     for member, own in zip(copies, _seeds(seed, len(copies)), strict=True):
-        judge = _fit_member(member, inputs, slipped, own, on_epoch)
+        judge = _fit_single(member.estimator, member.recipe, inputs, slipped, own, on_epoch)
         spread = float(judge.margins(inputs).std())
         fitted.append(judge)
         # A member that judges all grasps alike has learnt nothing and has no say.
@@ -225,16 +224,17 @@ def _fit_blend(
     return FittedBlend(tuple(fitted), tuple(factors))
 
 
-def _fit_member(
-    member: Member,
+def _fit_single(
+    estimator: AnyNetwork | ClassicalConfig,
+    recipe: AnyRecipe | None,
     inputs: NDArray[np.float32],
     slipped: NDArray[np.bool_],
     seed: int,
     on_epoch: Progress | None,
 ) -> FittedNetwork | FittedClassical:
-    match member.estimator:
+    match estimator:
         case NetworkConfig() | DenseConfig() as network:
-            return _fit_network(network, member.recipe, inputs, slipped, seed, on_epoch)
+            return _fit_network(network, recipe, inputs, slipped, seed, on_epoch)
         case classical:
             return FittedClassical(fit_classical(classical, inputs, slipped, seed))
 
