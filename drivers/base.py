@@ -63,6 +63,14 @@ class TactileReading:
     faults: NDArray[np.uint8]
     """Shape (fingers, 24), `ElectrodeFault` bits per electrode."""
     annotation: Annotation | None = None
+    recorded_ns: int | None = None
+    """Of a recording, which may be played faster or slower: when it was made, ns, on an axis of
+    its own."""
+
+    @property
+    def made_ns(self) -> int:
+        """Time, ns, by which readings follow each other; `t_ns` tells how old they are."""
+        return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
         """Check the shapes: a driver that breaks them is a bug, not bad input."""
@@ -83,6 +91,13 @@ class JointReading:
     """Joint names without hand prefix, such as `FFJ3`."""
     position_rad: NDArray[np.float64]
     """Shape (joints,), radians; NaN where a joint has no valid angle."""
+    recorded_ns: int | None = None
+    """As in a `TactileReading`."""
+
+    @property
+    def made_ns(self) -> int:
+        """As in a `TactileReading`."""
+        return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
 
 Reading = TactileReading | JointReading

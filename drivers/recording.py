@@ -224,6 +224,12 @@ class Recording:
         return RecordingError(self._path, problem, line=self._line, column=column)
 
 
+def columns_of(path: Path, fingers: Sequence[str]) -> Columns:
+    """What a recording's columns hold. Raises `RecordingError` if it is none of these fingers."""
+    with open_recording(path) as file:
+        return Recording(path, read_lines(path, file), fingers).columns
+
+
 def open_recording(path: Path) -> BinaryIO:
     """Open a recording. Raises `RecordingError` unless it is a regular file that can be read."""
     try:

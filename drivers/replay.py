@@ -24,8 +24,10 @@ from drivers.base import (
 from drivers.faults import FaultInjector, ReplayCounters, ReplayFaults
 from drivers.recording import Recording, Row, open_recording, read_lines
 
-DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
+DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Synthetic grasps, drawn by `drivers.twins.synthetic`: nobody ever grasped these."""
+DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
+"""Whole synthetic grasps, made by `drivers.twins.whole_grasps`."""
 RATE_MIN_HZ, RATE_MAX_HZ = 1e-3, 1e5
 SPEED_MIN, SPEED_MAX = 1e-3, 1e3
 """Beyond these a schedule makes no sense; `Pace.FAST` has no schedule at all."""
@@ -63,9 +65,9 @@ class ReplayDriver:
 
     `fingers` picks the fingers and their order. A row gives a `TactileReading`, in a stream with
     joints a `JointReading` before it. In real time `t_ns` is when the row was due, so that a late
-    reading is an old one; else it is the time of handing over. The run starts with the first call
-    of `read_ready`; several files play in a row, with `loop` without end. A late reading is
-    counted, never skipped.
+    reading is an old one; else it is the time of handing over. `recorded_ns` is the file's own
+    time. The run starts with the first call of `read_ready`; several files play in a row, with
+    `loop` without end. A late reading is counted, never skipped.
 
     The constructor raises `ValueError` for an argument out of range. `open` raises
     `RecordingError` if any of the files or headers is not right, `read_ready` if a row is not;
@@ -99,6 +101,7 @@ class ReplayDriver:
         self._paths = tuple(paths)
         self._fingers = tuple(fingers)
         self._pace = pace
+        self._speed = speed
         self._ns_per_recorded_s = _NS_PER_S / speed
         self._table_period_ns = _NS_PER_S / (rate_hz * speed)
         self._loop = loop
@@ -267,12 +270,15 @@ class ReplayDriver:
         t_ns = self._clock() - self._delay_ns
         if self._pace is Pace.REALTIME and self._started_ns is not None:
             t_ns = self._started_ns + scheduled.at_ns
+        made_ns = round(scheduled.at_ns * self._speed)
         readings: list[Reading] = []
         if row.position_rad is not None:
-            readings.append(JointReading(t_ns, index, scheduled.joint_names, row.position_rad))
+            names, angles = scheduled.joint_names, row.position_rad
+            readings.append(JointReading(t_ns, index, names, angles, made_ns))
             self.counters.bad_angles += int(np.isnan(row.position_rad).sum())
         if seq is not None:
-            readings.append(TactileReading(t_ns, seq, row.counts, row.faults, row.annotation))
+            counts, faults, note = row.counts, row.faults, row.annotation
+            readings.append(TactileReading(t_ns, seq, counts, faults, note, made_ns))
             self._count(row.faults)
         return readings
 

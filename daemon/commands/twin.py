@@ -15,7 +15,8 @@ from types import FrameType
 from drivers.base import DriverError
 from drivers.sweep import SEQUENCES
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import Counts, GeneratedContact, recorded_counts
+from drivers.twins.grasps import Counts, recorded_counts
+from drivers.twins.whole_grasps import PALM_RATE_HZ, synthetic_grasps
 from models.bts3 import FINGERS
 
 log = logging.getLogger("graspd")
@@ -25,8 +26,6 @@ CAN_GROUP = "239.74.163.2"
 """Default multicast group of python-can's `udp_multicast`."""
 PALM_TARGET = "udp://127.0.0.1:9870"
 JOINT_TARGET = "udp://127.0.0.1:9871"
-PALM_RATE_HZ = 1000 / 14
-"""Sweeps/s of a palm: 14 packets of a millisecond each."""
 PROBABILITIES = ("bit-flip", "drop", "duplicate", "reorder")
 
 
@@ -53,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             type=Path,
             action="append",
             metavar="FILE",
-            help="play this recording, row by row (default: a generated contact)",
+            help="play this recording, row by row (default: synthetic grasps)",
         )
         kind.add_argument("--loop", action="store_true", help="play recordings for ever")
     for kind in (spi, can, palm, joints):
@@ -99,7 +98,8 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 def _counts(args: argparse.Namespace, rate_hz: float) -> Iterator[Counts]:
     if not args.recording:
-        yield from GeneratedContact(len(FINGERS), rate_hz)
+        for moment in synthetic_grasps(rate_hz=rate_hz, loop=True):
+            yield moment.counts
     while True:
         for path in args.recording:
             yield from recorded_counts(path)

@@ -4,7 +4,7 @@ The model describes the BioTac SP Stability Set (palm down and palm side; MIT li
 Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by a few parameters per class and holds none
 of its grasps. Each class is a mixture of Gaussians with few axes over the raw counts of ff, mf, th.
 
-`python -m drivers.twins.synthetic` writes the demo recording again, byte for byte, and with
+`python -m drivers.twins.synthetic` writes the demo table again, byte for byte, and with
 `--fit FOLDER` first fits the model again to the tables in that folder.
 """
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from drivers.base import ELECTRODES, RecordingError
 from drivers.recording import Recording, open_recording, read_lines
 from drivers.recording_columns import OBJECT, SLIPPED, electrode_columns
-from drivers.replay import DEMO_RECORDING
+from drivers.replay import DEMO_TABLE
 
 FINGERS = ("ff", "mf", "th")
 COUNTS = len(FINGERS) * ELECTRODES
@@ -178,11 +178,11 @@ def read_model(path: Path = MODEL) -> GraspModel:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the demo recording, or one of another size, seed or model."""
+    """Write the demo table, or one of another size, seed or model."""
     parser = argparse.ArgumentParser(prog="python -m drivers.twins.synthetic", description=__doc__)
     parser.add_argument("--fit", type=Path, metavar="FOLDER", help=f"fit to {', '.join(TABLES)}")
     parser.add_argument("--model", type=Path, default=MODEL, help="JSON file of the model")
-    parser.add_argument("--out", type=Path, default=DEMO_RECORDING, help="CSV file to write")
+    parser.add_argument("--out", type=Path, default=DEMO_TABLE, help="CSV file to write")
     parser.add_argument("--grasps", type=int, default=DEMO_GRASPS)
     parser.add_argument("--seed", type=int, default=DEMO_SEED)
     options = parser.parse_args(arguments)

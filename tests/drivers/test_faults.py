@@ -13,16 +13,14 @@ from hypothesis import strategies as st
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.faults import ReplayFaults
-from drivers.replay import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.replay import DEMO_TABLE, Pace, ReplayDriver
 from tests.drivers.tables import stream, table, write
 
 MS = 1_000_000
 ROWS = 200
 
 
-def run(
-    faults: ReplayFaults, path: Path = DEMO_RECORDING
-) -> tuple[ReplayDriver, list[TactileReading]]:
+def run(faults: ReplayFaults, path: Path = DEMO_TABLE) -> tuple[ReplayDriver, list[TactileReading]]:
     driver = ReplayDriver([path], pace=Pace.FAST, faults=faults)
     readings: list[TactileReading] = []
     with driver:
@@ -233,4 +231,4 @@ def test_a_fault_out_of_range_is_refused(fields: dict[str, Any], message: str) -
 
 def test_a_fault_of_a_finger_that_does_not_play_is_refused() -> None:
     with pytest.raises(ValueError, match="faults name finger rf, the run has ff, mf"):
-        ReplayDriver([DEMO_RECORDING], ("ff", "mf"), faults=ReplayFaults(fingers=("rf",)))
+        ReplayDriver([DEMO_TABLE], ("ff", "mf"), faults=ReplayFaults(fingers=("rf",)))

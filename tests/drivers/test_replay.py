@@ -19,7 +19,7 @@ from drivers.base import (
     RecordingError,
     TactileReading,
 )
-from drivers.replay import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.replay import DEMO_TABLE, Pace, ReplayDriver
 from tests.drivers.tables import ELECTRODES, FINGERS, TABLE_HEADER, count, stream, table, write
 
 MS = 1_000_000
@@ -376,7 +376,7 @@ def csv_rows(path: Path) -> list[dict[str, str]]:
 
 
 def test_the_demo_recording_plays_without_a_fault() -> None:
-    driver = ReplayDriver([DEMO_RECORDING], pace=Pace.FAST, strict=True)
+    driver = ReplayDriver([DEMO_TABLE], pace=Pace.FAST, strict=True)
     readings = tactile(play(driver))
     assert len(readings) == 200
     assert not any(reading.faults.any() for reading in readings)

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.base import RecordingError
-from drivers.replay import DEMO_RECORDING
+from drivers.replay import DEMO_TABLE
 from drivers.twins import synthetic
 
 RANGE_MARGIN_COUNTS = 250
@@ -40,12 +40,12 @@ def whole(bts3_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
     out = tmp_path / "demo.csv"
     synthetic.main(["--out", str(out)])
-    assert out.read_bytes() == DEMO_RECORDING.read_bytes()
+    assert out.read_bytes() == DEMO_TABLE.read_bytes()
 
 
 def test_the_demo_is_small_labelled_and_called_synthetic() -> None:
-    assert DEMO_RECORDING.stat().st_size < 120_000
-    with DEMO_RECORDING.open(newline="") as file:
+    assert DEMO_TABLE.stat().st_size < 120_000
+    with DEMO_TABLE.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 200
     assert sum(row["slipped"] == "1" for row in rows) == 100
@@ -125,7 +125,7 @@ def test_tables_without_labels_cannot_be_fitted(tmp_path: Path) -> None:
 def test_the_demo_stays_in_the_real_range(
     whole: tuple[NDArray[np.float64], NDArray[np.int64]],
 ) -> None:
-    counts, _ = load(DEMO_RECORDING)
+    counts, _ = load(DEMO_TABLE)
     assert (counts >= whole[0].min(axis=0) - RANGE_MARGIN_COUNTS).all()
     assert (counts <= whole[0].max(axis=0) + RANGE_MARGIN_COUNTS).all()
 
@@ -133,7 +133,7 @@ def test_the_demo_stays_in_the_real_range(
 def test_no_synthetic_grasp_is_a_real_one(
     whole: tuple[NDArray[np.float64], NDArray[np.int64]],
 ) -> None:
-    counts, _ = load(DEMO_RECORDING)
+    counts, _ = load(DEMO_TABLE)
     nearest = [np.abs(whole[0] - grasp).max(axis=1).min() for grasp in counts]
     assert min(nearest) > 100, "counts, at the electrode that differs most"
 
@@ -152,7 +152,7 @@ def test_a_classifier_of_real_grasps_judges_synthetic_ones_about_as_well_as_real
     score = f1_score(drawn.slipped, classifier.predict(z_scores(drawn.counts.astype(float))))
     # Cross-validated on the real grasps the same classifier reaches 0.91.
     assert 0.85 < score < 0.97
-    counts, slipped = load(DEMO_RECORDING)
+    counts, slipped = load(DEMO_TABLE)
     demo_score = f1_score(slipped, classifier.predict(z_scores(counts)))
     # The demo is 200 such draws: four standard errors of 0.017.
     assert demo_score == pytest.approx(score, abs=0.07)

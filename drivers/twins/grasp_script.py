@@ -1,0 +1,259 @@
+"""The course of one whole grasp: when it does what, and what fingers and joints do meanwhile."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import ELECTRODES
+
+Range = tuple[float, float]
+"""Lower and upper end of a uniform distribution."""
+
+FIRST_REST_S: Range = (1.5, 2.0)
+"""Rest before the first grasp, s: enough sweeps to learn the resting level from."""
+APPROACH_S: Range = (0.4, 0.7)
+"""Joints move and nothing is touched, s."""
+TOUCH_S: Range = (0.03, 0.15)
+"""From the first finger that touches to the last, s: fingers of one command differ by this much."""
+CLOSE_S: Range = (0.25, 0.5)
+"""From the last touch to the end of closing, s."""
+SETTLE_S: Range = (0.6, 1.0)
+"""From the end of closing to the lift, s: five time constants of the creep, and time to judge."""
+LIFT_S: Range = (0.4, 0.6)
+"""From the start of the lift to the release, s."""
+RELEASE_S: Range = (0.2, 0.3)
+"""From the first finger opening to nothing touched, s: faster than closing."""
+REST_S: Range = (0.8, 1.5)
+"""From the release to the next approach, s."""
+
+FINGER_LEAD_S = 0.05
+"""A finger is done closing so much before the last one at most, s."""
+CREEP_SHARE: Range = (0.05, 0.07)
+"""Share of the deviation that is still missing when closing ends: skin and fluid yield slowly."""
+CREEP_TAU_S: Range = (0.10, 0.14)
+"""Time constant of that creep, s."""
+LOAD_COUNTS: Range = (20.0, 60.0)
+"""What a finger's most pressed electrode falls by when it takes the load, counts: the weight of a
+light object, far less than a grasp."""
+LOAD_S = 0.15
+"""The load comes within this time, s."""
+SLIPPING_ELECTRODES = 0.5
+"""Share of the electrodes that lose contact in a slip: the object tilts away from some."""
+SLIP_LOSS: Range = (0.3, 0.6)
+"""Share of its deviation that such an electrode loses."""
+SLIP_STEPS = (2, 4)
+"""Sticks and slips of an object that slides; each slip is over within a sweep."""
+SLIP_WINDOW: Range = (0.1, 0.7)
+"""When in the lift it slips, as a share of it."""
+
+JOINT_NAMES = ("FFJ3", "MFJ3", "THJ5", "FFJ2", "MFJ2", "THJ2")
+OPEN_RAD = 0.2
+"""Joint angle of an open hand, rad."""
+CLOSED_RAD: Range = (0.8, 1.0)
+"""Joint angle at the end of closing, rad: another one for each grasp and joint."""
+
+
+class Phase(StrEnum):
+    """What the hand does."""
+
+    REST = "rest"
+    APPROACH = "approach"
+    TOUCH = "touch"
+    CLOSE = "close"
+    SETTLE = "settle"
+    LIFT = "lift"
+    RELEASE = "release"
+
+
+@dataclass(frozen=True, slots=True)
+class Durations:
+    """How long the phases last, s: each drawn between two limits."""
+
+    first_rest_s: Range = FIRST_REST_S
+    approach_s: Range = APPROACH_S
+    touch_s: Range = TOUCH_S
+    close_s: Range = CLOSE_S
+    settle_s: Range = SETTLE_S
+    lift_s: Range = LIFT_S
+    release_s: Range = RELEASE_S
+    rest_s: Range = REST_S
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EndPoint:
+    """What a grasp feels like when it has settled, and how its lift ends."""
+
+    counts: NDArray[np.uint16]
+    """Shape (fingers, 24)."""
+    slipped: bool
+    object_name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Timetable:
+    """The truth about one grasp. Times in seconds since the stream's first sweep."""
+
+    grasp: int
+    """From 1."""
+    slipped: bool
+    object_name: str
+    approach_s: float
+    """The joints begin to move; the grasp begins here."""
+    touched_s: tuple[float, ...]
+    """When each finger touches. Its counts begin to move here, smoothly."""
+    closed_s: float
+    """All fingers are at the end of closing; the joints are still from here to the release."""
+    lift_s: float
+    release_s: float
+    """The hand begins to open."""
+    open_s: float
+    """The hand is open, nothing is touched."""
+    end_s: float
+    """The next grasp begins."""
+    creep_tau_s: float
+    creep_counts_per_s: float
+    """Mean over all electrodes of how fast they creep at `closed_s`, counts/s."""
+
+    def crept_s(self, rate_counts_per_s: float) -> float:
+        """When the mean rate of the electrodes falls below this rate, s, leaving out the lift.
+
+        Never before `closed_s`; later than `lift_s` if the lift comes first.
+        """
+        if self.creep_counts_per_s <= rate_counts_per_s:
+            return self.closed_s
+        return self.closed_s + self.creep_tau_s * math.log(
+            self.creep_counts_per_s / rate_counts_per_s
+        )
+
+    def phase(self, t_s: float) -> Phase:
+        """What the hand does at a time; outside of the grasp it rests."""
+        if t_s < self.approach_s or t_s >= self.open_s:
+            return Phase.REST
+        ends = (
+            (min(self.touched_s), Phase.APPROACH),
+            (max(self.touched_s), Phase.TOUCH),
+            (self.closed_s, Phase.CLOSE),
+            (self.lift_s, Phase.SETTLE),
+            (self.release_s, Phase.LIFT),
+        )
+        return next((phase for end_s, phase in ends if t_s < end_s), Phase.RELEASE)
+
+
+class GraspScript:
+    """One grasp as functions of time: deviation of the counts, and angles of the joints."""
+
+    def __init__(
+        self,
+        end_point: EndPoint,
+        rest: NDArray[np.float64],
+        grasp: int,
+        start_s: float,
+        durations: Durations,
+        rng: np.random.Generator,
+    ) -> None:
+        """`rest`: counts of the untouched fingers, shape (fingers, 24)."""
+        self._deviation = end_point.counts - rest
+        fingers = len(rest)
+        touched = _touches(fingers, start_s + rng.uniform(*durations.approach_s), durations, rng)
+        closed_s = float(touched.max()) + rng.uniform(*durations.close_s)
+        lead = rng.uniform(0.0, FINGER_LEAD_S, fingers)
+        closed = closed_s - (lead - lead.min())
+        self._touched, self._closed = touched[:, np.newaxis], closed[:, np.newaxis]
+        self._creep_share = rng.uniform(*CREEP_SHARE)
+        self._tau_s = rng.uniform(*CREEP_TAU_S)
+        lift_s = closed_s + rng.uniform(*durations.settle_s)
+        release_s = lift_s + rng.uniform(*durations.lift_s)
+        open_s = release_s + rng.uniform(*durations.release_s)
+        self._load, self._loss = self._lift_changes(end_point.slipped, rng)
+        steps = int(rng.integers(SLIP_STEPS[0], SLIP_STEPS[1] + 1))
+        self._slips_s = lift_s + (release_s - lift_s) * np.sort(rng.uniform(*SLIP_WINDOW, steps))
+        self._closed_rad = rng.uniform(*CLOSED_RAD, len(JOINT_NAMES))
+        self.timetable = Timetable(
+            grasp=grasp,
+            slipped=end_point.slipped,
+            object_name=end_point.object_name,
+            approach_s=start_s,
+            touched_s=tuple(touched.tolist()),
+            closed_s=closed_s,
+            lift_s=lift_s,
+            release_s=release_s,
+            open_s=open_s,
+            end_s=open_s + rng.uniform(*durations.rest_s),
+            creep_tau_s=self._tau_s,
+            creep_counts_per_s=self._creep_counts_per_s(closed_s),
+        )
+
+    def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Counts against the rest, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
+        timetable = self.timetable
+        if t_s.max() <= min(timetable.touched_s) or t_s.min() >= timetable.open_s:
+            return np.zeros_like(self._deviation)
+        ramp = _minimum_jerk((t_s - self._touched) / (self._closed - self._touched))
+        since_s = np.maximum(t_s - self._closed, 0.0)
+        creep = 1.0 - np.exp(-since_s / self._tau_s)
+        pressed = (1.0 - self._creep_share) * ramp + self._creep_share * creep
+        deviation: NDArray[np.float64] = pressed * self._deviation
+        if t_s.max() <= timetable.lift_s:
+            return deviation
+        deviation += _minimum_jerk((t_s - timetable.lift_s) / LOAD_S) * self._load
+        slips = (t_s >= self._slips_s.reshape(-1, *[1] * t_s.ndim)).mean(axis=0)
+        deviation *= 1.0 - slips * self._loss
+        opening_s = timetable.open_s - timetable.release_s
+        deviation *= 1.0 - _minimum_jerk((t_s - timetable.release_s) / opening_s)
+        return deviation
+
+    def position_rad(self, t_s: float) -> NDArray[np.float64]:
+        """Angles of `JOINT_NAMES` at a time, rad."""
+        timetable = self.timetable
+        if t_s < timetable.release_s:
+            share = (t_s - timetable.approach_s) / (timetable.closed_s - timetable.approach_s)
+        else:
+            share = (timetable.open_s - t_s) / (timetable.open_s - timetable.release_s)
+        return OPEN_RAD + (self._closed_rad - OPEN_RAD) * _minimum_jerk(np.asarray(share))
+
+    def _lift_changes(
+        self, slipped: bool, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Load in counts, and share of the deviation that is lost, both of shape (fingers, 24)."""
+        nothing = np.zeros_like(self._deviation)
+        if slipped:
+            losing = rng.random(nothing.shape) < SLIPPING_ELECTRODES
+            return nothing, losing * rng.uniform(*SLIP_LOSS, nothing.shape)
+        deepest = np.abs(self._deviation).max(axis=1, keepdims=True)
+        load = rng.uniform(*LOAD_COUNTS, deepest.shape)
+        # A finger bears no more load than it presses; one that touches nothing bears none.
+        scale = np.divide(load, deepest, out=np.zeros_like(deepest), where=deepest >= load)
+        return scale * self._deviation, nothing
+
+    def _creep_counts_per_s(self, t_s: float) -> float:
+        rate = self._creep_share / self._tau_s * np.exp((self._closed - t_s) / self._tau_s)
+        return float((rate * np.abs(self._deviation)).mean())
+
+
+def _touches(
+    fingers: int, first_s: float, durations: Durations, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """When each finger touches, s: the first one at `first_s`, the last one a drawn time later."""
+    order = rng.random(fingers)
+    span_s = rng.uniform(*durations.touch_s)
+    order -= order.min()
+    if fingers > 1:
+        order *= span_s / order.max()
+    return first_s + order
+
+
+def _minimum_jerk(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Way made after this share of the time, 0..1: how arms and hands move (Flash, Hogan 1985)."""
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
+    return share * share * share * (10.0 + share * (6.0 * share - 15.0))
+
+
+def check_rest(rest: NDArray[np.float64]) -> None:
+    """Raise `ValueError` unless these are counts of fingers, shape (fingers, 24)."""
+    if rest.ndim != 2 or not len(rest) or rest.shape[1] != ELECTRODES:
+        raise ValueError(f"rest has shape {rest.shape}, not (fingers, {ELECTRODES})")

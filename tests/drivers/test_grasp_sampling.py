@@ -1,0 +1,132 @@
+"""Sampling and noise of whole grasps, against the untouched recording of a palm.
+
+Its figures (`biotacs-noise`, 100 Hz): robust sigma 2.9 to 4.3 counts, 0.75 to 1.22 % spikes of 25
+to 150 counts, all downward, drift 0.56 to 0.84 counts/s, pairs unchanged in 2 of 7 rows.
+"""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.twins.grasp_script import Durations, EndPoint
+from drivers.twins.grasps import recorded_counts
+from drivers.twins.tactile_noise import MeasuredNoise, fresh_residuals
+from drivers.twins.whole_grasps import Moment, Sampling, WholeGrasps, synthetic_grasps
+
+REST = np.full((3, 24), 3000.0)
+UNPRESSED = EndPoint(REST.astype(np.uint16), False, "nothing")
+LONG_REST = Durations(first_rest_s=(60.0, 60.0))
+PAIRS = [(0,), *((first, first + 1) for first in range(1, 23, 2)), (23,)]
+"""Electrodes sampled by one request, from 0: E1 (with TDC), E2/E3 ... E22/E23, E24."""
+
+
+def counts_of(moments: list[Moment]) -> NDArray[np.float64]:
+    return np.array([moment.counts for moment in moments], dtype=np.float64)
+
+
+def untouched(sampling: Sampling) -> NDArray[np.float64]:
+    """A minute of rest, shape (6000, 3, 24)."""
+    grasps = WholeGrasps(REST, [UNPRESSED], sampling=sampling, durations=LONG_REST, seed=3)
+    return counts_of(list(itertools.islice(grasps, 6000)))
+
+
+def test_held_pairs_repeat_in_two_of_seven_rows_on_all_fingers_together() -> None:
+    repeats = np.diff(untouched(Sampling.HELD), axis=0) == 0.0
+    for pair in PAIRS:
+        together = repeats[:, :, pair].all(axis=(1, 2))
+        assert together.mean() == pytest.approx(0.2857, abs=0.001)
+        gaps = np.diff(np.flatnonzero(together))
+        # Three values that are new and all the same by chance: 0.08 to the third.
+        assert np.isin(gaps, (3, 4)).mean() > 0.995
+
+
+def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_palm() -> None:
+    numbers = np.broadcast_to(np.arange(1000.0)[:, np.newaxis, np.newaxis], (1000, 3, 24))
+    for seed in range(20):
+        grasps = WholeGrasps(
+            np.ones((3, 24)),
+            [EndPoint(np.ones((3, 24), dtype=np.uint16), False, "")],
+            sampling=Sampling.HELD,
+            residuals=numbers,
+            seed=seed,
+        )
+        rows = counts_of(list(itertools.islice(grasps, 100)))
+        if rows[0, 0, 0] < 800:  # the loop does not begin again within these rows
+            break
+    for row, counts in enumerate(rows):
+        for place, pair in enumerate(PAIRS, 1):
+            rounds_ago = (10 * row - place) // 14 + 1
+            assert (counts[:, list(pair)] == rows[0, 0, 0] + rounds_ago).all()
+
+
+def test_fresh_values_repeat_no_more_than_noise_does() -> None:
+    repeats = np.diff(untouched(Sampling.FRESH), axis=0) == 0.0
+    # Two whole numbers of sigma 3.5 are equal with a chance of 1 / (2 sqrt(pi) 3.5) = 0.0806.
+    assert repeats.mean() == pytest.approx(0.0806, abs=0.003)
+    assert not any(repeats[:, :, pair].all(axis=(1, 2)).any() for pair in PAIRS[1:-1])
+
+
+def test_noise_has_the_measured_width_drift_and_spikes() -> None:
+    counts = untouched(Sampling.FRESH)
+    times = np.arange(len(counts)) * 0.01
+    slopes = np.polyfit(times, counts.reshape(len(counts), -1), 1)[0]
+    assert slopes.mean() == pytest.approx(0.7, abs=0.01)
+    residuals = counts - 3000.0 - 0.7 * times[:, np.newaxis, np.newaxis]
+    sigma = 1.4826 * np.median(np.abs(residuals), axis=0)
+    assert ((sigma > 2.9) & (sigma < 4.3)).all()
+    assert residuals.max() < 6 * 3.5
+    spikes = residuals < -6 * 3.5
+    assert 0.0075 < spikes.mean() < 0.0122
+    assert residuals.min() > -(150 + 6 * 3.5)
+    assert spikes.sum(axis=2).max() == 1, "one electrode of a finger at a time"
+    assert not (spikes[1:] & spikes[:-1]).any(), "isolated in time"
+
+
+def test_drift_ends_with_the_warm_up() -> None:
+    noise = MeasuredNoise(3, np.random.default_rng(0))
+    assert np.median(noise.sweep(np.asarray(1e7))) == pytest.approx(210.0, abs=3.0)
+
+
+def test_a_palms_own_rate_can_be_played_fresh() -> None:
+    grasps = synthetic_grasps(rate_hz=1000 / 14, loop=True)
+    moments = list(itertools.islice(grasps, 200))
+    np.testing.assert_allclose([moment.t_s for moment in moments], 0.014 * np.arange(200))
+    assert not (np.diff(counts_of(moments), axis=0) == 0.0).all(axis=(1, 2)).any()
+
+
+def test_fresh_samples_are_found_in_held_rows() -> None:
+    samples = np.random.default_rng(0).normal(0.0, 40.0, (1001, 3, 24)).round() + 1000
+    held = np.zeros((1400, 3, 24), dtype=np.uint16)
+    for row in range(1400):
+        for place, pair in enumerate(PAIRS, 1):
+            electrodes = list(pair)
+            held[row][:, electrodes] = samples[(10 * row - place) // 14 + 1][:, electrodes]
+    residuals = fresh_residuals(held)
+    assert residuals.shape == (1000, 3, 24)
+    # What was taken away is a straight line. The first row counts as a repeat of what came before
+    # it for some electrodes, so their samples begin with the second.
+    bends = [np.diff(samples[at : at + 1000] - residuals, n=2, axis=0) for at in (0, 1)]
+    assert np.min([np.abs(bend).max(axis=0) for bend in bends], axis=0).max() < 1e-6
+
+
+def test_too_few_rows_do_not_tell_which_repeat() -> None:
+    with pytest.raises(ValueError, match="69 rows are too few"):
+        fresh_residuals(np.zeros((69, 3, 24), dtype=np.uint16))
+
+
+def test_real_residuals_are_as_wide_as_measured_and_hold_no_repeats(bts3_dir: Path) -> None:
+    path = bts3_dir.parent / "untouched" / "untouched.csv"
+    if not path.exists():
+        pytest.skip("no untouched recording beside the real grasps")
+    residuals = fresh_residuals(np.array(list(recorded_counts(path))))
+    sigma = np.median(1.4826 * np.median(np.abs(residuals), axis=0), axis=1)
+    # Robust sigma of FF, MF and TH in the recording; with a level of its own per electrode.
+    np.testing.assert_allclose(sigma, [4.3, 3.0, 2.9], atol=0.5)
+    repeats = np.diff(residuals, axis=0)
+    assert (np.abs(repeats) < 0.01).mean() < 0.13
+    assert not residuals.max() > 10 * sigma.max()
