@@ -7,15 +7,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from daemon.judge.pipeline import Limits, Pipeline
-from daemon.scene import (
+from daemon.judge.contact import ContactLimits
+from daemon.judge.decision import Limits
+from daemon.judge.gate import GateLimits
+from daemon.judge.grip import MEDIAN_SWEEPS, GripLimits
+from daemon.judge.joints import JointLimits
+from daemon.judge.pipeline import Pipeline
+from daemon.scene import GateMode, Scene, SceneError
+from daemon.scene_drivers import (
     CanTactile,
     PalmJoints,
     PalmTactile,
     ReplayTactile,
-    Scene,
-    SceneError,
     SpiTactile,
     StreamJoints,
 )
@@ -23,6 +28,11 @@ from drivers.base import Driver, DriverError, LinkError
 from models import zoo
 from models.contract import ModelError
 from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.judge.grip import GripLimits
+    from daemon.judge.joints import JointLimits
+    from drivers.recording_columns import Columns
 
 DEFAULT_MODEL = "small-session"
 
@@ -51,14 +61,80 @@ def build_pipeline(
 ) -> Pipeline:
     """The judge of this scene, whose session `learns` from the grasps or stays what it is.
 
-    Raises `ModelError` if the model does not fit the hand or never is right as often as wanted.
+    Raises `ModelError` if the model does not fit the hand or never is right as often as wanted,
+    `SceneError` or `RecordingError` if recordings do not say whether they are grasps or streams.
     """
     limits = Limits(
         max_age_ns=scene.max_age_ns,
         slip_threshold=scene.model.slip_threshold,
         min_confidence=min_confidence(model, scene.model.min_accuracy),
     )
-    return Pipeline(model, scene.hand.fingers, limits, clock, learns=learns)
+    return Pipeline(
+        model,
+        scene.hand.fingers,
+        limits,
+        clock,
+        grip=grip_limits(scene),
+        learns=learns,
+        needs_session=scene.session.required,
+    )
+
+
+def gate_mode(scene: Scene) -> GateMode:
+    """When the scene has grasps judged. Raises `SceneError` or `RecordingError`."""
+    if scene.gate.mode is not None:
+        return scene.gate.mode
+    if not isinstance(scene.tactile, ReplayTactile):
+        return "settled"
+    streams = {columns.time is not None for columns in _columns(scene, scene.tactile)}
+    if len(streams) > 1:
+        raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
+    return "settled" if True in streams else "every"
+
+
+def grip_limits(scene: Scene) -> GripLimits | None:
+    """The conditions of the moment before the lift; None if each reading is a grasp."""
+    mode, gate = gate_mode(scene), scene.gate
+    if mode == "every":
+        if gate.sweeps == 3:
+            raise SceneError("gate.sweeps 3: readings that are each a grasp have no median")
+        return None
+    from daemon.judge.grip import GripLimits
+
+    return GripLimits(
+        on_request=mode == "request",
+        sweeps=MEDIAN_SWEEPS if gate.sweeps is None else gate.sweeps,
+        required=gate.fingers,
+        contact=ContactLimits(counts=gate.contact_counts, sigmas=gate.contact_sigmas),
+        gate=GateLimits(
+            hold_ns=round(gate.hold_ms * 1e6),
+            rate_counts_per_s=gate.rate_counts_per_s,
+            change_counts=gate.change_counts,
+            gap_ns=round(gate.gap_ms * 1e6),
+        ),
+        joints=_joint_limits(scene),
+    )
+
+
+def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
+    from drivers.recording import columns_of
+
+    return [columns_of(path, scene.hand.fingers) for path in options.recordings]
+
+
+def _joint_limits(scene: Scene) -> JointLimits | None:
+    """None if the scene has no joints, not even in its recordings."""
+    tactile = scene.tactile
+    recorded = isinstance(tactile, ReplayTactile) and any(
+        c.joints for c in _columns(scene, tactile)
+    )
+    if scene.joints is None and not recorded:
+        return None
+    from daemon.judge.joints import JointLimits
+
+    return JointLimits(
+        rad_per_s=scene.gate.joint_rad_per_s, lost_ns=round(scene.gate.joints_lost_ms * 1e6)
+    )
 
 
 def min_confidence(model: TactileModel, min_accuracy: float | None) -> float:

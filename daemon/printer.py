@@ -7,7 +7,7 @@ import sys
 import time
 
 from daemon.judge.pipeline import Judgement
-from daemon.judge.verdict import Verdict
+from daemon.judge.verdict import GateState, Verdict
 from daemon.summary import Summary
 from daemon.text import printable
 from drivers.base import Annotation, TactileReading
@@ -28,21 +28,30 @@ class Printer:
         self._as_json = as_json
         self._summary = Summary()
         self._start_s = time.monotonic()
+        self._gate: GateState | None = None
 
     def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Write one verdict; `reading` is None where the verdict is about silence."""
         annotation = reading.annotation if reading else None
         self._summary.add(verdict, annotation.slipped if annotation else None)
+        if not self._as_json and not self._is_news(verdict):
+            return
         line = payload.decode() if self._as_json else _line(verdict, annotation)
         sys.stdout.write(line + "\n")
         if self._prompt:
             sys.stdout.flush()
 
+    def _is_news(self, verdict: Verdict) -> bool:
+        """Whether people want to read it: behind a gate, where something changed."""
+        if verdict.gate is None or verdict.judged or verdict.gate is not self._gate:
+            self._gate = verdict.gate
+            return True
+        return False
+
     def without_session(self, judgement: Judgement, reading: TactileReading) -> None:
         """Count what would have been judged without session calibration."""
         annotation = reading.annotation
-        slipped = annotation.slipped if annotation else None
-        self._summary.without_session.add(judgement.outcome, judgement.reasons, slipped)
+        self._summary.compare(judgement, annotation.slipped if annotation else None)
 
     def summary(self) -> None:
         """Write the summary of everything since the start."""
@@ -59,7 +68,8 @@ def _line(verdict: Verdict, annotation: Annotation | None) -> str:
         finding = ", ".join(verdict.reasons)
     else:
         finding = f"p_slip {verdict.p_slip:.3f}"
-    line = f"{verdict.grasp:6d}  {verdict.verdict:8}{finding:16}{verdict.latency_us:6.0f} us"
+    gate = "" if verdict.gate is None else f"{verdict.gate:9}"
+    line = f"{verdict.grasp:6d}  {gate}{verdict.verdict:8}{finding:16}{verdict.latency_us:6.0f} us"
     if annotation is not None:
         line += f"  {printable(annotation.object_name or '', NAME_MAX)}"
         if annotation.slipped is not None:

@@ -10,10 +10,11 @@ from collections.abc import Callable
 from importlib.metadata import version
 from typing import Protocol
 
-from daemon.judge.pipeline import Judgement
-from daemon.judge.session import SessionCalibration
+from daemon.judge.gate import GateChange
+from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import (
     OUTCOME_CODE,
+    GateMessage,
     Outcome,
     Reason,
     State,
@@ -51,6 +52,7 @@ class Reporter:
         self.reasons: Counter[Reason] = Counter()
         self._repaired: Counter[str] = Counter()
         self._verdict_topic = f"verdict.{hand}".encode()
+        self._gate_topic = f"gate.{hand}".encode()
         self._status_topic = f"status.{hand}".encode()
         self._model = model
         self._model_sha = model_sha256[:SHA_DIGITS]
@@ -59,6 +61,7 @@ class Reporter:
         self._wall_clock = wall_clock
         self._boot_id = uuid.uuid4().hex
         self._verdict_seq = 0
+        self._gate_seq = 0
         self._status_seq = 0
         self._versions = {
             "graspd": version("graspd"),
@@ -69,11 +72,13 @@ class Reporter:
     def verdict(
         self, judgement: Judgement, received_ns: int, silence_ns: int
     ) -> tuple[Verdict, bytes]:
-        """Send one verdict.
+        """Send one verdict, and before it what the gate did.
 
         `received_ns` is when the driver handed the reading over, `silence_ns` how long no message
         may come before the consumer must take it for unknown.
         """
+        for change in judgement.changes:
+            self._gate_change(judgement.t_ns, change)
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
         message = Verdict(
@@ -91,6 +96,9 @@ class Reporter:
             latency_us=latency_us,
             repaired=list(judgement.repaired),
             session_calibrated=judgement.session_calibrated,
+            judged=judgement.judged,
+            gate=judgement.gate,
+            contact=None if judgement.contact is None else list(judgement.contact),
             silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
@@ -105,14 +113,33 @@ class Reporter:
         self._repaired.update(judgement.repaired)
         return message, payload
 
+    def _gate_change(self, t_ns: int, change: GateChange) -> None:
+        message = GateMessage(
+            boot_id=self._boot_id,
+            seq=self._gate_seq,
+            t=self._wall_clock(),
+            t_mono_ns=t_ns,
+            grasp=change.grasp,
+            former=change.former,
+            state=change.state,
+            cause=change.cause,
+        )
+        self._gate_seq += 1
+        if self._output is not None:
+            self._output.send(self._gate_topic, encode(message))
+
     def status(
         self,
         state: State,
         readings_hz: float,
         drivers: dict[str, dict[str, int]],
-        session: SessionCalibration | None = None,
+        pipeline: Pipeline,
     ) -> None:
         """Send one status message."""
+        session, grip = pipeline.session, pipeline.grip
+        health = pipeline.health()
+        if state is State.SILENT:
+            health["link"] = Reason.STALE
         message = Status(
             boot_id=self._boot_id,
             seq=self._status_seq,
@@ -126,6 +153,9 @@ class Reporter:
             repaired=dict(self._repaired),
             session_grasps=None if session is None else session.grasps,
             session_calibrated=None if session is None else session.calibrated,
+            gate=None if grip is None else grip.state,
+            tared=None if grip is None else list(grip.tared),
+            health=health,
             latency_us={
                 "p50": self.latency.quantile_us(0.5),
                 "p99": self.latency.quantile_us(0.99),

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     ValidationError,
     ValidationInfo,
@@ -22,24 +18,21 @@ from pydantic import (
 )
 
 from daemon.endpoint import check_endpoint
+from daemon.scene_drivers import (
+    CanTactile,
+    FilePath,
+    Joints,
+    Name,
+    PalmJoints,
+    PalmTactile,
+    ReplayTactile,
+    Section,
+    SpiTactile,
+    Tactile,
+)
 from daemon.scene_errors import MESSAGE_MAX, lines_of
 from daemon.text import printable
-from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger
-
-StrOrPath = TypeVar("StrOrPath", str, Path)
-
-
-def _without_nul(value: StrOrPath) -> StrOrPath:
-    if "\0" in str(value):
-        raise ValueError("has a NUL character")
-    return value
-
-
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
-FilePath = Annotated[Path, Field(strict=False), AfterValidator(_without_nul)]
-"""TOML has no paths: a string is taken."""
 
 SCENE_MAX_BYTES = 1 << 20
 """A scene has a kilobyte; a larger file was named by mistake."""
@@ -51,14 +44,6 @@ STATE_DIRECTORY = Path("/var/lib/graspd")
 
 class SceneError(Exception):
     """The scene file is missing or wrong; the message is one line per mistake, naming the key."""
-
-
-class Section(BaseModel):
-    """Base of all sections: no unknown keys, no silent conversion, nothing changes later."""
-
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, validate_default=True
-    )
 
 
 class Hand(Section):
@@ -74,156 +59,6 @@ class Hand(Section):
         if len(set(fingers)) != len(fingers):
             raise ValueError("names a finger twice")
         return fingers
-
-
-class ReplayFaultsSection(Section):
-    """`[tactile.faults]`: break the replayed sensor on purpose, to test what listens to graspd."""
-
-    off_from: Annotated[int, Field(ge=0)] | None = None
-    """From this reading on nothing comes."""
-    stuck_from: Annotated[int, Field(ge=1)] | None = None
-    """From this reading on the counts are those of the reading before it."""
-    garbage_probability: Probability = 0.0
-    """Chance per reading that the counts are random 16-bit values."""
-    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX)] = 0
-    """Constant offset added to the counts."""
-    slow_every: Annotated[int, Field(ge=1)] = 1
-    """Only every n-th reading arrives."""
-    delayed_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
-    """Readings arrive this much late, s."""
-    intermittent_probability: Probability = 0.0
-    """Chance that a reading is lost."""
-    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
-    """Fingers that stuck, garbage and wrong apply to; all unless given."""
-    electrodes: (
-        Annotated[
-            tuple[Annotated[int, Field(ge=1, le=ELECTRODES)], ...],
-            Field(min_length=1, strict=False),
-        ]
-        | None
-    ) = None
-    """Electrodes 1..24 that stuck, garbage and wrong apply to; all unless given."""
-    seed: Annotated[int, Field(ge=0)] = 0
-
-
-class ReplayTactile(Section):
-    """`[tactile]` with `driver = "replay"`: recorded CSV files instead of sensors."""
-
-    driver: Literal["replay"]
-    recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
-    """Grasp tables or streams, relative to the scene file."""
-    pace: Literal["realtime", "fast"] = "realtime"
-    speed: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
-    """Factor on real time."""
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e5)] = 100.0
-    """Readings per second of a grasp table, which has no times of its own."""
-    loop: bool = False
-    strict: bool = False
-    """Stop at the first value that is not a 12-bit count."""
-    faults: ReplayFaultsSection = ReplayFaultsSection()
-
-    @field_validator("recordings")
-    @classmethod
-    def _beside_the_scene(cls, paths: tuple[Path, ...], info: ValidationInfo) -> tuple[Path, ...]:
-        base: Path = (info.context or {}).get("base", Path())
-        return tuple(base / path for path in paths)
-
-
-class SpiTactile(Section):
-    """`[tactile]` with `driver = "spi"`: a bridge on a serial line (deploy/bridge/PROTOCOL.md)."""
-
-    driver: Literal["spi"]
-    port: Name
-    """Serial port, best by its name in `/dev/serial/by-id/`, or a pyserial URL."""
-    sensors: (
-        Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
-    ) = None
-    """Fingers in the order of the chip selects; `hand.fingers` unless given."""
-    baud: Annotated[int, Field(ge=115_200, le=12_000_000)] = 921_600
-    """Line rate, bit/s; USB CDC ignores it."""
-
-
-class CanTactile(Section):
-    """`[tactile]` with `driver = "can"`: sensors behind a CAN board (deploy/can/PROTOCOL.md)."""
-
-    driver: Literal["can"]
-    interface: Name = "socketcan"
-    """Name of a python-can interface."""
-    channel: Name = "can0"
-    sensors: (
-        Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
-    ) = None
-    """Fingers in the order of the board's words (`syntouch`); `hand.fingers` unless given."""
-    format: Literal["syntouch", "sweep_fd"] = "syntouch"
-    """SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
-    arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF)] | None = None
-    """Of the samples, or of finger `ff` of the sweep frames. With `syntouch`, where it is not
-    documented, every frame of the right form is taken unless given."""
-    sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
-    """Order in which the board samples (`syntouch` only)."""
-    data_length: Annotated[int, Field(ge=3, le=8)] | None = None
-    """Bytes of a sample frame, where the board pads it."""
-    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] | None = None
-    """Bit/s; not with socketcan, where it belongs to `ip link`."""
-    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = None
-    """Bit/s of the data phase of CAN FD; not with socketcan."""
-
-
-class PalmTactile(Section):
-    """`[tactile]` with `driver = "palm"`: status packets of the hand's palm."""
-
-    driver: Literal["palm"]
-    source: Name
-    """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
-    only_from: str | None = None
-    """IP address of the relay, if packets of no other may be heard."""
-    heed_finger_bits: bool = True
-    """False for a palm that does not set the bits which say that a finger's data is valid."""
-
-    @field_validator("source")
-    @classmethod
-    def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
-        base: Path = (info.context or {}).get("base", Path())
-        return source if "://" in source else str(base / source)
-
-    @field_validator("only_from")
-    @classmethod
-    def _is_an_address(cls, address: str | None) -> str | None:
-        if address is not None:
-            ipaddress.ip_address(address)
-        return address
-
-
-Tactile = Annotated[
-    ReplayTactile | SpiTactile | CanTactile | PalmTactile, Field(discriminator="driver")
-]
-"""Section of each tactile driver, told apart by its key `driver`."""
-
-
-class PalmJoints(Section):
-    """`[joints]` with `driver = "palm"`: Hall sensors in the palm's packets."""
-
-    driver: Literal["palm"]
-    calibration: FilePath
-    """The hand's calibration (TOML), relative to the scene file."""
-
-    @field_validator("calibration")
-    @classmethod
-    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
-        base: Path = (info.context or {}).get("base", Path())
-        return base / path
-
-
-class StreamJoints(Section):
-    """`[joints]` with `driver = "stream"`: joint angles from elsewhere (deploy/wire/JOINTS.md)."""
-
-    driver: Literal["stream"]
-    source: Annotated[Name, Field(pattern=r"^udp://")]
-    """`udp://ADDRESS:PORT` to listen on."""
-
-
-Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]
-"""Section of each source of joint angles, told apart by its key `driver`."""
 
 
 class Model(Section):
@@ -258,8 +93,10 @@ class Session(Section):
     """False: begin a new session at every start, and write nothing. Unless given, kept for live
     sensors and not for recordings."""
     learn: bool | None = None
-    """Whether every reading counts as a grasp of the session. Unless given, yes for recordings, and
-    no for live sensors: most of their readings are of an open hand, so seed the session instead."""
+    """Whether what is judged counts as a grasp of the session. Unless given, yes, except for live
+    sensors with gate mode `every`: most of their readings are of an open hand."""
+    required: bool = False
+    """Whether nothing is judged before the session is calibrated."""
     file: FilePath | None = None
     """`/var/lib/graspd/<hand>.session.json` unless given; relative to the scene file."""
 
@@ -270,13 +107,42 @@ class Session(Section):
         return None if path is None else base / path
 
 
-class Gate(Section):
-    """`[gate]`: when a reading may be judged."""
+GateMode = Literal["settled", "every", "request"]
+Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0)]
 
-    mode: Literal["every"] = "every"
-    """`every`: each reading is a grasp of its own."""
-    max_age_ms: Annotated[float, Field(gt=0.0, le=10_000.0)] = 100.0
+
+class Gate(Section):
+    """`[gate]`: when a grasp is judged, and when it is refused."""
+
+    mode: GateMode | None = None
+    """`settled`: once per grasp, when it has settled; `every`: each reading is a grasp of its own;
+    `request`: when the controller asks. Unless given, `settled` for live sensors and for recorded
+    streams, `every` for grasp tables."""
+    max_age_ms: Milliseconds = 100.0
     """An older reading gives `unknown`; so does silence for that long."""
+    sweeps: Literal[1, 3] | None = None
+    """What is judged: 1, a single reading; 3, each electrode's median of three fresh ones. Unless
+    given, 3, and with mode `every` 1."""
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
+    """Fingers that must touch; all of `hand.fingers` unless given."""
+    contact_counts: Annotated[float, Field(ge=5.0, le=1000.0)] = 20.0
+    """A finger touches when three electrodes fall by so much below where they rest, counts ..."""
+    contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0)] = 5.0
+    """... and by so many standard deviations of its noise."""
+    rate_counts_per_s: Annotated[float, Field(ge=10.0, le=10_000.0)] = 120.0
+    """Electrodes of a finger that change faster, in the mean, are moving, counts/s."""
+    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.1
+    """A joint that turns faster is moving, rad/s; only with `[joints]`."""
+    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = 1000.0
+    """Late joint angles block a verdict no longer than this, ms; only with `[joints]`."""
+    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 80.0
+    """All this must last so long, ms."""
+    gap_ms: Milliseconds = 100.0
+    """After so long without a usable reading the grasp must settle anew, ms. More than two periods
+    of the readings."""
+    change_counts: Annotated[float, Field(ge=10.0, le=1000.0)] = 40.0
+    """Electrodes of a finger that are so far from where they were judged, in the mean, are another
+    grasp, counts."""
 
 
 class Publish(Section):
@@ -309,6 +175,9 @@ class Scene(Section):
     @model_validator(mode="after")
     def _sections_fit_together(self) -> Self:
         tactile, fingers = self.tactile, self.hand.fingers
+        for finger in self.gate.fingers or ():
+            if finger not in fingers:
+                raise ValueError(f"gate.fingers names {finger}, not in hand.fingers")
         if isinstance(tactile, ReplayTactile):
             for finger in tactile.faults.fingers or ():
                 if finger not in fingers:
@@ -346,7 +215,7 @@ class Scene(Section):
     def session_learns(self) -> bool:
         """Whether readings are taken into the session."""
         if self.session.learn is None:
-            return isinstance(self.tactile, ReplayTactile)
+            return isinstance(self.tactile, ReplayTactile) or self.gate.mode != "every"
         return self.session.learn
 
     @property

@@ -10,7 +10,7 @@ from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import State, Verdict
 from daemon.reporter import Reporter
 from daemon.stop import StopSignal
-from drivers.base import Driver, TactileReading
+from drivers.base import Driver, JointReading, TactileReading
 
 STATUS_PERIOD_NS = 1_000_000_000
 """Status goes out this often, ns, even when nothing happens."""
@@ -96,8 +96,9 @@ class Service:
         if readings and self._chore is not None:
             self._chore()
         for reading in readings:
-            if not isinstance(reading, TactileReading):
-                continue  # the verdict does not depend on joints
+            if isinstance(reading, JointReading):
+                self._pipeline.turn(reading)
+                continue
             judgement = self._pipeline.judge(reading)
             verdict, payload = self._reporter.verdict(judgement, received_ns, self._silence_ns())
             self._state = State.RUNNING
@@ -134,7 +135,7 @@ class Service:
             self._state,
             self._readings_since_status / elapsed_s,
             {driver.name: driver.counters.as_dict() for driver in self._drivers},
-            self._pipeline.session,
+            self._pipeline,
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+from daemon.judge.pipeline import Judgement
 from daemon.judge.verdict import Outcome, Reason, Verdict
 from daemon.latency import LatencyHistogram
 
@@ -75,7 +76,10 @@ class Tally:
 
 
 class Summary:
-    """Collects verdicts in constant memory."""
+    """Collects verdicts in constant memory.
+
+    Behind a gate a grasp counts once, by its first judgement; else each reading does.
+    """
 
     def __init__(self) -> None:
         self.tally = Tally()
@@ -84,18 +88,44 @@ class Summary:
         self.repaired = 0
         """Verdicts made with at least one repaired electrode."""
         self.latency = LatencyHistogram()
+        self.readings = 0
+        """Verdicts behind a gate; 0 where each reading is a grasp."""
+        self.grasps = 0
+        """Grasps that began, of these."""
+        self.again = 0
+        """Judgements of grasps that had changed since they were judged."""
+        self._judged_grasp: int | None = None
+        self._compared_grasp: int | None = None
 
     def add(self, verdict: Verdict, slipped: bool | None) -> None:
         """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
+        self.latency.add(verdict.latency_us)
+        if verdict.gate is not None:
+            self.readings += 1
+            self.grasps = max(self.grasps, verdict.grasp)
+            if not verdict.judged:
+                return
+            if verdict.grasp == self._judged_grasp:
+                self.again += 1
+                return
+            self._judged_grasp = verdict.grasp
         self.tally.add(verdict.verdict, verdict.reasons, slipped)
         self.repaired += verdict.valid and bool(verdict.repaired)
-        self.latency.add(verdict.latency_us)
+
+    def compare(self, judgement: Judgement, slipped: bool | None) -> None:
+        """Count what would have been judged without session calibration."""
+        if judgement.gate is not None:
+            if not judgement.judged or judgement.grasp == self._compared_grasp:
+                return
+            self._compared_grasp = judgement.grasp
+        self.without_session.add(judgement.outcome, judgement.reasons, slipped)
 
     def as_dict(self, wall_s: float) -> dict[str, Any]:
         """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""
         compared = bool(self.without_session.outcomes)
         return {
             **self.tally.as_dict(),
+            "gated": self._gated(),
             "repaired": self.repaired,
             "without_session": self.without_session.as_dict() if compared else None,
             "latency_us": {
@@ -106,10 +136,23 @@ class Summary:
             "wall_s": wall_s,
         }
 
+    def _gated(self) -> dict[str, int] | None:
+        if not self.readings:
+            return None
+        return {"readings": self.readings, "grasps": self.grasps, "judged_again": self.again}
+
     def lines(self, wall_s: float) -> list[str]:
         """The same for people."""
         total = self.tally.outcomes.total()
-        lines = [f"{total} verdicts in {wall_s:.2f} s: {self.tally.counts()}", *self.tally.lines()]
+        if self.readings:
+            lines = [
+                f"{self.readings} readings in {wall_s:.2f} s: {self.grasps} grasps, "
+                f"{total} judged, {self.again} again after a change",
+                f"first judgements: {self.tally.counts()}",
+            ]
+        else:
+            lines = [f"{total} verdicts in {wall_s:.2f} s: {self.tally.counts()}"]
+        lines += self.tally.lines()
         if self.repaired:
             lines.append(f"{self.repaired} of them with repaired electrodes")
         if self.without_session.outcomes:

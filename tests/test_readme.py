@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.judge.verdict import decode_verdict
+from drivers.replay import DEMO_TABLE
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -25,9 +26,9 @@ def block(language: str) -> str:
 
 
 def verdict_lines(command: list[str], endpoint: str) -> list[str]:
-    """Run a subscriber while a replay publishes ten verdicts to it."""
+    """Run a subscriber while a replay publishes 200 verdicts to it."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as subscriber:
-        replay = [sys.executable, "-m", "daemon", "replay", "--speed", "2"]
+        replay = [sys.executable, "-m", "daemon", "replay", str(DEMO_TABLE), "--speed", "2"]
         subprocess.run(
             [*replay, "--publish", endpoint, "--wait", "20"],
             check=True,

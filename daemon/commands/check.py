@@ -9,17 +9,17 @@ import sys
 from pathlib import Path
 from typing import get_args
 
-from daemon import assembly, scene
+from daemon import assembly, scene, scene_drivers
 from daemon.text import complain, printable
 from drivers.base import DriverError
 from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 TACTILE_SECTIONS = (
-    scene.ReplayTactile,
-    scene.SpiTactile,
-    scene.CanTactile,
-    scene.PalmTactile,
+    scene_drivers.ReplayTactile,
+    scene_drivers.SpiTactile,
+    scene_drivers.CanTactile,
+    scene_drivers.PalmTactile,
 )
 
 COIN = 0.505
@@ -61,11 +61,11 @@ def _try_drivers(wanted: scene.Scene) -> None:
     """Construct them all, and open what reads nothing but files: those are part of the scene."""
     tactile, joints = wanted.tactile, wanted.joints
     driver, *_ = assembly.build_drivers(wanted)
-    is_file = isinstance(tactile, scene.PalmTactile) and "://" not in tactile.source
-    if isinstance(tactile, scene.ReplayTactile) or is_file:
+    is_file = isinstance(tactile, scene_drivers.PalmTactile) and "://" not in tactile.source
+    if isinstance(tactile, scene_drivers.ReplayTactile) or is_file:
         with contextlib.closing(driver):
             assembly.open_driver(driver)
-    if isinstance(joints, scene.PalmJoints):
+    if isinstance(joints, scene_drivers.PalmJoints):
         from drivers.hall_calibration import load_calibration
 
         load_calibration(joints.calibration)
@@ -105,7 +105,7 @@ def _session(wanted: scene.Scene, needs: SessionInput) -> str:
     return f"calibrated {learns}, from {needs.calibrated_from:g} grasps on, {kept}"
 
 
-def _section(section: scene.Section) -> str:
+def _section(section: scene_drivers.Section) -> str:
     """The driver and whatever the scene says about it."""
     options = section.model_dump(mode="json", exclude_unset=True)
     driver = options.pop("driver")

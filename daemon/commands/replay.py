@@ -64,6 +64,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"come, '{OFF}' by nothing, or the file of a kept session",
     )
     parser.add_argument(
+        "--gate",
+        choices=("settled", "every"),
+        help="judge each grasp once it has settled, or every reading as a grasp of its own "
+        "(default: settled for streams, every for grasp tables)",
+    )
+    parser.add_argument(
         "--publish", type=_endpoint, metavar="ENDPOINT", help="publish too, as `graspd run` does"
     )
     parser.add_argument(
@@ -183,7 +189,7 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
             "strict": args.strict,
         },
         "model": model,
-        "gate": {"max_age_ms": MAX_AGE_MS},
+        "gate": {"max_age_ms": MAX_AGE_MS, "mode": args.gate},
     }
     return scene.parse(data, Path("command line"))
 

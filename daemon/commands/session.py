@@ -12,7 +12,7 @@ from pathlib import Path
 
 import msgspec
 
-from daemon import assembly, scene
+from daemon import assembly, scene, scene_drivers
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import Reason
 from daemon.session_file import KeptSession, SessionFile, SessionFileError, load
@@ -129,7 +129,7 @@ def _check(
 
 
 def _judge(wanted: scene.Scene, recordings: list[Path], pipeline: Pipeline) -> list[Judgement]:
-    replay = scene.ReplayTactile(
+    replay = scene_drivers.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
     (driver,) = assembly.build_drivers(

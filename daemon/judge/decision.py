@@ -1,20 +1,55 @@
-"""The final word: from a probability and the reasons against it to a verdict."""
+"""The final word: from probability, health and gate to a verdict. Nothing else makes one."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 from daemon.judge.verdict import Outcome, Reason
 
 
-def decide(p_slip: float | None, reasons: Sequence[Reason], slip_threshold: float) -> Outcome:
-    """Outcome of one reading; anything but a clean reading with a sound probability is unknown.
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a verdict other than `unknown` must keep to."""
 
-    `p_slip` at or above `slip_threshold` (both in 0..1) is slip.
-    """
-    if reasons or p_slip is None:
-        return Outcome.UNKNOWN
-    if not (math.isfinite(p_slip) and 0.0 <= p_slip <= 1.0):
-        return Outcome.UNKNOWN
-    return Outcome.SLIP if p_slip >= slip_threshold else Outcome.STABLE
+    max_age_ns: int
+    """Age of the reading at the end of judging, ns."""
+    slip_threshold: float = 0.5
+    """`p_slip` from here on is slip, in 0..1."""
+    min_confidence: float = 0.0
+    """Of what is judged, in 0..1: `p_slip` for slip, `1 - p_slip` for stable."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """All that a verdict depends on."""
+
+    p_slip: float | None
+    """What the network says, 0..1; None if it was not asked or gave no number."""
+    health: tuple[Reason, ...]
+    """What speaks against the reading at hand, or against the one that was judged."""
+    in_contact: bool
+    """All required fingers touch."""
+    settled: bool
+    """The grasp has settled and keeps still."""
+    gate: tuple[Reason, ...]
+    """Why not, where one of both is missing."""
+    age_ns: int
+    """Of the reading, ns."""
+
+
+def decide(case: Case, limits: Limits) -> tuple[Outcome, tuple[Reason, ...]]:
+    """Outcome, and the reasons if it is unknown: whatever is not clearly well is unknown."""
+    reasons = [*case.health]
+    if not (case.in_contact and case.settled):
+        reasons += case.gate or (Reason.MOVING,)
+    if not 0 <= case.age_ns <= limits.max_age_ns:
+        reasons.append(Reason.STALE)
+    p_slip = case.p_slip
+    if p_slip is not None and 0.0 <= p_slip <= 1.0:  # false for NaN
+        outcome = Outcome.SLIP if p_slip >= limits.slip_threshold else Outcome.STABLE
+        confidence = p_slip if outcome is Outcome.SLIP else 1.0 - p_slip
+        if confidence < limits.min_confidence:
+            reasons.append(Reason.LOW_CONFIDENCE)
+        if not reasons:
+            return outcome, ()
+    return Outcome.UNKNOWN, tuple(reasons) or (Reason.MODEL_FAILED,)

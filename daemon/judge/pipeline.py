@@ -1,39 +1,29 @@
-"""Reading in, judgement out: health, image, network, decision, in this order."""
+"""Reading in, judgement out: health, grip, plausibility, network, decision, in this order."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import decide
-from daemon.judge.health import Findings, Health
+from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.health import Health, Watched
+from daemon.judge.network import Network
+from daemon.judge.plausibility import Plausibility
 from daemon.judge.session import SessionCalibration
-from daemon.judge.verdict import Outcome, Reason
-from drivers.base import ELECTRODES, TactileReading
-from models.contract import ModelError, SessionInput
+from daemon.judge.verdict import GateState, Outcome, Reason
+from drivers.base import JointReading, TactileReading
+from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
 from models.inputs import SessionBuilder
 from models.runtime import TactileModel
-from models.tactile_image import SPREAD_FLOOR_COUNTS
 
-TINY = 1e-12
-"""Stands for a probability of zero, whose logarithm there is not."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What a verdict other than `unknown` must keep to."""
-
-    max_age_ns: int
-    """Age of the reading at the end of judging, ns."""
-    slip_threshold: float = 0.5
-    """`p_slip` from here on is slip, in 0..1."""
-    min_confidence: float = 0.0
-    """max(p_slip, 1 - p_slip) must reach this, in 0..1."""
+if TYPE_CHECKING:
+    from daemon.judge.gate import GateChange
+    from daemon.judge.grip import Grip, GripLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +37,30 @@ class Judgement:
     p_slip: float | None
     """None exactly when the outcome is unknown."""
     reasons: tuple[Reason, ...]
+    judged: bool = True
+    """Whether the network judged, or would have judged, this very reading."""
     repaired: tuple[str, ...] = ()
     """Electrodes that were replaced before judging, such as `ff_7`."""
     session_calibrated: bool | None = None
     """Whether the session is known well enough; None for a model that needs none."""
+    gate: GateState | None = None
+    """None where each reading is a grasp."""
+    contact: tuple[Finger, ...] | None = None
+    """Fingers that touch; None where nobody looks."""
+    changes: tuple[GateChange, ...] = ()
+    """What the gate did at this reading, oldest first."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Opinion:
+    """What the network said of a grasp, and what stands against its being asked."""
+
+    p_slip: float | None
+    reasons: tuple[Reason, ...]
+    repaired: tuple[str, ...] = ()
+
+
+NO_OPINION = _Opinion(None, ())
 
 
 class Pipeline:
@@ -59,108 +69,160 @@ class Pipeline:
     def __init__(
         self,
         model: TactileModel,
-        fingers: Sequence[str],
+        fingers: Sequence[Finger],
         limits: Limits,
         clock: Callable[[], int],
         *,
+        grip: GripLimits | None = None,
         learns: bool = True,
+        needs_session: bool = False,
     ) -> None:
-        """`clock` gives monotonic ns; with `learns` false the session stays what it is.
+        """`clock` gives monotonic ns; without `grip` each reading is a grasp.
 
-        Raises `ModelError` if the model is for other fingers.
+        With `learns` false the session stays what it is; with `needs_session` nothing is judged
+        before it is calibrated. Raises `ModelError` if the model is for other fingers.
         """
         if model.contract.fingers != tuple(fingers):
             raise ModelError(
                 f"{model.path}: judges the fingers {', '.join(model.contract.fingers)} "
                 f"in this order, the hand has {', '.join(fingers)}"
             )
-        self._model = model
+        electrodes = Electrodes(model.contract.seen)
+        self.session = _session(model, electrodes)
+        """None for a model that needs none."""
         self._limits = limits
         self._clock = clock
         self._learns = learns
-        electrodes = range(1, ELECTRODES + 1)
-        self._names = [f"{finger}_{electrode}" for finger in fingers for electrode in electrodes]
-        self.session = _session(model)
-        """None for a model that needs none."""
-        self._health = Health(len(fingers), model.contract.seen, self.session)
-        self._grasp = 0
+        self._needs_session = needs_session
+        self._fingers = tuple(fingers)
+        self._health = Health(len(fingers))
+        self._plausibility = Plausibility(model.contract.seen, electrodes, self.session)
+        self._network = Network(model, self.session, limits.slip_threshold)
+        self.grip = None if grip is None else _grip(fingers, grip)
+        """None where each reading is a grasp."""
+        self._readings = 0
+        self._learnt_grasp = 0
+        self._opinion = NO_OPINION
+
+    def turn(self, reading: JointReading) -> None:
+        """Take in joint angles."""
+        if self.grip is not None:
+            self.grip.turn(reading)
 
     def judge(self, reading: TactileReading) -> Judgement:
-        """Judge one reading as a grasp of its own. Never raises on bad data."""
-        self._grasp += 1
-        findings = self._health.examine(reading)
-        reasons = list(findings.reasons)
-        p_slip = None if reasons else self._infer(findings.counts, reasons)
-        # The age is taken last, so that a slow inference counts too.
-        age_ns = self._clock() - reading.t_ns
-        if not 0 <= age_ns <= self._limits.max_age_ns:
-            reasons.append(Reason.STALE)
-        judgement = self._judgement(reading.t_ns, p_slip, reasons, self._repaired(findings))
+        """Judge one reading, as what it is of its grasp. Never raises on bad data."""
+        self._readings += 1
+        watched = self._health.watch(reading)
+        counts = self._counts_to_judge(reading, watched)
+        judged = counts is not None or self.grip is None
+        grasp = None
+        if counts is not None:
+            self._opinion, grasp = self._consider(counts, watched)
+            if self.grip is not None:
+                self.grip.judged()
+        elif self.grip is None or self.grip.state is not GateState.JUDGED:
+            self._opinion = NO_OPINION
+        judgement = self._judgement(reading.t_ns, watched.reasons, self._opinion, judged=judged)
         # Last, so that a grasp is judged by what came before it.
-        if self._learns and Reason.STALE not in reasons:
-            self._learn(findings)
+        if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
+            self._learn(grasp, judgement.grasp)
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
-        return self._judgement(last_t_ns, None, [Reason.STALE])
+        return self._judgement(last_t_ns, (Reason.STALE,), NO_OPINION, judged=False)
 
-    def _learn(self, findings: Findings) -> None:
-        if self.session is not None and findings.grasp is not None:
-            self.session.observe(findings.grasp)
+    def health(self) -> dict[str, Reason]:
+        """What is not well now: electrodes such as `ff_7`, fingers, joints, model, session."""
+        broken = self._health.electrodes()
+        found = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
+        found |= {self._name(*place): reason for place, reason in broken.items()}
+        if self.grip is not None:
+            untared = [finger for finger in self._fingers if finger not in self.grip.tared]
+            found |= dict.fromkeys(untared, Reason.NOT_TARED)
+            if self.grip.joints_lost:
+                found["joints"] = Reason.JOINTS_LATE
+        if Reason.MODEL_FAILED in self._opinion.reasons:
+            found["model"] = Reason.MODEL_FAILED
+        if self.session is not None and not self.session.calibrated:
+            found["session"] = Reason.NOT_CALIBRATED
+        return found
 
-    def _infer(self, counts: NDArray[np.generic], reasons: list[Reason]) -> float | None:
-        spread = self._model.inputs.build(counts, self._model.input)
-        if not (spread >= SPREAD_FLOOR_COUNTS).all():
-            reasons.append(Reason.FLAT)
+    def _counts_to_judge(
+        self, reading: TactileReading, watched: Watched
+    ) -> NDArray[np.uint16] | None:
+        """The counts, if this reading is one to judge."""
+        if self.grip is None:
+            return None if watched.reasons else reading.counts
+        self.grip.feel(reading, watched)
+        if watched.reasons or not 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
             return None
-        try:
-            p_stable, p_slip = self._model.run()
-        except ModelError:
-            reasons.append(Reason.MODEL_FAILED)
-            return None
-        if not abs(p_stable + p_slip - 1.0) < 1e-3:  # also true for NaN
-            reasons.append(Reason.MODEL_FAILED)
-            return None
-        if self.session is not None:
-            threshold = self._limits.slip_threshold
-            p_slip = _softened(p_stable, p_slip, self.session.temperature, threshold)
-        confidence = p_slip if p_slip >= self._limits.slip_threshold else 1.0 - p_slip
-        if confidence < self._limits.min_confidence:
-            reasons.append(Reason.LOW_CONFIDENCE)
-        return p_slip
+        return self.grip.counts_to_judge(reading, watched)
 
-    def _repaired(self, findings: Findings) -> tuple[str, ...]:
-        if findings.repaired is None:
-            return ()
-        return tuple(self._names[index] for index in np.flatnonzero(findings.repaired))
+    def _consider(
+        self, counts: NDArray[np.uint16], watched: Watched
+    ) -> tuple[_Opinion, NDArray[np.generic] | None]:
+        """What the network says of counts (fingers, 24), and what the session may learn."""
+        findings = self._plausibility.examine(counts, watched.broken)
+        p_slip, reasons = None, findings.reasons
+        if self._needs_session and self.session is not None and not self.session.calibrated:
+            reasons = (*reasons, Reason.NOT_CALIBRATED)
+        if not reasons:
+            p_slip, reasons = self._network.judge(findings.counts)
+        repaired = () if findings.repaired is None else np.argwhere(findings.repaired)
+        names = tuple(self._name(int(finger), int(place)) for finger, place in repaired)
+        return _Opinion(p_slip, reasons, names), findings.grasp
+
+    def _learn(self, counts: NDArray[np.generic], grasp: int) -> None:
+        """Take a grasp into the session, as it was before the lift and not as it changed since."""
+        if self.session is not None and grasp != self._learnt_grasp:
+            self._learnt_grasp = grasp
+            self.session.observe(counts)
 
     def _judgement(
-        self, t_ns: int, p_slip: float | None, reasons: list[Reason], repaired: tuple[str, ...] = ()
+        self, t_ns: int, against: tuple[Reason, ...], opinion: _Opinion, *, judged: bool
     ) -> Judgement:
-        outcome = decide(p_slip, reasons, self._limits.slip_threshold)
-        if outcome is Outcome.UNKNOWN:
-            p_slip = None
-            reasons = reasons or [Reason.MODEL_FAILED]
-        calibrated = None if self.session is None else self.session.calibrated
-        return Judgement(t_ns, self._grasp, outcome, p_slip, tuple(reasons), repaired, calibrated)
+        grip = self.grip
+        case = Case(
+            p_slip=opinion.p_slip,
+            health=(*against, *opinion.reasons),
+            in_contact=grip is None or grip.in_contact,
+            settled=grip is None or grip.settled,
+            gate=() if grip is None else grip.reasons,
+            # Taken last, so that a slow inference counts too.
+            age_ns=self._age_ns(t_ns),
+        )
+        outcome, reasons = decide(case, self._limits)
+        return Judgement(
+            t_ns=t_ns,
+            grasp=self._readings if grip is None else grip.grasp,
+            outcome=outcome,
+            p_slip=None if outcome is Outcome.UNKNOWN else opinion.p_slip,
+            reasons=tuple(dict.fromkeys(reasons)),
+            judged=judged,
+            repaired=opinion.repaired,
+            session_calibrated=None if self.session is None else self.session.calibrated,
+            gate=None if grip is None else grip.state,
+            contact=None if grip is None else grip.touching,
+            changes=() if grip is None else tuple(grip.take_changes()),
+        )
+
+    def _age_ns(self, t_ns: int) -> int:
+        return self._clock() - t_ns
+
+    def _name(self, finger: int, electrode: int) -> str:
+        return f"{self._fingers[finger]}_{electrode + 1}"
 
 
-def _session(model: TactileModel) -> SessionCalibration | None:
+def _grip(fingers: Sequence[Finger], limits: GripLimits) -> Grip:
+    """Imported only where the scene has a gate."""
+    from daemon.judge.grip import Grip
+
+    return Grip(fingers, limits)
+
+
+def _session(model: TactileModel, electrodes: Electrodes) -> SessionCalibration | None:
     wanted, inputs = model.contract.input, model.inputs
     if not (isinstance(wanted, SessionInput) and isinstance(inputs, SessionBuilder)):
         return None
-    training = Electrodes(model.contract.seen)
-    return SessionCalibration(wanted, inputs, training.centre, training.spread)
-
-
-def _softened(p_stable: float, p_slip: float, temperature: float, threshold: float) -> float:
-    """The slip probability with its log-odds, counted from the threshold, over the temperature.
-
-    So it is less sure, and on the same side of the threshold as before.
-    """
-    if temperature == 1.0 or not (0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0):
-        return p_slip
-    margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
-    zero = math.log(threshold) - math.log1p(-threshold)
-    return 1.0 / (1.0 + math.exp(-(zero + (margin - zero) / temperature)))
+    return SessionCalibration(wanted, inputs, electrodes.centre, electrodes.spread)

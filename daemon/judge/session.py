@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.base import COUNT_MAX
 from models.contract import SessionInput
 from models.inputs import SessionBuilder, raw_features
 from models.session import SessionState, SessionStatistics
 
-COUNT_MAX = 4095
 SPREAD_RATIOS = (0.2, 3.0)
 """Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
 by 0.7 to 1.3 times from twenty grasps of the published tables on; those of a dead finger by 0.06
@@ -29,7 +29,7 @@ class SessionCalibration:
         """Start with the training's statistics: `wanted`, and of the counts (fingers, 24)."""
         self._wanted = wanted
         self._inputs = inputs
-        self._shape = counts_mean.shape
+        self._training_mean = counts_mean
         self._training_spread = counts_spread
         self._statistics = SessionStatistics(
             np.concatenate((wanted.mean, counts_mean.ravel())),
@@ -60,6 +60,19 @@ class SessionCalibration:
         if self._statistics.observe(values):
             self._settle()
 
+    def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
+        """What counts (fingers, 24) would have been with the training's sensors."""
+        deviation = counts.astype(np.float64) - self.counts_mean
+        values: NDArray[np.float64] = self._training_mean + deviation * self._scale
+        return values
+
+    def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_training`."""
+        counts: NDArray[np.float64] = (
+            self.counts_mean + (values - self._training_mean) / self._scale
+        )
+        return counts
+
     def reset(self) -> None:
         """A sensor was exchanged: start again."""
         self._statistics.reset()
@@ -81,11 +94,12 @@ class SessionCalibration:
         features = len(self._wanted.mean)
         mean, spread = self._statistics.mean, self._statistics.spread
         self._inputs.use(mean[:features], spread[:features])
-        self.counts_mean = mean[features:].reshape(self._shape)
+        self.counts_mean = mean[features:].reshape(self._training_mean.shape)
         """Of each electrode in this session, shape (fingers, 24)."""
-        self.counts_spread = spread[features:].reshape(self._shape)
+        self.counts_spread = spread[features:].reshape(self._training_mean.shape)
         """Standard deviation of each electrode in this session, shape (fingers, 24)."""
         least, most = SPREAD_RATIOS
+        self._scale = self._training_spread / self.counts_spread
         ratio = np.median(self.counts_spread / self._training_spread, axis=1)
         enough = self.grasps >= self._wanted.calibrated_from
         self.odd = enough and not bool(((ratio >= least) & (ratio <= most)).all())

@@ -1,4 +1,4 @@
-"""The messages on the wire, version 1: verdict and status, as JSON objects without NaN.
+"""The messages on the wire, version 1: verdict, gate and status, as JSON objects without NaN.
 
 `graspd schema` prints their JSON Schema; golden messages stand in `tests/daemon/golden/`. Fields
 are only ever added; `v` changes when a meaning does.
@@ -10,6 +10,8 @@ from enum import StrEnum
 from typing import Annotated, Any, Final, Literal
 
 import msgspec
+
+from models.contract import Finger
 
 WIRE_VERSION: Final = 1
 
@@ -35,7 +37,7 @@ OUTCOME_CODE: dict[Outcome, Literal[0, 1, 2]] = {
 
 
 class Reason(StrEnum):
-    """Why a verdict is `unknown`; `ADVICE` says what the operator can do about each."""
+    """Why a verdict is `unknown`, or a part is not well; `ADVICE` says what to do about each."""
 
     STALE = "stale"
     SENSOR_MISSING = "sensor-missing"
@@ -49,6 +51,17 @@ class Reason(StrEnum):
     FLAT = "flat"
     NEVER_SEEN = "never-seen"
     ELECTRODES_BROKEN = "electrodes-broken"
+    ELECTRODE_DEAD = "electrode-dead"
+    ELECTRODE_JUMPS = "electrode-jumps"
+    ELECTRODE_IMPLAUSIBLE = "electrode-implausible"
+    NOT_TARED = "not-tared"
+    NO_CONTACT = "no-contact"
+    MOVING = "moving"
+    SETTLING = "settling"
+    SEQUENCE_GAP = "sequence-gap"
+    JOINTS_LATE = "joints-late"
+    NOT_ASKED = "not-asked"
+    NOT_CALIBRATED = "not-calibrated"
     LOW_CONFIDENCE = "low-confidence"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
@@ -67,14 +80,56 @@ ADVICE: dict[Reason, str] = {
     Reason.FLAT: "a finger's electrodes read about the same: it touches nothing or does not work",
     Reason.NEVER_SEEN: "counts unlike all grasps of the training: check sensor, reset session",
     Reason.ELECTRODES_BROKEN: "too many electrodes to repair: check finger and plug",
+    Reason.ELECTRODE_DEAD: "an electrode keeps its count: repaired; exchange the finger",
+    Reason.ELECTRODE_JUMPS: "an electrode jumps alone: repaired; a loose contact in finger or plug",
+    Reason.ELECTRODE_IMPLAUSIBLE: "an electrode contradicts the others: repaired; does it stay?",
+    Reason.NOT_TARED: "where the fingers rest is not known yet: open the hand for two seconds",
+    Reason.NO_CONTACT: "not all fingers touch: close the hand; or open it once, to tare",
+    Reason.MOVING: "fingers or object move: wait until they are still",
+    Reason.SETTLING: "still for too short a time yet: wait for the hold time",
+    Reason.SEQUENCE_GAP: "readings were lost, so motion is not known: check cable and bus load",
+    Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
+    Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
+    Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
     Reason.LOW_CONFIDENCE: "too close to call for min_accuracy: grasp again",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
 }
 
 
+class GateState(StrEnum):
+    """Where in a grasp the hand is."""
+
+    IDLE = "idle"
+    """Nothing touches."""
+    CLOSING = "closing"
+    """Some finger touches; not all do, or something moves, or too little time has passed."""
+    SETTLED = "settled"
+    """All fingers touch and are still; waits to be judged."""
+    JUDGED = "judged"
+    """The verdict of the grasp stands as long as readings confirm it."""
+    RELEASED = "released"
+    """Nothing touches any more, for a moment."""
+
+
+class GateCause(StrEnum):
+    """Why the gate changed its state."""
+
+    CONTACT = "contact"
+    STILL = "still"
+    JUDGED = "judged"
+    MOVED = "moved"
+    CHANGED = "changed"
+    """The grasp is another than the one that was judged."""
+    CONTACT_LOST = "contact-lost"
+    GAP = "gap"
+    """No usable reading for too long."""
+    ASKED = "asked"
+    TIME = "time"
+
+
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """One judgement, on topic `verdict.<hand>`."""
+    """What is known of the grasp by one reading, on topic `verdict.<hand>`."""
 
     v: Literal[1] = WIRE_VERSION
     boot_id: str
@@ -105,11 +160,34 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     session_calibrated: bool | None = None
     """False: the session's grasps are too few yet, so the verdict is less sure; null: the model
     needs none."""
+    judged: bool = True
+    """Whether the network judged this very reading; if not, the reading confirms the grasp's
+    standing verdict, or is `unknown`."""
+    gate: GateState | None = None
+    """Null: each reading is a grasp of its own."""
+    contact: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
+    """Fingers that touch; null with a null `gate`."""
     silence_ms: Duration
     """If no message comes for longer than this, take the grasp for unknown."""
     model: str
     model_sha: str
     """First 12 hex digits of the model file's SHA-256."""
+
+
+class GateMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """The gate changed its state, on topic `gate.<hand>`; comes before the reading's verdict."""
+
+    v: Literal[1] = WIRE_VERSION
+    boot_id: str
+    seq: Count
+    """Counts up by one per message of this topic; a gap is a loss."""
+    t: float
+    t_mono_ns: Count
+    """Monotonic time, ns, of the last byte of the reading that made the change."""
+    grasp: Count
+    former: GateState
+    state: GateState
+    cause: GateCause
 
 
 class State(StrEnum):
@@ -145,6 +223,13 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """Grasps by which the session is calibrated; null: the model needs none."""
     session_calibrated: bool | None = None
     """Whether they are enough."""
+    gate: GateState | None = None
+    """Null: each reading is a grasp of its own."""
+    tared: Annotated[list[Finger], msgspec.Meta(max_length=5)] | None = None
+    """Fingers of which it is known where they rest; null with a null `gate`."""
+    health: Annotated[dict[str, Reason], msgspec.Meta(max_length=130)] = {}
+    """What is not well now: an electrode such as `ff_7`, a finger such as `ff`, `link`, `joints`,
+    `model` or `session`, and why."""
     latency_us: dict[Literal["p50", "p99", "max"], Duration]
     """Reading to publish since start; all zero before the first verdict."""
     model: str
@@ -152,12 +237,15 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
 
 
+MESSAGES = (Verdict, GateMessage, Status)
+
 _verdict_decoder = msgspec.json.Decoder(Verdict)
+_gate_decoder = msgspec.json.Decoder(GateMessage)
 _status_decoder = msgspec.json.Decoder(Status)
 _encoder = msgspec.json.Encoder()
 
 
-def encode(message: Verdict | Status) -> bytes:
+def encode(message: Verdict | GateMessage | Status) -> bytes:
     """JSON payload of a message."""
     return _encoder.encode(message)
 
@@ -167,16 +255,21 @@ def decode_verdict(payload: bytes) -> Verdict:
     return _verdict_decoder.decode(payload)
 
 
+def decode_gate(payload: bytes) -> GateMessage:
+    """Parse and check a gate payload. Raises `msgspec.DecodeError`."""
+    return _gate_decoder.decode(payload)
+
+
 def decode_status(payload: bytes) -> Status:
     """Parse and check a status payload. Raises `msgspec.DecodeError`."""
     return _status_decoder.decode(payload)
 
 
 def schema() -> dict[str, Any]:
-    """JSON Schema (2020-12) of both messages, each under its name in `$defs`."""
+    """JSON Schema (2020-12) of all messages, each under its name in `$defs`."""
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "graspd wire messages, version 1",
-        "anyOf": [{"$ref": "#/$defs/Verdict"}, {"$ref": "#/$defs/Status"}],
-        "$defs": msgspec.json.schema_components([Verdict, Status])[1],
+        "anyOf": [{"$ref": f"#/$defs/{message.__name__}"} for message in MESSAGES],
+        "$defs": msgspec.json.schema_components(MESSAGES)[1],
     }

@@ -12,11 +12,11 @@ import pytest
 from daemon import assembly
 from daemon.judge.verdict import Outcome
 from daemon.scene import parse
-from drivers.replay import DEMO_RECORDING, ReplayDriver
+from drivers.replay import DEMO_TABLE, ReplayDriver
 from drivers.spi_bridge import SpiBridgeDriver
 from tests.daemon.fakes import Clock, reading
 
-REPLAY = {"driver": "replay", "recordings": [str(DEMO_RECORDING)]}
+REPLAY = {"driver": "replay", "recordings": [str(DEMO_TABLE)]}
 
 
 @pytest.mark.parametrize("threshold", [1e-9, 1 - 1e-9])

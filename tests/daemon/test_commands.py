@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from daemon.judge.verdict import decode_verdict, schema
-from drivers.replay import DEMO_RECORDING
+from drivers.replay import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
 
 
@@ -19,7 +19,7 @@ def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     endpoint = f"ipc://{tmp_path}/graspd"
     scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[publish]\nendpoint = "{endpoint}"\n'
     )
     with start("run", scene) as process:
@@ -57,7 +57,7 @@ def test_a_sensor_that_fails_ends_in_unknown_at_the_subscriber(tmp_path: Path, f
     scene = tmp_path / "scene.toml"
     endpoint = f"ipc://{tmp_path}/graspd"
     scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[tactile.faults]\n{fault}\n[publish]\nendpoint = "{endpoint}"\n'
     )
     with start("run", scene) as process:
@@ -167,7 +167,7 @@ def test_check_refuses_a_hand_that_the_model_does_not_know(tmp_path: Path) -> No
     scene = tmp_path / "scene.toml"
     scene.write_text(
         f'[hand]\nfingers = ["ff", "th"]\n[tactile]\ndriver = "replay"\n'
-        f'recordings = ["{DEMO_RECORDING}"]\n'
+        f'recordings = ["{DEMO_TABLE}"]\n'
     )
     result = graspd("check", scene)
     assert result.returncode == 2

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.judge.verdict import Verdict, decode_verdict
-from drivers.replay import DEMO_RECORDING
+from drivers.replay import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
 WANTED = 150
@@ -36,10 +36,14 @@ MODEL = "cnn1"
 """Its verdict on a reading does not depend on what came before."""
 
 
-def scene_for(kind: str, folder: Path) -> Path:
+EVERY = '[gate]\nmode = "every"\n'
+"""The rows of a grasp table follow each other faster than any hand can grasp."""
+
+
+def scene_for(kind: str, folder: Path, gate: str = EVERY) -> Path:
     scene = folder / "scene.toml"
     scene.write_text(
-        f"[tactile]\n{SCENES[kind].format(folder=folder, port=PORT)}\n"
+        f"[tactile]\n{SCENES[kind].format(folder=folder, port=PORT)}\n{gate}"
         f'[model]\nname = "{MODEL}"\n[publish]\nendpoint = "ipc://{folder}/graspd"\n'
     )
     return scene
@@ -58,7 +62,7 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def replayed() -> list[float | None]:
-    result = graspd("replay", "--json", "--model", MODEL)
+    result = graspd("replay", DEMO_TABLE, "--json", "--model", MODEL)
     return [json.loads(line)["p_slip"] for line in result.stdout.splitlines()]
 
 
@@ -72,7 +76,7 @@ def published(folder: Path, wanted: int) -> list[Verdict]:
 def test_a_recording_on_the_wire_gets_the_verdicts_of_its_replay(tmp_path: Path, kind: str) -> None:
     with start("run", scene_for(kind, tmp_path)) as daemon:
         wait_for(tmp_path / "graspd")
-        with twin(kind, tmp_path, "--recording", str(DEMO_RECORDING), "--loop") as hardware:
+        with twin(kind, tmp_path, "--recording", str(DEMO_TABLE), "--loop") as hardware:
             verdicts = published(tmp_path, WANTED)
             output = end(hardware)
         end(daemon)
@@ -84,6 +88,26 @@ def test_a_recording_on_the_wire_gets_the_verdicts_of_its_replay(tmp_path: Path,
     # came before a row decides whether an electrode seems to jump, so a few may differ.
     others = [p_slip for p_slip in judged if p_slip not in set(expected)]
     assert len(others) <= 0.05 * len(judged)
+
+
+@pytest.mark.parametrize("kind", TWINS)
+def test_whole_grasps_on_the_wire_are_judged_once_each(tmp_path: Path, kind: str) -> None:
+    with start("run", scene_for(kind, tmp_path, gate="")) as daemon:
+        wait_for(tmp_path / "graspd")
+        with twin(kind, tmp_path) as hardware:
+            verdicts = published(tmp_path, 1100)  # at least two grasps of about four seconds
+            end(hardware)
+        end(daemon)
+    judged = [verdict.grasp for verdict in verdicts if verdict.judged]
+    assert {1, 2} <= set(judged)
+    first = verdicts[[verdict.judged for verdict in verdicts].index(True)]
+    assert first.gate == "judged"
+    assert first.contact == ["ff", "mf", "th"]
+    for verdict in verdicts:
+        assert not verdict.valid or verdict.gate == "judged"
+    before = [verdict for verdict in verdicts if verdict.seq < first.seq]
+    assert {verdict.verdict for verdict in before} == {"unknown"}
+    assert "no-contact" in {reason for verdict in before for reason in verdict.reasons}
 
 
 def test_an_unplugged_finger_is_unknown_at_the_subscriber(tmp_path: Path) -> None:
@@ -101,7 +125,7 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
     with start("run", scene_for("spi", tmp_path)) as daemon:
         wait_for(tmp_path / "graspd")
         for _ in range(2):
-            recording = ["--recording", str(DEMO_RECORDING), "--loop"]
+            recording = ["--recording", str(DEMO_TABLE), "--loop"]
             with twin("spi", tmp_path, *recording) as hardware:
                 deadline_s = time.monotonic() + 20
                 while not any(verdict.valid for verdict in published(tmp_path, 10)):
@@ -115,7 +139,7 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
 
 def test_run_prints_verdicts(tmp_path: Path) -> None:
     scene = scene_for("spi", tmp_path)
-    with twin("spi", tmp_path, "--recording", str(DEMO_RECORDING), "--loop") as hardware:
+    with twin("spi", tmp_path, "--recording", str(DEMO_TABLE), "--loop") as hardware:
         with start("run", "--print", scene) as daemon:
             assert daemon.stdout is not None
             lines = [daemon.stdout.readline() for _ in range(30)]

@@ -11,37 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from daemon.judge.decision import decide
 from daemon.judge.health import REASON_OF_FAULT
 from daemon.judge.verdict import ADVICE, Outcome, Reason
 from drivers.base import ElectrodeFault, TactileReading
 from models.contract import ModelError
 from tests.daemon.fakes import FINGERS, HIGH, LOW, MARGIN, MS, Clock, FakeModel, pipeline, reading
-
-
-@pytest.mark.parametrize(
-    ("p_slip", "threshold", "outcome"),
-    [
-        (0.0, 0.5, Outcome.STABLE),
-        (0.4999, 0.5, Outcome.STABLE),
-        (0.5, 0.5, Outcome.SLIP),
-        (1.0, 0.5, Outcome.SLIP),
-        (0.3, 0.3, Outcome.SLIP),
-        (None, 0.5, Outcome.UNKNOWN),
-        (math.nan, 0.5, Outcome.UNKNOWN),
-        (math.inf, 0.5, Outcome.UNKNOWN),
-        (-math.inf, 0.5, Outcome.UNKNOWN),
-        (-1e-9, 0.5, Outcome.UNKNOWN),
-        (1.0000001, 0.5, Outcome.UNKNOWN),
-    ],
-)
-def test_decision(p_slip: float | None, threshold: float, outcome: Outcome) -> None:
-    assert decide(p_slip, [], threshold) is outcome
-
-
-@pytest.mark.parametrize("reason", Reason)
-def test_any_reason_makes_the_verdict_unknown(reason: Reason) -> None:
-    assert decide(0.0, [reason], 0.5) is Outcome.UNKNOWN
 
 
 def test_every_reason_says_what_to_do_and_every_fault_has_a_reason() -> None:

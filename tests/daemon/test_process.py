@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from daemon.text import printable
-from drivers.replay import DEMO_RECORDING
+from drivers.replay import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, graspd, start, wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -53,7 +53,7 @@ def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
 def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
     )
     result = python(AT_IMPORT.format(module="drivers.faults"), "run", scene)
@@ -154,7 +154,7 @@ def test_an_output_that_cannot_be_written_is_one_line(
     if DEMO_SCENE in arguments:
         scene = tmp_path / "scene.toml"
         scene.write_text(
-            f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\n'
+            f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
             f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
         )
         arguments = [scene if word == DEMO_SCENE else word for word in arguments]
@@ -167,7 +167,7 @@ def test_an_output_that_cannot_be_written_is_one_line(
 def test_a_daemon_needs_no_output(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(
-        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
     )
     assert redirected(">&- 2>&-", "run", scene) == (0, "", "")
@@ -192,7 +192,7 @@ daemon.commands.schema.run = run
 
 def recording_of(folder: Path, name: str) -> Path:
     """The demo recording, its first object named like that."""
-    header, first, *rest = DEMO_RECORDING.read_text().splitlines()
+    header, first, *rest = DEMO_TABLE.read_text().splitlines()
     recording = folder / "grasps.csv"
     text = "\n".join([header, name + first[first.index(",") :], *rest]) + "\n"
     recording.write_text(text, encoding="utf-8", newline="")

@@ -15,17 +15,43 @@ import jsonschema
 import pytest
 
 from daemon.judge.verdict import decode_verdict, schema
-from drivers.replay import DEMO_RECORDING
+from drivers.replay import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
 
 def demo_rows() -> list[dict[str, str]]:
-    with DEMO_RECORDING.open(newline="") as file:
+    with DEMO_TABLE.open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_replay_without_arguments_judges_the_demo_recording() -> None:
-    result = graspd("replay")
+def test_replay_without_arguments_judges_each_grasp_of_the_demo_recording_once() -> None:
+    people, program = graspd("replay"), graspd("replay", "--json")
+    assert people.returncode == program.returncode == 0, people.stderr
+    verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
+    with DEMO_RECORDING.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(verdicts) == len(rows)
+    first = {v.grasp: v for v in reversed(verdicts) if v.judged}
+    assert sorted(first) == list(range(1, 13))
+    assert all(v.gate == "judged" for v in verdicts if v.valid)
+    summary = json.loads(program.stderr)
+    assert summary["gated"]["grasps"] == 12
+    assert summary["labelled"] == 12
+    assert sum(summary["verdicts"].values()) == 12
+    lines = people.stdout.splitlines()
+    assert "12 grasps, 12 judged" in lines[lines.index("") + 1]
+    assert any("  judged   " in line and "p_slip" in line for line in lines)
+
+
+def test_replay_says_so_when_streams_and_tables_are_mixed() -> None:
+    result = graspd("replay", DEMO_TABLE, DEMO_RECORDING)
+    assert result.returncode == 2
+    assert "both grasp tables and streams" in result.stderr
+    assert graspd("replay", DEMO_RECORDING, "--gate", "every", "--json").returncode == 0
+
+
+def test_a_grasp_table_is_judged_row_by_row() -> None:
+    result = graspd("replay", DEMO_TABLE)
     assert result.returncode == 0, result.stderr
     lines = result.stdout.splitlines()
     blank = lines.index("")
@@ -95,7 +121,7 @@ def peak_memory_kib(recording: Path) -> int:
 
 
 def test_memory_does_not_grow_with_the_length_of_the_file(tmp_path: Path) -> None:
-    header, *rows = DEMO_RECORDING.read_text().splitlines(keepends=True)
+    header, *rows = DEMO_TABLE.read_text().splitlines(keepends=True)
     short, long = tmp_path / "short.csv", tmp_path / "long.csv"
     short.write_text(header + "".join(rows))
     long.write_text(header + "".join(rows) * 100)  # 20,000 grasps, 7.5 MB
@@ -123,7 +149,7 @@ def test_a_signal_ends_a_replay_with_its_summary_and_nothing_left(
 
 
 def replace_cell(text: str) -> str:
-    header, first, *rest = DEMO_RECORDING.read_text().splitlines()
+    header, first, *rest = DEMO_TABLE.read_text().splitlines()
     cells = first.split(",")
     cells[2] = text
     return "\n".join([header, ",".join(cells), *rest]) + "\n"
@@ -146,7 +172,7 @@ def test_a_value_that_is_no_count_is_repaired_and_said(tmp_path: Path, text: str
 
 
 def bad_recordings() -> dict[str, tuple[bytes | None, str]]:
-    content = DEMO_RECORDING.read_bytes()
+    content = DEMO_TABLE.read_bytes()
     header, first, *rest = content.splitlines(keepends=True)
     without = header.replace(b",mf_biotac_7,", b",") + first.replace(b",", b"", 1)
     short = b"".join([header, first, first.rsplit(b",", 1)[0] + b"\n", *rest])

@@ -11,14 +11,8 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from daemon.endpoint import check_endpoint
-from daemon.scene import (
-    SCENE_MAX_BYTES,
-    ReplayFaultsSection,
-    ReplayTactile,
-    Scene,
-    SceneError,
-    load,
-)
+from daemon.scene import SCENE_MAX_BYTES, Scene, SceneError, load
+from daemon.scene_drivers import ReplayFaultsSection, ReplayTactile
 from drivers.faults import ReplayFaults
 
 GOOD = """
@@ -39,7 +33,7 @@ def test_the_smallest_scene_has_the_documented_defaults(tmp_path: Path) -> None:
     assert scene.hand.fingers == ("ff", "mf", "th")
     assert scene.endpoint == "ipc:///run/graspd/right.ipc"
     assert scene.max_age_ns == 100_000_000
-    assert scene.gate.mode == "every"
+    assert scene.gate.mode is None
 
 
 def test_paths_are_relative_to_the_scene_file(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,15 @@ import pytest
 from daemon.commands.schema import schema_text
 from daemon.judge.verdict import (
     ADVICE,
+    GateCause,
+    GateMessage,
+    GateState,
     Outcome,
     Reason,
     State,
     Status,
     Verdict,
+    decode_gate,
     decode_status,
     decode_verdict,
     encode,
@@ -29,7 +34,7 @@ GOLDEN = Path(__file__).parent / "golden"
 SCHEMA_FILE = Path(__file__).parents[2] / "deploy" / "wire" / "messages.schema.json"
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"
-MESSAGES: dict[str, Verdict | Status] = {
+MESSAGES: dict[str, Verdict | GateMessage | Status] = {
     "verdict_stable": Verdict(
         boot_id=BOOT,
         seq=41,
@@ -100,6 +105,37 @@ MESSAGES: dict[str, Verdict | Status] = {
         model="small-session",
         model_sha="0123456789ab",
     ),
+    "verdict_gated": Verdict(
+        boot_id=BOOT,
+        seq=45,
+        t=1790000000.9375,
+        t_mono_ns=123456829012345,
+        grasp=3,
+        verdict=Outcome.SLIP,
+        verdict_code=2,
+        p_slip=0.75,
+        valid=True,
+        reasons=[],
+        age_ms=0.5,
+        latency_us=500.0,
+        session_calibrated=True,
+        judged=True,
+        gate=GateState.JUDGED,
+        contact=["ff", "mf", "th"],
+        silence_ms=100.0,
+        model="small-session",
+        model_sha="0123456789ab",
+    ),
+    "gate": GateMessage(
+        boot_id=BOOT,
+        seq=11,
+        t=1790000000.9375,
+        t_mono_ns=123456829012345,
+        grasp=3,
+        former=GateState.SETTLED,
+        state=GateState.JUDGED,
+        cause=GateCause.JUDGED,
+    ),
     "status": Status(
         boot_id=BOOT,
         seq=7,
@@ -113,6 +149,9 @@ MESSAGES: dict[str, Verdict | Status] = {
         repaired={"ff_7": 12},
         session_grasps=57,
         session_calibrated=True,
+        gate=GateState.IDLE,
+        tared=["ff", "th"],
+        health={"ff_7": Reason.SATURATED, "mf": Reason.NOT_TARED},
         latency_us={"p50": 250.0, "p99": 500.0, "max": 500.0},
         model="cnn1",
         model_sha="0123456789ab",
@@ -121,13 +160,26 @@ MESSAGES: dict[str, Verdict | Status] = {
 }
 
 
+DECODE: dict[type, Callable[[bytes], Verdict | GateMessage | Status]] = {
+    Verdict: decode_verdict,
+    GateMessage: decode_gate,
+    Status: decode_status,
+}
+
+
+def test_a_verdict_of_before_there_was_a_gate_is_still_read() -> None:
+    former = json.loads((GOLDEN / "verdict_stable.json").read_text())
+    for added in ("judged", "gate", "contact", "repaired", "session_calibrated"):
+        del former[added]
+    assert decode_verdict(json.dumps(former).encode()) == MESSAGES["verdict_stable"]
+
+
 @pytest.mark.parametrize("name", MESSAGES)
 def test_golden_messages_are_written_and_read_as_committed(name: str) -> None:
     payload = (GOLDEN / f"{name}.json").read_bytes().rstrip(b"\n")
     message = MESSAGES[name]
     assert encode(message) == payload
-    decode = decode_verdict if isinstance(message, Verdict) else decode_status
-    assert decode(payload) == message
+    assert DECODE[type(message)](payload) == message
 
 
 @pytest.mark.parametrize("name", MESSAGES)
@@ -182,9 +234,11 @@ def test_the_documentation_names_every_field_and_every_reason_with_its_advice() 
     text = (SCHEMA_FILE.parent / "README.md").read_text()
     for reason in Reason:
         assert f"| `{reason}` | {ADVICE[reason]} |" in text
-    for message in (Verdict, Status):
+    for message in (Verdict, GateMessage, Status):
         for field in message.__struct_fields__:
             assert f"`{field}`" in text, field
+    for name in (*GateState, *GateCause):
+        assert f"| `{name}` |" in text, name
 
 
 def test_a_reader_of_version_1_skips_fields_added_later() -> None:

@@ -1,0 +1,162 @@
+"""How the hand holds: fresh values, contact, joints and gate of one hand, reading by reading."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.contact import Contact, ContactLimits
+from daemon.judge.fresh import FreshMedian
+from daemon.judge.gate import Gate, GateChange, GateLimits
+from daemon.judge.health import Watched
+from daemon.judge.verdict import GateState, Reason
+from drivers.base import ELECTRODES, JointReading, TactileReading
+from models.contract import Finger
+
+if TYPE_CHECKING:
+    from daemon.judge.joints import JointLimits, JointMotion
+
+MEDIAN_SWEEPS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class GripLimits:
+    """All conditions of the moment before the lift."""
+
+    on_request: bool = False
+    """Whether a settled grasp is judged only when somebody asks."""
+    sweeps: int = MEDIAN_SWEEPS
+    """What is judged: 1, the reading at hand; 3, the median of three fresh sweeps."""
+    required: tuple[Finger, ...] | None = None
+    """Fingers that must touch; all unless given."""
+    contact: ContactLimits = field(default_factory=ContactLimits)
+    gate: GateLimits = field(default_factory=GateLimits)
+    joints: JointLimits | None = None
+    """None for a hand without joint angles."""
+
+
+class Grip:
+    """Feels one hand."""
+
+    def __init__(self, fingers: Sequence[Finger], limits: GripLimits) -> None:
+        """`fingers` are those of the readings, in their order."""
+        required = fingers if limits.required is None else limits.required
+        self._fingers = tuple(fingers)
+        self._required = np.array([finger in required for finger in fingers])
+        self._gap_ns = limits.gate.gap_ns
+        self._judges_median = limits.sweeps == MEDIAN_SWEEPS
+        self._fresh = FreshMedian((len(fingers), ELECTRODES))
+        self._contact = Contact(len(fingers), limits.contact)
+        self._joints = None if limits.joints is None else _joint_motion(limits.joints)
+        self._gate = Gate(self._required, limits.gate, on_request=limits.on_request)
+        self._last_ns: int | None = None
+
+    @property
+    def state(self) -> GateState:
+        """State of the gate."""
+        return self._gate.state
+
+    @property
+    def grasp(self) -> int:
+        """Number of the grasp at hand, from 1; 0 before the first."""
+        return self._gate.grasp
+
+    @property
+    def in_contact(self) -> bool:
+        """Whether all required fingers touch."""
+        return self._gate.in_contact
+
+    @property
+    def settled(self) -> bool:
+        """Whether the grasp has settled, was judged, and still keeps still."""
+        return self._gate.settled
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Why it has not."""
+        return self._gate.reasons
+
+    @property
+    def touching(self) -> tuple[Finger, ...]:
+        """Fingers that touch."""
+        return self._names(self._contact.touching)
+
+    @property
+    def tared(self) -> tuple[Finger, ...]:
+        """Fingers of which it is known where they rest."""
+        return self._names(self._contact.tared)
+
+    @property
+    def joints_lost(self) -> bool:
+        """Whether the hand should have joint angles, and judging goes on without them."""
+        return (
+            self._joints is not None
+            and self._last_ns is not None
+            and self._joints.is_lost(self._last_ns)
+        )
+
+    def ask(self) -> None:
+        """The controller wants the grasp at hand judged."""
+        self._gate.ask(0 if self._last_ns is None else self._last_ns)
+
+    def take_changes(self) -> list[GateChange]:
+        """Changes of the gate since the last call, oldest first."""
+        return self._gate.take_changes()
+
+    def turn(self, reading: JointReading) -> None:
+        """Take in joint angles."""
+        if self._joints is not None:
+            self._joints.observe(reading, reading.made_ns)
+
+    def feel(self, reading: TactileReading, watched: Watched) -> None:
+        """Take in a reading of these fingers and what was found in it."""
+        t_ns = reading.made_ns
+        if watched.reasons:
+            self._gate.skip(t_ns)
+            return
+        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._gap_ns:
+            self._fresh.reset()
+        self._last_ns = t_ns
+        usable = ~watched.broken
+        self._fresh.push(reading.counts, usable)
+        median = self._fresh.counts
+        self._contact.observe(t_ns, reading.counts, median, usable)
+        against = self._against(t_ns)
+        self._gate.step(t_ns, median, usable, self._contact.touching, against)
+
+    def counts_to_judge(
+        self, reading: TactileReading, watched: Watched
+    ) -> NDArray[np.uint16] | None:
+        """Shape (fingers, 24), if this reading is the moment to judge the grasp; else None."""
+        usable = ~watched.broken
+        if not self._gate.wants_judgement or not self._fresh.is_full(usable):
+            return None
+        return self._fresh.counts if self._judges_median else reading.counts
+
+    def judged(self) -> None:
+        """The grasp was judged by the last reading."""
+        if self._last_ns is not None:
+            self._gate.judged(self._last_ns, self._fresh.counts)
+
+    def _against(self, t_ns: int) -> tuple[Reason, ...]:
+        against: list[Reason] = []
+        if not self._contact.tared[self._required].all():
+            against.append(Reason.NOT_TARED)
+        joints = None if self._joints is None else self._joints.against(t_ns)
+        if joints is not None:
+            against.append(joints)
+        return tuple(against)
+
+    def _names(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
+        return tuple(self._fingers[index] for index in np.flatnonzero(which))
+
+
+def _joint_motion(limits: JointLimits) -> JointMotion:
+    """Imported only where the scene has joints."""
+    from daemon.judge.joints import JointMotion
+
+    return JointMotion(limits)

@@ -1,0 +1,94 @@
+"""Whether the hand's joints keep still, as far as they are heard of."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.verdict import Reason
+from drivers.base import JointReading
+
+ANGLES = 16
+"""Angles remembered of a window; of faster readings, some are left out."""
+SOURCES_MAX = 8
+"""Sets of joints that are told apart: a sender may send one finger at a time, not random names."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointLimits:
+    """When joints keep still, and how long they are waited for."""
+
+    rad_per_s: float = 0.1
+    """A joint that turns faster is moving. One count of a Hall sensor is 0.0006 rad, so noise in
+    a window shows up to 0.02."""
+    window_ns: int = 80_000_000
+    """Speed is the difference to the angles at least so long ago, ns."""
+    late_ns: int = 150_000_000
+    """Angles that are older than this speak against settling, ns ..."""
+    lost_ns: int = 1_000_000_000
+    """... until they are this old, ns: then the stream is lost, and judging goes on without it."""
+
+
+class JointMotion:
+    """Follows the joints of one hand. Constant memory, no clock."""
+
+    def __init__(self, limits: JointLimits = JointLimits()) -> None:
+        """Nothing is known yet; the time for `lost_ns` runs from the first sweep on."""
+        self._limits = limits
+        self._past: dict[tuple[str, ...], deque[tuple[int, NDArray[np.float64]]]] = {}
+        self._last_ns: int | None = None
+
+    @property
+    def heard(self) -> bool:
+        """Whether any angle ever came."""
+        return bool(self._past)
+
+    def observe(self, reading: JointReading, t_ns: int) -> None:
+        """Take in the angles of `t_ns`, on the same clock as the sweeps; those all NaN are none."""
+        if np.isnan(reading.position_rad).all():
+            return
+        past = self._past.get(reading.names)
+        if past is None:
+            if len(self._past) >= SOURCES_MAX:
+                self._past.clear()
+            past = self._past[reading.names] = deque(maxlen=ANGLES + 2)
+        if past and t_ns < past[-1][0]:
+            past.clear()  # time went back: what was before cannot be compared with
+        self._last_ns = t_ns
+        if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
+            past.append((t_ns, reading.position_rad))
+
+    def against(self, t_ns: int) -> Reason | None:
+        """What the joints say against settling at `t_ns`; None if they are still, or are lost."""
+        if self._last_ns is None:
+            self._last_ns = t_ns
+        age_ns = t_ns - self._last_ns
+        if age_ns > self._limits.lost_ns:
+            return None
+        if not self._past or abs(age_ns) > self._limits.late_ns:
+            return Reason.JOINTS_LATE
+        return (
+            None
+            if all(self._is_still(past, t_ns) for past in self._past.values())
+            else Reason.MOVING
+        )
+
+    def is_lost(self, t_ns: int) -> bool:
+        """Whether judging goes on without the joints at `t_ns`."""
+        return self._last_ns is not None and t_ns - self._last_ns > self._limits.lost_ns
+
+    def _is_still(self, past: deque[tuple[int, NDArray[np.float64]]], t_ns: int) -> bool:
+        now_ns, now = past[-1]
+        if t_ns - now_ns > self._limits.lost_ns:
+            return True  # a sender that no longer sends these
+        while len(past) > 2 and now_ns - past[1][0] >= self._limits.window_ns:
+            past.popleft()
+        then_ns, then = past[0]
+        if now_ns - then_ns < self._limits.window_ns:
+            return False
+        moved = np.abs(now - then) / ((now_ns - then_ns) / 1e9)
+        fastest = np.nanmax(moved) if not np.isnan(moved).all() else np.inf
+        return bool(fastest <= self._limits.rad_per_s)

@@ -1,0 +1,56 @@
+"""Counts in, probability of slip out: image or features, network, and how sharp it may be."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.session import SessionCalibration
+from daemon.judge.verdict import Reason
+from models.contract import ModelError
+from models.runtime import TactileModel
+from models.tactile_image import SPREAD_FLOOR_COUNTS
+
+TINY = 1e-12
+"""Stands for a probability of zero, whose logarithm there is not."""
+
+
+class Network:
+    """Runs one model, softened as far as its session is known."""
+
+    def __init__(
+        self, model: TactileModel, session: SessionCalibration | None, slip_threshold: float
+    ) -> None:
+        """`slip_threshold` is the probability, 0..1, that softening must not cross."""
+        self._model = model
+        self._session = session
+        self._threshold = slip_threshold
+
+    def judge(self, counts: NDArray[np.generic]) -> tuple[float | None, tuple[Reason, ...]]:
+        """Probability of slip of counts (fingers, 24), or None and why there is none."""
+        spread = self._model.inputs.build(counts, self._model.input)
+        if not (spread >= SPREAD_FLOOR_COUNTS).all():
+            return None, (Reason.FLAT,)
+        try:
+            p_stable, p_slip = self._model.run()
+        except ModelError:
+            return None, (Reason.MODEL_FAILED,)
+        if not abs(p_stable + p_slip - 1.0) < 1e-3:  # also true for NaN
+            return None, (Reason.MODEL_FAILED,)
+        if self._session is not None:
+            p_slip = _softened(p_stable, p_slip, self._session.temperature, self._threshold)
+        return p_slip, ()
+
+
+def _softened(p_stable: float, p_slip: float, temperature: float, threshold: float) -> float:
+    """The slip probability with its log-odds, counted from the threshold, over the temperature.
+
+    So it is less sure, and on the same side of the threshold as before.
+    """
+    if temperature == 1.0 or not (0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0):
+        return p_slip
+    margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
+    zero = math.log(threshold) - math.log1p(-threshold)
+    return 1.0 / (1.0 + math.exp(-(zero + (margin - zero) / temperature)))
