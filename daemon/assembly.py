@@ -110,6 +110,7 @@ def grip_limits(scene: Scene) -> GripLimits | None:
             hold_ns=round(gate.hold_ms * 1e6),
             rate_counts_per_s=gate.rate_counts_per_s,
             change_counts=gate.change_counts,
+            request_ns=round(gate.request_ms * 1e6),
             gap_ns=round(gate.gap_ms * 1e6),
         ),
         joints=_joint_limits(scene),

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 from typing import Protocol, Self
 
 import zmq
 
-from daemon.socket_file import OccupiedError, SocketFile
+from daemon.binding import PublishError, bind, socket_file
 
 SUBSCRIBED = 1
 """First byte of a subscription message on an XPUB socket."""
@@ -20,10 +19,6 @@ SUBSCRIPTIONS_WAITING_MAX = 4
 """Subscriptions of one peer that wait to be looked at; the rest waits in the peer."""
 LINGER_MS = 500
 """How long closing waits for subscribers to take what is still queued, ms."""
-
-
-class PublishError(Exception):
-    """The socket cannot be had: fix the endpoint or stop whoever holds it."""
 
 
 class Stop(Protocol):
@@ -54,7 +49,7 @@ class Publisher:
         """
         self.endpoint = endpoint
         self._waits = waits
-        self._file = _socket_file(endpoint)
+        self._file = socket_file(endpoint)
         self._context = zmq.Context(io_threads=1)
         try:
             self._socket = self._bound(high_water_mark)
@@ -68,14 +63,7 @@ class Publisher:
         bound.sndhwm = high_water_mark
         bound.rcvhwm = SUBSCRIPTIONS_WAITING_MAX
         bound.maxmsgsize = SUBSCRIPTION_MAX_BYTES
-        bound.ipv6 = "[" in self.endpoint
-        if self._file is None:
-            bound.bind(self.endpoint)
-        else:
-            # Left to itself libzmq would first remove whatever is at the path.
-            bound.setsockopt(zmq.USE_FD, self._file.listener.fileno())
-            bound.bind(self.endpoint)
-            self._file.listener.detach()
+        bind(bound, self.endpoint, self._file)
         return bound
 
     def send(self, topic: bytes, payload: bytes) -> None:
@@ -116,14 +104,3 @@ class Publisher:
 
     def __exit__(self, *_details: object) -> None:
         self.close()
-
-
-def _socket_file(endpoint: str) -> SocketFile | None:
-    if not endpoint.startswith("ipc://") or endpoint.startswith("ipc://@"):
-        return None  # for TCP and abstract sockets the kernel refuses a second bind
-    try:
-        return SocketFile(Path(endpoint.removeprefix("ipc://")))
-    except OccupiedError as error:
-        raise PublishError(f"cannot publish on {endpoint}: {error}") from None
-    except OSError as error:
-        raise PublishError(f"cannot publish on {endpoint}: {error.strerror or error}") from error

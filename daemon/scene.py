@@ -135,8 +135,10 @@ class Gate(Section):
     """A joint that turns faster is moving, rad/s; only with `[joints]`."""
     joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = 1000.0
     """Late joint angles block a verdict no longer than this, ms; only with `[joints]`."""
-    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 80.0
+    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 60.0
     """All this must last so long, ms."""
+    request_ms: Milliseconds = 1000.0
+    """A question that cannot be answered with a judgement by then is answered with `unknown`."""
     gap_ms: Milliseconds = 100.0
     """After so long without a usable reading the grasp must settle anew, ms. More than two periods
     of the readings."""
@@ -161,6 +163,20 @@ class Publish(Section):
         return endpoint
 
 
+class Ask(Section):
+    """`[ask]`: where the grasp controller asks for a verdict (deploy/wire/README.md)."""
+
+    endpoint: str | None = None
+    """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` is for loopback addresses only."""
+
+    @field_validator("endpoint")
+    @classmethod
+    def _endpoint_is_local(cls, endpoint: str | None) -> str | None:
+        if endpoint is not None:
+            check_endpoint(endpoint)
+        return endpoint
+
+
 class Scene(Section):
     """The whole file."""
 
@@ -171,6 +187,7 @@ class Scene(Section):
     session: Session = Session()
     gate: Gate = Gate()
     publish: Publish = Publish()
+    ask: Ask | None = None
 
     @model_validator(mode="after")
     def _sections_fit_together(self) -> Self:
@@ -198,6 +215,14 @@ class Scene(Section):
     def endpoint(self) -> str:
         """Where verdicts are published."""
         return self.publish.endpoint or f"ipc:///run/graspd/{self.hand.name}.ipc"
+
+    @property
+    def ask_endpoint(self) -> str | None:
+        """Where questions are taken; None if nobody asks."""
+        if self.ask is None and self.gate.mode != "request":
+            return None
+        endpoint = None if self.ask is None else self.ask.endpoint
+        return endpoint or f"ipc:///run/graspd/{self.hand.name}.ask.ipc"
 
     @property
     def session_path(self) -> Path:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import selectors
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import State, Verdict
+from daemon.questions import Questions
 from daemon.reporter import Reporter
 from daemon.stop import StopSignal
 from drivers.base import Driver, JointReading, TactileReading
+
+if TYPE_CHECKING:
+    from daemon.questions import Questions
 
 STATUS_PERIOD_NS = 1_000_000_000
 """Status goes out this often, ns, even when nothing happens."""
@@ -35,11 +40,13 @@ class Service:
         max_age_ns: int,
         listener: Listener | None = None,
         chore: Callable[[], None] | None = None,
+        questions: Questions | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
 
-        `chore` is done before readings are judged, and once a second.
+        `chore` is done before readings are judged, and once a second. `questions` are answered
+        with the next verdict, or if a grasp is judged on request only, when it has been.
         """
         self._drivers = drivers
         self._tactile = drivers[0]
@@ -48,6 +55,7 @@ class Service:
         self._stop = stop
         self._listener = listener
         self._chore = chore
+        self._questions = questions
         self._clock = clock
         self._max_age_ns = max_age_ns
         self._state = State.RUNNING
@@ -64,6 +72,8 @@ class Service:
             with selectors.SelectSelector() as selector:
                 selector.register(self._stop, selectors.EVENT_READ)
                 while self._stop.received is None and not self._tactile.exhausted:
+                    # Now, and not when the descriptor says so: sending an answer quietens it.
+                    self._take_questions()
                     self._wait(selector)
                     if not self._take_readings():
                         self._mind_silence()
@@ -77,12 +87,16 @@ class Service:
         """Sleep until a driver, a timer or a signal wants attention."""
         descriptors = (driver.fileno() for driver in self._drivers)
         wanted = {descriptor for descriptor in descriptors if descriptor is not None}
+        if self._questions is not None:
+            wanted.add(self._questions.fileno())
         watched = {key.fd for key in selector.get_map().values()} - {self._stop.fileno()}
         for former in watched - wanted:
             selector.unregister(former)
         for descriptor in wanted - watched:
             selector.register(descriptor, selectors.EVENT_READ)
         dues_ns = [driver.due_ns() for driver in self._drivers]
+        if self._questions is not None:
+            dues_ns.append(self._questions.due_ns())
         due_ns = min(
             self._silence_due_ns, self._status_due_ns, *(due for due in dues_ns if due is not None)
         )
@@ -106,19 +120,39 @@ class Service:
             self._silence_due_ns = received_ns + self._silence_ns()
             self._readings_since_status += 1
             taken = True
+            self._answer(verdict, payload)
             if self._listener is not None:
                 self._listener(verdict, payload, reading)
         return taken
 
+    def _take_questions(self) -> None:
+        if self._questions is not None and self._questions.take(self._clock()):
+            self._pipeline.ask()
+
+    def _answer(self, verdict: Verdict, payload: bytes) -> None:
+        """Answer who asked, if this verdict is what they wait for or they have waited too long."""
+        if self._questions is None:
+            return
+        due_ns = self._questions.due_ns()
+        if due_ns is None:
+            return
+        if verdict.judged or not self._pipeline.on_request or self._clock() >= due_ns:
+            self._questions.answer(payload)
+
     def _mind_silence(self) -> None:
         now_ns = self._clock()
-        if now_ns < self._silence_due_ns or self._tactile.exhausted:
+        asked_ns = None if self._questions is None else self._questions.due_ns()
+        is_asked = asked_ns is not None and now_ns >= asked_ns
+        is_silent = now_ns >= self._silence_due_ns
+        if not (is_silent or is_asked) or self._tactile.exhausted:
             return
-        self._state = State.SILENT
-        self._silence_due_ns = now_ns + self._silence_ns()
+        if is_silent:
+            self._state = State.SILENT
+            self._silence_due_ns = now_ns + self._silence_ns()
         verdict, payload = self._reporter.verdict(
             self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
         )
+        self._answer(verdict, payload)
         if self._listener is not None:
             self._listener(verdict, payload, None)
 

@@ -84,14 +84,31 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
             f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
             f"{wanted.model.slip_threshold:g} on{_rejects(wanted, model)}"
         ),
-        "gate": f"{wanted.gate.mode} reading, not older than {wanted.gate.max_age_ms:g} ms",
-        "publish": f"verdict.{wanted.hand.name}, status.{wanted.hand.name} on {wanted.endpoint}",
+        "gate": _gate(wanted),
+        "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
     }
+    if wanted.ask_endpoint is not None:
+        parts["ask"] = f"on {wanted.ask_endpoint}, answered within {wanted.gate.request_ms:g} ms"
     if wanted.joints is not None:
         parts["joints"] = _section(wanted.joints)
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
     return parts
+
+
+def _gate(wanted: scene.Scene) -> str:
+    limits, gate = assembly.grip_limits(wanted), wanted.gate
+    age = f"not older than {gate.max_age_ms:g} ms"
+    if limits is None:
+        return f"every reading, {age}"
+    what = "one reading" if limits.sweeps == 1 else f"median of {limits.sweeps} fresh readings"
+    when = "when asked, " if limits.on_request else ""
+    joints = "" if limits.joints is None else f", joints below {gate.joint_rad_per_s:g} rad/s"
+    fingers = ", ".join(gate.fingers or wanted.hand.fingers)
+    return (
+        f"{when}once per grasp: {fingers} touch, still below {gate.rate_counts_per_s:g} counts/s"
+        f"{joints} for {gate.hold_ms:g} ms; {what}, {age}"
+    )
 
 
 def _rejects(wanted: scene.Scene, model: TactileModel) -> str:
@@ -101,7 +118,7 @@ def _rejects(wanted: scene.Scene, model: TactileModel) -> str:
 
 def _session(wanted: scene.Scene, needs: SessionInput) -> str:
     kept = f"kept in {wanted.session_path}" if wanted.keeps_session else "not kept"
-    learns = "by the readings" if wanted.session_learns else "by `graspd session seed`"
+    learns = "by what is judged" if wanted.session_learns else "by `graspd session seed`"
     return f"calibrated {learns}, from {needs.calibrated_from:g} grasps on, {kept}"
 
 
@@ -119,6 +136,8 @@ def _what_is_left_out(wanted: scene.Scene, model: TactileModel) -> dict[str, str
     left_out["drivers"] = f"{', '.join(others)}: not imported"
     if wanted.joints is None:
         left_out["joints"] = "no joint code"
+    if assembly.grip_limits(wanted) is None:
+        left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
     if not isinstance(model.contract.input, SessionInput):
         left_out["session"] = f"{model.contract.name} needs no session calibration"
     without = [name for name in get_args(Finger) if name not in wanted.hand.fingers]

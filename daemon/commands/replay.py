@@ -9,11 +9,12 @@ from pathlib import Path
 
 from daemon import assembly, scene
 from daemon.arguments import positive, within
+from daemon.binding import PublishError
 from daemon.endpoint import check_endpoint
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import Verdict
 from daemon.printer import Printer
-from daemon.publisher import Publisher, PublishError
+from daemon.publisher import Publisher
 from daemon.reporter import Reporter
 from daemon.service import Listener, Service
 from daemon.session_file import SessionFileError, load, statistics_of

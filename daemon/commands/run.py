@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon import assembly, scene
+from daemon.binding import PublishError
 from daemon.judge.pipeline import Pipeline
 from daemon.printer import Printer
-from daemon.publisher import Publisher, PublishError
+from daemon.publisher import Publisher
 from daemon.reporter import Reporter
 from daemon.service import Service
 from daemon.stop import StopSignal
@@ -20,6 +21,7 @@ from drivers.base import Driver, DriverError, RecordingError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
+    from daemon.questions import Questions
     from daemon.session_keeper import SessionKeeper
 
 log = logging.getLogger("graspd")
@@ -65,6 +67,7 @@ def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None
             max_age_ns=wanted.max_age_ns,
             listener=printer.verdict if printer else None,
             chore=None if keeper is None else keeper.mind,
+            questions=_questions(wanted, stack),
         )
         try:
             service.run()
@@ -73,6 +76,17 @@ def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None
                 keeper.save()
             if printer is not None:
                 printer.summary()
+
+
+def _questions(wanted: scene.Scene, stack: ExitStack) -> Questions | None:
+    """Who takes questions; None if the scene takes none. Raises `PublishError`."""
+    if wanted.ask_endpoint is None:
+        return None
+    from daemon.questions import Questions
+
+    log.info("questions on %s", wanted.ask_endpoint)
+    patience_ns = round(wanted.gate.request_ms * 1e6)
+    return stack.enter_context(Questions(wanted.ask_endpoint, patience_ns))
 
 
 def _keeper(

@@ -26,7 +26,7 @@ CHANGES_MAX = 64
 class GateLimits:
     """When a grasp has settled, and when it is another one. Times in ns, counts raw."""
 
-    hold_ns: int = 80_000_000
+    hold_ns: int = 60_000_000
     """Touch and stillness must last so long."""
     rate_window_ns: int = 80_000_000
     """Motion is the difference to the sweep so long ago."""

@@ -45,6 +45,8 @@ class Grip:
     def __init__(self, fingers: Sequence[Finger], limits: GripLimits) -> None:
         """`fingers` are those of the readings, in their order."""
         required = fingers if limits.required is None else limits.required
+        self.on_request = limits.on_request
+        """Whether a settled grasp is judged only when somebody asks."""
         self._fingers = tuple(fingers)
         self._required = np.array([finger in required for finger in fingers])
         self._gap_ns = limits.gate.gap_ns

@@ -104,6 +104,16 @@ class Pipeline:
         self._learnt_grasp = 0
         self._opinion = NO_OPINION
 
+    @property
+    def on_request(self) -> bool:
+        """Whether a settled grasp is judged only when somebody asks."""
+        return self.grip is not None and self.grip.on_request
+
+    def ask(self) -> None:
+        """The controller wants to know."""
+        if self.grip is not None:
+            self.grip.ask()
+
     def turn(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self.grip is not None:

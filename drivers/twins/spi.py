@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import select
@@ -189,6 +190,10 @@ class SpiTwin:
         self._master = self._slave = None
         self._unsent.clear()
         self._unsent_bytes = 0
+
+    def pull_fingers(self, *fingers: int) -> None:
+        """From now on nothing drives the lines of these fingers, and of no others."""
+        self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
     def fileno(self) -> int | None:
         """Descriptor on which the host's bytes come, None while unplugged."""

@@ -110,7 +110,7 @@ def test_check_says_what_is_in_and_what_is_left_out() -> None:
     assert people.returncode == 0, people.stderr
     assert "fine" in people.stdout
     content = json.loads(graspd("check", scene, "--json").stdout)
-    assert "synthetic_grasps.csv" in content["in"]["tactile"]
+    assert "synthetic_stream.csv" in content["in"]["tactile"]
     assert "small-session" in content["in"]["model"]
     assert "not kept" in content["in"]["session"]
     assert "rf, lf" in content["left_out"]["fingers"]

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.publisher import Publisher, PublishError
+from daemon.binding import PublishError
+from daemon.publisher import Publisher
 from daemon.stop import StopSignal
 
 WAIT_MS = 5000

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publisher import Publisher, PublishError
+from daemon.binding import PublishError
+from daemon.publisher import Publisher
 from daemon.socket_file import SocketFile
 
 

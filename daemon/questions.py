@@ -1,0 +1,103 @@
+"""The socket on which a grasp controller asks: is the grasp stable, now?"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Self
+
+import zmq
+
+from daemon.binding import PublishError, bind, socket_file
+
+QUESTION = b"judge"
+FRAMES_MAX = 3
+"""Of a question: who asks, an empty frame from a REQ socket, the question."""
+MESSAGE_MAX_BYTES = 64
+"""A peer that sends more asks nothing and is disconnected."""
+WAITING_MAX = 16
+"""Questions that wait for an answer; the oldest is given up for a newer one."""
+QUEUE_MAX = 16
+"""Messages queued per peer in either direction."""
+TAKEN_MAX = 64
+"""Messages taken in one round: a flood must not hold up the readings."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    envelope: tuple[bytes, ...]
+    due_ns: int
+
+
+class Questions:
+    """Takes questions and gives each one answer; never blocks."""
+
+    def __init__(self, endpoint: str, patience_ns: int) -> None:
+        """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
+        self.counters: Counter[str] = Counter()
+        """`asked`, `answered`, `given_up`, `malformed`."""
+        self._patience_ns = patience_ns
+        self._waiting: deque[_Question] = deque()
+        self._file = socket_file(endpoint)
+        self._context = zmq.Context(io_threads=1)
+        try:
+            self._socket = self._context.socket(zmq.ROUTER)
+            self._socket.linger = 0
+            self._socket.sndhwm = self._socket.rcvhwm = QUEUE_MAX
+            self._socket.maxmsgsize = MESSAGE_MAX_BYTES
+            bind(self._socket, endpoint, self._file)
+        except zmq.ZMQError as error:
+            self.close()
+            raise PublishError(f"cannot take questions on {endpoint}: {error.strerror}") from error
+
+    @property
+    def waiting(self) -> int:
+        """Questions without an answer."""
+        return len(self._waiting)
+
+    def fileno(self) -> int:
+        """Becomes readable when something may have come; then `take` until it gives 0."""
+        return int(self._socket.fileno())
+
+    def due_ns(self) -> int | None:
+        """When the oldest question must be answered, monotonic ns."""
+        return self._waiting[0].due_ns if self._waiting else None
+
+    def take(self, now_ns: int) -> int:
+        """Take in what has come; how many questions it was."""
+        taken = 0
+        for _ in range(TAKEN_MAX):
+            if not int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
+                break
+            *envelope, question = self._socket.recv_multipart(zmq.NOBLOCK)
+            delimiters = envelope[1:]
+            if question != QUESTION or delimiters not in ([], [b""]):
+                self.counters["malformed"] += 1
+                continue
+            if len(self._waiting) >= WAITING_MAX:
+                self._waiting.popleft()
+                self.counters["given_up"] += 1
+            self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
+            taken += 1
+        self.counters["asked"] += taken
+        return taken
+
+    def answer(self, payload: bytes) -> None:
+        """Answer all questions that wait; whoever is gone misses it."""
+        while self._waiting:
+            question = self._waiting.popleft()
+            self._socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
+            self.counters["answered"] += 1
+
+    def close(self) -> None:
+        """Close the socket and remove its file. May be called again."""
+        self._context.destroy()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()

@@ -1,0 +1,213 @@
+"""Questions to the daemon: each gets one answer, in time, and nothing that comes in hurts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon.binding import PublishError
+from daemon.judge.verdict import Outcome, Reason, Verdict, decode_verdict
+from daemon.questions import WAITING_MAX, Questions
+from drivers.replay import DEMO_RECORDING
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
+
+PATIENCE_NS = 1_000_000_000
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/ask"
+
+
+@pytest.fixture
+def questions(endpoint: str) -> Iterator[Questions]:
+    with Questions(endpoint, PATIENCE_NS) as questions:
+        yield questions
+
+
+Connect = Callable[..., "zmq.Socket[bytes]"]
+
+
+@pytest.fixture
+def connect() -> Iterator[Connect]:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    sockets: list[zmq.Socket[bytes]] = []
+
+    def connected(endpoint: str, kind: int = zmq.DEALER) -> zmq.Socket[bytes]:
+        socket = context.socket(kind)
+        sockets.append(socket)
+        socket.connect(endpoint)
+        return socket
+
+    yield connected
+    for socket in sockets:
+        socket.close(linger=0)
+    context.term()
+
+
+def take_until(questions: Questions, wanted: int) -> int:
+    deadline_s = time.monotonic() + 10.0
+    taken = 0
+    while taken < wanted and time.monotonic() < deadline_s:
+        taken += questions.take(0)
+    return taken
+
+
+@pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
+def test_a_question_gets_one_answer(
+    questions: Questions, endpoint: str, connect: Connect, kind: int
+) -> None:
+    asker = connect(endpoint, kind)
+    asker.send(b"judge")
+    assert take_until(questions, 1) == 1
+    assert questions.due_ns() == PATIENCE_NS
+    questions.answer(b"{}")
+    assert asker.poll(5000)
+    assert asker.recv_multipart() == [b"{}"]
+    assert questions.waiting == 0
+    assert questions.due_ns() is None
+    assert questions.counters == {"asked": 1, "answered": 1}
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [b""],
+        [b"Judge"],
+        [b"judge", b"judge"],
+        [b"", b"", b"judge"],
+        [b"judge", b""],
+        [b"\xff" * 60],
+    ],
+)
+def test_what_is_no_question_is_counted_and_not_answered(
+    questions: Questions,
+    endpoint: str,
+    connect: Connect,
+    frames: list[bytes],
+) -> None:
+    asker = connect(endpoint)
+    asker.send_multipart(frames)
+    asker.send(b"judge")
+    assert take_until(questions, 1) == 1
+    questions.answer(b"{}")
+    assert asker.poll(5000)
+    assert asker.recv() == b"{}"
+    assert not asker.poll(50)
+    assert questions.counters["malformed"] == 1
+
+
+def test_a_peer_that_sends_too_much_is_cut_off_and_others_are_not(
+    questions: Questions, endpoint: str, connect: Connect
+) -> None:
+    loud, polite = connect(endpoint), connect(endpoint)
+    loud.send(b"x" * 100_000)
+    polite.send(b"judge")
+    assert take_until(questions, 1) == 1
+    questions.answer(b"{}")
+    assert polite.poll(5000)
+
+
+def test_a_flood_of_questions_is_bounded_and_the_newest_are_answered(
+    questions: Questions, endpoint: str, connect: Connect
+) -> None:
+    for asker in [connect(endpoint) for _ in range(10)]:
+        for _ in range(5):
+            asker.send(b"judge")
+    assert take_until(questions, 50) == 50
+    assert questions.waiting == WAITING_MAX
+    assert questions.counters["given_up"] == 50 - WAITING_MAX
+    questions.answer(b"{}")
+    assert questions.counters["answered"] == WAITING_MAX
+
+
+def test_whoever_asks_and_goes_does_no_harm(
+    questions: Questions, endpoint: str, connect: Connect
+) -> None:
+    asker = connect(endpoint)
+    asker.send(b"judge")
+    assert take_until(questions, 1) == 1
+    asker.close(linger=0)
+    time.sleep(0.1)
+    questions.answer(b"{}")
+    assert questions.waiting == 0
+
+
+def test_an_endpoint_that_is_taken_is_refused(questions: Questions, endpoint: str) -> None:
+    assert questions.waiting == 0
+    with pytest.raises(PublishError, match="another graspd"):
+        Questions(endpoint, PATIENCE_NS)
+
+
+def scene(folder: Path, mode: str) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[gate]\nmode = "{mode}"\nrequest_ms = 800.0\n[model]\nname = "cnn1"\n'
+        f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
+    )
+    return path
+
+
+def ask(asker: zmq.Socket[bytes]) -> tuple[Verdict, float]:
+    """One answer, and how long it took, s."""
+    asked_s = time.monotonic()
+    asker.send(b"judge")
+    assert asker.poll(5000)
+    return decode_verdict(asker.recv()), time.monotonic() - asked_s
+
+
+def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown_in_time(
+    tmp_path: Path, connect: Connect
+) -> None:
+    with start("run", scene(tmp_path, "request")) as daemon:
+        wait_for(tmp_path / "ask")
+        asker = connect(f"ipc://{tmp_path}/ask", zmq.REQ)
+        answers: list[Verdict] = []
+        deadline_s = time.monotonic() + 25.0
+        while time.monotonic() < deadline_s and len([a for a in answers if a.valid]) < 2:
+            answer, took_s = ask(asker)
+            answers.append(answer)
+            assert took_s < 0.8 + 0.5  # the deadline, and a machine that is busy
+            assert answer.valid == (answer.judged and answer.verdict is not Outcome.UNKNOWN)
+        daemon.terminate()
+        daemon.communicate(timeout=TIMEOUT_S)
+    assert len([answer for answer in answers if answer.valid]) >= 2
+    for answer in answers:
+        assert answer.valid or answer.reasons
+        if not answer.judged:
+            assert answer.verdict is Outcome.UNKNOWN
+
+
+def test_nothing_is_judged_in_request_mode_unless_somebody_asks(
+    tmp_path: Path, connect: Connect
+) -> None:
+    with start("run", scene(tmp_path, "request")) as daemon:
+        wait_for(tmp_path / "graspd")
+        listener = connect(f"ipc://{tmp_path}/graspd", zmq.SUB)
+        listener.subscribe("verdict.")
+        verdicts = []
+        for _ in range(450):  # two grasps
+            assert listener.poll(5000)
+            verdicts.append(decode_verdict(listener.recv_multipart()[1]))
+        daemon.terminate()
+        daemon.communicate(timeout=TIMEOUT_S)
+    assert not any(verdict.judged or verdict.valid for verdict in verdicts)
+    assert Reason.NOT_ASKED in {reason for verdict in verdicts for reason in verdict.reasons}
+
+
+def test_in_other_modes_the_answer_is_the_verdict_of_the_next_reading(
+    tmp_path: Path, connect: Connect
+) -> None:
+    with start("run", scene(tmp_path, "settled")) as daemon:
+        wait_for(tmp_path / "ask")
+        asker = connect(f"ipc://{tmp_path}/ask", zmq.REQ)
+        answers = [ask(asker) for _ in range(5)]
+        daemon.terminate()
+        daemon.communicate(timeout=TIMEOUT_S)
+    assert [answer.seq for answer, _ in answers] == sorted({answer.seq for answer, _ in answers})
+    assert all(took_s < 0.5 for _, took_s in answers[1:])
