@@ -44,7 +44,8 @@ class ContactLimits:
     """What a touch is: the larger of both, for the third deepest electrode of a finger."""
 
     counts: float = 20.0
-    """Fall below the baseline, counts. In 9.8 s of three untouched sensors it was 9 at most."""
+    """Fall below the baseline, counts. In 9.8 s of three untouched sensors it was 10 at most; from
+    24 on a touch of three electrodes was always seen there (thresholds were 20 to 22)."""
     sigmas: float = 5.0
     """The same in standard deviations of the finger's median electrode."""
 
@@ -62,7 +63,8 @@ class Contact:
         self._threshold = np.full(fingers, limits.counts)
         self.fall = np.zeros(fingers)
         """Counts by which each finger's third deepest electrode is below its baseline, and below
-        the finger's median electrode: the smaller of both. Zero without a baseline."""
+        the finger's median electrode: the smaller of both, and the latter alone where the finger
+        touches already, for in a long hold the sensors drift. Zero without a baseline."""
         self.touching = np.zeros(fingers, dtype=np.bool_)
         self.tared = np.zeros(fingers, dtype=np.bool_)
         """Whether each finger has a baseline. Without one, nobody knows whether it touches."""
@@ -95,8 +97,10 @@ class Contact:
         needed = np.where(self.touching, LET_GO, 1.0) * self._threshold
         self.touching = enough & (self.fall >= needed)
         may_touch = self.fall >= SUSPECT * self._threshold
+        # With too few electrodes nobody knows any more: to find out, it must be tared again.
+        self.tared &= enough
         for finger, tare in enumerate(self._tares):
-            if self.tared[finger] and (may_touch[finger] or not enough[finger]):
+            if self.tared[finger] and may_touch[finger]:
                 tare.clear()
             elif tare.add(counts[finger], usable[finger]):
                 self._settle(finger, tare, t_ns)
@@ -109,7 +113,8 @@ class Contact:
         fall = np.zeros(len(falls))
         for finger in np.flatnonzero(number >= SOUND_MIN):
             deep = falls[finger, number[finger] - FALLEN]
-            fall[finger] = min(deep, deep - falls[finger, number[finger] // 2])
+            relative = deep - falls[finger, number[finger] // 2]
+            fall[finger] = relative if self.touching[finger] else min(deep, relative)
         return fall
 
     def _settle(self, finger: int, tare: _Tare, t_ns: int) -> None:

@@ -31,7 +31,7 @@ class FreshMedian:
         self._number.fill(0)
 
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
-        """Take in one sweep, shape (fingers, 24); what is not `usable` is left out.
+        """Take in one sweep, shape (fingers, 24); what is not `usable` is forgotten.
 
         A value that repeats the one before is taken for held, so not fresh; the next one counts
         again: a held value of 71.43 Hz data is never held twice, and a quiet electrode repeats
@@ -39,6 +39,7 @@ class FreshMedian:
         """
         self._held = (counts == self._last) & ~self._held
         fresh = usable & ~self._held
+        self._number[~usable] = 0
         oldest, middle, newest = self._values
         first = fresh & (self._number == 0)
         np.copyto(oldest, middle, where=fresh)

@@ -1,7 +1,9 @@
 """The gate: the moment between "the fingers have closed" and "the hand lifts", as a state machine.
 
-    idle -> closing -> settled -> judged -> released -> idle
-              ^-----------+---------+   (moved, lost a finger, or a gap in the readings)
+    idle -> closing -> settled -> judged
+              ^           |         |     moved, changed, lost a finger, or a gap in the readings:
+              +-----------+---------+     back to closing; asked again: from judged to settled
+    closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
 
 A grasp begins with the first touch and ends when nothing touches any more. It is judged once, when
 all fingers touch and everything has kept still for the hold time, and again when it has changed.
@@ -149,7 +151,8 @@ class Gate:
         if self.state is GateState.JUDGED:
             self._follow_judged(t_ns, median, usable)
         elif self.state is GateState.SETTLED and reasons:
-            self._enter(GateState.CLOSING, t_ns, GateCause.MOVED)
+            cause = GateCause.MOVED if self.in_contact else GateCause.CONTACT_LOST
+            self._enter(GateState.CLOSING, t_ns, cause)
         self._against = (*reasons, *self._hold(t_ns, bool(reasons)))
 
     def _disturbances(
@@ -215,6 +218,10 @@ class Gate:
 
     def _restart(self, t_ns: int) -> None:
         """Nobody knows what happened meanwhile, or time went back."""
+        if self._last_ns is not None and t_ns < self._last_ns:
+            self._released_ns = t_ns
+            if self._asked_until_ns is not None:
+                self._asked_until_ns = t_ns + self._limits.request_ns
         self._last_ns = t_ns
         self._held_since_ns = None
         self._stillness.reset()

@@ -39,51 +39,59 @@ class JointMotion:
         """Nothing is known yet; the time for `lost_ns` runs from the first sweep on."""
         self._limits = limits
         self._past: dict[tuple[str, ...], deque[tuple[int, NDArray[np.float64]]]] = {}
-        self._last_ns: int | None = None
-
-    @property
-    def heard(self) -> bool:
-        """Whether any angle ever came."""
-        return bool(self._past)
+        """Angles of each set of joints that is heard of."""
+        self._latest_ns: dict[tuple[str, ...], int] = {}
+        self._waits_since_ns: int | None = None
+        """Since when no joint was heard of."""
 
     def observe(self, reading: JointReading, t_ns: int) -> None:
         """Take in the angles of `t_ns`, on the same clock as the sweeps; those all NaN are none."""
         if np.isnan(reading.position_rad).all():
             return
-        past = self._past.get(reading.names)
-        if past is None:
-            if len(self._past) >= SOURCES_MAX:
-                self._past.clear()
-            past = self._past[reading.names] = deque(maxlen=ANGLES + 2)
-        if past and t_ns < past[-1][0]:
-            past.clear()  # time went back: what was before cannot be compared with
-        self._last_ns = t_ns
+        names = reading.names
+        if names not in self._past and len(self._past) >= SOURCES_MAX:
+            self._forget()
+        past = self._past.setdefault(names, deque(maxlen=ANGLES + 2))
+        latest_ns = self._latest_ns.get(names, t_ns)
+        if not 0 <= t_ns - latest_ns <= self._limits.late_ns:
+            past.clear()  # time went back, or nobody knows what the joints did meanwhile
+        self._latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
             past.append((t_ns, reading.position_rad))
 
     def against(self, t_ns: int) -> Reason | None:
         """What the joints say against settling at `t_ns`; None if they are still, or are lost."""
-        if self._last_ns is None:
-            self._last_ns = t_ns
-        age_ns = t_ns - self._last_ns
-        if age_ns > self._limits.lost_ns:
-            return None
-        if not self._past or abs(age_ns) > self._limits.late_ns:
+        self._drop_lost(t_ns)
+        if not self._past:
+            if self._waits_since_ns is None or self._waits_since_ns > t_ns:
+                self._waits_since_ns = t_ns
+            return None if self.is_lost(t_ns) else Reason.JOINTS_LATE
+        if any(t_ns - at_ns > self._limits.late_ns for at_ns in self._latest_ns.values()):
             return Reason.JOINTS_LATE
-        return (
-            None
-            if all(self._is_still(past, t_ns) for past in self._past.values())
-            else Reason.MOVING
-        )
+        return None if all(map(self._is_still, self._past.values())) else Reason.MOVING
 
     def is_lost(self, t_ns: int) -> bool:
         """Whether judging goes on without the joints at `t_ns`."""
-        return self._last_ns is not None and t_ns - self._last_ns > self._limits.lost_ns
+        return (
+            not self._past
+            and self._waits_since_ns is not None
+            and t_ns - self._waits_since_ns > self._limits.lost_ns
+        )
 
-    def _is_still(self, past: deque[tuple[int, NDArray[np.float64]]], t_ns: int) -> bool:
+    def _drop_lost(self, t_ns: int) -> None:
+        """Forget joints that no longer come, and those of a time that has gone back."""
+        for names, latest_ns in list(self._latest_ns.items()):
+            if -self._limits.late_ns <= t_ns - latest_ns <= self._limits.lost_ns:
+                continue
+            del self._past[names], self._latest_ns[names]
+            self._waits_since_ns = min(latest_ns, t_ns)
+
+    def _forget(self) -> None:
+        self._past.clear()
+        self._latest_ns.clear()
+
+    def _is_still(self, past: deque[tuple[int, NDArray[np.float64]]]) -> bool:
         now_ns, now = past[-1]
-        if t_ns - now_ns > self._limits.lost_ns:
-            return True  # a sender that no longer sends these
         while len(past) > 2 and now_ns - past[1][0] >= self._limits.window_ns:
             past.popleft()
         then_ns, then = past[0]

@@ -13,7 +13,6 @@ from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.health import Health, Watched
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
-from daemon.judge.session import SessionCalibration
 from daemon.judge.verdict import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
@@ -24,6 +23,7 @@ from models.runtime import TactileModel
 if TYPE_CHECKING:
     from daemon.judge.gate import GateChange
     from daemon.judge.grip import Grip, GripLimits
+    from daemon.judge.session import SessionCalibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,7 +232,10 @@ def _grip(fingers: Sequence[Finger], limits: GripLimits) -> Grip:
 
 
 def _session(model: TactileModel, electrodes: Electrodes) -> SessionCalibration | None:
+    """Imported only where the model has a session."""
     wanted, inputs = model.contract.input, model.inputs
     if not (isinstance(wanted, SessionInput) and isinstance(inputs, SessionBuilder)):
         return None
+    from daemon.judge.session import SessionCalibration
+
     return SessionCalibration(wanted, inputs, electrodes.centre, electrodes.spread)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.health import too_many
-from daemon.judge.session import SessionCalibration
 from daemon.judge.verdict import Reason
 from drivers.base import COUNT_MAX
 from models.contract import SeenCounts
 from models.electrodes import Electrodes
 from models.seen import SeenCheck
+
+if TYPE_CHECKING:
+    from daemon.judge.session import SessionCalibration
 
 CONTRADICTING_MAX = 2
 """Electrodes that may contradict the others without anything else being known against them. Of

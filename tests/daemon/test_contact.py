@@ -1,0 +1,416 @@
+"""Tare and contact, on a real recording of untouched sensors and on streams with its noise."""
+
+from __future__ import annotations
+
+import copy
+import gc
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.contact import Contact
+from daemon.judge.fresh import FreshMedian
+from drivers.twins.grasps import recorded_counts
+from tests.conftest import data_dir
+
+FF, MF, TH = 0, 1, 2
+PERIOD_NS = 10_000_000
+NOISE = 3.5
+"""Counts, standard deviation of an untouched electrode (facts: 2.9 to 4.3)."""
+DRIFT = 0.7
+"""Counts/s, of warming up (facts: 0.56 to 0.84, all electrodes alike)."""
+PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
+"""Share of a touch's depth that each electrode feels: eight all of it, the others a fifth."""
+ALL = np.ones((3, 24), dtype=np.bool_)
+
+Counts = NDArray[np.uint16]
+
+
+class Hand:
+    """Feeds a hand's sweeps, 10 ms apart, to fresh values and contact."""
+
+    def __init__(self) -> None:
+        self.contact = Contact(3)
+        self.fresh = FreshMedian((3, 24))
+        self.t_ns = 10**12
+
+    def feel(self, counts: Counts, usable: NDArray[np.bool_] = ALL) -> None:
+        self.fresh.push(counts, usable)
+        self.contact.observe(self.t_ns, counts, self.fresh.counts, usable)
+        self.t_ns += PERIOD_NS
+
+    def play(self, sweeps: Counts, usable: NDArray[np.bool_] = ALL) -> NDArray[np.bool_]:
+        """Which fingers touched in each sweep, shape (sweeps, fingers)."""
+        touching = np.zeros((len(sweeps), 3), dtype=np.bool_)
+        for place, counts in enumerate(sweeps):
+            self.feel(counts, usable)
+            touching[place] = self.contact.touching
+        return touching
+
+
+def at_rest() -> NDArray[np.float64]:
+    return np.random.default_rng(1).uniform(2400.0, 3400.0, (3, 24))
+
+
+def noisy(mean: NDArray[np.float64], seed: int = 0) -> Counts:
+    """Counts around `mean`, shape (sweeps, 3, 24), as an untouched sensor wavers."""
+    noise = np.random.default_rng(seed).normal(0.0, NOISE, mean.shape)
+    return np.clip(np.rint(mean + noise), 1, 4094).astype(np.uint16)
+
+
+def still(seconds: float, seed: int = 0) -> Counts:
+    return noisy(np.broadcast_to(at_rest(), (round(seconds * 100), 3, 24)), seed)
+
+
+def touched(seconds: float, depth: float, seed: int = 0) -> Counts:
+    """All fingers are pressed at once by `depth` counts."""
+    mean = np.broadcast_to(at_rest() - depth * PRESSED, (round(seconds * 100), 3, 24))
+    return noisy(mean, seed)
+
+
+def as_sampled(recorded: Counts, changed: NDArray[np.int64]) -> Counts:
+    """What a palm that held values where `recorded` repeats would have read of `changed`."""
+    sampled = changed.copy()
+    for sweep in range(1, len(sampled)):
+        held = recorded[sweep] == recorded[sweep - 1]
+        sampled[sweep][held] = sampled[sweep - 1][held]
+    return sampled.astype(np.uint16)
+
+
+@pytest.fixture(scope="module")
+def untouched() -> Counts:
+    """9.8 s of three untouched sensors at 100 Hz, shape (977, 3, 24)."""
+    folder = data_dir()
+    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
+        pytest.skip("the real recording of an untouched hand is not there")
+    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
+
+
+@pytest.mark.parametrize("direction", [1, -1], ids=["forward", "backward"])
+def test_nothing_touches_in_a_real_untouched_recording_five_times_in_a_row(
+    untouched: Counts, direction: int
+) -> None:
+    hand = Hand()
+    played = np.tile(untouched[::direction], (5, 1, 1))
+    assert not hand.play(played[:100]).any()
+    assert hand.contact.tared.all(), "one second is enough for a tare"
+    falls = []
+    for counts in played[100:]:
+        hand.feel(counts)
+        falls.append(hand.contact.fall)
+        assert not hand.contact.touching.any()
+        assert hand.contact.tared.all()
+    assert np.max(falls) < 11.0, "the third deepest fall leaves half of the threshold free"
+
+
+def test_baseline_and_threshold_are_those_of_the_real_noise(untouched: Counts) -> None:
+    hand = Hand()
+    hand.play(untouched[:100])
+    window = untouched[:100].astype(np.float64)
+    baseline = np.median(window, axis=0)
+    sigma = 1.4826 * np.median(np.abs(window - baseline), axis=0)
+    np.testing.assert_allclose(hand.contact.baseline, baseline)
+    expected = np.maximum(20.0, 5.0 * np.median(sigma, axis=1))
+    np.testing.assert_allclose(hand.contact.threshold, expected, rtol=1e-6)
+
+
+@dataclass
+class Place:
+    """Where in the recording three electrodes are pressed, and what was felt up to there."""
+
+    sweep: int
+    finger: int
+    electrodes: NDArray[np.int64]
+    hand: Hand
+
+
+@pytest.fixture(scope="module")
+def places(untouched: Counts) -> list[Place]:
+    random = np.random.default_rng(5)
+    hand, found = Hand(), []
+    chosen = set(random.choice(np.arange(150, 900), 50, replace=False).tolist())
+    for sweep, counts in enumerate(untouched):
+        if sweep in chosen:
+            electrodes = random.choice(24, 3, replace=False)
+            finger = int(random.integers(3))
+            found.append(Place(sweep, finger, electrodes, copy.deepcopy(hand)))
+        hand.feel(counts)
+    return found
+
+
+def seen_after(place: Place, untouched: Counts, depth: int, sweeps: int = 50) -> int | None:
+    """Sweeps until three electrodes lowered by `depth` are a touch; None if they never are."""
+    recorded = untouched[place.sweep - 1 : place.sweep + sweeps]
+    lowered = recorded.astype(np.int64)
+    lowered[1:, place.finger, place.electrodes] -= depth
+    touching = copy.deepcopy(place.hand).play(as_sampled(recorded, lowered)[1:])
+    assert not np.delete(touching, place.finger, axis=1).any(), "no other finger touches"
+    felt = touching[:, place.finger]
+    return int(felt.argmax()) if felt.any() else None
+
+
+def test_three_electrodes_lowered_by_10_counts_are_never_a_touch(
+    untouched: Counts, places: list[Place]
+) -> None:
+    assert {seen_after(place, untouched, 10) for place in places} == {None}
+
+
+def test_three_electrodes_lowered_by_24_counts_are_always_seen_within_half_a_second(
+    untouched: Counts, places: list[Place]
+) -> None:
+    assert len(places) == 50
+    assert None not in [seen_after(place, untouched, 24) for place in places]
+    assert None in [seen_after(place, untouched, 22) for place in places], "24 is about the least"
+
+
+def test_three_electrodes_lowered_by_30_counts_are_always_seen_within_fifty_milliseconds(
+    untouched: Counts, places: list[Place]
+) -> None:
+    after = [seen_after(place, untouched, 30, sweeps=20) for place in places]
+    assert max(99 if sweeps is None else sweeps for sweeps in after) <= 5
+
+
+@pytest.mark.parametrize(
+    ("electrodes", "sweeps"), [(1, 1), (1, 2), (1, 5), (1, 50), (2, 1), (2, 2)]
+)
+def test_spikes_of_one_or_two_electrodes_never_make_a_touch(
+    untouched: Counts, electrodes: int, sweeps: int
+) -> None:
+    random = np.random.default_rng(7)
+    spiked = untouched.astype(np.int64)
+    for start in range(100, 900, sweeps + 10):
+        for finger in range(3):
+            where = random.choice(24, electrodes, replace=False)
+            spiked[start : start + sweeps, finger, where] -= 150
+    assert not Hand().play(as_sampled(untouched, spiked)).any()
+
+
+@pytest.mark.parametrize("seconds", [0.5, 2.0])
+def test_a_sag_of_all_electrodes_is_no_touch(untouched: Counts, seconds: float) -> None:
+    sweeps = np.arange(len(untouched))
+    fall = np.interp(sweeps, [300, 300 + 100 * seconds, 600, 600 + 100 * seconds], [0, 300, 300, 0])
+    sagged = untouched - np.rint(fall).astype(np.int64)[:, None, None]
+    hand = Hand()
+    assert not hand.play(as_sampled(untouched, sagged)).any()
+    assert hand.contact.tared.all()
+
+
+@pytest.mark.parametrize("edges", [[300, 301, 500, 700], [300, 500, 700, 701]])
+def test_a_sag_from_one_sweep_to_the_next_is_a_touch_for_three_sweeps_at_most(
+    untouched: Counts, edges: list[int]
+) -> None:
+    # Held electrodes follow a sweep or two later than the others; too short a time to settle in.
+    fall = np.interp(np.arange(len(untouched)), edges, [0, 300, 300, 0])
+    sagged = untouched - np.rint(fall).astype(np.int64)[:, None, None]
+    assert (Hand().play(as_sampled(untouched, sagged)).sum(axis=0) <= 3).all()
+
+
+def test_a_touch_is_seen_while_all_electrodes_sag() -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    sunk = np.broadcast_to(at_rest() - 300.0, (50, 3, 24))
+    assert not hand.play(noisy(sunk, 1)).any()
+    assert hand.play(noisy(sunk - 50.0 * PRESSED, 2))[5:].all()
+
+
+@dataclass
+class TenMinutes:
+    """What was found in ten minutes at 100 Hz, and in the three seconds after them."""
+
+    touching: NDArray[np.bool_]
+    tared: NDArray[np.bool_]
+    baseline: NDArray[np.float64]
+    after: NDArray[np.bool_]
+    baseline_after: NDArray[np.float64]
+    hand: Hand
+
+
+def ten_minutes_mean(t_s: NDArray[np.float64], held: bool) -> NDArray[np.float64]:
+    """FF is untouched and warms up; MF warms up and is pressed if `held`; TH sinks by 3 counts/s.
+
+    Shape (times, 3, 24).
+    """
+    drift = np.array([DRIFT, DRIFT, -3.0]) * t_s[:, None]
+    pressed = np.zeros((3, 24))
+    pressed[MF] = 1000.0 * PRESSED if held else 0.0
+    mean: NDArray[np.float64] = at_rest() - pressed + drift[:, :, None]
+    return mean
+
+
+@pytest.fixture(scope="module")
+def ten_minutes() -> TenMinutes:
+    hand = Hand()
+    hand.play(still(1.5))
+    touching, tared = [], []
+    for second in range(600):
+        mean = ten_minutes_mean(second + np.arange(100) / 100, held=True)
+        touching.append(hand.play(noisy(mean, second)))
+        tared.append(hand.contact.tared.copy())
+    baseline = hand.contact.baseline.copy()
+    after = hand.play(noisy(ten_minutes_mean(600 + np.arange(300) / 100, held=False), 600))
+    return TenMinutes(
+        np.concatenate(touching),
+        np.array(tared),
+        baseline,
+        after,
+        hand.contact.baseline.copy(),
+        hand,
+    )
+
+
+def test_warming_up_for_ten_minutes_is_followed(ten_minutes: TenMinutes) -> None:
+    assert not ten_minutes.touching[:, FF].any()
+    assert ten_minutes.tared[:, FF].all()
+    # The median of the last second lags by half a second, the look at it by a quarter.
+    assert np.abs(ten_minutes.baseline[FF] - (at_rest()[FF] + 600.0 * DRIFT)).max() < 3.0
+
+
+def test_sinking_three_counts_per_second_as_a_whole_is_no_touch(ten_minutes: TenMinutes) -> None:
+    assert not ten_minutes.touching[:, TH].any()
+    assert ten_minutes.tared[:, TH].all()
+
+
+def test_a_firm_grasp_is_felt_for_ten_minutes_of_warming_up(ten_minutes: TenMinutes) -> None:
+    assert ten_minutes.touching[5:, MF].all()
+    assert np.abs(ten_minutes.baseline[MF] - at_rest()[MF]).max() < 3.0, "no tare while it touches"
+
+
+def test_after_a_grasp_of_ten_minutes_the_finger_is_tared_anew_within_three_seconds(
+    ten_minutes: TenMinutes,
+) -> None:
+    assert not ten_minutes.after[5:, MF].any()
+    expected = at_rest()[MF] + 600.0 * DRIFT
+    assert np.abs(ten_minutes.baseline_after[MF] - expected).max() < 4.0
+    light = ten_minutes_mean(np.full(20, 603.0), held=False) - 40.0 * PRESSED
+    touching = copy.deepcopy(ten_minutes.hand).play(noisy(light, 601))
+    assert touching[5:, MF].all(), "a light touch is seen at once"
+
+
+def test_a_light_grasp_is_felt_for_three_minutes_of_warming_up() -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    warmer = DRIFT * np.arange(18_000)[:, None, None] / 100
+    felt = hand.play(noisy(at_rest() - 100.0 * PRESSED + warmer))[5:]
+    lost = np.flatnonzero(~felt.all(axis=1))
+    assert len(lost) == 0, f"lost after {lost[0] / 100:.0f} s"
+
+
+def test_a_touch_that_grows_by_three_counts_per_second_is_not_tared_away() -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    depth = 3.0 * np.arange(3000)[:, None, None] / 100
+    touching = hand.play(noisy(at_rest() - depth * PRESSED))
+    assert touching[2500:].all()
+    assert not touching[:500].any()
+
+
+MOTIONS = {
+    "rising": lambda t: 30.0 * t,
+    "rising slowly": lambda t: 15.0 * t,
+    "sinking": lambda t: -30.0 * t,
+    "swaying slowly": lambda t: 40.0 * np.sin(2 * np.pi * 0.5 * t),
+    "shaking": lambda t: 20.0 * np.sin(2 * np.pi * 3.1 * t),
+}
+
+
+@pytest.mark.parametrize("motion", list(MOTIONS))
+def test_a_finger_that_moves_is_not_tared_until_it_rests(motion: str) -> None:
+    hand = Hand()
+    t_s = np.arange(300) / 100
+    moved = MOTIONS[motion](t_s)[:, None, None]
+    for counts in noisy(at_rest() + moved):
+        hand.feel(counts)
+        assert not hand.contact.tared.any()
+        assert not hand.contact.touching.any()
+    hand.play(noisy(np.broadcast_to(at_rest() + moved[-1], (150, 3, 24)), 1))
+    assert hand.contact.tared.all()
+
+
+def test_a_hand_that_never_opened_touches_nothing_until_it_opens() -> None:
+    hand = Hand()
+    assert not hand.play(touched(3.0, 500.0)).any()
+    assert not hand.play(still(2.0))[5:].any()
+    assert hand.play(touched(0.5, 40.0))[5:].all()
+
+
+def test_a_dead_electrode_makes_no_touch_and_hinders_none() -> None:
+    hand = Hand()
+    rest, touch = still(3.0), touched(0.5, 40.0)
+    rest[150:, FF, 0] = touch[:, FF, 0] = 137
+    usable = ALL.copy()
+    assert not hand.play(rest[:166]).any()
+    usable[FF, 0] = False  # found dead after 16 repetitions
+    assert not hand.play(rest[166:], usable).any()
+    assert hand.contact.tared.all()
+    assert hand.play(touch, usable)[5:].all()
+
+
+@pytest.mark.parametrize("rail", [0, 4095])
+@pytest.mark.parametrize("before_tare", [True, False])
+def test_railed_electrodes_make_no_touch_and_hinder_none(rail: int, before_tare: bool) -> None:
+    hand, usable = Hand(), ALL.copy()
+    usable[MF, [0, 3, 7, 20]] = False
+    rest, touch = still(4.0), touched(0.5, 40.0)
+    start = 0 if before_tare else 150
+    rest[start:, ~usable] = rail
+    touch[:, ~usable] = rail
+    assert not hand.play(rest[:start]).any()
+    assert not hand.play(rest[start:], usable).any()
+    assert hand.contact.tared.all()
+    assert hand.play(touch, usable)[5:].all()
+
+
+def test_an_electrode_that_comes_back_counts_again_after_the_next_tare() -> None:
+    hand, usable = Hand(), ALL.copy()
+    usable[FF] = PRESSED < 1.0  # the eight that a touch presses most are lost at first
+    hand.play(still(1.5) * usable, usable)
+    assert not hand.play(touched(0.3, 40.0) * usable, usable)[:, FF].any(), "others sink alike"
+    hand.play(still(2.0))
+    assert hand.play(touched(0.3, 40.0))[5:].all()
+
+
+@pytest.mark.parametrize("usable_electrodes", [11, 12])
+def test_fewer_than_twelve_usable_electrodes_never_touch(usable_electrodes: int) -> None:
+    hand, usable = Hand(), ALL.copy()
+    usable[FF, usable_electrodes:] = False
+    hand.play(still(1.5))
+    touching = hand.play(touched(0.5, 500.0), usable)
+    enough = usable_electrodes == 12
+    assert (touching[5:, FF] == enough).all()
+    assert touching[5:, [MF, TH]].all()
+    never_more = Hand()
+    never_more.play(still(1.5), usable)
+    assert never_more.contact.tared.tolist() == [enough, True, True]
+    assert never_more.play(touched(0.5, 500.0), usable)[:, FF].any() == enough
+
+
+def test_a_finger_that_loses_its_electrodes_lets_go() -> None:
+    hand, usable = Hand(), ALL.copy()
+    hand.play(still(1.5))
+    assert hand.play(touched(0.5, 500.0))[5:].all()
+    usable[TH, 5:] = False
+    assert hand.play(touched(0.1, 500.0), usable).tolist() == [[True, True, False]] * 10
+
+
+def test_letting_go_takes_less_than_six_tenths_of_a_touch() -> None:
+    hand = Hand()
+    hand.play(still(1.5))
+    # Third deepest against the median electrode: 0.8 of the depth; a touch takes 20, 12 keeps it.
+    assert hand.play(touched(0.5, 50.0))[5:].all()
+    assert hand.play(touched(1.0, 24.0)).all(), "19 keeps a touch"
+    assert not hand.play(touched(1.0, 6.0))[5:].any(), "5 does not"
+    assert not hand.play(touched(0.5, 12.0)).any(), "10 begins none"
+
+
+def test_memory_does_not_grow() -> None:
+    hand = Hand()
+    sweeps = np.concatenate([still(3.0), touched(2.0, 100.0)])
+    blocks = []
+    for _ in range(5):
+        hand.play(sweeps)
+        gc.collect()
+        blocks.append(sys.getallocatedblocks())
+    assert blocks[-1] - blocks[1] < 50, "1500 sweeps more"

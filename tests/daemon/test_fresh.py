@@ -1,0 +1,211 @@
+"""Median of three fresh values: against numpy, and on a real stream that holds its values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.fresh import FreshMedian
+from drivers.twins.grasps import recorded_counts
+from tests.conftest import data_dir
+
+SHAPE = (3, 24)
+ALL = np.ones(SHAPE, dtype=np.bool_)
+PAIRS = [(2 * pair + 1, 2 * pair + 2) for pair in range(11)]
+"""Places of E2 and E3 to E22 and E23, which a palm asks for together (facts, section 5.2)."""
+
+Counts = NDArray[np.uint16]
+
+
+@pytest.fixture(scope="module")
+def untouched() -> Counts:
+    """9.8 s of three untouched sensors at 100 Hz, held values of 71.43 Hz: shape (977, 3, 24)."""
+    folder = data_dir()
+    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
+        pytest.skip("the real recording of an untouched hand is not there")
+    return np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
+
+
+def play(fresh: FreshMedian, sweeps: Counts, usable: NDArray[np.bool_] = ALL) -> Counts:
+    """The median after each sweep, shape (sweeps, 3, 24)."""
+    medians = np.zeros(sweeps.shape, dtype=np.uint16)
+    for place, counts in enumerate(sweeps):
+        fresh.push(counts, usable)
+        medians[place] = fresh.counts
+    return medians
+
+
+def never_repeating(sweeps: int, seed: int = 0) -> Counts:
+    """Noise in which no value is that of the sweep before, shape (sweeps, 3, 24)."""
+    noise = np.random.default_rng(seed).integers(1000, 2000, (sweeps, *SHAPE))
+    return (2 * noise + np.arange(sweeps)[:, None, None] % 2).astype(np.uint16)
+
+
+def fresh_values(values: list[int]) -> list[int]:
+    """What counts by the definition: a value that repeats the one before does not, but the next."""
+    kept: list[int] = []
+    held = False
+    for place, value in enumerate(values):
+        held = place > 0 and value == values[place - 1] and not held
+        if not held:
+            kept.append(value)
+    return kept
+
+
+def held_pairs(untouched: Counts) -> NDArray[np.bool_]:
+    """Which pairs were not sampled in each sweep: all six values stayed; shape (977, 11)."""
+    same = np.zeros(untouched.shape, dtype=np.bool_)
+    same[1:] = untouched[1:] == untouched[:-1]
+    return np.stack([same[:, :, pair].all(axis=(1, 2)) for pair in PAIRS], axis=1)
+
+
+def test_median_of_three_is_that_of_numpy_on_fresh_values() -> None:
+    sweeps = never_repeating(300)
+    medians = play(FreshMedian(SHAPE), sweeps)
+    windows = np.stack([sweeps[:-2], sweeps[1:-1], sweeps[2:]])
+    np.testing.assert_array_equal(medians[2:], np.median(windows, axis=0))
+
+
+def test_first_value_stands_for_those_that_are_missing() -> None:
+    sweeps, fresh = never_repeating(3), FreshMedian(SHAPE)
+    assert not fresh.counts.any(), "zero where there is none"
+    for number, counts in enumerate(sweeps, start=1):
+        fresh.push(counts, ALL)
+        assert fresh.is_full(ALL) == (number == 3)
+        if number < 3:
+            np.testing.assert_array_equal(fresh.counts, sweeps[0])
+
+
+def test_every_median_of_a_real_stream_follows_from_the_definition(untouched: Counts) -> None:
+    medians = play(FreshMedian(SHAPE), untouched)
+    for finger in range(3):
+        for electrode in range(24):
+            values = untouched[:, finger, electrode].tolist()
+            for sweep in range(20, len(values), 31):
+                last = fresh_values(values[: sweep + 1])[-3:]
+                assert medians[sweep, finger, electrode] == sorted(last)[1]
+
+
+def test_a_palm_leaves_two_of_seven_sweeps_out_and_never_two_in_a_row(untouched: Counts) -> None:
+    held = held_pairs(untouched)
+    np.testing.assert_allclose(held.mean(axis=0), 2 / 7, atol=0.003)
+    assert not (held[1:] & held[:-1]).any()
+
+
+def test_no_sample_of_a_palm_counts_twice(untouched: Counts) -> None:
+    held = held_pairs(untouched)
+    counter = np.cumsum(~held, axis=0)  # of each pair: the number of the sample
+    sweeps = np.zeros(untouched.shape, dtype=np.uint16)
+    for pair, places in enumerate(PAIRS):
+        sweeps[:, :, places] = counter[:, pair, None, None]
+    medians = play(FreshMedian(SHAPE), sweeps)
+    # Of three samples that count up, the middle one is the second to last.
+    for pair, places in enumerate(PAIRS):
+        expected = np.broadcast_to(counter[5:, pair, None, None] - 1, (len(sweeps) - 5, 3, 2))
+        np.testing.assert_array_equal(medians[5:][:, :, places], expected)
+
+
+def test_of_real_noise_never_more_counts_than_was_sampled(untouched: Counts) -> None:
+    held = held_pairs(untouched)
+    for pair, places in enumerate(PAIRS):
+        for finger in range(3):
+            for place in places:
+                values = untouched[:, finger, place].tolist()
+                counted = len(fresh_values(values))
+                sampled = len(values) - int(held[:, pair].sum())
+                assert 0.85 * sampled < counted <= sampled, "noise repeats itself now and then"
+
+
+def test_a_quiet_electrode_counts_every_second_time() -> None:
+    fresh = FreshMedian(SHAPE)
+    sweeps = np.full((6, *SHAPE), 3000, dtype=np.uint16)
+    full = []
+    for counts in sweeps:
+        fresh.push(counts, ALL)
+        full.append(fresh.is_full(ALL))
+    assert full == [False, False, False, False, True, True]
+
+
+@pytest.mark.parametrize("holds", [False, True])
+def test_one_spike_in_three_samples_never_shows(holds: bool) -> None:
+    random = np.random.default_rng(3)
+    samples = never_repeating(600).astype(np.int64)
+    low = samples.min()
+    phase = random.integers(0, 3, SHAPE)
+    spiked = np.arange(600)[:, None, None] % 3 == phase
+    samples -= spiked * random.integers(low // 4, low // 2, samples.shape)
+    sweep = np.arange(600 if not holds else 840)
+    sampled = sweep if not holds else sweep * 5 // 7  # 71.43 Hz read at 100 Hz
+    medians = play(FreshMedian(SHAPE), samples[sampled].astype(np.uint16))
+    assert (medians[5:] >= low).all()
+    assert (medians[:5] < low).any(), "before there are three, the first one may show"
+
+
+def test_unusable_values_never_enter_and_those_before_them_are_forgotten() -> None:
+    random = np.random.default_rng(4)
+    sweeps = never_repeating(400)
+    fresh = FreshMedian(SHAPE)
+    kept: dict[tuple[int, int], list[int]] = {(0, 0): [], (1, 11): [], (2, 23): []}
+    for counts in sweeps:
+        usable = random.random(SHAPE) < 0.7
+        read = np.where(usable, counts, random.choice([0, 4095, 0xFFFF], SHAPE)).astype(np.uint16)
+        fresh.push(read, usable)
+        for place, values in kept.items():
+            if not usable[place]:
+                values.clear()  # what was before the loss counts no more
+                continue
+            values.append(int(counts[place]))
+            last = fresh_values(values)[-3:]
+            if len(last) == 3:
+                assert fresh.counts[place] == sorted(last)[1]
+
+
+def test_a_value_that_repeats_the_last_usable_one_is_held_whatever_came_between() -> None:
+    fresh, unusable = FreshMedian(SHAPE), ~ALL
+    for value, usable in ((10, ALL), (20, ALL), (0, unusable), (20, ALL), (0, unusable)):
+        fresh.push(np.full(SHAPE, value, dtype=np.uint16), usable)
+    assert not fresh.is_full(ALL)
+    assert (fresh.counts == 10).all(), "10, 10 and 20"
+
+
+def test_an_electrode_that_never_was_usable_reads_zero_and_is_waited_for_only_if_usable() -> None:
+    fresh, usable = FreshMedian(SHAPE), ALL.copy()
+    usable[1, 5] = False
+    medians = play(fresh, never_repeating(5), usable)
+    assert (medians[:, 1, 5] == 0).all()
+    assert fresh.is_full(usable)
+    assert not fresh.is_full(ALL)
+
+
+def test_an_electrode_that_comes_back_is_not_full_before_it_has_three_new_values() -> None:
+    fresh, lost = FreshMedian(SHAPE), ALL.copy()
+    lost[0, :8] = False
+    play(fresh, never_repeating(10))
+    play(fresh, never_repeating(1000, seed=1), lost)
+    fresh.push(never_repeating(1, seed=2)[0], ALL)
+    assert not fresh.is_full(ALL)
+
+
+def test_nothing_of_before_a_reset_is_left() -> None:
+    fresh, anew = FreshMedian(SHAPE), FreshMedian(SHAPE)
+    play(fresh, never_repeating(10))
+    fresh.reset()
+    assert not fresh.is_full(ALL)
+    sweeps = never_repeating(10)[9:]  # the very sweep before the reset is no repetition
+    for _ in range(3):
+        fresh.push(sweeps[0], ALL)
+        anew.push(sweeps[0], ALL)
+        np.testing.assert_array_equal(fresh.counts, anew.counts)
+        np.testing.assert_array_equal(fresh.counts, sweeps[0])
+    assert not fresh.is_full(ALL), "three times the same is two fresh values"
+
+
+def test_a_median_that_was_handed_out_stays_what_it_was() -> None:
+    fresh, sweeps = FreshMedian(SHAPE), never_repeating(10)
+    play(fresh, sweeps[:3])
+    given = fresh.counts
+    kept = given.copy()
+    play(fresh, sweeps[3:])
+    np.testing.assert_array_equal(given, kept)
+    assert (fresh.counts != kept).any()

@@ -1,0 +1,292 @@
+"""Whether joints keep still: speeds by hand, late and lost streams, several senders."""
+
+from __future__ import annotations
+
+import gc
+import sys
+
+import numpy as np
+import pytest
+
+from daemon.judge.joints import SOURCES_MAX, JointLimits, JointMotion
+from daemon.judge.verdict import Reason
+from drivers.base import JointReading
+
+MS = 1_000_000
+START_NS = 10**12
+NAMES = ("FFJ1", "FFJ2", "FFJ3")
+HALL_RAD = 0.0006
+"""One count of a Hall sensor."""
+LIMITS = JointLimits(rad_per_s=0.1, window_ns=80 * MS, late_ns=150 * MS, lost_ns=1000 * MS)
+
+
+def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] = NAMES) -> None:
+    motion.observe(JointReading(t_ns, 0, names, np.array(angles)), t_ns)
+
+
+def turning(
+    rate_hz: float, rad_per_s: float, seconds: float = 1.0, limits: JointLimits = LIMITS
+) -> tuple[JointMotion, int]:
+    """One joint of three turns at a constant speed; also the time of the last angles."""
+    motion, t_ns = JointMotion(limits), START_NS
+    for place in range(round(seconds * rate_hz) + 1):
+        t_ns = START_NS + round(place / rate_hz * 1e9)
+        send(motion, t_ns, 0.3, 1.2 + rad_per_s * (t_ns - START_NS) / 1e9, -0.1)
+    return motion, t_ns
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 30.0, 71.43, 100.0, 1000.0])
+@pytest.mark.parametrize(
+    ("rad_per_s", "reason"),
+    [
+        (0.0, None),
+        (0.095, None),
+        (-0.095, None),
+        (0.105, Reason.MOVING),
+        (-0.105, Reason.MOVING),
+        (3.0, Reason.MOVING),
+    ],
+)
+def test_speed_is_angle_over_time_at_every_rate(
+    rate_hz: float, rad_per_s: float, reason: Reason | None
+) -> None:
+    motion, now_ns = turning(rate_hz, rad_per_s)
+    assert motion.against(now_ns) is reason
+
+
+@pytest.mark.parametrize(("rate_hz", "still_after_ms"), [(10.0, 100), (100.0, 80), (1000.0, 85)])
+def test_a_step_counts_as_motion_for_a_window_and_no_longer(
+    rate_hz: float, still_after_ms: int
+) -> None:
+    # By hand: 0.02 rad within 80 ms are 0.25 rad/s. At 1 kHz an angle in 5 ms is remembered.
+    motion, now_ns = turning(rate_hz, 0.0)
+    seen: dict[int, Reason | None] = {}
+    for place in range(1, round(0.3 * rate_hz) + 1):
+        after_ns = round((place - 1) / rate_hz * 1e9)
+        t_ns = now_ns + round(place / rate_hz * 1e9)
+        send(motion, t_ns, 0.3, 1.22, -0.1)
+        seen[after_ns // MS] = motion.against(t_ns)
+    moving = [ms for ms, reason in seen.items() if reason is Reason.MOVING]
+    assert moving[0] <= 5
+    assert moving == [ms for ms in seen if moving[0] <= ms <= moving[-1]], "without a break"
+    assert moving[-1] < still_after_ms
+    assert all(reason is None for ms, reason in seen.items() if ms >= still_after_ms)
+
+
+def test_speed_is_taken_over_the_whole_window_and_not_from_angle_to_angle() -> None:
+    # A jerk of 0.007 rad in 10 ms is 0.7 rad/s, but 0.0875 rad/s in a window of 80 ms.
+    motion, now_ns = turning(100.0, 0.0)
+    send(motion, now_ns + 10 * MS, 0.3, 1.207, -0.1)
+    assert motion.against(now_ns + 10 * MS) is None
+    # 0.009 rad in the same time are 0.1125 rad/s.
+    motion, now_ns = turning(100.0, 0.0)
+    send(motion, now_ns + 10 * MS, 0.3, 1.209, -0.1)
+    assert motion.against(now_ns + 10 * MS) is Reason.MOVING
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 100.0, 1000.0])
+def test_hall_noise_of_one_count_is_still(rate_hz: float) -> None:
+    random, motion = np.random.default_rng(2), JointMotion(LIMITS)
+    for place in range(round(2 * rate_hz)):
+        t_ns = START_NS + round(place / rate_hz * 1e9)
+        send(motion, t_ns, *(np.array([0.3, 1.2, -0.1]) + HALL_RAD * random.integers(-1, 2, 3)))
+        if t_ns - START_NS >= 100 * MS:
+            assert motion.against(t_ns) is None
+
+
+def test_until_a_window_has_passed_the_joints_are_not_known_to_be_still() -> None:
+    motion = JointMotion(LIMITS)
+    reasons = []
+    for ms in range(0, 121, 10):
+        send(motion, START_NS + ms * MS, 0.3, 1.2, -0.1)
+        reasons.append(motion.against(START_NS + ms * MS))
+    assert reasons == [Reason.MOVING] * 8 + [None] * 5
+
+
+@pytest.mark.parametrize("joint", range(3))
+def test_a_joint_without_an_angle_hides_no_other(joint: int) -> None:
+    for speed, reason in ((0.0, None), (0.3, Reason.MOVING)):
+        motion = JointMotion(LIMITS)
+        for ms in range(0, 501, 10):
+            angles = np.full(3, 1.0 + speed * ms / 1000)
+            angles[joint] = np.nan
+            send(motion, START_NS + ms * MS, *angles)
+        assert motion.against(START_NS + 500 * MS) is reason
+
+
+def test_joints_of_which_none_can_be_compared_are_not_known_to_be_still() -> None:
+    motion = JointMotion(LIMITS)
+    for ms in range(0, 161, 10):
+        send(motion, START_NS + ms * MS, *((1.0, np.nan) if ms <= 100 else (np.nan, 1.0)))
+    assert motion.against(START_NS + 160 * MS) is Reason.MOVING
+
+
+def test_angles_that_are_all_missing_are_as_good_as_none() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    for ms in range(10, 400, 10):
+        send(motion, now_ns + ms * MS, np.nan, np.nan, np.nan)
+        expected = None if ms <= 150 else Reason.JOINTS_LATE
+        assert motion.against(now_ns + ms * MS) is expected
+    unheard = JointMotion(LIMITS)
+    send(unheard, START_NS, np.nan, np.nan, np.nan)
+
+
+@pytest.mark.parametrize(
+    ("age_ms", "reason", "lost"),
+    [
+        (0, None, False),
+        (150, None, False),
+        (151, Reason.JOINTS_LATE, False),
+        (1000, Reason.JOINTS_LATE, False),
+        (1001, None, True),
+        (3_600_000, None, True),
+    ],
+)
+def test_joints_are_late_and_then_lost(age_ms: int, reason: Reason | None, lost: bool) -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    assert motion.against(now_ns + age_ms * MS) is reason
+    assert motion.is_lost(now_ns + age_ms * MS) is lost
+
+
+def test_joints_that_were_moving_as_they_fell_silent_are_given_up_too() -> None:
+    motion, now_ns = turning(100.0, 1.0)
+    assert motion.against(now_ns + 100 * MS) is Reason.MOVING
+    assert motion.against(now_ns + 500 * MS) is Reason.JOINTS_LATE
+    assert motion.against(now_ns + 1001 * MS) is None
+
+
+def test_joints_that_never_come_are_waited_for_once_from_the_first_sweep_on() -> None:
+    motion = JointMotion(LIMITS)
+    assert not motion.is_lost(START_NS)
+    assert motion.against(START_NS) is Reason.JOINTS_LATE
+    assert motion.against(START_NS + 1000 * MS) is Reason.JOINTS_LATE
+    assert motion.against(START_NS + 1001 * MS) is None
+    assert motion.is_lost(START_NS + 1001 * MS)
+
+
+def test_joints_that_come_back_must_show_a_window_of_stillness() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    back_ns = now_ns + 2000 * MS
+    send(motion, back_ns, 0.3, 2.9, -0.1)  # it moved meanwhile: 1.7 rad in 2 s
+    assert motion.against(back_ns) is Reason.MOVING
+    for ms in range(10, 101, 10):
+        send(motion, back_ns + ms * MS, 0.3, 2.9, -0.1)
+    assert motion.against(back_ns + 100 * MS) is None
+
+
+def test_joints_that_come_back_moving_are_moving() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    # By hand: 0.04 rad in the last 0.2 s of 0.9 s of silence; then 0.002 rad per 10 ms.
+    for ms in range(0, 50, 10):
+        t_ns = now_ns + (900 + ms) * MS
+        send(motion, t_ns, 0.3, 1.24 + 0.2 * ms / 1000, -0.1)
+        assert motion.against(t_ns) is Reason.MOVING
+
+
+def test_angles_of_one_and_the_same_time_are_no_speed() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    for _ in range(1000):
+        send(motion, now_ns, 0.3, 1.2, -0.1)
+    assert motion.against(now_ns) is None
+    alone = JointMotion(LIMITS)
+    for angle in range(100):
+        send(alone, START_NS, float(angle), 0.0, 0.0)
+        assert alone.against(START_NS) is Reason.MOVING
+
+
+def test_each_sender_must_be_still() -> None:
+    motion = JointMotion(LIMITS)
+    for ms in range(0, 501, 10):
+        t_ns = START_NS + ms * MS
+        send(motion, t_ns, 0.3, 1.2, -0.1)
+        send(motion, t_ns + MS, 0.5 * ms / 1000, names=("THJ1",))
+        send(motion, t_ns + 2 * MS, 0.1, 0.2, names=("WRJ1", "WRJ2"))
+    assert motion.against(START_NS + 502 * MS) is Reason.MOVING
+    for ms in range(510, 700, 10):
+        t_ns = START_NS + ms * MS
+        send(motion, t_ns, 0.3, 1.2, -0.1)
+        send(motion, t_ns + MS, 0.25, names=("THJ1",))
+        send(motion, t_ns + 2 * MS, 0.1, 0.2, names=("WRJ1", "WRJ2"))
+    assert motion.against(START_NS + 692 * MS) is None
+
+
+def silent_beside_another(silent_ms: int) -> Reason | None:
+    """What is said as a still sender has been silent so long, while another goes on."""
+    motion, now_ns = turning(100.0, 0.0)
+    for ms in range(-500, silent_ms + 1, 10):
+        send(motion, now_ns + ms * MS, 0.5, names=("THJ1",))
+    return motion.against(now_ns + silent_ms * MS)
+
+
+@pytest.mark.parametrize("silent_ms", [200, 900])
+def test_a_sender_that_falls_silent_beside_another_is_late(silent_ms: int) -> None:
+    assert silent_beside_another(silent_ms) is Reason.JOINTS_LATE
+
+
+@pytest.mark.parametrize("silent_ms", [100, 1100, 5000])
+def test_a_sender_that_is_given_up_leaves_the_others(silent_ms: int) -> None:
+    assert silent_beside_another(silent_ms) is None
+
+
+def test_a_sender_that_moved_before_it_fell_silent_is_late_and_then_given_up() -> None:
+    motion, now_ns = turning(100.0, 1.0)
+    for ms in range(-500, 1100, 10):
+        send(motion, now_ns + ms * MS, 0.5, names=("THJ1",))
+        if ms >= 0:
+            late = Reason.JOINTS_LATE if ms <= 1000 else None
+            expected = Reason.MOVING if ms <= 150 else late
+            assert motion.against(now_ns + ms * MS) is expected
+
+
+def test_random_names_never_grow_memory() -> None:
+    motion = JointMotion(LIMITS)
+
+    def flood(start: int, number: int) -> None:
+        for place in range(start, start + number):
+            t_ns = START_NS + place * MS
+            send(motion, t_ns, 1.0, names=(f"J{place}",))
+            assert motion.against(t_ns) is Reason.MOVING
+
+    flood(0, 5000)
+    gc.collect()
+    before = sys.getallocatedblocks()
+    flood(5000, 5000)
+    gc.collect()
+    assert sys.getallocatedblocks() - before < 200
+    assert SOURCES_MAX < 200
+
+
+def test_a_fast_sender_never_grows_memory() -> None:
+    motion = JointMotion(LIMITS)
+
+    def rush(start: int) -> None:
+        for place in range(start, start + 20_000):
+            send(motion, START_NS + place * 50_000, 0.3, 1.2, -0.1)  # 20 kHz
+
+    rush(0)
+    before = sys.getallocatedblocks()
+    rush(20_000)
+    assert sys.getallocatedblocks() - before < 50
+
+
+def test_time_that_goes_back_starts_a_new_window() -> None:
+    motion, _ = turning(100.0, 0.0)
+    early_ns = START_NS - 10**11
+    reasons = []
+    for ms in range(0, 121, 10):
+        send(motion, early_ns + ms * MS, 0.3, 2.5, -0.1)
+        reasons.append(motion.against(early_ns + ms * MS))
+    assert reasons == [Reason.MOVING] * 8 + [None] * 5
+
+
+def test_angles_from_the_future_are_not_trusted() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    assert motion.against(now_ns - 100 * MS) is None, "jitter between two links"
+    assert motion.against(now_ns - 151 * MS) is Reason.JOINTS_LATE
+
+
+def test_after_time_went_back_missing_joints_block_no_longer_than_the_time_for_lost_ones() -> None:
+    motion, _ = turning(100.0, 0.0)
+    early_ns = START_NS - 10**11
+    reasons = [motion.against(early_ns + ms * MS) for ms in range(0, 3000, 10)]
+    assert set(reasons[110:]) == {None}
