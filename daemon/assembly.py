@@ -9,11 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.judge.contact import ContactLimits
 from daemon.judge.decision import Limits
-from daemon.judge.gate import GateLimits
-from daemon.judge.grip import MEDIAN_SWEEPS, GripLimits
-from daemon.judge.joints import JointLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.scene import GateMode, Scene, SceneError
 from daemon.scene_drivers import (
@@ -99,7 +95,9 @@ def grip_limits(scene: Scene) -> GripLimits | None:
         if gate.sweeps == 3:
             raise SceneError("gate.sweeps 3: readings that are each a grasp have no median")
         return None
-    from daemon.judge.grip import GripLimits
+    from daemon.judge.contact import ContactLimits
+    from daemon.judge.gate import GateLimits
+    from daemon.judge.grip import MEDIAN_SWEEPS, GripLimits
 
     return GripLimits(
         on_request=mode == "request",
@@ -113,7 +111,7 @@ def grip_limits(scene: Scene) -> GripLimits | None:
             request_ns=round(gate.request_ms * 1e6),
             gap_ns=round(gate.gap_ms * 1e6),
         ),
-        joints=_joint_limits(scene),
+        joints=joint_limits(scene),
     )
 
 
@@ -123,7 +121,7 @@ def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
     return [columns_of(path, scene.hand.fingers) for path in options.recordings]
 
 
-def _joint_limits(scene: Scene) -> JointLimits | None:
+def joint_limits(scene: Scene) -> JointLimits | None:
     """None if the scene has no joints, not even in its recordings."""
     tactile = scene.tactile
     recorded = isinstance(tactile, ReplayTactile) and any(

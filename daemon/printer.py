@@ -48,10 +48,10 @@ class Printer:
             return True
         return False
 
-    def without_session(self, judgement: Judgement, reading: TactileReading) -> None:
-        """Count what would have been judged without session calibration."""
+    def without_session(self, judgement: Judgement, reading: TactileReading, grasp: int) -> None:
+        """Count what would have been judged of this grasp without session calibration."""
         annotation = reading.annotation
-        self._summary.compare(judgement, annotation.slipped if annotation else None)
+        self._summary.compare(judgement, annotation.slipped if annotation else None, grasp)
 
     def summary(self) -> None:
         """Write the summary of everything since the start."""

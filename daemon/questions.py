@@ -20,7 +20,7 @@ WAITING_MAX = 16
 QUEUE_MAX = 16
 """Messages queued per peer in either direction."""
 TAKEN_MAX = 64
-"""Messages taken in one round: a flood must not hold up the readings."""
+"""Messages, and at most so many frames, taken in one round: a flood must not hold up readings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,12 @@ class _Question:
 
 
 class Questions:
-    """Takes questions and gives each one answer; never blocks."""
+    """Takes questions and answers them; never blocks.
+
+    libzmq has no limit on the number of frames of a message, and holds them all before it hands the
+    first one over. So only those who may make the daemon grow should be able to connect: keep the
+    socket in a folder of yours.
+    """
 
     def __init__(self, endpoint: str, patience_ns: int) -> None:
         """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
@@ -38,6 +43,8 @@ class Questions:
         """`asked`, `answered`, `given_up`, `malformed`."""
         self._patience_ns = patience_ns
         self._waiting: deque[_Question] = deque()
+        self._frames: list[bytes] = []
+        """Of the message at hand, as far as it has been read."""
         self._file = socket_file(endpoint)
         self._context = zmq.Context(io_threads=1)
         try:
@@ -56,7 +63,7 @@ class Questions:
         return len(self._waiting)
 
     def fileno(self) -> int:
-        """Becomes readable when something may have come; then `take` until it gives 0."""
+        """Becomes readable when something may have come; call `take` before waiting for it."""
         return int(self._socket.fileno())
 
     def due_ns(self) -> int | None:
@@ -69,22 +76,36 @@ class Questions:
         for _ in range(TAKEN_MAX):
             if not int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
                 break
-            *envelope, question = self._socket.recv_multipart(zmq.NOBLOCK)
-            delimiters = envelope[1:]
-            if question != QUESTION or delimiters not in ([], [b""]):
-                self.counters["malformed"] += 1
-                continue
-            if len(self._waiting) >= WAITING_MAX:
-                self._waiting.popleft()
-                self.counters["given_up"] += 1
-            self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
-            taken += 1
+            frame = self._socket.recv(zmq.NOBLOCK)
+            if len(self._frames) <= FRAMES_MAX:
+                self._frames.append(frame)
+            if not self._socket.get(zmq.RCVMORE):
+                taken += self._take_message(now_ns)
+                self._frames.clear()
         self.counters["asked"] += taken
         return taken
 
-    def answer(self, payload: bytes) -> None:
-        """Answer all questions that wait; whoever is gone misses it."""
-        while self._waiting:
+    def _take_message(self, now_ns: int) -> bool:
+        *envelope, question = self._frames
+        if (
+            question != QUESTION
+            or len(self._frames) > FRAMES_MAX
+            or envelope[1:] not in ([], [b""])
+        ):
+            self.counters["malformed"] += 1
+            return False
+        if len(self._waiting) >= WAITING_MAX:
+            self._waiting.popleft()
+            self.counters["given_up"] += 1
+        self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
+        return True
+
+    def answer(self, payload: bytes, now_ns: int | None = None) -> None:
+        """Answer all questions, or with `now_ns` those that can wait no longer.
+
+        Whoever is gone misses it.
+        """
+        while self._waiting and (now_ns is None or self._waiting[0].due_ns <= now_ns):
             question = self._waiting.popleft()
             self._socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
             self.counters["answered"] += 1

@@ -8,9 +8,8 @@ import uuid
 from collections import Counter
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from daemon.judge.gate import GateChange
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import (
     OUTCOME_CODE,
@@ -23,6 +22,9 @@ from daemon.judge.verdict import (
     encode,
 )
 from daemon.latency import LatencyHistogram
+
+if TYPE_CHECKING:
+    from daemon.judge.gate import GateChange
 
 SHA_DIGITS = 12
 

@@ -30,7 +30,6 @@ from daemon.scene_drivers import (
     SpiTactile,
     Tactile,
 )
-from daemon.scene_errors import MESSAGE_MAX, lines_of
 from daemon.text import printable
 from models.contract import Finger
 
@@ -262,6 +261,8 @@ def load(path: Path) -> Scene:
     except RecursionError as error:
         raise SceneError(f"{path}: not TOML that can be read: nested too deeply") from error
     except ValueError as error:  # TOMLDecodeError, and Python's own limit on long numbers
+        from daemon.scene_errors import MESSAGE_MAX
+
         raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error
     return parse(data, path)
 
@@ -282,4 +283,6 @@ def parse(data: Mapping[str, Any], path: Path) -> Scene:
     try:
         return Scene.model_validate(data, context={"base": path.parent})
     except ValidationError as error:
+        from daemon.scene_errors import lines_of
+
         raise SceneError("\n".join(lines_of(error, Scene, path))) from error

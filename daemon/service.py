@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import State, Verdict
-from daemon.questions import Questions
 from daemon.reporter import Reporter
 from daemon.stop import StopSignal
 from drivers.base import Driver, JointReading, TactileReading
@@ -95,8 +94,6 @@ class Service:
         for descriptor in wanted - watched:
             selector.register(descriptor, selectors.EVENT_READ)
         dues_ns = [driver.due_ns() for driver in self._drivers]
-        if self._questions is not None:
-            dues_ns.append(self._questions.due_ns())
         due_ns = min(
             self._silence_due_ns, self._status_due_ns, *(due for due in dues_ns if due is not None)
         )
@@ -133,22 +130,17 @@ class Service:
         """Answer who asked, if this verdict is what they wait for or they have waited too long."""
         if self._questions is None:
             return
-        due_ns = self._questions.due_ns()
-        if due_ns is None:
-            return
-        if verdict.judged or not self._pipeline.on_request or self._clock() >= due_ns:
+        if verdict.judged or not self._pipeline.on_request:
             self._questions.answer(payload)
+        else:
+            self._questions.answer(payload, self._clock())
 
     def _mind_silence(self) -> None:
         now_ns = self._clock()
-        asked_ns = None if self._questions is None else self._questions.due_ns()
-        is_asked = asked_ns is not None and now_ns >= asked_ns
-        is_silent = now_ns >= self._silence_due_ns
-        if not (is_silent or is_asked) or self._tactile.exhausted:
+        if now_ns < self._silence_due_ns or self._tactile.exhausted:
             return
-        if is_silent:
-            self._state = State.SILENT
-            self._silence_due_ns = now_ns + self._silence_ns()
+        self._state = State.SILENT
+        self._silence_due_ns = now_ns + self._silence_ns()
         verdict, payload = self._reporter.verdict(
             self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
         )
@@ -168,9 +160,15 @@ class Service:
         self._reporter.status(
             self._state,
             self._readings_since_status / elapsed_s,
-            {driver.name: driver.counters.as_dict() for driver in self._drivers},
+            self._counters(),
             self._pipeline,
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
+
+    def _counters(self) -> dict[str, dict[str, int]]:
+        counters = {driver.name: driver.counters.as_dict() for driver in self._drivers}
+        if self._questions is not None:
+            counters["ask"] = dict(self._questions.counters)
+        return counters

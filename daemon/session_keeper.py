@@ -26,9 +26,15 @@ class SessionKeeper:
         tactile: Driver,
         file: SessionFile,
         clock: Callable[[], int] = time.monotonic_ns,
+        on_exchange: Callable[[], None] | None = None,
     ) -> None:
-        """Restore what `file` has; a new session, and a warning, if that is none of this hand."""
+        """Restore what `file` has; a new session, and a warning, if that is none of this hand.
+
+        `on_exchange` is done when a sensor is another one than before; it must reset the session,
+        which is what is done unless it is given.
+        """
         self._session = session
+        self._on_exchange = on_exchange or session.reset
         self._fingers = tuple(fingers)
         self._tactile = tactile
         self._file = file
@@ -85,6 +91,6 @@ class SessionKeeper:
                 ", ".join(changed),
                 self._session.grasps,
             )
-            self._session.reset()
+            self._on_exchange()
             self._save_due_ns = self._clock()
         self._serials.update(serials)

@@ -112,13 +112,11 @@ class Summary:
         self.tally.add(verdict.verdict, verdict.reasons, slipped)
         self.repaired += verdict.valid and bool(verdict.repaired)
 
-    def compare(self, judgement: Judgement, slipped: bool | None) -> None:
-        """Count what would have been judged without session calibration."""
-        if judgement.gate is not None:
-            if not judgement.judged or judgement.grasp == self._compared_grasp:
-                return
-            self._compared_grasp = judgement.grasp
-        self.without_session.add(judgement.outcome, judgement.reasons, slipped)
+    def compare(self, judgement: Judgement, slipped: bool | None, grasp: int) -> None:
+        """Count what would have been judged of a grasp without session calibration, once."""
+        if grasp != self._compared_grasp:
+            self._compared_grasp = grasp
+            self.without_session.add(judgement.outcome, judgement.reasons, slipped)
 
     def as_dict(self, wall_s: float) -> dict[str, Any]:
         """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""

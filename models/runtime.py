@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import stat
 from pathlib import Path
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
+
+# From 1.29 on onnxruntime keeps a telemetry database in the home folder, and a thread for it,
+# unless this says no before it is imported. A robot's PC tells nobody what it does.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+import onnxruntime as ort
 
 from models.contract import (
     METADATA_KEY,

@@ -6,14 +6,18 @@ import argparse
 import contextlib
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 from daemon import assembly, scene, scene_drivers
 from daemon.text import complain, printable
 from drivers.base import DriverError
 from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.cost import Footprint
 
 TACTILE_SECTIONS = (
     scene_drivers.ReplayTactile,
@@ -22,39 +26,93 @@ TACTILE_SECTIONS = (
     scene_drivers.PalmTactile,
 )
 
+WRONG, FAILED = 2, 1
 COIN = 0.505
 """Every verdict is as sure as this, to two digits: a threshold below refuses nothing."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Checked:
+    """What became of one scene."""
+
+    code: int
+    cost: Footprint | None = None
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("scene", type=Path, help="scene file (TOML)")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("scene", type=Path, nargs="+", help="scene file (TOML)")
+    parser.add_argument("--json", action="store_true", help="one JSON object per scene on stdout")
+    parser.add_argument(
+        "--cost", action="store_true", help="measure it too; of several scenes, as one table"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check the scene, its model and its files; 0 if the scene is right.
+    """Check the scenes, their models and files; 0 if all are right.
 
-    Whether devices and socket are there is for `graspd doctor`.
+    Whether devices and socket are there is for `graspd doctor`. A scene that is right and whose
+    cost cannot be measured gives 1.
     """
+    found = [(path, _check(path, args)) for path in args.scene]
+    costs = [(path, checked.cost) for path, checked in found if checked.cost is not None]
+    if len(found) > 1 and costs and not args.json:
+        from daemon.cost import markdown
+
+        sys.stdout.writelines(f"{line}\n" for line in markdown(costs))
+    return max(checked.code for _, checked in found)
+
+
+def _check(path: Path, args: argparse.Namespace) -> _Checked:
+    """Check one scene and write what there is to write about it alone."""
     try:
-        wanted = scene.load(args.scene)
+        wanted = scene.load(path)
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
         _try_drivers(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
-        return 2
+        return _Checked(WRONG)
+    cost = None
+    if args.cost:
+        from daemon.cost import CostError, measure
+
+        try:
+            cost = measure(path)
+        except CostError as error:
+            complain(error)
+            return _Checked(FAILED)
     parts = {"in": _what_is_in(wanted, model), "left_out": _what_is_left_out(wanted, model)}
     if args.json:
-        sys.stdout.write(json.dumps({"scene": str(args.scene), **parts}) + "\n")
-        return 0
-    sys.stdout.write(f"{printable(str(args.scene))}: fine\n")
+        _write_json(path, parts, cost)
+    elif cost is None or len(args.scene) == 1:
+        _write(path, parts, cost)
+    return _Checked(0, cost)
+
+
+def _write_json(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None) -> None:
+    content: dict[str, object] = {"scene": str(path), **parts}
+    if cost is not None:
+        import msgspec
+
+        content["cost"] = {
+            **msgspec.to_builtins(cost),
+            "packages": cost.packages,
+            "start": {"wall_ms": cost.start_wall_ms, "cpu_ms": cost.start_cpu_ms},
+        }
+    sys.stdout.write(json.dumps(content) + "\n")
+
+
+def _write(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None) -> None:
+    sys.stdout.write(f"{printable(str(path))}: fine\n")
     for title, entries in (("in", parts["in"]), ("left out", parts["left_out"])):
         sys.stdout.write(f"{title}\n")
         for key, value in entries.items():
             sys.stdout.write(f"  {key:9} {printable(value)}\n")
-    return 0
+    if cost is not None:
+        from daemon.cost import lines
+
+        sys.stdout.writelines(f"{line}\n" for line in lines(cost))
 
 
 def _try_drivers(wanted: scene.Scene) -> None:
@@ -89,8 +147,11 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
     }
     if wanted.ask_endpoint is not None:
         parts["ask"] = f"on {wanted.ask_endpoint}, answered within {wanted.gate.request_ms:g} ms"
+    limits = assembly.grip_limits(wanted)
     if wanted.joints is not None:
         parts["joints"] = _section(wanted.joints)
+    elif limits is not None and limits.joints is not None:
+        parts["joints"] = "those of the recordings"
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
     return parts
@@ -134,9 +195,10 @@ def _what_is_left_out(wanted: scene.Scene, model: TactileModel) -> dict[str, str
     drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
     others = [driver for driver in drivers if driver != wanted.tactile.driver]
     left_out["drivers"] = f"{', '.join(others)}: not imported"
-    if wanted.joints is None:
+    limits = assembly.grip_limits(wanted)
+    if wanted.joints is None and (limits is None or limits.joints is None):
         left_out["joints"] = "no joint code"
-    if assembly.grip_limits(wanted) is None:
+    if limits is None:
         left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
     if not isinstance(model.contract.input, SessionInput):
         left_out["session"] = f"{model.contract.name} needs no session calibration"

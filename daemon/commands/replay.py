@@ -161,14 +161,16 @@ class _Comparison:
 
     def __init__(self, wanted: scene.Scene, printer: Printer) -> None:
         model = assembly.load_model(wanted)
-        self._pipeline = assembly.build_pipeline(wanted, model, learns=False)
+        # What it judges is what the other one judged: it has no joints to know the moment by.
+        every = wanted.model_copy(update={"gate": wanted.gate.model_copy(update={"mode": "every"})})
+        self._pipeline = assembly.build_pipeline(every, model, learns=False)
         self._printer = printer
 
     def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Print the verdict and count what it would have been."""
         self._printer.verdict(verdict, payload, reading)
-        if reading is not None:
-            self._printer.without_session(self._pipeline.judge(reading), reading)
+        if reading is not None and verdict.judged:
+            self._printer.without_session(self._pipeline.judge(reading), reading, verdict.grasp)
 
 
 def _wait(publisher: Publisher, timeout_s: float, stop: StopSignal) -> None:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from daemon import assembly, scene
 from daemon.binding import PublishError
 from daemon.judge.pipeline import Pipeline
-from daemon.printer import Printer
 from daemon.publisher import Publisher
 from daemon.reporter import Reporter
 from daemon.service import Service
@@ -21,6 +20,7 @@ from drivers.base import Driver, DriverError, RecordingError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
+    from daemon.printer import Printer
     from daemon.questions import Questions
     from daemon.session_keeper import SessionKeeper
 
@@ -37,8 +37,7 @@ def run(args: argparse.Namespace) -> int:
     """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording."""
     try:
         with StopSignal() as stop:
-            printer = Printer(as_json=False, prompt=True) if args.print else None
-            _run(scene.load(args.scene), printer, stop)
+            _run(scene.load(args.scene), _printer() if args.print else None, stop)
     except (scene.SceneError, ModelError, RecordingError) as error:
         complain(error)
         return 2
@@ -58,7 +57,7 @@ def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None
             stack.callback(driver.close)
             assembly.open_driver(driver)
         log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-        keeper = _keeper(wanted, pipeline, drivers[0], stack)
+        kept = keeper(wanted, pipeline, drivers[0], stack)
         service = Service(
             drivers,
             pipeline,
@@ -66,19 +65,25 @@ def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None
             stop,
             max_age_ns=wanted.max_age_ns,
             listener=printer.verdict if printer else None,
-            chore=None if keeper is None else keeper.mind,
-            questions=_questions(wanted, stack),
+            chore=None if kept is None else kept.mind,
+            questions=questions(wanted, stack),
         )
         try:
             service.run()
         finally:
-            if keeper is not None:
-                keeper.save()
+            if kept is not None:
+                kept.save()
             if printer is not None:
                 printer.summary()
 
 
-def _questions(wanted: scene.Scene, stack: ExitStack) -> Questions | None:
+def _printer() -> Printer:
+    from daemon.printer import Printer
+
+    return Printer(as_json=False, prompt=True)
+
+
+def questions(wanted: scene.Scene, stack: ExitStack) -> Questions | None:
     """Who takes questions; None if the scene takes none. Raises `PublishError`."""
     if wanted.ask_endpoint is None:
         return None
@@ -89,7 +94,7 @@ def _questions(wanted: scene.Scene, stack: ExitStack) -> Questions | None:
     return stack.enter_context(Questions(wanted.ask_endpoint, patience_ns))
 
 
-def _keeper(
+def keeper(
     wanted: scene.Scene, pipeline: Pipeline, tactile: Driver, stack: ExitStack
 ) -> SessionKeeper | None:
     """Who keeps the session; None if model or scene need none, or if there is no place for it."""
@@ -104,4 +109,10 @@ def _keeper(
         log.warning("%s; every start begins a new session", error)
         return None
     stack.callback(file.close)
-    return SessionKeeper(pipeline.session, wanted.hand.fingers, tactile, file)
+    return SessionKeeper(
+        pipeline.session,
+        wanted.hand.fingers,
+        tactile,
+        file,
+        on_exchange=pipeline.sensors_exchanged,
+    )

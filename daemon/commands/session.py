@@ -17,7 +17,7 @@ from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import Reason
 from daemon.session_file import KeptSession, SessionFile, SessionFileError, load
 from daemon.text import complain, printable
-from drivers.base import DriverError, TactileReading
+from drivers.base import DriverError, JointReading
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
 from models.session import SessionState
@@ -98,47 +98,55 @@ def _reset(wanted: scene.Scene) -> None:
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
     """Judge the recordings as the daemon does, and keep the session that comes out."""
+    wanted = _on_recordings(wanted, recordings)
     pipeline = assembly.build_pipeline(wanted, model)
     session = pipeline.session
     if session is None:
         raise ModelError(f"the model {model.contract.name} keeps no session")
     with SessionFile(wanted.session_path) as file:
-        read = len(_judge(wanted, recordings, pipeline))
+        read = len(_judge(wanted, pipeline))
         if not session.calibrated:
             raise DriverError(
                 f"{session.grasps} grasps of {read} readings are too few, or they are no grasps"
             )
-        _check(wanted, model, recordings, session.state())
+        _check(wanted, model, session.state())
         # Of which sensors they are is not known before the daemon hears from them.
         file.save(session.state(), wanted.hand.fingers, {})
     where = printable(str(wanted.session_path))
     sys.stdout.write(f"{where}: {session.grasps} grasps of {read} readings taken in\n")
 
 
-def _check(
-    wanted: scene.Scene, model: TactileModel, recordings: list[Path], state: SessionState
-) -> None:
+def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> None:
     """Raise `DriverError` if the session does not know its own recordings again."""
     pipeline = assembly.build_pipeline(wanted, model, learns=False)
     if pipeline.session is not None:
         pipeline.session.restore(state)
-    again = _judge(wanted, recordings, pipeline)
+    again = _judge(wanted, pipeline)
     unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
     if 2 * unlike > len(again):
         raise DriverError(f"{unlike} of {len(again)} readings are unlike all grasps")
 
 
-def _judge(wanted: scene.Scene, recordings: list[Path], pipeline: Pipeline) -> list[Judgement]:
+def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:
+    """The scene with recordings in place of its sensors: tables are judged row by row."""
     replay = scene_drivers.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
-    (driver,) = assembly.build_drivers(
-        wanted.model_copy(update={"tactile": replay, "joints": None})
-    )
+    gate = wanted.gate.model_copy(update={"mode": None, "sweeps": None})
+    return wanted.model_copy(update={"tactile": replay, "joints": None, "gate": gate})
+
+
+def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
+    """What is judged of the recordings, grasp by grasp."""
+    (driver,) = assembly.build_drivers(wanted)
     judgements: list[Judgement] = []
     with contextlib.closing(driver):
         assembly.open_driver(driver)
         while not driver.exhausted:
             readings = driver.read_ready()
-            judgements += [pipeline.judge(r) for r in readings if isinstance(r, TactileReading)]
-    return judgements
+            for reading in readings:
+                if isinstance(reading, JointReading):
+                    pipeline.turn(reading)
+                else:
+                    judgements.append(pipeline.judge(reading))
+    return [judgement for judgement in judgements if judgement.judged]

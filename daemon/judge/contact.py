@@ -23,7 +23,22 @@ FALLEN = 3
 SOUND_MIN = 12
 """Usable electrodes, of 24, below which nobody knows whether a finger touches."""
 LET_GO = 0.6
-"""A finger that touched has let go when it falls by less than this share of what a touch takes."""
+"""A finger that touched has let go when it falls by less than this share of a touch ..."""
+RELEASED = 0.25
+"""... or by less than this share of how deep it was held: in a long hold the electrodes of a finger
+drift apart, so what is left when the hand opens may look like a light touch ..."""
+RELEASED_LONG = 0.5
+"""... and more so the longer it was: this is the share after `LONG_HOLD_NS`."""
+DEPTH_FADES_COUNTS_PER_S = 5.0
+"""How fast the depth of a hold follows a lighter touch."""
+APART_NS = 50_000_000
+"""No finger touches again so soon after it let go: while it opens, its electrodes rise one sweep
+after the other, and for a moment look as if it pressed again."""
+LONG_HOLD_NS = 60_000_000_000
+"""Who has held for longer than this is tared anew afterwards: by then 0.2 counts/s between the
+electrodes of a finger (measured on three sensors) make more than half of a touch."""
+ALONE_NS = 30_000_000_000
+"""A finger that touches for so long without all the others does not grasp: it is tared anew."""
 SUSPECT = 0.5
 """A fall above this share of what a touch takes may be the beginning of one: not for the tare."""
 SIGMA_MIN_COUNTS = 1.5
@@ -61,6 +76,13 @@ class Contact:
         self._baseline = np.zeros(shape)
         self._known = np.zeros(shape, dtype=np.bool_)
         self._threshold = np.full(fingers, limits.counts)
+        self._depth = np.zeros(fingers)
+        self._let_go_ns: list[int | None] = [None] * fingers
+        self._lowest = np.zeros(fingers)
+        """Smallest fall since each finger let go: a new touch falls from there, not from zero."""
+        self._touches_since_ns: list[int | None] = [None] * fingers
+        self._alone_since_ns: list[int | None] = [None] * fingers
+        self._last_ns: int | None = None
         self.fall = np.zeros(fingers)
         """Counts by which each finger's third deepest electrode is below its baseline, and below
         the finger's median electrode: the smaller of both, and the latter alone where the finger
@@ -79,6 +101,11 @@ class Contact:
         """Fall that makes a touch, counts, shape (fingers,)."""
         return self._threshold
 
+    def forget(self) -> None:
+        """The sensors may be others, or have been away: all fingers must be tared anew."""
+        for finger in range(len(self._tares)):
+            self._forget(finger)
+
     def observe(
         self,
         t_ns: int,
@@ -92,30 +119,79 @@ class Contact:
         """
         sound = usable & self._known
         number = np.count_nonzero(sound, axis=1)
-        self.fall = self._fall(median, sound, number)
-        enough = self.tared & (number >= SOUND_MIN)
-        needed = np.where(self.touching, LET_GO, 1.0) * self._threshold
-        self.touching = enough & (self.fall >= needed)
-        may_touch = self.fall >= SUSPECT * self._threshold
         # With too few electrodes nobody knows any more: to find out, it must be tared again.
-        self.tared &= enough
+        self.tared &= number >= SOUND_MIN
+        self.fall, middle = self._falls(median, sound, number)
+        self._follow_touches(t_ns)
         for finger, tare in enumerate(self._tares):
-            if self.tared[finger] and may_touch[finger]:
+            if self.tared[finger] and self._must_tare_anew(finger, middle[finger], t_ns):
+                self._forget(finger)
+            if self.tared[finger] and self.fall[finger] >= SUSPECT * self._threshold[finger]:
                 tare.clear()
             elif tare.add(counts[finger], usable[finger]):
                 self._settle(finger, tare, t_ns)
 
-    def _fall(
+    def _falls(
         self, median: NDArray[np.uint16], sound: NDArray[np.bool_], number: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Each finger's `fall`, and the fall of its median electrode, counts."""
         falls = np.where(sound, self._baseline - median, np.inf)
         falls.sort(axis=1)  # those that do not count come last
-        fall = np.zeros(len(falls))
-        for finger in np.flatnonzero(number >= SOUND_MIN):
+        fall, middle = np.zeros(len(falls)), np.zeros(len(falls))
+        for finger in np.flatnonzero(self.tared):
             deep = falls[finger, number[finger] - FALLEN]
-            relative = deep - falls[finger, number[finger] // 2]
+            middle[finger] = falls[finger, number[finger] // 2]
+            relative = deep - middle[finger]
             fall[finger] = relative if self.touching[finger] else min(deep, relative)
-        return fall
+        return fall, middle
+
+    def _follow_touches(self, t_ns: int) -> None:
+        """Which fingers touch now, how deep, since when, and which without the others."""
+        elapsed_s = 0.0 if self._last_ns is None else max(t_ns - self._last_ns, 0) / 1e9
+        self._last_ns = t_ns
+        long = [
+            since is not None and t_ns - since > LONG_HOLD_NS for since in self._touches_since_ns
+        ]
+        share = np.where(long, RELEASED_LONG, RELEASED)
+        held = self.fall >= np.maximum(LET_GO * self._threshold, share * self._depth)
+        apart = [at is None or not 0 <= t_ns - at < APART_NS for at in self._let_go_ns]
+        begins = (self.fall >= self._threshold + self._lowest) & apart
+        touched = self.touching
+        self.touching = self.tared & np.where(touched, held, begins)
+        for let_go in np.flatnonzero(touched & ~self.touching):
+            self._let_go_ns[let_go] = t_ns
+        # While it touches the fall is only that of a share of the electrodes: it starts anew.
+        lowest = np.where(touched, self.fall, self._lowest)
+        self._lowest = np.where(self.touching, 0.0, np.minimum(lowest, np.maximum(self.fall, 0.0)))
+        faded = self._depth - DEPTH_FADES_COUNTS_PER_S * elapsed_s
+        self._depth = np.where(self.touching, np.maximum(self.fall, faded), 0.0)
+        alone = self.touching & ~self.touching.all()
+        for finger in range(len(self.touching)):
+            if not alone[finger]:
+                self._alone_since_ns[finger] = None
+            elif self._alone_since_ns[finger] is None:
+                self._alone_since_ns[finger] = t_ns
+
+    def _must_tare_anew(self, finger: int, middle: float, t_ns: int) -> bool:
+        """Whether what is known of where the finger rests is to be trusted no longer."""
+        since_ns = self._touches_since_ns[finger]
+        if self.touching[finger]:
+            self._touches_since_ns[finger] = t_ns if since_ns is None else since_ns
+            alone_ns = self._alone_since_ns[finger]
+            return alone_ns is not None and t_ns - alone_ns > ALONE_NS
+        self._touches_since_ns[finger] = None
+        if since_ns is not None and t_ns - since_ns > LONG_HOLD_NS:
+            return True
+        # A finger that rests higher as a whole was tared while it touched, or has drifted far.
+        return middle < -float(self._threshold[finger])
+
+    def _forget(self, finger: int) -> None:
+        self.tared[finger] = self.touching[finger] = False
+        self._known[finger] = False
+        self._depth[finger] = 0.0
+        self._lowest[finger] = 0.0
+        self._touches_since_ns[finger] = self._alone_since_ns[finger] = None
+        self._tares[finger] = _Tare()
 
     def _settle(self, finger: int, tare: _Tare, t_ns: int) -> None:
         """Take over what a finger's window says, if it was at rest."""
@@ -126,12 +202,10 @@ class Contact:
         elapsed_s = 0.0 if tare.settled_ns is None else max(t_ns - tare.settled_ns, 0) / 1e9
         tare.settled_ns = t_ns
         step = baseline - self._baseline[finger]
-        new = known & ~self._known[finger]
-        if self.tared[finger] and np.median(step[known]) <= self._threshold[finger]:
-            step = np.clip(step, -DOWN_COUNTS_PER_S * elapsed_s, UP_COUNTS_PER_S * elapsed_s)
-            step[new] = (baseline - self._baseline[finger])[new]
-        # Else it had no baseline, or rests higher as a whole, as no touch makes it: the hand was
-        # opened, or held something for so long that its sensors drifted.
+        if self.tared[finger]:
+            limited = np.clip(step, -DOWN_COUNTS_PER_S * elapsed_s, UP_COUNTS_PER_S * elapsed_s)
+            # An electrode that was not known before is taken as it is.
+            step = np.where(self._known[finger], limited, step)
         self._baseline[finger] += step
         self._known[finger] = known
         self._threshold[finger] = max(self._limits.counts, self._limits.sigmas * sigma)

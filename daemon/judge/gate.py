@@ -76,7 +76,9 @@ class Gate:
         self._last_ns: int | None = None
         self._held_since_ns: int | None = None
         self._released_ns = 0
+        self._asked = False
         self._asked_until_ns: int | None = None
+        """None until the first reading after the question."""
         self.state = GateState.IDLE
         self.grasp = 0
         """Touches so far; the number of the grasp at hand."""
@@ -104,18 +106,20 @@ class Gate:
 
     @property
     def _is_asked(self) -> bool:
-        return not self._on_request or self._asked_until_ns is not None
+        return self._asked or not self._on_request
 
-    def ask(self, t_ns: int) -> None:
-        """The controller wants a judgement, from `t_ns` on, of whatever has settled by then."""
-        self._asked_until_ns = t_ns + self._limits.request_ns
-        if self._on_request and self.state is GateState.JUDGED:
-            self._enter(GateState.SETTLED, t_ns, GateCause.ASKED)
+    def ask(self) -> None:
+        """The controller wants a judgement of what settles within `request_ns` of the next reading.
+
+        A grasp that was judged is judged again.
+        """
+        self._asked = True
+        self._asked_until_ns = None
 
     def judged(self, t_ns: int, median: NDArray[np.uint16]) -> None:
         """The settled grasp was judged, by the reading of `t_ns` with these counts."""
         self._reference = median
-        self._asked_until_ns = None
+        self._asked = False
         self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
 
     def take_changes(self) -> list[GateChange]:
@@ -126,7 +130,7 @@ class Gate:
     def skip(self, t_ns: int) -> None:
         """A reading came that cannot be used."""
         if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._limits.gap_ns:
-            self._restart(t_ns)
+            self.restart(t_ns)
 
     def step(
         self,
@@ -142,8 +146,7 @@ class Gate:
         """
         self.skip(t_ns)
         self._last_ns = t_ns
-        if self._asked_until_ns is not None and t_ns > self._asked_until_ns:
-            self._asked_until_ns = None
+        self._follow_question(t_ns)
         self._stillness.add(t_ns, median)
         self.in_contact = bool(touching[self._required].all())
         reasons = self._disturbances(t_ns, median, usable, against)
@@ -154,6 +157,16 @@ class Gate:
             cause = GateCause.MOVED if self.in_contact else GateCause.CONTACT_LOST
             self._enter(GateState.CLOSING, t_ns, cause)
         self._against = (*reasons, *self._hold(t_ns, bool(reasons)))
+
+    def _follow_question(self, t_ns: int) -> None:
+        if not self._asked:
+            return
+        if self._asked_until_ns is None:
+            self._asked_until_ns = t_ns + self._limits.request_ns
+            if self._on_request and self.state is GateState.JUDGED:
+                self._enter(GateState.SETTLED, t_ns, GateCause.ASKED)
+        elif t_ns > self._asked_until_ns:
+            self._asked = False
 
     def _disturbances(
         self,
@@ -216,12 +229,11 @@ class Gate:
         self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
         return ()
 
-    def _restart(self, t_ns: int) -> None:
+    def restart(self, t_ns: int) -> None:
         """Nobody knows what happened meanwhile, or time went back."""
         if self._last_ns is not None and t_ns < self._last_ns:
             self._released_ns = t_ns
-            if self._asked_until_ns is not None:
-                self._asked_until_ns = t_ns + self._limits.request_ns
+            self._asked_until_ns = None
         self._last_ns = t_ns
         self._held_since_ns = None
         self._stillness.reset()

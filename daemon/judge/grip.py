@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from daemon.judge.joints import JointLimits, JointMotion
 
 MEDIAN_SWEEPS = 3
+OUTAGE_NS = 1_000_000_000
+"""After so long without a usable reading the sensors may have been exchanged or powered anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,16 +96,23 @@ class Grip:
 
     @property
     def joints_lost(self) -> bool:
-        """Whether the hand should have joint angles, and judging goes on without them."""
+        """Whether judging goes on without joint angles that should be there."""
         return (
             self._joints is not None
             and self._last_ns is not None
-            and self._joints.is_lost(self._last_ns)
+            and (self._joints.is_lost(self._last_ns) or self._joints.some_lost)
         )
 
     def ask(self) -> None:
         """The controller wants the grasp at hand judged."""
-        self._gate.ask(0 if self._last_ns is None else self._last_ns)
+        self._gate.ask()
+
+    def forget(self) -> None:
+        """The sensors are others, or may be: where they rest is not known, nor what they hold."""
+        self._contact.forget()
+        self._fresh.reset()
+        if self._last_ns is not None:
+            self._gate.restart(self._last_ns)
 
     def take_changes(self) -> list[GateChange]:
         """Changes of the gate since the last call, oldest first."""
@@ -122,6 +131,8 @@ class Grip:
             return
         if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._gap_ns:
             self._fresh.reset()
+            if t_ns - self._last_ns > OUTAGE_NS:
+                self._contact.forget()
         self._last_ns = t_ns
         usable = ~watched.broken
         self._fresh.push(reading.counts, usable)

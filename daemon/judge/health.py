@@ -79,14 +79,10 @@ class Health:
             return Watched((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
         self._faults = reading.faults
         faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
-        repeats = self._compare(counts)
-        railed = _railed(counts)
-        broken = (
-            (reading.faults != 0)
-            | railed
-            | (self._unchanged >= UNCHANGED_MAX)
-            | (self._jumps > JUMPS_MAX)
-        )
+        sound = reading.faults == 0
+        repeats = self._compare(counts, sound)
+        railed = _railed(counts) & sound
+        broken = ~sound | railed | (self._unchanged >= UNCHANGED_MAX) | (self._jumps > JUMPS_MAX)
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
             return Watched(_fault_reasons(faults), broken)
         if repeats:
@@ -94,7 +90,7 @@ class Health:
             return Watched((Reason.FROZEN, *also), broken)
         if too_many(broken):
             reasons = [*_fault_reasons(faults)]
-            if (railed & (reading.faults == 0)).any():
+            if railed.any():
                 reasons.append(Reason.SATURATED)
             return Watched((*reasons, Reason.ELECTRODES_BROKEN), broken)
         return Watched((), broken)
@@ -112,10 +108,13 @@ class Health:
             found[finger, electrode] = _fault_reasons(int(self._faults[finger, electrode]))[0]
         return found
 
-    def _compare(self, counts: NDArray[np.uint16]) -> bool:
-        """Take in how the counts have changed; True if a whole finger reads exactly as before."""
+    def _compare(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_]) -> bool:
+        """Take in how the counts have changed; True if a whole finger reads exactly as before.
+
+        What is not `sound` was not read, so it repeats nothing.
+        """
         steps = np.abs(counts.astype(np.int32) - self._previous)
-        same = steps == 0
+        same = (steps == 0) & sound
         self._previous = counts
         self._unchanged = np.where(same, self._unchanged + 1, 0)
         moves = np.partition(steps, STILL - 1, axis=1)[:, STILL - 1 : STILL]

@@ -13,6 +13,8 @@ from drivers.base import JointReading
 
 ANGLES = 16
 """Angles remembered of a window; of faster readings, some are left out."""
+LOST_MAX = 64
+"""Names of lost joints that are remembered; a hand has 24."""
 SOURCES_MAX = 8
 """Sets of joints that are told apart: a sender may send one finger at a time, not random names."""
 
@@ -43,21 +45,30 @@ class JointMotion:
         self._latest_ns: dict[tuple[str, ...], int] = {}
         self._waits_since_ns: int | None = None
         """Since when no joint was heard of."""
+        self._lost: set[str] = set()
+        """Joints that came once, and no longer."""
 
     def observe(self, reading: JointReading, t_ns: int) -> None:
-        """Take in the angles of `t_ns`, on the same clock as the sweeps; those all NaN are none."""
-        if np.isnan(reading.position_rad).all():
+        """Take in the angles of `t_ns`, on the same clock as the sweeps.
+
+        Joints whose angle is NaN are not heard: the others count as a sender of their own.
+        """
+        valid = ~np.isnan(reading.position_rad)
+        if not valid.any():
             return
-        names = reading.names
+        names = tuple(
+            name for name, is_valid in zip(reading.names, valid, strict=False) if is_valid
+        )
         if names not in self._past and len(self._past) >= SOURCES_MAX:
-            self._forget()
+            self._past.clear()
+            self._latest_ns.clear()
         past = self._past.setdefault(names, deque(maxlen=ANGLES + 2))
         latest_ns = self._latest_ns.get(names, t_ns)
         if not 0 <= t_ns - latest_ns <= self._limits.late_ns:
             past.clear()  # time went back, or nobody knows what the joints did meanwhile
         self._latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
-            past.append((t_ns, reading.position_rad))
+            past.append((t_ns, reading.position_rad[valid]))
 
     def against(self, t_ns: int) -> Reason | None:
         """What the joints say against settling at `t_ns`; None if they are still, or are lost."""
@@ -70,8 +81,13 @@ class JointMotion:
             return Reason.JOINTS_LATE
         return None if all(map(self._is_still, self._past.values())) else Reason.MOVING
 
+    @property
+    def some_lost(self) -> bool:
+        """Whether judging goes on without a joint that came once."""
+        return bool(self._lost.difference(*self._past))
+
     def is_lost(self, t_ns: int) -> bool:
-        """Whether judging goes on without the joints at `t_ns`."""
+        """Whether judging goes on without any joints at `t_ns`."""
         return (
             not self._past
             and self._waits_since_ns is not None
@@ -85,18 +101,18 @@ class JointMotion:
                 continue
             del self._past[names], self._latest_ns[names]
             self._waits_since_ns = min(latest_ns, t_ns)
-
-    def _forget(self) -> None:
-        self._past.clear()
-        self._latest_ns.clear()
+            if len(self._lost) < LOST_MAX:
+                self._lost.update(names)
 
     def _is_still(self, past: deque[tuple[int, NDArray[np.float64]]]) -> bool:
         now_ns, now = past[-1]
         while len(past) > 2 and now_ns - past[1][0] >= self._limits.window_ns:
             past.popleft()
-        then_ns, then = past[0]
-        if now_ns - then_ns < self._limits.window_ns:
+        if now_ns - past[0][0] < self._limits.window_ns:
             return False
-        moved = np.abs(now - then) / ((now_ns - then_ns) / 1e9)
-        fastest = np.nanmax(moved) if not np.isnan(moved).all() else np.inf
-        return bool(fastest <= self._limits.rad_per_s)
+        # Against every moment of the window: two alone would miss what swings.
+        return all(
+            float(np.abs(now - then).max())
+            <= self._limits.rad_per_s * max(now_ns - at_ns, self._limits.window_ns) / 1e9
+            for at_ns, then in past
+        )

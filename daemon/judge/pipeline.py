@@ -114,6 +114,14 @@ class Pipeline:
         if self.grip is not None:
             self.grip.ask()
 
+    def sensors_exchanged(self) -> None:
+        """What is known of the sensors, and of what they hold, no longer counts."""
+        self._opinion = NO_OPINION
+        if self.session is not None:
+            self.session.reset()
+        if self.grip is not None:
+            self.grip.forget()
+
     def turn(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self.grip is not None:
@@ -175,8 +183,6 @@ class Pipeline:
         """What the network says of counts (fingers, 24), and what the session may learn."""
         findings = self._plausibility.examine(counts, watched.broken)
         p_slip, reasons = None, findings.reasons
-        if self._needs_session and self.session is not None and not self.session.calibrated:
-            reasons = (*reasons, Reason.NOT_CALIBRATED)
         if not reasons:
             p_slip, reasons = self._network.judge(findings.counts)
         repaired = () if findings.repaired is None else np.argwhere(findings.repaired)
@@ -193,9 +199,12 @@ class Pipeline:
         self, t_ns: int, against: tuple[Reason, ...], opinion: _Opinion, *, judged: bool
     ) -> Judgement:
         grip = self.grip
+        health = (*against, *opinion.reasons)
+        if self._needs_session and self.session is not None and not self.session.calibrated:
+            health = (*health, Reason.NOT_CALIBRATED)
         case = Case(
             p_slip=opinion.p_slip,
-            health=(*against, *opinion.reasons),
+            health=health,
             in_contact=grip is None or grip.in_contact,
             settled=grip is None or grip.settled,
             gate=() if grip is None else grip.reasons,

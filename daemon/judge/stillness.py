@@ -1,4 +1,4 @@
-"""How fast the electrodes change: now against a moment ago, so that noise is not taken for motion.
+"""How fast the electrodes change: now against the last moments, so that noise is no motion.
 
 The window is remembered in few sweeps however fast they come, so memory is constant.
 """
@@ -35,18 +35,20 @@ class Stillness:
     def rate(
         self, t_ns: int, median: NDArray[np.uint16], usable: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
-        """Mean change of each finger's `usable` electrodes, counts/s, shape (fingers,).
+        """How far each finger's `usable` electrodes were away, counts/s, shape (fingers,).
 
-        Against the latest sweep that is at least a window old; None while there is none.
+        The largest mean distance to any sweep of the window, over the window, and to the latest one
+        before it, over its age: two moments alone would miss what swings. None while no sweep is
+        that old.
         """
-        former = None
-        while self._past and t_ns - self._past[0][0] >= self._window_ns:
-            former = self._past.popleft()
-        if former is None:
+        while len(self._past) > 1 and t_ns - self._past[1][0] >= self._window_ns:
+            self._past.popleft()
+        if not self._past or t_ns - self._past[0][0] < self._window_ns:
             return None
-        self._past.appendleft(former)
-        then_ns, then = former
-        distance = np.abs(median.astype(np.int32) - then) * usable
+        then = np.array([past for _, past in self._past])
+        distance = np.abs(then.astype(np.int32) - median) * usable
         number = np.maximum(np.count_nonzero(usable, axis=1), 1)
-        rate: NDArray[np.float64] = distance.sum(axis=1) / number / ((t_ns - then_ns) / 1e9)
+        ages_ns = np.array([max(t_ns - at_ns, self._window_ns) for at_ns, _ in self._past])
+        rates = distance.sum(axis=2) / number / (ages_ns[:, np.newaxis] / 1e9)
+        rate: NDArray[np.float64] = rates.max(axis=0)
         return rate

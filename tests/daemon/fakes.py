@@ -8,7 +8,9 @@ from typing import cast
 
 import numpy as np
 
-from daemon.judge.pipeline import Limits, Pipeline
+from daemon.judge.decision import Limits
+from daemon.judge.grip import GripLimits
+from daemon.judge.pipeline import Pipeline
 from drivers.base import DriverCounters, DriverError, Reading, TactileReading
 from models.contract import (
     Dataset,
@@ -88,17 +90,23 @@ class Clock:
 
 
 def pipeline(
-    model: FakeModel, clock: Clock, fingers: Sequence[str] = FINGERS, **limits: float
+    model: FakeModel,
+    clock: Clock,
+    fingers: Sequence[str] = FINGERS,
+    *,
+    grip: GripLimits | None = None,
+    **limits: float,
 ) -> Pipeline:
     return Pipeline(
         cast(TactileModel, model),
-        fingers,
+        cast(Sequence[Finger], fingers),
         Limits(
             max_age_ns=int(limits.get("max_age_ns", 100 * MS)),
             slip_threshold=limits.get("slip_threshold", 0.5),
             min_confidence=limits.get("min_confidence", 0.0),
         ),
         clock,
+        grip=grip,
     )
 
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -60,16 +57,3 @@ def test_the_port_of_the_scene_arrives_at_the_bridge() -> None:
     (driver,) = assembly.build_drivers(scene)
     assert isinstance(driver, SpiBridgeDriver)
     assert driver.describe()["port"] == "/dev/serial/by-id/mine"
-
-
-def test_a_replay_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
-    code = (
-        "import json, sys; from daemon.cli import main; main(['replay']); "
-        "sys.stderr.write(json.dumps(sorted(sys.modules)))"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    loaded = set(json.loads(result.stderr))
-    unwanted = {"can", "serial", "cobs", "torch", "sklearn", "onnx", "rich", "models.training"}
-    unwanted |= {"drivers.twins", "drivers.spi_bridge", "drivers.can_bridge", "drivers.palm"}
-    assert not unwanted & loaded
-    assert "drivers.replay" in loaded

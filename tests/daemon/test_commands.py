@@ -114,7 +114,8 @@ def test_check_says_what_is_in_and_what_is_left_out() -> None:
     assert "small-session" in content["in"]["model"]
     assert "not kept" in content["in"]["session"]
     assert "rf, lf" in content["left_out"]["fingers"]
-    assert "joints" in content["left_out"]
+    assert content["in"]["joints"] == "those of the recordings"
+    assert "joints" not in content["left_out"]
 
 
 def test_check_finds_a_recording_that_is_not_there(tmp_path: Path) -> None:

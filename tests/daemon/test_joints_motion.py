@@ -290,3 +290,30 @@ def test_after_time_went_back_missing_joints_block_no_longer_than_the_time_for_l
     early_ns = START_NS - 10**11
     reasons = [motion.against(early_ns + ms * MS) for ms in range(0, 3000, 10)]
     assert set(reasons[110:]) == {None}
+
+
+@pytest.mark.parametrize("swing_hz", [12.5, 11.9, 25.0])
+@pytest.mark.parametrize("rate_hz", [100.0, 1000.0])
+def test_joints_that_swing_in_step_with_the_window_are_moving(
+    swing_hz: float, rate_hz: float
+) -> None:
+    motion = JointMotion(LIMITS)
+    for place in range(round(rate_hz)):
+        t_s = place / rate_hz
+        send(
+            motion, START_NS + round(t_s * 1e9), 0.1 * np.sin(2 * np.pi * swing_hz * t_s), 0.0, 0.0
+        )
+        if t_s > 0.3:
+            assert motion.against(START_NS + round(t_s * 1e9)) is Reason.MOVING
+
+
+def test_a_joint_that_loses_its_angle_is_late_and_then_lost() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    for ms in range(10, 1500, 10):
+        send(motion, now_ns + ms * MS, 0.3, np.nan, -0.1)
+        found = motion.against(now_ns + ms * MS)
+        if 160 <= ms <= 1000:
+            assert found is Reason.JOINTS_LATE
+        if ms >= 1010:
+            assert found is None
+            assert motion.some_lost

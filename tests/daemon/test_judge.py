@@ -365,3 +365,13 @@ def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
             if before is not None and before.counts.shape == raw.counts.shape:
                 assert not (before.counts == raw.counts).all(axis=1).any()
         before = given_reading
+
+
+def test_a_finger_that_is_flagged_as_a_whole_is_missing_and_not_frozen() -> None:
+    clock = Clock()
+    judge = pipeline(FakeModel(), clock)
+    for number in range(3):
+        bad = reading(clock(), number)
+        bad.counts[1] = 0
+        bad.faults[1] = ElectrodeFault.MISSING
+        assert judge.judge(bad).reasons == (Reason.SENSOR_MISSING, Reason.ELECTRODES_BROKEN)

@@ -125,6 +125,43 @@ def test_a_flood_of_questions_is_bounded_and_the_newest_are_answered(
     assert questions.counters["answered"] == WAITING_MAX
 
 
+def test_a_message_of_very_many_frames_is_read_in_pieces_and_refused(
+    questions: Questions, endpoint: str, connect: Connect
+) -> None:
+    loud, polite = connect(endpoint), connect(endpoint)
+    loud.send_multipart([b""] * 5000)
+    deadline_s = time.monotonic() + 10.0
+    rounds = 0
+    while not questions.counters["malformed"] and time.monotonic() < deadline_s:
+        questions.take(0)
+        rounds += 1
+    assert questions.counters["malformed"] == 1
+    assert rounds >= 5000 // 64
+    polite.send(b"judge")
+    assert take_until(questions, 1) == 1
+
+
+def test_when_time_is_up_only_those_are_answered_who_have_waited_that_long(
+    questions: Questions, endpoint: str, connect: Connect
+) -> None:
+    first, second = connect(endpoint), connect(endpoint)
+    first.send(b"judge")
+    assert take_until(questions, 1) == 1
+    second.send(b"judge")
+    deadline_s = time.monotonic() + 10.0
+    while not questions.take(500) and time.monotonic() < deadline_s:
+        pass
+    questions.answer(b"early", PATIENCE_NS - 1)
+    assert questions.waiting == 2
+    questions.answer(b"late", PATIENCE_NS)
+    assert first.poll(5000)
+    assert first.recv() == b"late"
+    assert questions.waiting == 1
+    questions.answer(b"judged")
+    assert second.poll(5000)
+    assert second.recv() == b"judged"
+
+
 def test_whoever_asks_and_goes_does_no_harm(
     questions: Questions, endpoint: str, connect: Connect
 ) -> None:

@@ -15,20 +15,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.pipeline import Judgement, Limits, Pipeline
+from daemon.judge.decision import Limits
+from daemon.judge.grip import GripLimits
+from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.session import SessionCalibration
-from daemon.judge.verdict import Outcome, Reason
+from daemon.judge.verdict import GateState, Outcome, Reason
 from daemon.session_file import SessionFile, SessionFileError, exchanged, load
 from daemon.session_keeper import SAVE_PERIOD_NS, SessionKeeper
 from drivers.base import ElectrodeFault, TactileReading
+from drivers.twins.grasp_script import Durations
+from drivers.twins.whole_grasps import synthetic_grasps
 from models import zoo
-from models.contract import SessionInput, Sharpness
+from models.contract import Finger, SessionInput, Sharpness
 from models.inputs import SessionBuilder, raw_features
 from models.runtime import TactileModel
 from models.training.datasets import read_table
 from tests.daemon.fakes import Clock, FakeDriver
 
-FINGERS = ("ff", "mf", "th")
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
 
 
@@ -259,10 +263,10 @@ def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None
         assert kept.statistics.grasps >= 20
 
 
-def session_pipeline(**options: bool) -> Pipeline:
+def session_pipeline(*, learns: bool = True) -> Pipeline:
     model = TactileModel(zoo.find("small-session"))
     limits = Limits(max_age_ns=10**18)
-    return Pipeline(model, FINGERS, limits, lambda: 0, **options)
+    return Pipeline(model, FINGERS, limits, lambda: 0, learns=learns)
 
 
 def judge(pipeline: Pipeline, rows: NDArray[np.generic], fault: int = 0) -> list[Judgement]:
@@ -418,3 +422,52 @@ def test_a_session_that_cannot_be_is_not_restored(change: dict[str, Any], says: 
     with pytest.raises(ValueError, match=says):
         session.restore(msgspec.structs.replace(other.state(), **change))
     assert session.grasps == 0
+
+
+def settled_verdicts(pipeline: Pipeline, clock: Clock, seconds: float) -> list[Judgement]:
+    """What is said while a synthetic grasp is closed and held."""
+    held = Durations(first_rest_s=(1.5, 1.5), settle_s=(60.0, 60.0))
+    found = []
+    for moment in synthetic_grasps(1, durations=held, seed=1):
+        if moment.t_s > seconds:
+            break
+        clock.now_ns = 10**12 + round(moment.t_s * 1e9)
+        faults = np.zeros((3, 24), dtype=np.uint8)
+        found.append(pipeline.judge(TactileReading(clock.now_ns, 0, moment.counts, faults)))
+    return found
+
+
+def test_a_scene_that_requires_a_session_judges_nothing_without_one(bts3_dir: Path) -> None:
+    model, clock = TactileModel(zoo.find("cnn1-session")), Clock()
+    pipeline = Pipeline(
+        model, FINGERS, Limits(10**12), clock, grip=GripLimits(), needs_session=True, learns=False
+    )
+    assert pipeline.session is not None
+    for row in read_table(bts3_dir / "palm_down.csv").counts[:100]:
+        pipeline.session.observe(row)
+    assert settled_verdicts(pipeline, clock, 4.0)[-1].outcome is not Outcome.UNKNOWN
+    pipeline.session.reset()
+    after = pipeline.judge(reading_of(clock))
+    assert after.outcome is Outcome.UNKNOWN
+    assert Reason.NOT_CALIBRATED in after.reasons
+    assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
+
+
+def test_an_exchanged_sensor_ends_the_verdict_that_stands(bts3_dir: Path) -> None:
+    model, clock = TactileModel(zoo.find("cnn1")), Clock()
+    pipeline = Pipeline(model, FINGERS, Limits(10**12), clock, grip=GripLimits())
+    assert settled_verdicts(pipeline, clock, 4.0)[-1].gate is GateState.JUDGED
+    pipeline.sensors_exchanged()
+    after = pipeline.judge(reading_of(clock))
+    assert after.outcome is Outcome.UNKNOWN
+    assert Reason.NOT_TARED in after.reasons
+    assert after.contact == ()
+
+
+def reading_of(clock: Clock) -> TactileReading:
+    """One more reading of the same grasp."""
+    held = Durations(first_rest_s=(1.5, 1.5), settle_s=(60.0, 60.0))
+    stream = synthetic_grasps(1, durations=held, seed=1)
+    counts = next(moment.counts for moment in stream if moment.t_s > 4.0)
+    clock.now_ns += 10_000_000
+    return TactileReading(clock.now_ns, 0, counts, np.zeros((3, 24), dtype=np.uint8))

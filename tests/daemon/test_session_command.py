@@ -61,6 +61,17 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
         assert (reset.returncode, says in reset.stdout) == (0, True)
 
 
+def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3_dir: Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[model]\nname = "small-session"\n'
+        '[session]\nfile = "right.session.json"\n'
+    )
+    seeded = graspd("session", "seed", path, bts3_dir / "palm_45.csv")
+    assert seeded.returncode == 0, seeded.stderr
+    assert re.search(r": \d+ grasps of 2133 readings", seeded.stdout)
+
+
 def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     header = [f"{finger}_biotac_{n}" for finger in ("ff", "mf", "th") for n in range(1, 25)]
