@@ -117,7 +117,11 @@ class CountsBuilder:
 
 
 class SessionBuilder:
-    """Features of a reading, standardised by what `use` was told, then clipped."""
+    """Features of a reading, standardised by what `use` was told, then clipped.
+
+    The error is 6e-8 of the largest magnitude, the rounding to float32, as long as no mean is more
+    than a million times its spread.
+    """
 
     name = "session_features"
 
@@ -164,12 +168,17 @@ def _features(counts: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray
 def _z_scores(
     counts: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Z-values, means and (population) spreads of each finger; all zero where it is flat."""
+    """Z-values, means and (population) spreads of each finger; all zero where it is flat.
+
+    In two passes, so that large counts that hardly differ cancel before they are squared: for
+    counts of 12 bits the error is below 1e-9 of the largest magnitude, 6e-8 once it is float32.
+    """
     mean = counts.mean(axis=-1)
     centred = counts - mean[..., np.newaxis]
     spread: NDArray[np.float64] = np.sqrt(
         np.einsum("...e,...e->...", centred, centred) / ELECTRODES
     )
+    spread[np.isinf(spread)] = np.nan  # overflowed: no number to judge by
     judgeable = spread >= SPREAD_FLOOR_COUNTS
     scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
     return centred * scale[..., np.newaxis], mean, spread

@@ -75,7 +75,8 @@ class TactileImager:
     """Builds normalised tactile images without allocating an image per reading.
 
     The arithmetic is float64 on integers below 2**12, so an image differs from the exact one by
-    less than 1e-9 before it is rounded to float32.
+    less than 1e-9 before it is rounded to float32, which is 6e-8 of its largest magnitude: the
+    mean goes off each pixel before anything is squared, so nothing cancels.
     """
 
     name = "tactile_image"
@@ -122,7 +123,7 @@ class TactileImager:
         `counts` has shape (fingers, 24), `out` has shape `self.shape` and is C-contiguous. The
         result, shape (fingers,), is the standard deviation in counts; where it is below
         `SPREAD_FLOOR_COUNTS` (or not finite) the finger's image is all zeros and must not be
-        judged.
+        judged. For counts of 12 bits its relative error is below 1e-9.
         """
         if out.shape != self.shape or not out.flags.c_contiguous:
             raise ValueError(f"out must be C-contiguous {self.shape}, is {out.shape}")
@@ -136,6 +137,7 @@ class TactileImager:
             spread = np.sqrt(squares / len(pixels))
         else:
             spread = electrodes.std(axis=0)
+        spread[np.isinf(spread)] = np.nan  # overflowed: no number to judge by
         judgeable = spread >= SPREAD_FLOOR_COUNTS
         scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
         planes = out.reshape(self._split).transpose(self._axes)

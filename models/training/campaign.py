@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ from models.training.jobs import Job, JobResult
 from models.training.protocols import FOLDS, Protocol, splits
 from models.training.summary import Summary, summarise
 from models.training.sweep import sweep
-from models.training.system import System, with_recipes
+from models.training.system import System, digest, with_recipes
 
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
 """Enough to see that everything runs; the figures mean nothing."""
@@ -98,11 +100,24 @@ def campaign(
     counts = {protocol: len(splits(protocol, grasps, 0, folds)) for protocol in protocols}
     jobs = tuple(
         Job(system, protocol, seed, fold, folds)
-        for system, protocol in groups
+        for forms, protocol in itertools.product(_forms(systems), protocols)
         for seed in range(seeds)
         for fold in range(counts[protocol])
+        for system in forms
     )
     return Campaign(groups, jobs, grasps)
+
+
+def _forms(systems: Sequence[System]) -> list[list[System]]:
+    """The systems, with those together that are one network in different forms.
+
+    Their jobs of a fold follow each other, so it is trained once.
+    """
+    forms: dict[str, list[System]] = {}
+    for system in systems:
+        whole = dataclasses.replace(system, compression=None)
+        forms.setdefault(digest(whole), []).append(system)
+    return list(forms.values())
 
 
 def quickened(system: System) -> System:

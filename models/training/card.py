@@ -111,8 +111,9 @@ class Card(msgspec.Struct, frozen=True):
     temperature: float
     """In the file, fitted on the margins of `calibrated_by`: grasps that were not trained on."""
     calibrated_by: str
-    broken: Study
-    """What broken electrodes cost, and what is left of that after their repair."""
+    broken: Study | None
+    """What broken electrodes cost, and what is left of that after their repair; None if it was not
+    studied."""
     never_seen: NeverSeen
     same_seed_same_margins: bool
     """Training the first fold again gave bit-identical margins."""
@@ -151,10 +152,11 @@ def weak_points(summaries: Sequence[Summary]) -> tuple[str, ...]:
 
 def configuration(system: System) -> dict[str, Any]:
     """Everything that decides the result, JSON-ready."""
-    return {name: plain(getattr(system, name)) for name in ("input", "estimator", "recipe")} | {
-        "augmentation": plain(system.augmentation),
-        "tables": list(system.tables),
-    }
+    parts = {name: plain(getattr(system, name)) for name in ("input", "estimator", "recipe")}
+    parts |= {"augmentation": plain(system.augmentation), "tables": list(system.tables)}
+    if system.compression is not None:
+        parts["compression"] = plain(system.compression)
+    return parts
 
 
 def made_with() -> dict[str, str]:

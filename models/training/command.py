@@ -45,6 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--folds", type=whole(2, 1000), default=10, metavar="N", help="default: 10")
     parser.add_argument(
+        "--only",
+        choices=("cv", "objects", "objects-whole"),
+        metavar="PROTOCOL",
+        help="measure by this one protocol and leave the other studies out: for a model that is "
+        "compared and not used",
+    )
+    parser.add_argument(
         "--jobs", type=whole(1, 256), default=1, metavar="N", help="trainings at once (default: 1)"
     )
     parser.add_argument("--quiet", action="store_true", help="show no progress bar")
@@ -52,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Train, measure, export. Returns 0, 1 (export failed), 2 (data or folder), 130 (Ctrl-C)."""
-    order = Order(SYSTEMS[args.model], args.folds, args.seed, args.jobs)
+    order = Order(SYSTEMS[args.model], args.folds, args.seed, args.jobs, args.only)
     out: Path = args.out or Path("runs") / args.model
     started_s = time.monotonic()
     try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from sklearn.model_selection import StratifiedKFold
 from torch import nn
 
-from models.training import graphs
+from models.training import compression, graphs
 from models.training.augmentation import augment
 from models.training.calibration import fit_temperature
 from models.training.classical import (
@@ -24,7 +25,7 @@ from models.training.classical import (
 )
 from models.training.networks import AnyNetwork, DenseConfig, NetworkConfig, parameter_count
 from models.training.recipe import AnyRecipe, Progress, logits, train
-from models.training.system import BlendConfig, DistilConfig, System
+from models.training.system import BlendConfig, DistilConfig, System, digest
 
 
 class Fitted(Protocol):
@@ -157,6 +158,31 @@ class FittedStandardised:
         return graphs.standardised(self.inner.margin_graph(input_name), self.mean, self.scale)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedCompressed:
+    """A trained system in a smaller form, which judges as its graph does; see `Fitted`."""
+
+    graph: onnx.ModelProto
+    """From inputs to `margin`."""
+
+    @property
+    def parameters(self) -> int:
+        """Of the graph."""
+        return compression.size(self.graph)
+
+    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+        """See `Fitted`."""
+        return compression.GraphMargins(self.graph)(inputs)
+
+    def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+        """See `Fitted`."""
+        return graphs.with_probability(self.margin_graph(input_name), temperature)
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        """See `Fitted`."""
+        return graphs.renamed(self.graph, input_name)
+
+
 def fit(
     system: System,
     inputs: NDArray[np.float32],
@@ -170,6 +196,12 @@ def fit(
     The same arguments give the same result on the same machine. Raises `ValueError` if the inputs
     do not fit the estimator, or are too few.
     """
+    if system.compression is not None:
+        plain = replace(system, compression=None)
+        whole = _fit_before(plain, inputs, slipped, seed, on_epoch)
+        return FittedCompressed(
+            compression.compressed(whole.margin_graph("given"), system.compression, inputs)
+        )
     if system.standardise:
         mean, spread = inputs.mean(axis=0, dtype=np.float64), inputs.std(axis=0, dtype=np.float64)
         # A value that never changes tells nothing: it becomes zero.
@@ -222,6 +254,27 @@ def _fit_blend(
         share = member.weight / (member.copies * total)
         factors.append(share / spread if spread > 0.0 else 0.0)
     return FittedBlend(tuple(fitted), tuple(factors))
+
+
+_former: list[tuple[str, Fitted]] = []
+"""The last system that was fitted to be compressed, and what it came from: its other forms come
+next, and differ in nothing else."""
+
+
+def _fit_before(
+    system: System,
+    inputs: NDArray[np.float32],
+    slipped: NDArray[np.bool_],
+    seed: int,
+    on_epoch: Progress | None,
+) -> Fitted:
+    parts = hashlib.sha256(f"{digest(system)} {seed}".encode())
+    parts.update(np.ascontiguousarray(inputs).data)
+    parts.update(np.ascontiguousarray(slipped).data)
+    key = parts.hexdigest()
+    if not _former or _former[0][0] != key:
+        _former[:] = [(key, fit(system, inputs, slipped, seed=seed, on_epoch=on_epoch))]
+    return _former[0][1]
 
 
 def _fit_single(

@@ -99,6 +99,17 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
     return _model(nodes, constants, margin.graph.input[0], OUTPUT_NAME, 2)
 
 
+def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
+    """A copy whose input has this name."""
+    copied = onnx.ModelProto()
+    copied.CopyFrom(model)
+    former = copied.graph.input[0].name
+    copied.graph.input[0].name = input_name
+    for node in copied.graph.node:
+        node.input[:] = [input_name if name == former else name for name in node.input]
+    return copied
+
+
 def standardised(
     model: onnx.ModelProto, mean: NDArray[np.float32], scale: NDArray[np.float32]
 ) -> onnx.ModelProto:

@@ -50,9 +50,14 @@ class Order:
     folds: int
     seed: int
     processes: int = 1
+    only: Protocol | None = None
+    """Measured by this protocol alone, and without broken electrodes: for a model that is compared
+    and not used."""
 
     def protocols(self, grasps: Grasps) -> tuple[Protocol, ...]:
         """By what it is measured: `cv` first; the second, with new objects, calibrates it."""
+        if self.only is not None:
+            return (self.only,)
         if NEW_SESSION not in {file.name for file in grasps.files}:
             return ("cv", "objects-whole")
         objects: Protocol = "objects" if NEW_SESSION in self.system.tables else "objects-whole"
@@ -69,7 +74,11 @@ class Order:
     @property
     def command(self) -> str:
         """The command line that repeats it."""
-        return f"graspd train {self.system.name} --data DIR --seed {self.seed} --folds {self.folds}"
+        only = "" if self.only is None else f" --only {self.only}"
+        return (
+            f"graspd train {self.system.name} --data DIR --seed {self.seed} --folds {self.folds}"
+            + only
+        )
 
 
 def make(
@@ -89,8 +98,9 @@ def make(
     trained = train(order.system, grasps.of_tables(order.system.tables), order.seed)
     on_done()
     contract = _contract(order, trained, summaries)
+    calibrator = _calibrator(summaries)
     path = out / f"{order.system.name}.onnx"
-    temperature = summaries[1].main.temperature
+    temperature = calibrator.main.temperature
     parity = export(
         trained.fitted, temperature, contract, trained.grasps.counts, path, _sessions(trained)
     )
@@ -103,8 +113,12 @@ def make(
         system=cards.configuration(order.system),
         protocols={summary.protocol: cards.Measured.of(summary) for summary in summaries},
         temperature=temperature,
-        calibrated_by=summaries[1].protocol,
-        broken=broken_study(order.system, trained.grasps, order.seed),
+        calibrated_by=calibrator.protocol,
+        broken=(
+            None
+            if order.only is not None
+            else broken_study(order.system, trained.grasps, order.seed)
+        ),
         never_seen=_never_seen(trained, contract, order.seed),
         same_seed_same_margins=_same(found[0], again),
         command=order.command,
@@ -113,6 +127,11 @@ def make(
     )
     cards.write(card, path.with_suffix(".json"))
     return card
+
+
+def _calibrator(summaries: list[Summary]) -> Summary:
+    """What probabilities are calibrated by: new objects, where they were measured."""
+    return summaries[min(1, len(summaries) - 1)]
 
 
 def _summaries(order: Order, grasps: Grasps, found: list[JobResult]) -> list[Summary]:
@@ -139,7 +158,7 @@ def _contract(order: Order, trained: Trained, summaries: list[Summary]) -> Model
         measured=tuple(map(_measured, summaries)),
         confidence=tuple(
             ConfidenceStep(point.confidence, point.accuracy, point.coverage)
-            for point in reversed(summaries[1].main.curve)
+            for point in reversed(_calibrator(summaries).main.curve)
         ),
         seen=seen_counts(_mapped(trained), trained.looks.margin),
     )
@@ -170,7 +189,7 @@ def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
 
 def _sharpness(summaries: list[Summary]) -> tuple[Sharpness, ...]:
     """How much less sure a young session is than the calibrated model, never more sure."""
-    base = summaries[1].main.temperature
+    base = _calibrator(summaries).main.temperature
     later = next((s for s in summaries if s.protocol == "session"), None)
     if later is None:
         return (Sharpness(0.0, 1.0),)

@@ -14,6 +14,7 @@ from models.bts3 import WHOLE
 from models.contract import CountsInput, ImageInput, VectorInput
 from models.training.augmentation import Augmentation
 from models.training.classical import ClassicalConfig
+from models.training.compression import Compression
 from models.training.networks import AnyNetwork
 from models.training.recipe import AnyRecipe, PublishedRecipe, Recipe
 
@@ -89,6 +90,8 @@ class System:
     augmentation: Augmentation | None = None
     standardise: bool = False
     """Each value of an input by its own mean and spread in the training, within the model."""
+    compression: Compression | None = None
+    """What is done to the trained network before it judges."""
     tables: tuple[str, ...] = WHOLE
     """What the model that is kept is trained on; protocols say for themselves."""
     published: tuple[Published, ...] = ()
@@ -96,10 +99,10 @@ class System:
 
 def digest(system: System) -> str:
     """SHA-256, hexadecimal, of all that decides a fold's result; not of name and description."""
-    parts = {
-        name: plain(getattr(system, name))
-        for name in ("input", "estimator", "recipe", "augmentation", "standardise")
-    }
+    names = ["input", "estimator", "recipe", "augmentation", "standardise"]
+    if system.compression is not None:
+        names.append("compression")
+    parts = {name: plain(getattr(system, name)) for name in names}
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -11,6 +11,7 @@ from models.tactile_image import Composition, Fill, Normalisation
 from models.training.augmentation import Augmentation
 from models.training.classical import BoostingConfig, ForestConfig, MlpConfig
 from models.training.classical import SvmConfig as Svm
+from models.training.compression import Compression, HalfWeights, Integers, LowRank
 from models.training.networks import CNN0, CNN1, CNN2, CNN3, NetworkConfig, SecondConvolution
 from models.training.recipe import PublishedRecipe, Recipe
 from models.training.system import (
@@ -61,6 +62,9 @@ COUNTS = CountsInput()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
+RANKS = (8, 16, 32, 64, 128, 256)
+NARROW = ((4, 32), (8, 64), (16, 64))
+"""Filters and hidden units."""
 SHARP_SVM = Svm(c=5.0, gamma=0.02)
 SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
 SMALL_RECIPE = Recipe(epochs=20, weight_decay=1.0, input_noise=0.2)
@@ -208,6 +212,41 @@ def _compositions() -> tuple[System, ...]:
     )
 
 
+def _smaller() -> tuple[System, ...]:
+    """CNN1 in smaller forms, and narrower networks: what is error worth in run time?"""
+    cnn1 = next(system for system in _PAPER if system.name == "cnn1")
+    forms: dict[str, tuple[str, Compression]] = {
+        "f16": ("with weights of 16 bits", HalfWeights()),
+        "int8": ("with weights and inputs of layers of 8 bits", Integers(static=False)),
+        "int8-static": ("the same, with ranges taken from the training", Integers(static=True)),
+        **{
+            f"rank-{rank}": (f"its large layer factored to rank {rank}", LowRank(rank))
+            for rank in RANKS
+        },
+    }
+    compressed = (
+        dataclasses.replace(
+            cnn1,
+            name=f"cnn1-{name}",
+            description=f"CNN1 {text}.",
+            compression=how,
+            published=(),
+        )
+        for name, (text, how) in forms.items()
+    )
+    narrow = (
+        System(
+            f"narrow-{filters}x{hidden}",
+            f"Conv{filters} - FC{hidden} on the same image as CNN1.",
+            image(),
+            NetworkConfig(filters=filters, hidden=hidden),
+            CNN_RECIPE,
+        )
+        for filters, hidden in NARROW
+    )
+    return (*compressed, *narrow)
+
+
 _ELECTRODES = (
     System(
         "svm-electrodes",
@@ -288,6 +327,6 @@ _SESSION = (
 
 SYSTEMS = {
     system.name: system
-    for system in (*_PAPER, *_layouts(), *_compositions(), *_ELECTRODES, *_SESSION)
+    for system in (*_PAPER, *_layouts(), *_compositions(), *_smaller(), *_ELECTRODES, *_SESSION)
 }
 """By name, the paper's first."""
