@@ -14,7 +14,6 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from types import ModuleType
 
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
@@ -31,9 +30,15 @@ COMMANDS = {
     "session": ("daemon.commands.session", "show, reset or seed what is known of the sensors"),
     "train": ("models.training.command", "train and export a model (extra: train)"),
     "evaluate": ("models.training.evaluate", "measure how good systems are (extra: train)"),
+    "report": (
+        "daemon.commands.report",
+        "measure error, time and exactness of the models (extras: train, report)",
+    ),
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
+EXTRAS = {"train": "train", "evaluate": "train", "report": "train,report"}
+"""Extras that a command needs."""
 WRONG = 2
 LOGGERS = ("graspd", "daemon", "drivers", "models")
 
@@ -60,9 +65,7 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     for name, (module_name, text) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         if name == named:
-            module = _load(name, module_name)
-            module.add_arguments(command)
-            run = module.run
+            run = _load(name, module_name, command)
     args = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="graspd: %(levelname)s: %(message)s")
     for ours in LOGGERS:  # libraries speak up only when something is wrong
@@ -72,15 +75,20 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     return functools.partial(run, args)
 
 
-def _load(command: str, module: str) -> ModuleType:
+def _load(
+    command: str, module: str, parser: argparse.ArgumentParser
+) -> Callable[[argparse.Namespace], int]:
     try:
-        return importlib.import_module(module)
+        loaded = importlib.import_module(module)
+        loaded.add_arguments(parser)
     except ModuleNotFoundError as error:
         package = (error.name or "").split(".")[0]
-        if not module.startswith("models.training.") or package in {"daemon", "drivers", "models"}:
+        if command not in EXTRAS or package in {"daemon", "drivers", "models"}:
             raise
         sys.stderr.write(
-            f"graspd: {command} needs the package '{package}': run pip install '.[train]' in the "
-            "folder of graspd's source\n"
+            f"graspd: {command} needs the package '{package}': run pip install "
+            f"'.[{EXTRAS[command]}]' in the folder of graspd's source\n"
         )
         raise SystemExit(WRONG) from None
+    run: Callable[[argparse.Namespace], int] = loaded.run
+    return run

@@ -1,0 +1,156 @@
+"""What a model should be fed with, in extended precision and by definition, step for step.
+
+Pixels are filled one by one in passes, moments are taken in two passes: none of the shortcuts of
+`models.tactile_image` and `models.inputs` is taken here.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.network import TINY
+from models.contract import CountsInput, ImageInput, ModelContract, SessionInput
+from models.layout import LAYOUTS, Layout
+from models.session import SessionState
+from models.tactile_image import SPREAD_FLOOR_COUNTS, Composition, Fill, Normalisation
+
+Exact = NDArray[np.longdouble]
+Standard = tuple[Exact, Exact]
+"""Mean and spread by which features are standardised, shape (features,) each."""
+
+
+def exact_input(
+    contract: ModelContract,
+    counts: NDArray[np.generic],
+    standard: Standard | None = None,
+) -> tuple[Exact, Exact]:
+    """Inputs (N, *shape) and spreads (N, fingers) of counts (N, fingers, 24).
+
+    Features are standardised by `standard`, mean and spread (features,), or by the training's.
+    Where a finger is flat its part of the input is zero.
+    """
+    values = counts.astype(np.longdouble)
+    match contract.input:
+        case ImageInput() as image:
+            return _image(values, image)
+        case CountsInput():
+            return values.reshape(len(values), -1), _z_scores(values)[2]
+        case SessionInput() as session:
+            return _features(values, session, standard)
+        case _:
+            z, _, spread = _z_scores(values)
+            return z.reshape(len(z), -1), spread
+
+
+def exact_standard(session: SessionInput, state: SessionState) -> Standard:
+    """Mean and spread of the features of a session: its own, blended with the training's."""
+    features = len(session.mean)
+    own, prior = np.longdouble(state.weight), np.longdouble(session.prior_grasps)
+    mean = np.array(state.mean[:features], dtype=np.longdouble)
+    squares = np.array(state.squares[:features], dtype=np.longdouble)
+    prior_mean = np.array(session.mean, dtype=np.longdouble)
+    prior_spread = np.array(session.spread, dtype=np.longdouble)
+    return (
+        (prior * prior_mean + own * mean) / (prior + own),
+        np.sqrt((prior * prior_spread**2 + squares) / (prior + own)),
+    )
+
+
+def exact_softening(
+    p_stable: NDArray[np.float64],
+    p_slip: NDArray[np.float64],
+    temperature: float,
+    threshold: float,
+) -> NDArray[np.float64]:
+    """What a young session publishes for these: the margin over the temperature.
+
+    Counted from the threshold, and probabilities taken for `TINY` at least, by definition.
+    """
+    slip = np.maximum(p_slip, TINY).astype(np.longdouble)
+    stable = np.maximum(p_stable, TINY).astype(np.longdouble)
+    zero = np.log(np.longdouble(threshold)) - np.log(np.longdouble(1.0 - threshold))
+    margin = zero + (np.log(slip / stable) - zero) / np.longdouble(temperature)
+    softened: NDArray[np.float64] = (1.0 / (1.0 + np.exp(-margin))).astype(np.float64)
+    return softened
+
+
+def _moments(values: Exact) -> tuple[Exact, Exact]:
+    """Mean and population standard deviation over the last axis, in two passes."""
+    mean = values.mean(axis=-1)
+    deviations = values - mean[..., np.newaxis]
+    return mean, np.sqrt((deviations * deviations).mean(axis=-1))
+
+
+def _divided(deviations: Exact, spread: Exact) -> Exact:
+    """Deviations over their spread; zero where it is below the floor or no number."""
+    sound = spread >= SPREAD_FLOOR_COUNTS
+    scale = np.where(sound, spread, 1)[..., np.newaxis]
+    quotient: Exact = np.where(sound[..., np.newaxis], deviations / scale, 0)
+    return quotient
+
+
+def _z_scores(values: Exact) -> tuple[Exact, Exact, Exact]:
+    mean, spread = _moments(values)
+    return _divided(values - mean[..., np.newaxis], spread), mean, spread
+
+
+def _features(
+    values: Exact,
+    session: SessionInput,
+    standard: Standard | None,
+) -> tuple[Exact, Exact]:
+    z, mean, spread = _z_scores(values)
+    raw = np.concatenate((z.reshape(len(z), -1), mean, spread), axis=1)
+    centre, width = standard or (
+        np.array(session.mean, dtype=np.longdouble),
+        np.array(session.spread, dtype=np.longdouble),
+    )
+    clipped: Exact = np.clip((raw - centre) / width, -session.clip, session.clip)
+    return clipped, spread
+
+
+def _image(values: Exact, wanted: ImageInput) -> tuple[Exact, Exact]:
+    filled = _filled(values, LAYOUTS[wanted.layout], Fill(wanted.fill))
+    height, width = filled.shape[2:]
+    pixels = filled.reshape(*filled.shape[:2], -1)
+    if Normalisation(wanted.normalisation) is Normalisation.FILLED_IMAGE:
+        mean, spread = _moments(pixels)
+    else:
+        mean, spread = _moments(values)
+    planes = _divided(pixels - mean[..., np.newaxis], spread)
+    images = planes.reshape(*planes.shape[:2], height, width)
+    match Composition(wanted.composition):
+        case Composition.CHANNELS:
+            return images.transpose(0, 2, 3, 1), spread
+        case Composition.HORIZONTAL:
+            return np.concatenate(list(images.swapaxes(0, 1)), axis=2)[..., np.newaxis], spread
+        case Composition.VERTICAL:
+            return np.concatenate(list(images.swapaxes(0, 1)), axis=1)[..., np.newaxis], spread
+
+
+def _filled(values: Exact, layout: Layout, fill: Fill) -> Exact:
+    """Images (N, fingers, height, width) of counts (N, fingers, 24), paper section II-A."""
+    height, width = layout.shape
+    images = np.zeros((*values.shape[:2], height, width), dtype=np.longdouble)
+    known = np.zeros((height, width), dtype=np.bool_)
+    for electrode, (row, column) in enumerate(zip(layout.rows, layout.columns, strict=True)):
+        images[..., row, column] = values[..., electrode]
+        known[row, column] = True
+    if fill is Fill.LEAST_CONTACT:
+        images[..., ~known] = values.max(axis=-1)[..., np.newaxis]
+        return images
+    while not known.all():
+        before, was_known = images.copy(), known.copy()
+        for row, column in np.argwhere(~was_known).tolist():
+            around = [
+                (r, c)
+                for r in range(max(row - 1, 0), min(row + 2, height))
+                for c in range(max(column - 1, 0), min(column + 2, width))
+                if was_known[r, c]
+            ]
+            if around:
+                total = sum(before[..., r, c] for r, c in around)
+                images[..., row, column] = total / np.longdouble(len(around))
+                known[row, column] = True
+    return images

@@ -1,0 +1,235 @@
+"""The report as figures, table, picture and one page that needs nothing else."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+Found = dict[str, Any]
+Row = dict[str, Any]
+
+PROTOCOL = "cv"
+COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
+MARKERS = {"model": "o", "peer": "s"}
+STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; background: #fff }
+table { border-collapse: collapse; width: 100%; font-size: 13px }
+th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #ddd }
+th:first-child, td:first-child { text-align: left }
+th { border-bottom: 2px solid #888 }
+svg { max-width: 100%; height: auto }
+"""
+
+
+def write(found: Found, folder: Path) -> None:
+    """Write `error-vs-time.json`, `.md`, `.svg` and `.html`. Raises `OSError`."""
+    base = folder / "error-vs-time"
+    picture = draw(found)
+    base.with_suffix(".json").write_text(json.dumps(found, indent=1) + "\n")
+    base.with_suffix(".md").write_text(table(found) + "\n")
+    base.with_suffix(".svg").write_text(picture)
+    base.with_suffix(".html").write_text(_page(found, picture))
+
+
+def table(found: Found) -> str:
+    """All rows as Markdown, the most exact first, with the advice."""
+    lines = list(_lines(COLUMNS, [_cells(row) for row in _sorted(found["rows"])]))
+    lines += ["", *_stages(found), "", *(f"- {text}" for text in advice(found["rows"]))]
+    lines += ["", _made(found)]
+    return "\n".join(lines)
+
+
+COLUMNS = (
+    "model",
+    "F1, known objects (95 %)",
+    "other objects",
+    "Brier",
+    "ECE",
+    "off float64, flips",
+    "hot p50 / p99 / p99.9, us",
+    "paced p50 / p99, us",
+    "CPU at 100 Hz",
+    "file, MB",
+    "floor, us",
+    "start, ms",
+    "memory, MiB",
+)
+
+
+def _cells(row: Row) -> list[str]:
+    error = row["error"].get(PROTOCOL, {})
+    other = row["error"].get("objects") or row["error"].get("objects-whole")
+    exact, took = row["numerical"], row["time"]
+    return [
+        f"`{row['name']}`" if row["kind"] == "model" else row["name"],
+        _interval(error),
+        "-" if not other else f"{100 * other['f1']:.1f}",
+        "-" if not error else f"{error['brier']:.3f}",
+        "-" if not error else f"{error['ece']:.3f}",
+        f"{exact['largest']:.0e}, {exact['flipped']}" if "largest" in exact else "-",
+        f"{took['hot_p50_us']:.0f} / {took['hot_p99_us']:.0f} / {took['hot_p99.9_us']:.0f}",
+        f"{took['paced_p50_us']:.0f} / {took['paced_p99_us']:.0f}",
+        f"{took['cpu_percent_at_100_hz']:.1f} %",
+        "-" if row["bytes"] is None else f"{row['bytes'] / 1e6:.2f}",
+        "-" if row["floor_us"] is None else f"{row['floor_us']:.1f}",
+        "-" if row["start_ms"] is None else f"{row['start_ms']:.0f}",
+        "-" if row["memory_mib"] is None else f"{row['memory_mib']:.0f}",
+    ]
+
+
+def _interval(error: dict[str, float]) -> str:
+    if not error:
+        return "-"
+    return f"{100 * error['f1']:.1f} ({100 * error['low']:.1f}..{100 * error['high']:.1f})"
+
+
+def _sorted(rows: Sequence[Row]) -> list[Row]:
+    order = {"model": 0, "peer": 1, "floor": 2}
+    return sorted(
+        rows, key=lambda row: (order[row["kind"]], -row["error"].get(PROTOCOL, {}).get("f1", 0.0))
+    )
+
+
+def _stages(found: Found) -> Iterator[str]:
+    yield f"Stages of a reading with `{found['stages']['model']}`, hot:"
+    yield ""
+    cells = [
+        [name, f"{took['p50']:.0f}", f"{took['p99']:.0f}"]
+        for name, took in found["stages"]["us"].items()
+    ]
+    yield from _lines(("stage", "p50, us", "p99, us"), cells)
+
+
+def _lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    yield "| " + " | ".join(titles) + " |"
+    yield "|" + "---|" * len(titles)
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+
+
+def advice(rows: Sequence[Row]) -> Iterator[str]:
+    """Which model for which need, by these figures."""
+    models = [row for row in rows if row["kind"] == "model"]
+    for protocol, need in (
+        ("cv", "objects that are known, no other day"),
+        ("objects", "new objects"),
+        ("session", "another day"),
+    ):
+        judged = [
+            (row["error"][protocol]["f1"], row["name"])
+            for row in models
+            if protocol in row["error"]
+        ]
+        if judged:
+            f1, name = max(judged)
+            yield f"For {need}: `{name}`, F1 {100 * f1:.1f} %."
+    base = next((row for row in models if row["name"] == "cnn1" and row["error"]), None)
+    if base is None:
+        return
+    low = base["error"][PROTOCOL]["low"]
+    as_good = [row for row in models if row["error"].get(PROTOCOL, {}).get("f1", 0.0) >= low]
+    fastest = min(as_good, key=lambda row: float(row["time"]["paced_p50_us"]))
+    ratio = base["time"]["paced_p50_us"] / fastest["time"]["paced_p50_us"]
+    yield (
+        f"For the least time at an F1 within the interval of `cnn1`: `{fastest['name']}`, "
+        f"{ratio:.1f} times as fast as `cnn1` when paced."
+    )
+
+
+def draw(found: Found) -> str:
+    """Error against run time as SVG."""
+    mpl.rcParams["svg.hashsalt"] = "graspd"
+    figure = Figure(figsize=(9.0, 5.6), layout="constrained")
+    axes = figure.subplots()
+    shown = [row for row in found["rows"] if PROTOCOL in row["error"]]
+    for row in shown:
+        error = row["error"][PROTOCOL]
+        x, y = row["time"]["paced_p50_us"], 100 * (1 - error["f1"])
+        reach = [[100 * (error["high"] - error["f1"])], [100 * (error["f1"] - error["low"])]]
+        colour = COLOURS[row["kind"]]
+        axes.errorbar(x, y, yerr=reach, fmt=MARKERS[row["kind"]], color=colour, alpha=0.8, lw=0.8)
+        axes.annotate(
+            row["name"], (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour
+        )
+    _draw_front(axes, [row for row in shown if row["kind"] == "model"])
+    for row in found["rows"]:
+        if row["kind"] == "floor":
+            axes.axvline(row["time"]["paced_p50_us"], color="#888", ls=":", lw=1)
+            axes.text(
+                row["time"]["paced_p50_us"],
+                axes.get_ylim()[1],
+                f" {row['name']}",
+                fontsize=7,
+                va="top",
+                color="#666",
+            )
+    axes.set_xscale("log")
+    axes.set_xlabel("time per reading, paced at 100 Hz: input and network, p50, us")
+    axes.set_ylabel("1 - F1 on known objects, % (bars: 95 %)")
+    axes.grid(alpha=0.25)
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return text.getvalue()
+
+
+def _draw_front(axes: Any, rows: Sequence[Row]) -> None:  # noqa: ANN401 - matplotlib's own
+    """Models that none is both faster and more exact than."""
+    front, best = [], np.inf
+    for row in sorted(rows, key=lambda row: float(row["time"]["paced_p50_us"])):
+        error = 100 * (1 - row["error"][PROTOCOL]["f1"])
+        if error < best:
+            best = error
+            front.append((row["time"]["paced_p50_us"], error))
+    axes.plot(*zip(*front, strict=True), color="#1f6f8b", lw=1.2, alpha=0.6, zorder=0)
+
+
+def _made(found: Found) -> str:
+    machine = ", ".join(
+        value if name == "processor" else f"{name} {value}"
+        for name, value in found["machine"].items()
+    )
+    return (
+        f"{machine}; {found['readings']['hot']} readings hot, {found['readings']['paced']} paced, "
+        f"memory {found['bandwidth_bytes_per_s'] / 1e9:.1f} GB/s; `graspd report error-vs-time`"
+    )
+
+
+def _page(found: Found, picture: str) -> str:
+    cells = [_cells(row) for row in _sorted(found["rows"])]
+    stages = [
+        [name, f"{took['p50']:.0f}", f"{took['p99']:.0f}"]
+        for name, took in found["stages"]["us"].items()
+    ]
+    items = "".join(f"<li>{_marked(text)}</li>" for text in advice(found["rows"]))
+    return (
+        "<!doctype html><html lang=en><meta charset=utf-8><title>graspd: error against run time"
+        f"</title><style>{STYLE}</style><h1>Error against run time</h1><ul>{items}</ul>"
+        f"{picture[picture.index('<svg') :]}{_html_table(COLUMNS, cells)}"
+        f"<h2>Stages of a reading</h2>{_html_table(('stage', 'p50, us', 'p99, us'), stages)}"
+        f"<p>{_marked(_made(found))}</p></html>\n"
+    )
+
+
+def _html_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{_marked(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _marked(text: str) -> str:
+    """Escaped, with what stands between back ticks as code."""
+    parts = html.escape(text).split("`")
+    return "".join(
+        f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts)
+    )
