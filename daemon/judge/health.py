@@ -109,9 +109,9 @@ class Health:
         return found
 
     def _compare(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_]) -> bool:
-        """Take in how the counts have changed; True if a whole finger reads exactly as before.
+        """Take in how the counts have changed; True if a finger reads exactly as before.
 
-        What is not `sound` was not read, so it repeats nothing.
+        What is not `sound` was not read: it neither repeats anything nor hides that others do.
         """
         steps = np.abs(counts.astype(np.int32) - self._previous)
         same = (steps == 0) & sound
@@ -120,7 +120,8 @@ class Health:
         moves = np.partition(steps, STILL - 1, axis=1)[:, STILL - 1 : STILL]
         jumped = (steps > JUMP_COUNTS) & (moves <= STILL_COUNTS)
         self._jumps = JUMPS_FADE * self._jumps + jumped
-        return bool(same.all(axis=1).any())
+        repeats = (same | ~sound).all(axis=1) & sound.any(axis=1)
+        return bool(repeats.any())
 
 
 def too_many(broken: NDArray[np.bool_]) -> bool:

@@ -1,0 +1,169 @@
+"""A hand that plays a whole grasp soundly up to a state of the gate, and under a fault from there.
+
+The grasp comes in two ways: as readings at 100 Hz, and as a palm's packets, 71.43 readings/s.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from daemon.judge.decision import Limits
+from daemon.judge.gate import GateLimits
+from daemon.judge.grip import GripLimits
+from daemon.judge.joints import JointLimits
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.verdict import GateState, Outcome, Reason
+from drivers.base import JointReading, TactileReading
+from drivers.twins.grasp_script import Durations
+from drivers.twins.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
+from models import zoo
+from models.runtime import TactileModel
+from tests.daemon.fakes import FINGERS, MS, Clock
+
+START_NS = 10**12
+MAX_AGE_NS = 100 * MS
+GATE = GateLimits(hold_ns=80 * MS, rate_window_ns=80 * MS, gap_ns=100 * MS, release_ns=100 * MS)
+JOINTS = JointLimits(rad_per_s=0.1, window_ns=80 * MS, late_ns=150 * MS, lost_ns=1000 * MS)
+UNDER_FAULT = 30
+"""Periods of the readings."""
+KEPT = 20
+"""Of so many states of the pipeline on the way one is kept, to go on from it later."""
+DURATIONS = Durations(
+    first_rest_s=(3.0, 3.0), close_s=(0.7, 0.7), settle_s=(1.2, 1.2), rest_s=(1.0, 1.0)
+)
+"""Each state of the gate, but `released`, lasts longer than the readings under fault."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """What comes when the daemon's own clock shows `now_ns`; None is nothing."""
+
+    now_ns: int
+    tactile: TactileReading | None
+    joints: JointReading | None
+
+
+Fault = Callable[[Sequence[Step]], list[Step]]
+"""From sound steps, the first of which is the last one before the fault, to what comes after it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What is said under a fault, and without it."""
+
+    outcome: Outcome
+    reasons: tuple[Reason, ...]
+    sound: Judgement
+    """Of the last sound reading by then."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hand:
+    pipeline: Pipeline
+    clock: Clock
+    silence_ns: int
+
+    def copy(self) -> _Hand:
+        """Another one that goes on from here; the network is the same."""
+        shared = {id(network()): network()}
+        return _Hand(*copy.deepcopy((self.pipeline, self.clock), shared), self.silence_ns)
+
+    def play(self, steps: Sequence[Step]) -> Iterator[tuple[Step, Judgement]]:
+        """Judge what comes after the first step, as the service does."""
+        last_ns, due_ns = steps[0].now_ns, steps[0].now_ns + self.silence_ns
+        for step in steps[1:]:
+            self.clock.now_ns = step.now_ns
+            if step.joints is not None:
+                self.pipeline.turn(step.joints)
+            if step.tactile is not None:
+                last_ns, due_ns = step.tactile.t_ns, step.now_ns + self.silence_ns
+                yield step, self.pipeline.judge(step.tactile)
+            elif step.now_ns >= due_ns:
+                due_ns = step.now_ns + self.silence_ns
+                yield step, self.pipeline.silence(last_ns)
+
+
+class Grasp:
+    """One whole grasp, what is said of it, and what is said of it under faults."""
+
+    def __init__(self, rate_hz: float, *, on_request: bool) -> None:
+        """Play it soundly. With `on_request` nobody asks, so a settled grasp stays `settled`."""
+        self._period_ns = round(1e9 / rate_hz)
+        self._steps = self._sound_steps(rate_hz)
+        clock = Clock(START_NS)
+        grip = GripLimits(on_request=on_request, gate=GATE, joints=JOINTS)
+        pipeline = Pipeline(network(), FINGERS, Limits(MAX_AGE_NS), clock, grip=grip)
+        # A daemon tells of silence after ten periods, and not before the age limit.
+        hand = _Hand(pipeline, clock, max(MAX_AGE_NS, 10 * self._period_ns))
+        self._kept = {0: hand.copy()}
+        self._sound: list[Judgement | None] = [None]
+        for number, (_, judgement) in enumerate(hand.play(self._steps), start=1):
+            self._sound.append(judgement)
+            if number % KEPT == 0:
+                self._kept[number] = hand.copy()
+
+    def under(self, fault: Fault, state: GateState, *, earlier: int = 0) -> list[Finding]:
+        """What is said in the 30 periods after the first reading of a state.
+
+        A fault may begin so many readings `earlier`.
+        """
+        at = self._first(state)
+        begin = at - earlier
+        sound = self._steps[begin : at + UNDER_FAULT + 1]
+        return [
+            Finding(judgement.outcome, judgement.reasons, self._judgement_at(step.now_ns))
+            for step, judgement in self._hand_at(begin).play([sound[0], *fault(sound)])
+            if step.now_ns > self._steps[at].now_ns
+        ]
+
+    def soundly(self, state: GateState) -> list[Judgement]:
+        """What is said in these 30 periods without a fault."""
+        steps = self._steps[self._first(state) + 1 :][:UNDER_FAULT]
+        return [self._judgement_at(step.now_ns) for step in steps]
+
+    def _first(self, state: GateState) -> int:
+        if state is GateState.IDLE:  # at the end of it, when all fingers are tared
+            return self._first(GateState.CLOSING) - UNDER_FAULT - 1
+        return [None if said is None else said.gate for said in self._sound].index(state)
+
+    def _judgement_at(self, now_ns: int) -> Judgement:
+        said = self._sound[min((now_ns - START_NS) // self._period_ns, len(self._sound) - 1)]
+        if said is None:
+            raise ValueError("nothing is said at the start")
+        return said
+
+    def _hand_at(self, number: int) -> _Hand:
+        kept = number // KEPT * KEPT
+        hand = self._kept[kept].copy()
+        for _ in hand.play(self._steps[kept : number + 1]):
+            pass
+        return hand
+
+    def _sound_steps(self, rate_hz: float) -> list[Step]:
+        steps = []
+        for number, moment in enumerate(
+            synthetic_grasps(1, rate_hz=rate_hz, durations=DURATIONS, seed=0)
+        ):
+            t_ns = START_NS + number * self._period_ns
+            faults = np.zeros(moment.counts.shape, dtype=np.uint8)
+            tactile = TactileReading(t_ns, number, moment.counts, faults)
+            joints = JointReading(t_ns, number, moment.joint_names, moment.position_rad)
+            steps.append(Step(t_ns, tactile, joints))
+        return steps
+
+
+@cache
+def network() -> TactileModel:
+    """A real one, by which counts that are like those of no grasp are refused."""
+    return TactileModel(zoo.find("cnn1"))
+
+
+@cache
+def grasp(*, of_a_palm: bool, on_request: bool) -> Grasp:
+    """The grasp, played once."""
+    return Grasp(PALM_RATE_HZ if of_a_palm else RATE_HZ, on_request=on_request)

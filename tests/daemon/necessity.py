@@ -1,0 +1,218 @@
+"""What a verdict needs, followed reading by reading after the documentation, beside the judge.
+
+All bounds are necessary conditions. Where the judge remembers more than is followed here (which
+electrodes jump or are dead), what depends on it is left open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import JointReading, TactileReading
+
+MS = 1_000_000
+AGE_MAX_MS = 100
+GAP_MS = 100
+HOLD_MS, WINDOW_MS = 80, 80
+RATE_COUNTS_PER_S = 120.0
+LET_GO_COUNTS = 0.6 * 20.0
+"""A finger touches while its third deepest electrode is so much further below its rest than its
+median electrode."""
+TARE_COUNTS = 5.0
+"""What the judge's own tare may differ by, for it follows the rest and has noise."""
+JOINT_RAD_PER_S = 0.1
+JOINTS_LATE_MS, JOINTS_LOST_MS = 150, 1000
+LEFT_OUT_NS = WINDOW_MS * MS // 16
+"""Angles that come faster than this may be left out."""
+REPAIRABLE_BITS = 1 | 2 | 4 | 8
+BROKEN_MAX, BROKEN_FINGER_MAX = 12, 8
+DEAD_AFTER = 16
+SICK_FOR = 24
+"""Readings for which an electrode that was broken may still count as one that jumps."""
+DOUBT_FOR = 40
+"""Readings after one of which it is open whether the judge used it."""
+NEAREST, FURTHEST = 3, 5
+"""Three fresh values are among the last five, for at most every other one is held; and two of them
+among the last three."""
+KEPT_MS = 300
+"""What is older matters to nothing here."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Used:
+    """A reading that the judge used."""
+
+    t_ns: int
+    depth: float
+    """By how much each required finger touches at best, counts: the least of them."""
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    """Shape (fingers, 24): where each electrode's median is."""
+
+    def __deepcopy__(self, _memo: object) -> Self:
+        return self
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Angles:
+    t_ns: int
+    angles_rad: NDArray[np.float64]
+
+
+class Necessity:
+    """Knows where the fingers rest, because the test made them."""
+
+    def __init__(
+        self, rest: NDArray[np.int64], fingers: Sequence[str], required: Sequence[str]
+    ) -> None:
+        """`rest`, shape (fingers, 24), is also what was read before the first reading."""
+        self._rest = rest
+        self._required = [fingers.index(finger) for finger in required]
+        self._values = np.repeat(rest[np.newaxis].astype(np.float64), FURTHEST, axis=0)
+        """Last values of each electrode, newest first."""
+        self._previous: NDArray[np.uint16] | None = None
+        self._unchanged = np.zeros(rest.shape, dtype=np.int64)
+        self._sick = np.zeros(rest.shape, dtype=np.int64)
+        self._doubt = 0
+        self._used: list[_Used] = []
+        """The last ones, between which time goes on and no gap is."""
+        self._joints: dict[bytes, list[_Angles]] = {}
+        """By which are valid: the last ones, between which time goes on and no gap is."""
+        self._without_joints_since_ns: int | None = None
+        self._unusable: list[str] = []
+
+    def turn(self, reading: JointReading) -> None:
+        """Take in angles."""
+        valid = ~np.isnan(reading.position_rad)
+        if not valid.any():
+            return
+        t_ns = reading.t_ns
+        before = self._joints.get(valid.tobytes(), [])
+        if before and not 0 <= t_ns - before[-1].t_ns <= JOINTS_LATE_MS * MS:
+            before = []
+        kept = [one for one in before if t_ns - one.t_ns <= KEPT_MS * MS]
+        self._joints[valid.tobytes()] = [*kept, _Angles(t_ns, reading.position_rad[valid])]
+
+    def feel(self, reading: TactileReading) -> None:
+        """Take in a reading."""
+        self._doubt = max(self._doubt - 1, 0)
+        self._unusable = []
+        counts, faults = reading.counts, reading.faults
+        if counts.shape != self._rest.shape:
+            self._unusable = ["the fingers of the model"]
+            return
+        broken = (faults != 0) | (counts == 0) | (counts >= 4095)
+        if (faults & ~np.uint8(REPAIRABLE_BITS)).any():
+            self._unusable.append("flags that can be repaired")
+        if self._is_same(counts, faults != 0):
+            self._unusable.append("a finger that does not repeat itself")
+        if _too_many(broken):
+            self._unusable.append("no more broken electrodes than can be repaired")
+        self._sick = np.where(broken | (self._unchanged >= DEAD_AFTER), SICK_FOR, self._sick - 1)
+        if self._unusable:
+            return
+        if _too_many(broken | (self._sick > 0)):
+            self._doubt = DOUBT_FOR
+        self._use(reading, ~broken)
+
+    def lacks(self) -> list[str]:
+        """What a verdict on the reading at hand would lack."""
+        lacks = [*self._unusable]
+        if not lacks and not self._doubt:
+            lacks += self._lacks_contact() + self._lacks_stillness() + self._lacks_joints()
+        return lacks
+
+    def _is_same(self, counts: NDArray[np.uint16], flagged: NDArray[np.bool_]) -> bool:
+        if self._previous is None:
+            same = np.zeros(counts.shape, dtype=np.bool_)
+        else:
+            same = counts == self._previous
+        self._previous = counts
+        self._unchanged = np.where(same, self._unchanged + 1, 0)
+        # A flagged electrode neither repeats anything nor hides that the others do.
+        return bool(((same | flagged).all(axis=1) & ~flagged.all(axis=1)).any())
+
+    def _use(self, reading: TactileReading, valid: NDArray[np.bool_]) -> None:
+        shifted = np.concatenate([reading.counts[np.newaxis], self._values[:-1]])
+        self._values = np.where(valid, shifted, self._values)
+        depth = float(self._depths()[self._required].min())
+        low, high = self._values.min(axis=0), self._values.max(axis=0)
+        low, high = np.where(self._sick > 0, 0, low), np.where(self._sick > 0, 4095, high)
+        t_ns = reading.t_ns
+        if self._used and not 0 <= t_ns - self._used[-1].t_ns <= GAP_MS * MS:
+            self._used.clear()
+        self._used = [used for used in self._used if t_ns - used.t_ns <= KEPT_MS * MS]
+        self._used.append(_Used(t_ns, depth, low, high))
+        self._drop_joints(t_ns)
+
+    def _depths(self) -> NDArray[np.float64]:
+        """By how much each finger touches at best, counts, shape (fingers,)."""
+        nearest = self._values[:NEAREST]
+        most, least = self._rest - nearest.min(axis=0), self._rest - nearest.max(axis=0)
+        third = np.sort(np.where(self._sick > 0, np.inf, most), axis=1)[:, -3]
+        middle = np.sort(np.where(self._sick > 0, -np.inf, least), axis=1)[:, 12]
+        depths: NDArray[np.float64] = third - middle
+        return depths
+
+    def _lacks_contact(self) -> list[str]:
+        now_ns = self._used[-1].t_ns
+        for used in self._used:
+            if used.t_ns > now_ns - HOLD_MS * MS and used.depth < LET_GO_COUNTS - TARE_COUNTS:
+                return ["contact of all required fingers for the hold time"]
+        return []
+
+    def _lacks_stillness(self) -> list[str]:
+        now = self._used[-1]
+        if now.t_ns - self._used[0].t_ns < (WINDOW_MS + HOLD_MS) * MS:
+            return ["readings without a gap for the window and the hold time"]
+        for then in self._used:
+            apart_ms = (now.t_ns - then.t_ns) / MS
+            if WINDOW_MS <= apart_ms <= WINDOW_MS + GAP_MS + WINDOW_MS / 16:
+                distance = np.maximum(now.low - then.high, then.low - now.high).clip(min=0.0)
+                if (distance.mean(axis=1) <= RATE_COUNTS_PER_S * apart_ms / 1e3).all():
+                    return []
+        return ["electrodes that are still"]
+
+    def _drop_joints(self, t_ns: int) -> None:
+        """Leave out joints that are lost, and those of a time that is over."""
+        for valid, angles in list(self._joints.items()):
+            age_ns = t_ns - angles[-1].t_ns
+            if not -JOINTS_LATE_MS * MS <= age_ns <= JOINTS_LOST_MS * MS:
+                del self._joints[valid]
+                self._without_joints_since_ns = min(angles[-1].t_ns, t_ns)
+        if self._without_joints_since_ns is not None:
+            self._without_joints_since_ns = min(self._without_joints_since_ns, t_ns)
+
+    def _lacks_joints(self) -> list[str]:
+        t_ns = self._used[-1].t_ns
+        since_ns = self._without_joints_since_ns
+        if not self._joints and since_ns is not None and t_ns - since_ns <= JOINTS_LOST_MS * MS:
+            return ["joint angles, or to have waited for them"]
+        for angles in self._joints.values():
+            if t_ns - angles[-1].t_ns > JOINTS_LATE_MS * MS:
+                return ["joint angles in time"]
+            if not _may_be_still(angles):
+                return ["joints that are still"]
+        return []
+
+
+def _may_be_still(angles: Sequence[_Angles]) -> bool:
+    last_ns = angles[-1].t_ns
+    before = [one for one in angles if last_ns - one.t_ns >= WINDOW_MS * MS]
+    lately = [one for one in angles if last_ns - one.t_ns < LEFT_OUT_NS]
+    then = [one for one in before if before[-1].t_ns - one.t_ns < 2 * LEFT_OUT_NS]
+    return any(
+        np.abs(now.angles_rad - one.angles_rad).max()
+        <= JOINT_RAD_PER_S * (now.t_ns - one.t_ns + LEFT_OUT_NS) / 1e9
+        for one in then
+        for now in lately
+    )
+
+
+def _too_many(broken: NDArray[np.bool_]) -> bool:
+    return bool(broken.sum() > BROKEN_MAX or broken.sum(axis=1).max() > BROKEN_FINGER_MAX)
