@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+# Before anybody imports onnxruntime: its telemetry opens descriptors whenever it likes.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
 ROOT = Path(__file__).parents[1]
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, get_args
 from daemon import assembly, scene, scene_drivers
 from daemon.text import complain, printable
 from drivers.base import DriverError
+from models import zoo
 from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
@@ -141,6 +142,7 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
         "model": (
             f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
             f"{wanted.model.slip_threshold:g} on{_rejects(wanted, model)}"
+            f"{_standing(model)}"
         ),
         "gate": _gate(wanted),
         "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
@@ -170,6 +172,15 @@ def _gate(wanted: scene.Scene) -> str:
         f"{when}once per grasp: {fingers} touch, still below {gate.rate_counts_per_s:g} counts/s"
         f"{joints} for {gate.hold_ms:g} ms; {what}, {age}"
     )
+
+
+def _standing(model: TactileModel) -> str:
+    """Where the model stands among those that were compared; empty for one that was not."""
+    found = zoo.standing(model.sha256)
+    if found is None:
+        return ""
+    speed = "" if found["speed"] is None else f", {found['speed']:.1f} times as fast as cnn1"
+    return f"; number {found['f1_rank']} of {found['models']} on known objects{speed}"
 
 
 def _rejects(wanted: scene.Scene, model: TactileModel) -> str:

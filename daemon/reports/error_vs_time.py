@@ -68,6 +68,7 @@ class Row:
     """Against float64: `largest` and `mean` deviation of p_slip, `flipped`, `grasps`."""
     time: dict[str, float] = field(default_factory=dict)
     """Quantiles in us, as `timing.Times` has them."""
+    sha256: str | None = None
     bytes: int | None = None
     parameters: int | None = None
     floor_us: float | None = None
@@ -97,6 +98,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the page, the table, the picture and the figures",
     )
+    parser.add_argument(
+        "--standing",
+        action="store_true",
+        help="keep where each model stands beside the zoo, for `graspd check` to tell",
+    )
     parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
 
@@ -108,6 +114,8 @@ def run(args: argparse.Namespace) -> int:
         found = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
         args.out.mkdir(parents=True, exist_ok=True)
         page.write(found, args.out)
+        if args.standing:
+            zoo.STANDING.write_text(json.dumps(page.standing(found), indent=1) + "\n")
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
@@ -155,6 +163,7 @@ def _model_row(model: TactileModel, grasps: Grasps) -> Row:
         "model",
         error={name: _errors(figures) for name, figures in card["protocols"].items()},
         numerical=_numerical(model, grasps.counts),
+        sha256=model.sha256,
         bytes=model.path.stat().st_size,
         parameters=card["parameters"],
         start_ms=start_ms,

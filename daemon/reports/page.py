@@ -40,6 +40,29 @@ def write(found: Found, folder: Path) -> None:
     base.with_suffix(".html").write_text(_page(found, picture))
 
 
+def standing(found: Found) -> dict[str, Any]:
+    """Where each model stands, by the digest of its file; see `models.zoo.standing`."""
+    models = [row for row in _sorted(found["rows"]) if row["kind"] == "model"]
+    base = next((row for row in models if row["name"] == "cnn1"), None)
+    return {
+        "machine": found["machine"],
+        "models": {
+            row["sha256"]: {
+                "name": row["name"],
+                "f1": row["error"][PROTOCOL]["f1"],
+                "f1_rank": rank,
+                "models": len(models),
+                "paced_p50_us": row["time"]["paced_p50_us"],
+                "speed": None
+                if base is None
+                else base["time"]["paced_p50_us"] / row["time"]["paced_p50_us"],
+            }
+            for rank, row in enumerate(models, start=1)
+            if PROTOCOL in row["error"]
+        },
+    }
+
+
 def table(found: Found) -> str:
     """All rows as Markdown, the most exact first, with the advice."""
     lines = list(_lines(COLUMNS, [_cells(row) for row in _sorted(found["rows"])]))
@@ -146,32 +169,32 @@ def advice(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def draw(found: Found) -> str:
-    """Error against run time as SVG."""
+    """Error against run time as SVG: points are numbered, the list beside them names them."""
     mpl.rcParams["svg.hashsalt"] = "graspd"
-    figure = Figure(figsize=(9.0, 5.6), layout="constrained")
-    axes = figure.subplots()
-    shown = [row for row in found["rows"] if PROTOCOL in row["error"]]
-    for row in shown:
-        error = row["error"][PROTOCOL]
-        x, y = row["time"]["paced_p50_us"], 100 * (1 - error["f1"])
-        reach = [[100 * (error["high"] - error["f1"])], [100 * (error["f1"] - error["low"])]]
-        colour = COLOURS[row["kind"]]
-        axes.errorbar(x, y, yerr=reach, fmt=MARKERS[row["kind"]], color=colour, alpha=0.8, lw=0.8)
-        axes.annotate(
-            row["name"], (x, y), xytext=(4, 4), textcoords="offset points", fontsize=7, color=colour
+    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
+    axes, names = figure.subplots(1, 2, width_ratios=(3, 1))
+    shown = [row for row in _sorted(found["rows"]) if PROTOCOL in row["error"]]
+    for number, row in enumerate(shown, start=1):
+        _draw_row(axes, row, number)
+        names.text(
+            0.0,
+            1.0 - (number - 1) / max(len(shown), 24),
+            f"{number:2d}  {row['name']}",
+            fontsize=8,
+            va="top",
+            color=COLOURS[row["kind"]],
+            transform=names.transAxes,
         )
     _draw_front(axes, [row for row in shown if row["kind"] == "model"])
     for row in found["rows"]:
         if row["kind"] == "floor":
-            axes.axvline(row["time"]["paced_p50_us"], color="#888", ls=":", lw=1)
+            x = row["time"]["paced_p50_us"]
+            axes.axvline(x, color="#888", ls=":", lw=1)
             axes.text(
-                row["time"]["paced_p50_us"],
-                axes.get_ylim()[1],
-                f" {row['name']}",
-                fontsize=7,
-                va="top",
-                color="#666",
-            )
+                x, 0.99, f" {row['name']}", fontsize=8, va="top", color="#666",
+                transform=axes.get_xaxis_transform(),
+            )  # fmt: skip
+    names.axis("off")
     axes.set_xscale("log")
     axes.set_xlabel("time per reading, paced at 100 Hz: input and network, p50, us")
     axes.set_ylabel("1 - F1 on known objects, % (bars: 95 %)")
@@ -179,6 +202,15 @@ def draw(found: Found) -> str:
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     return text.getvalue()
+
+
+def _draw_row(axes: Any, row: Row, number: int) -> None:  # noqa: ANN401 - matplotlib's own
+    error, colour = row["error"][PROTOCOL], COLOURS[row["kind"]]
+    x, y = row["time"]["paced_p50_us"], 100 * (1 - error["f1"])
+    reach = [[100 * (error["high"] - error["f1"])], [100 * (error["f1"] - error["low"])]]
+    axes.errorbar(x, y, yerr=reach, fmt="none", ecolor=colour, alpha=0.25, lw=0.8)
+    axes.plot(x, y, MARKERS[row["kind"]], color=colour, markersize=13, alpha=0.85)
+    axes.text(x, y, str(number), color="white", fontsize=7, ha="center", va="center", zorder=5)
 
 
 def _draw_front(axes: Any, rows: Sequence[Row]) -> None:  # noqa: ANN401 - matplotlib's own
