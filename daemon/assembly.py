@@ -37,10 +37,15 @@ Clock = Callable[[], int]
 
 
 def model_path(scene: Scene) -> Path:
-    """File of the scene's model. Raises `ModelError` if the zoo does not have it."""
+    """File of the scene's model, of its hand's fingers alone where the zoo has such a form of it.
+
+    Raises `ModelError` if the zoo does not have it.
+    """
     if scene.model.path is not None:
         return scene.model.path
-    return zoo.find(DEFAULT_MODEL if scene.model.name is None else scene.model.name)
+    name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
+    for_the_hand = f"{name}-{'-'.join(scene.hand.fingers)}"
+    return zoo.find(for_the_hand if for_the_hand in zoo.names() else name)
 
 
 def load_model(scene: Scene) -> TactileModel:

@@ -118,7 +118,7 @@ class Contact:
         Electrodes that are not `usable` count for nothing.
         """
         sound = usable & self._known
-        number = np.count_nonzero(sound, axis=1)
+        number = sound.sum(axis=1)
         # With too few electrodes nobody knows any more: to find out, it must be tared again.
         self.tared &= number >= SOUND_MIN
         self.fall, middle = self._falls(median, sound, number)

@@ -212,7 +212,7 @@ class Gate:
         reference: NDArray[np.uint16],
     ) -> bool:
         distance = np.abs(median.astype(np.int32) - reference)
-        number = np.maximum(np.count_nonzero(usable, axis=1), 1)
+        number = np.maximum(usable.sum(axis=1), 1)
         return bool(((distance * usable).sum(axis=1) / number > self._limits.change_counts).any())
 
     def _hold(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:

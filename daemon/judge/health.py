@@ -117,16 +117,19 @@ class Health:
         same = (steps == 0) & sound
         self._previous = counts
         self._unchanged = np.where(same, self._unchanged + 1, 0)
-        moves = np.partition(steps, STILL - 1, axis=1)[:, STILL - 1 : STILL]
-        jumped = (steps > JUMP_COUNTS) & (moves <= STILL_COUNTS)
-        self._jumps = JUMPS_FADE * self._jumps + jumped
+        self._jumps *= JUMPS_FADE
+        if steps.max() > JUMP_COUNTS:
+            moves = np.partition(steps, STILL - 1, axis=1)[:, STILL - 1 : STILL]
+            self._jumps += (steps > JUMP_COUNTS) & (moves <= STILL_COUNTS)
         repeats = (same | ~sound).all(axis=1) & sound.any(axis=1)
         return bool(repeats.any())
 
 
 def too_many(broken: NDArray[np.bool_]) -> bool:
     """Whether so many electrodes, shape (fingers, 24), are more than can be repaired."""
-    per_finger = np.count_nonzero(broken, axis=1)
+    if not broken.any():
+        return False
+    per_finger = broken.sum(axis=1)
     return bool(per_finger.sum() > BROKEN_MAX or per_finger.max() > BROKEN_FINGER_MAX)
 
 

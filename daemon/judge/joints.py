@@ -111,8 +111,6 @@ class JointMotion:
         if now_ns - past[0][0] < self._limits.window_ns:
             return False
         # Against every moment of the window: two alone would miss what swings.
-        return all(
-            float(np.abs(now - then).max())
-            <= self._limits.rad_per_s * max(now_ns - at_ns, self._limits.window_ns) / 1e9
-            for at_ns, then in past
-        )
+        moved = np.abs(np.array([then for _, then in past]) - now).max(axis=1)
+        ages_ns = [max(now_ns - at_ns, self._limits.window_ns) for at_ns, _ in past]
+        return bool((moved <= self._limits.rad_per_s * np.array(ages_ns) / 1e9).all())

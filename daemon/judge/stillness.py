@@ -47,7 +47,7 @@ class Stillness:
             return None
         then = np.array([past for _, past in self._past])
         distance = np.abs(then.astype(np.int32) - median) * usable
-        number = np.maximum(np.count_nonzero(usable, axis=1), 1)
+        number = np.maximum(usable.sum(axis=1), 1)
         ages_ns = np.array([max(t_ns - at_ns, self._window_ns) for at_ns, _ in self._past])
         rates = distance.sum(axis=2) / number / (ages_ns[:, np.newaxis] / 1e9)
         rate: NDArray[np.float64] = rates.max(axis=0)

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from models.bts3 import CITATIONS, LICENCE, REPOSITORY
+from models.bts3 import CITATIONS, FINGERS, LICENCE, REPOSITORY
 from models.contract import ModelContract
 from models.training.broken import Study
 from models.training.export import Parity
@@ -156,6 +156,8 @@ def configuration(system: System) -> dict[str, Any]:
     parts |= {"augmentation": plain(system.augmentation), "tables": list(system.tables)}
     if system.compression is not None:
         parts["compression"] = plain(system.compression)
+    if system.fingers != FINGERS:
+        parts["fingers"] = list(system.fingers)
     return parts
 
 

@@ -6,6 +6,7 @@ Columns: `object`, `slipped` (0 or 1) and 24 raw counts per finger, `ff_biotac_1
 from __future__ import annotations
 
 import csv
+import dataclasses
 import hashlib
 import io
 import json
@@ -48,7 +49,7 @@ class Grasps:
     """Labelled grasps and the files they come from."""
 
     counts: NDArray[np.uint16]
-    """Shape (N, 3, 24), raw counts 0..4095, fingers in the order ff, mf, th."""
+    """Shape (N, fingers, 24), raw counts 0..4095; a table has the fingers ff, mf, th."""
     slipped: NDArray[np.bool_]
     """Shape (N,): True where the object slipped in the lift."""
     objects: tuple[str, ...]
@@ -81,6 +82,16 @@ class Grasps:
         """Only the grasps of these tables."""
         wanted = [index for index, file in enumerate(self.files) if file.name in tables]
         return self.rows(np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64))
+
+    def of_fingers(self, fingers: Sequence[str]) -> Grasps:
+        """With these fingers alone, in this order; the grasps must have those of a table.
+
+        Raises `ValueError` for a finger that they do not have.
+        """
+        if self.counts.shape[1] != len(FINGERS) or not set(fingers) <= set(FINGERS):
+            raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}")
+        chosen = [FINGERS.index(finger) for finger in fingers]
+        return dataclasses.replace(self, counts=np.ascontiguousarray(self.counts[:, chosen]))
 
     def digest(self) -> str:
         """SHA-256, hexadecimal, of what a result may depend on."""

@@ -20,7 +20,6 @@ import joblib
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bts3 import FINGERS
 from models.inputs import builder, raw_features
 from models.training.datasets import Grasps
 from models.training.fitting import Fitted, fit
@@ -118,13 +117,14 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     """
     split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
     system, seed = _alone(job.system), fold_seed(job.seed, job.fold)
+    grasps = grasps.of_fingers(system.fingers)
     # A forest would otherwise send its trees back to the cluster that this job came from.
     with _ONE_AT_A_TIME, joblib.parallel_config("sequential"), _interruptible():
         started_s = time.perf_counter()
         if isinstance(system.input, SessionFeatures):
             fitted, margins, ages = _run_session(system, system.input, grasps, split, seed)
         else:
-            inputs = builder(system.input, len(FINGERS)).build_batch(grasps.counts)[0]
+            inputs = builder(system.input, len(system.fingers)).build_batch(grasps.counts)[0]
             fitted = fit(system, inputs[split.train], grasps.slipped[split.train], seed=seed)
             margins, ages = {NONE: fitted.margins(inputs[split.test])}, {}
         seconds = time.perf_counter() - started_s

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bts3 import FINGERS, NEW_SESSION
+from models.bts3 import NEW_SESSION
 from models.contract import (
     CLASSES,
     ConfidenceStep,
@@ -95,7 +95,8 @@ def make(
     summaries = _summaries(order, grasps, found)
     again = jobs.run(wanted[0], grasps)
     on_done()
-    trained = train(order.system, grasps.of_tables(order.system.tables), order.seed)
+    own = grasps.of_tables(order.system.tables).of_fingers(order.system.fingers)
+    trained = train(order.system, own, order.seed)
     on_done()
     contract = _contract(order, trained, summaries)
     calibrator = _calibrator(summaries)
@@ -151,7 +152,7 @@ def _contract(order: Order, trained: Trained, summaries: list[Summary]) -> Model
         version=2,
         name=order.system.name,
         input=_input(order.system, trained, summaries),
-        fingers=FINGERS,
+        fingers=order.system.fingers,
         classes=CLASSES,
         seed=order.seed,
         datasets=tuple(file for file in trained.grasps.files if file.rows),

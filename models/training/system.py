@@ -10,8 +10,8 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from models.bts3 import WHOLE
-from models.contract import CountsInput, ImageInput, VectorInput
+from models.bts3 import FINGERS, WHOLE
+from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.training.augmentation import Augmentation
 from models.training.classical import ClassicalConfig
 from models.training.compression import Compression
@@ -92,6 +92,8 @@ class System:
     """Each value of an input by its own mean and spread in the training, within the model."""
     compression: Compression | None = None
     """What is done to the trained network before it judges."""
+    fingers: tuple[Finger, ...] = FINGERS
+    """Those that it judges by."""
     tables: tuple[str, ...] = WHOLE
     """What the model that is kept is trained on; protocols say for themselves."""
     published: tuple[Published, ...] = ()
@@ -102,6 +104,8 @@ def digest(system: System) -> str:
     names = ["input", "estimator", "recipe", "augmentation", "standardise"]
     if system.compression is not None:
         names.append("compression")
+    if system.fingers != FINGERS:
+        names.append("fingers")
     parts = {name: plain(getattr(system, name)) for name in names}
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
-from models.bts3 import NEW_SESSION, WHOLE
-from models.contract import CountsInput, ImageInput, VectorInput
+from models.bts3 import FINGERS, NEW_SESSION, WHOLE
+from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.layout import D1, D2A, D2B, D3
 from models.tactile_image import Composition, Fill, Normalisation
 from models.training.augmentation import Augmentation
@@ -62,6 +63,7 @@ COUNTS = CountsInput()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
+HAND: tuple[Finger, ...] = FINGERS
 RANKS = (8, 16, 32, 64, 128, 256)
 NARROW = ((4, 32), (8, 64), (16, 64))
 """Filters and hidden units."""
@@ -325,8 +327,32 @@ _SESSION = (
     ),
 )
 
+
+def _fewer_fingers() -> tuple[System, ...]:
+    """The default system for hands with fewer sensors: fewer channels, no padding."""
+    whole = next(system for system in _SESSION if system.name == "small-session")
+    return tuple(
+        dataclasses.replace(
+            whole,
+            name=f"{whole.name}-{'-'.join(fingers)}",
+            description=f"Conv16 - FC64 on session-calibrated features of {' and '.join(fingers)}.",
+            fingers=fingers,
+        )
+        for number in (1, 2)
+        for fingers in itertools.combinations(HAND, number)
+    )
+
+
 SYSTEMS = {
     system.name: system
-    for system in (*_PAPER, *_layouts(), *_compositions(), *_smaller(), *_ELECTRODES, *_SESSION)
+    for system in (
+        *_PAPER,
+        *_layouts(),
+        *_compositions(),
+        *_smaller(),
+        *_ELECTRODES,
+        *_SESSION,
+        *_fewer_fingers(),
+    )
 }
 """By name, the paper's first."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bts3 import FINGERS
 from models.inputs import builder, raw_features
 from models.training.datasets import Grasps
 from models.training.fitting import Fitted, fit
@@ -35,7 +34,10 @@ class Trained:
 
 
 def train(system: System, grasps: Grasps, seed: int) -> Trained:
-    """The system trained on these grasps, on one thread. Raises `ValueError` for too few."""
+    """The system trained on these grasps, of its fingers alone, on one thread.
+
+    Raises `ValueError` for too few.
+    """
     counts, table_of = grasps.counts, grasps.table_of
     session = isinstance(system.input, SessionFeatures)
     standards = TrainingStandards.of(raw_features(counts), table_of) if session else None
@@ -55,4 +57,4 @@ def _inputs(
         if standards is None:
             raise ValueError("a session system needs standards")
         return standards.apply(raw_features(counts), table_of, system.input.clip)
-    return builder(system.input, len(FINGERS)).build_batch(counts)[0]
+    return builder(system.input, len(system.fingers)).build_batch(counts)[0]
