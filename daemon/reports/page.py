@@ -20,10 +20,11 @@ PROTOCOL = "cv"
 COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
 MARKERS = {"model": "o", "peer": "s"}
 STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto; padding: 0 1rem;
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 90rem; margin: 2rem auto; padding: 0 1rem;
   color: #222; background: #fff }
 table { border-collapse: collapse; width: 100%; font-size: 13px }
-th, td { padding: .25rem .6rem; text-align: right; border-bottom: 1px solid #ddd }
+th, td { padding: .25rem .5rem; text-align: right; white-space: nowrap;
+  border-bottom: 1px solid #ddd }
 th:first-child, td:first-child { text-align: left }
 th { border-bottom: 2px solid #888 }
 svg { max-width: 100%; height: auto }
