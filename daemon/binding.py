@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Self
 
 import zmq
 
@@ -35,3 +36,26 @@ def bind(socket: zmq.Socket[bytes], endpoint: str, file: SocketFile | None) -> N
     socket.setsockopt(zmq.USE_FD, file.listener.fileno())
     socket.bind(endpoint)
     file.listener.detach()
+
+
+class Bound:
+    """A ZeroMQ context of its own for one bound socket, and the socket's file."""
+
+    def __init__(self, endpoint: str) -> None:
+        """Take the file of the endpoint. Raises `PublishError`."""
+        self.endpoint = endpoint
+        self._file = socket_file(endpoint)
+        self._context = zmq.Context(io_threads=1)
+
+    def close(self) -> None:
+        """Close the socket and remove its file. May be called again."""
+        self._context.destroy()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()

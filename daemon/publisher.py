@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Protocol, Self
+from typing import Protocol
 
 import zmq
 
-from daemon.binding import PublishError, bind, socket_file
+from daemon.binding import Bound, PublishError, bind
 
 SUBSCRIBED = 1
 """First byte of a subscription message on an XPUB socket."""
@@ -28,7 +28,7 @@ class Stop(Protocol):
         """Descriptor to wait on."""
 
 
-class Publisher:
+class Publisher(Bound):
     """Publishes two-frame messages `[topic, payload]`; never blocks the caller.
 
     A subscriber that falls behind by the high-water mark loses messages, and sees the gap in
@@ -47,10 +47,8 @@ class Publisher:
         `waits`: `wait_for_subscriber` will be used. libzmq then keeps what peers send later too,
         without a limit: for a replay, not for a daemon.
         """
-        self.endpoint = endpoint
+        super().__init__(endpoint)
         self._waits = waits
-        self._file = socket_file(endpoint)
-        self._context = zmq.Context(io_threads=1)
         try:
             self._socket = self._bound(high_water_mark)
         except zmq.ZMQError as error:
@@ -91,16 +89,3 @@ class Publisher:
                 return True
             if remaining_s == 0.0:
                 return False
-
-    def close(self) -> None:
-        """Close the socket and remove its file. May be called again."""
-        self._context.destroy()
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()

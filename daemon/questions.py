@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import Self
 
 import zmq
 
-from daemon.binding import PublishError, bind, socket_file
+from daemon.binding import Bound, PublishError, bind
 
 QUESTION = b"judge"
 FRAMES_MAX = 3
@@ -29,7 +28,7 @@ class _Question:
     due_ns: int
 
 
-class Questions:
+class Questions(Bound):
     """Takes questions and answers them; never blocks.
 
     libzmq has no limit on the number of frames of a message, and holds them all before it hands the
@@ -39,14 +38,13 @@ class Questions:
 
     def __init__(self, endpoint: str, patience_ns: int) -> None:
         """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
+        super().__init__(endpoint)
         self.counters: Counter[str] = Counter()
         """`asked`, `answered`, `given_up`, `malformed`."""
         self._patience_ns = patience_ns
         self._waiting: deque[_Question] = deque()
         self._frames: list[bytes] = []
         """Of the message at hand, as far as it has been read."""
-        self._file = socket_file(endpoint)
-        self._context = zmq.Context(io_threads=1)
         try:
             self._socket = self._context.socket(zmq.ROUTER)
             self._socket.linger = 0
@@ -109,16 +107,3 @@ class Questions:
             question = self._waiting.popleft()
             self._socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
             self.counters["answered"] += 1
-
-    def close(self) -> None:
-        """Close the socket and remove its file. May be called again."""
-        self._context.destroy()
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()

@@ -73,20 +73,10 @@ class Contact:
         shape = (fingers, ELECTRODES)
         self._limits = limits
         self._tares = [_Tare() for _ in range(fingers)]
+        self._touches = [_Touch(limits.counts) for _ in range(fingers)]
         self._baseline = np.zeros(shape)
         self._known = np.zeros(shape, dtype=np.bool_)
-        self._threshold = np.full(fingers, limits.counts)
-        self._depth = np.zeros(fingers)
-        self._let_go_ns: list[int | None] = [None] * fingers
-        self._lowest = np.zeros(fingers)
-        """Smallest fall since each finger let go: a new touch falls from there, not from zero."""
-        self._touches_since_ns: list[int | None] = [None] * fingers
-        self._alone_since_ns: list[int | None] = [None] * fingers
         self._last_ns: int | None = None
-        self.fall = np.zeros(fingers)
-        """Counts by which each finger's third deepest electrode is below its baseline, and below
-        the finger's median electrode: the smaller of both, and the latter alone where the finger
-        touches already, for in a long hold the sensors drift. Zero without a baseline."""
         self.touching = np.zeros(fingers, dtype=np.bool_)
         self.tared = np.zeros(fingers, dtype=np.bool_)
         """Whether each finger has a baseline. Without one, nobody knows whether it touches."""
@@ -97,9 +87,14 @@ class Contact:
         return self._baseline
 
     @property
+    def fall(self) -> NDArray[np.float64]:
+        """How deep each finger is pressed, counts, shape (fingers,); see `_Touch.fall`."""
+        return np.array([touch.fall for touch in self._touches])
+
+    @property
     def threshold(self) -> NDArray[np.float64]:
         """Fall that makes a touch, counts, shape (fingers,)."""
-        return self._threshold
+        return np.array([touch.threshold for touch in self._touches])
 
     def forget(self) -> None:
         """The sensors may be others, or have been away: all fingers must be tared anew."""
@@ -118,79 +113,43 @@ class Contact:
         Electrodes that are not `usable` count for nothing.
         """
         sound = usable & self._known
-        number = sound.sum(axis=1)
-        # With too few electrodes nobody knows any more: to find out, it must be tared again.
-        self.tared &= number >= SOUND_MIN
-        self.fall, middle = self._falls(median, sound, number)
-        self._follow_touches(t_ns)
-        for finger, tare in enumerate(self._tares):
-            if self.tared[finger] and self._must_tare_anew(finger, middle[finger], t_ns):
-                self._forget(finger)
-            if self.tared[finger] and self.fall[finger] >= SUSPECT * self._threshold[finger]:
-                tare.clear()
-            elif tare.add(counts[finger], usable[finger]):
-                self._settle(finger, tare, t_ns)
-
-    def _falls(
-        self, median: NDArray[np.uint16], sound: NDArray[np.bool_], number: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Each finger's `fall`, and the fall of its median electrode, counts."""
+        numbers = sound.sum(axis=1).tolist()
         falls = np.where(sound, self._baseline - median, np.inf)
         falls.sort(axis=1)  # those that do not count come last
-        fall, middle = np.zeros(len(falls)), np.zeros(len(falls))
-        for finger in np.flatnonzero(self.tared):
-            deep = falls[finger, number[finger] - FALLEN]
-            middle[finger] = falls[finger, number[finger] // 2]
-            relative = deep - middle[finger]
-            fall[finger] = relative if self.touching[finger] else min(deep, relative)
-        return fall, middle
-
-    def _follow_touches(self, t_ns: int) -> None:
-        """Which fingers touch now, how deep, since when, and which without the others."""
         elapsed_s = 0.0 if self._last_ns is None else max(t_ns - self._last_ns, 0) / 1e9
         self._last_ns = t_ns
-        long = [
-            since is not None and t_ns - since > LONG_HOLD_NS for since in self._touches_since_ns
-        ]
-        share = np.where(long, RELEASED_LONG, RELEASED)
-        held = self.fall >= np.maximum(LET_GO * self._threshold, share * self._depth)
-        apart = [at is None or not 0 <= t_ns - at < APART_NS for at in self._let_go_ns]
-        begins = (self.fall >= self._threshold + self._lowest) & apart
-        touched = self.touching
-        self.touching = self.tared & np.where(touched, held, begins)
-        for let_go in np.flatnonzero(touched & ~self.touching):
-            self._let_go_ns[let_go] = t_ns
-        # While it touches the fall is only that of a share of the electrodes: it starts anew.
-        lowest = np.where(touched, self.fall, self._lowest)
-        self._lowest = np.where(self.touching, 0.0, np.minimum(lowest, np.maximum(self.fall, 0.0)))
-        faded = self._depth - DEPTH_FADES_COUNTS_PER_S * elapsed_s
-        self._depth = np.where(self.touching, np.maximum(self.fall, faded), 0.0)
-        alone = self.touching & ~self.touching.all()
-        for finger in range(len(self.touching)):
-            if not alone[finger]:
-                self._alone_since_ns[finger] = None
-            elif self._alone_since_ns[finger] is None:
-                self._alone_since_ns[finger] = t_ns
+        middles = [0.0] * len(numbers)
+        for finger, (touch, number) in enumerate(zip(self._touches, numbers, strict=True)):
+            # With too few electrodes nobody knows any more: to find out, it must be tared again.
+            self.tared[finger] &= number >= SOUND_MIN
+            if self.tared[finger]:
+                deep = float(falls[finger, number - FALLEN])
+                middles[finger] = float(falls[finger, number // 2])
+                touch.follow(t_ns, elapsed_s, deep, deep - middles[finger])
+            else:
+                touch.end()
+        all_touch = all(touch.touching for touch in self._touches)
+        for finger, touch in enumerate(self._touches):
+            anew = touch.must_be_tared_anew(t_ns, middles[finger], accompanied=all_touch)
+            self.touching[finger] = touch.touching
+            if self.tared[finger] and anew:
+                self._forget(finger)
+            self._tare(finger, t_ns, counts[finger], usable[finger])
 
-    def _must_tare_anew(self, finger: int, middle: float, t_ns: int) -> bool:
-        """Whether what is known of where the finger rests is to be trusted no longer."""
-        since_ns = self._touches_since_ns[finger]
-        if self.touching[finger]:
-            self._touches_since_ns[finger] = t_ns if since_ns is None else since_ns
-            alone_ns = self._alone_since_ns[finger]
-            return alone_ns is not None and t_ns - alone_ns > ALONE_NS
-        self._touches_since_ns[finger] = None
-        if since_ns is not None and t_ns - since_ns > LONG_HOLD_NS:
-            return True
-        # A finger that rests higher as a whole was tared while it touched, or has drifted far.
-        return middle < -float(self._threshold[finger])
+    def _tare(
+        self, finger: int, t_ns: int, counts: NDArray[np.uint16], usable: NDArray[np.bool_]
+    ) -> None:
+        """Take a finger's sweep into its window, unless it may be the beginning of a touch."""
+        tare, touch = self._tares[finger], self._touches[finger]
+        if self.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
+            tare.clear()
+        elif tare.add(counts, usable):
+            self._settle(finger, tare, t_ns)
 
     def _forget(self, finger: int) -> None:
         self.tared[finger] = self.touching[finger] = False
         self._known[finger] = False
-        self._depth[finger] = 0.0
-        self._lowest[finger] = 0.0
-        self._touches_since_ns[finger] = self._alone_since_ns[finger] = None
+        self._touches[finger] = _Touch(self._touches[finger].threshold)
         self._tares[finger] = _Tare()
 
     def _settle(self, finger: int, tare: _Tare, t_ns: int) -> None:
@@ -208,8 +167,80 @@ class Contact:
             step = np.where(self._known[finger], limited, step)
         self._baseline[finger] += step
         self._known[finger] = known
-        self._threshold[finger] = max(self._limits.counts, self._limits.sigmas * sigma)
+        self._touches[finger].threshold = max(self._limits.counts, self._limits.sigmas * sigma)
         self.tared[finger] = True
+
+
+class _Touch:
+    """Whether one finger touches, by how far it has fallen and how it came there."""
+
+    def __init__(self, threshold: float) -> None:
+        self.threshold = threshold
+        """Fall that makes a touch, counts."""
+        self.touching = False
+        self.fall = 0.0
+        """Counts by which the third deepest electrode is below its baseline, and below the finger's
+        median electrode: the smaller of both, and the latter alone where the finger touches
+        already, for in a long hold the sensors drift. Zero without a baseline."""
+        self._depth = 0.0
+        self._lowest = 0.0
+        """Smallest fall since it let go: a new touch falls from there, not from zero."""
+        self._let_go_ns: int | None = None
+        self._since_ns: int | None = None
+        self._alone_since_ns: int | None = None
+        self._held_long = False
+
+    def end(self) -> None:
+        """Where the finger rests is not known."""
+        self.touching = False
+        self.fall = self._depth = self._lowest = 0.0
+        self._since_ns = self._alone_since_ns = None
+
+    def follow(self, t_ns: int, elapsed_s: float, deep: float, relative: float) -> None:
+        """Take in the fall of the third deepest electrode, below its baseline and relative."""
+        touched = self.touching
+        self.fall = relative if touched else min(deep, relative)
+        if touched:
+            self.touching = self.fall >= self._held(t_ns)
+        else:
+            apart = self._let_go_ns is None or not 0 <= t_ns - self._let_go_ns < APART_NS
+            self.touching = apart and self.fall >= self.threshold + self._lowest
+        self._held_long = False
+        if self.touching:
+            self._since_ns = t_ns if self._since_ns is None else self._since_ns
+            self._depth = max(self.fall, self._depth - DEPTH_FADES_COUNTS_PER_S * elapsed_s)
+            self._lowest = 0.0
+            return
+        if touched:
+            self._let_go_ns = t_ns
+            self._held_long = self._is_long(t_ns)
+            self._lowest = self.fall
+        self._since_ns = None
+        self._depth = 0.0
+        self._lowest = min(self._lowest, max(self.fall, 0.0))
+
+    def must_be_tared_anew(self, t_ns: int, middle: float, *, accompanied: bool) -> bool:
+        """Whether what is known of where the finger rests is to be trusted no longer.
+
+        `middle` is the fall of its median electrode, `accompanied` whether all fingers touch.
+        """
+        if not self.touching:
+            self._alone_since_ns = None
+            # One that rests higher as a whole was tared while it touched, or has drifted far.
+            return self._held_long or middle < -self.threshold
+        if accompanied:
+            self._alone_since_ns = None
+        elif self._alone_since_ns is None:
+            self._alone_since_ns = t_ns
+        return self._alone_since_ns is not None and t_ns - self._alone_since_ns > ALONE_NS
+
+    def _held(self, t_ns: int) -> float:
+        """Fall from which on a finger that touches still does."""
+        share = RELEASED_LONG if self._is_long(t_ns) else RELEASED
+        return max(LET_GO * self.threshold, share * self._depth)
+
+    def _is_long(self, t_ns: int) -> bool:
+        return self._since_ns is not None and t_ns - self._since_ns > LONG_HOLD_NS
 
 
 class _Tare:
