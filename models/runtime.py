@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import stat
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-
-# From 1.29 on onnxruntime keeps a telemetry database in the home folder, and a thread for it,
-# unless this says no before it is imported. A robot's PC tells nobody what it does.
-os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-
 import onnxruntime as ort
+from numpy.typing import NDArray
 
 from models.contract import (
     METADATA_KEY,
@@ -82,7 +76,8 @@ def _read(path: Path) -> bytes:
         raise ModelError(f"{str(path)!r}: cannot read the model: {error}") from error
 
 
-def _session(path: Path, data: bytes) -> ort.InferenceSession:
+def single_threaded(model: bytes) -> ort.InferenceSession:
+    """A session as the daemon runs one. Raises what onnxruntime raises for no usable model."""
     options = ort.SessionOptions()
     # One thread, no spinning: a second thread gains nothing on a network this small, and spinning
     # between readings would burn a core of the robot's PC.
@@ -90,8 +85,12 @@ def _session(path: Path, data: bytes) -> ort.InferenceSession:
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
+    return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+def _session(path: Path, data: bytes) -> ort.InferenceSession:
     try:
-        return ort.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        return single_threaded(data)
     except Exception as error:  # onnxruntime's exceptions share no narrower base
         raise ModelError(f"{path}: not a usable ONNX model: {_one_line(error)}") from error
 

@@ -19,6 +19,7 @@ from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.cost import Footprint
+    from daemon.judge.grip import GripLimits
 
 TACTILE_SECTIONS = (
     scene_drivers.ReplayTactile,
@@ -70,6 +71,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
+        limits = assembly.grip_limits(wanted)
         _try_drivers(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
@@ -83,7 +85,10 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         except CostError as error:
             complain(error)
             return _Checked(FAILED)
-    parts = {"in": _what_is_in(wanted, model), "left_out": _what_is_left_out(wanted, model)}
+    parts = {
+        "in": _what_is_in(wanted, model, limits),
+        "left_out": _what_is_left_out(wanted, model, limits),
+    }
     if args.json:
         _write_json(path, parts, cost)
     elif cost is None or len(args.scene) == 1:
@@ -130,7 +135,9 @@ def _try_drivers(wanted: scene.Scene) -> None:
         load_calibration(joints.calibration)
 
 
-def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
+def _what_is_in(
+    wanted: scene.Scene, model: TactileModel, limits: GripLimits | None
+) -> dict[str, str]:
     contract = model.contract
     figures = ", ".join(
         f"{measured.protocol} {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
@@ -144,12 +151,11 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
             f"{wanted.model.slip_threshold:g} on{_rejects(wanted, model)}"
             f"{_standing(model)}"
         ),
-        "gate": _gate(wanted),
+        "gate": _gate(wanted, limits),
         "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
     }
     if wanted.ask_endpoint is not None:
         parts["ask"] = f"on {wanted.ask_endpoint}, answered within {wanted.gate.request_ms:g} ms"
-    limits = assembly.grip_limits(wanted)
     if wanted.joints is not None:
         parts["joints"] = _section(wanted.joints)
     elif limits is not None and limits.joints is not None:
@@ -159,8 +165,8 @@ def _what_is_in(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
     return parts
 
 
-def _gate(wanted: scene.Scene) -> str:
-    limits, gate = assembly.grip_limits(wanted), wanted.gate
+def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
+    gate = wanted.gate
     age = f"not older than {gate.max_age_ms:g} ms"
     if limits is None:
         return f"every reading, {age}"
@@ -201,12 +207,13 @@ def _section(section: scene_drivers.Section) -> str:
     return f"{driver}: " + ", ".join(f"{key} {value}" for key, value in options.items())
 
 
-def _what_is_left_out(wanted: scene.Scene, model: TactileModel) -> dict[str, str]:
+def _what_is_left_out(
+    wanted: scene.Scene, model: TactileModel, limits: GripLimits | None
+) -> dict[str, str]:
     left_out = {}
     drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]
     others = [driver for driver in drivers if driver != wanted.tactile.driver]
     left_out["drivers"] = f"{', '.join(others)}: not imported"
-    limits = assembly.grip_limits(wanted)
     if wanted.joints is None and (limits is None or limits.joints is None):
         left_out["joints"] = "no joint code"
     if limits is None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-NOT_A_COUNT = 0xFFFF
+from daemon.judge.health import NO_COUNT
 
 
 class FreshMedian:
@@ -26,7 +26,7 @@ class FreshMedian:
 
     def reset(self) -> None:
         """Forget everything: what comes next does not continue what came before."""
-        self._last.fill(NOT_A_COUNT)
+        self._last.fill(NO_COUNT)
         self._held.fill(False)
         self._number.fill(0)
 

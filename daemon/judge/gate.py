@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.stillness import Stillness
+from daemon.judge.stillness import Stillness, mean_distance
 from daemon.judge.verdict import GateCause, GateState, Reason
 
 CHANGES_MAX = 64
@@ -211,9 +211,8 @@ class Gate:
         usable: NDArray[np.bool_],
         reference: NDArray[np.uint16],
     ) -> bool:
-        distance = np.abs(median.astype(np.int32) - reference)
-        number = np.maximum(usable.sum(axis=1), 1)
-        return bool(((distance * usable).sum(axis=1) / number > self._limits.change_counts).any())
+        distance = mean_distance(median, reference, usable)
+        return bool((distance > self._limits.change_counts).any())
 
     def _hold(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:
         """Wait for the hold time; what speaks against settling besides what disturbs."""

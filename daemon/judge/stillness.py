@@ -14,6 +14,19 @@ SWEEPS = 16
 """Sweeps remembered of a window; of faster readings, some are left out."""
 
 
+def mean_distance(
+    one: NDArray[np.uint16], other: NDArray[np.uint16], usable: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Of the `usable` electrodes (fingers, 24), counts, shape (..., fingers).
+
+    Counts of shape (..., fingers, 24).
+    """
+    distance = np.abs(one.astype(np.int32) - other) * usable
+    number = np.maximum(usable.sum(axis=1), 1)
+    mean: NDArray[np.float64] = distance.sum(axis=-1) / number
+    return mean
+
+
 class Stillness:
     """Remembers the medians of the last window."""
 
@@ -46,9 +59,8 @@ class Stillness:
         if not self._past or t_ns - self._past[0][0] < self._window_ns:
             return None
         then = np.array([past for _, past in self._past])
-        distance = np.abs(then.astype(np.int32) - median) * usable
-        number = np.maximum(usable.sum(axis=1), 1)
+        distance = mean_distance(then, median, usable)
         ages_ns = np.array([max(t_ns - at_ns, self._window_ns) for at_ns, _ in self._past])
-        rates = distance.sum(axis=2) / number / (ages_ns[:, np.newaxis] / 1e9)
+        rates = distance / (ages_ns[:, np.newaxis] / 1e9)
         rate: NDArray[np.float64] = rates.max(axis=0)
         return rate

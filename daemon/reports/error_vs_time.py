@@ -12,7 +12,6 @@ import math
 import platform
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -135,10 +134,9 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> d
     models = {path.stem: TactileModel(path) for path in paths}
     rows = {name: _model_row(model, grasps) for name, model in models.items()}
     steps: dict[str, Step] = {name: _step(model, grasps.counts) for name, model in models.items()}
-    with tempfile.TemporaryDirectory() as folder:
-        _add_peers(rows, steps, grasps, Path(folder))
-        readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
-        times = measure(steps, readings, paced)
+    _add_peers(rows, steps, grasps)
+    readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
+    times = measure(steps, readings, paced)
     bandwidth = bandwidth_bytes_per_s()
     for name, row in rows.items():
         row.time = times[name].quantiles()
@@ -227,7 +225,7 @@ def _step(model: TactileModel, counts: NDArray[np.uint16]) -> Step:
     return step
 
 
-def _add_peers(rows: dict[str, Row], steps: dict[str, Step], grasps: Grasps, folder: Path) -> None:
+def _add_peers(rows: dict[str, Row], steps: dict[str, Step], grasps: Grasps) -> None:
     from daemon.reports.peers import empty_session, peers
 
     for name, step in peers(grasps):
@@ -235,7 +233,7 @@ def _add_peers(rows: dict[str, Row], steps: dict[str, Step], grasps: Grasps, fol
         rows[name] = Row(name, "peer", error={} if same is None else same.error)
         steps[name] = step
     rows["empty session"] = Row("empty session", "floor")
-    steps["empty session"] = empty_session(folder)
+    steps["empty session"] = empty_session()
 
 
 def _start(path: Path) -> tuple[float, float]:

@@ -89,6 +89,9 @@ COLUMNS = (
 )
 
 
+STAGE_COLUMNS = ("stage", "p50, us", "p99, us")
+
+
 def _cells(row: Row) -> list[str]:
     error = row["error"].get(PROTOCOL, {})
     other = row["error"].get("objects") or row["error"].get("objects-whole")
@@ -126,11 +129,14 @@ def _sorted(rows: Sequence[Row]) -> list[Row]:
 def _stages(found: Found) -> Iterator[str]:
     yield f"Stages of a reading with `{found['stages']['model']}`, hot:"
     yield ""
-    cells = [
+    yield from _lines(STAGE_COLUMNS, _stage_cells(found))
+
+
+def _stage_cells(found: Found) -> list[list[str]]:
+    return [
         [name, f"{took['p50']:.0f}", f"{took['p99']:.0f}"]
         for name, took in found["stages"]["us"].items()
     ]
-    yield from _lines(("stage", "p50, us", "p99, us"), cells)
 
 
 def _lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -238,16 +244,13 @@ def _made(found: Found) -> str:
 
 def _page(found: Found, picture: str) -> str:
     cells = [_cells(row) for row in _sorted(found["rows"])]
-    stages = [
-        [name, f"{took['p50']:.0f}", f"{took['p99']:.0f}"]
-        for name, took in found["stages"]["us"].items()
-    ]
+    stages = _stage_cells(found)
     items = "".join(f"<li>{_marked(text)}</li>" for text in advice(found["rows"]))
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>graspd: error against run time"
         f"</title><style>{STYLE}</style><h1>Error against run time</h1><ul>{items}</ul>"
         f"{picture[picture.index('<svg') :]}{_html_table(COLUMNS, cells)}"
-        f"<h2>Stages of a reading</h2>{_html_table(('stage', 'p50, us', 'p99, us'), stages)}"
+        f"<h2>Stages of a reading</h2>{_html_table(STAGE_COLUMNS, stages)}"
         f"<p>{_marked(_made(found))}</p></html>\n"
     )
 

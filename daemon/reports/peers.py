@@ -9,12 +9,9 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
-import onnxruntime as ort
 import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
@@ -22,6 +19,7 @@ from onnx import TensorProto, helper
 from daemon.reports.timing import Step
 from models.inputs import VectorBuilder
 from models.layout import D1
+from models.runtime import single_threaded
 from models.tactile_image import TactileImager
 from models.training.classical import ForestConfig, MlpConfig, SvmConfig, fit_classical
 from models.training.datasets import Grasps
@@ -41,7 +39,7 @@ def peers(grasps: Grasps) -> Iterator[tuple[str, Step]]:
         yield f"scikit-learn predict_proba, {name}", _classical(name, grasps)
 
 
-def empty_session(folder: Path) -> Step:
+def empty_session() -> Step:
     """A network that does nothing: what onnxruntime costs by itself."""
     given = helper.make_tensor_value_info("given", TensorProto.FLOAT, [1, 2])
     out = helper.make_tensor_value_info("out", TensorProto.FLOAT, [1, 2])
@@ -49,11 +47,7 @@ def empty_session(folder: Path) -> Step:
         [helper.make_node("Identity", ["given"], ["out"])], "nothing", [given], [out]
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
-    path = folder / "nothing.onnx"
-    onnx.save(model, path)
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    session = single_threaded(model.SerializeToString())
     binding = session.io_binding()
     values, answer = np.zeros((1, 2), np.float32), np.zeros((1, 2), np.float32)
     binding.bind_input("given", "cpu", 0, np.float32, values.shape, values.ctypes.data)

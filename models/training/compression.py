@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from onnxruntime.quantization import (
@@ -22,7 +21,8 @@ from onnxruntime.quantization import (
     quantize_static,
 )
 
-from models.training.graphs import MARGIN_NAME
+from models.runtime import single_threaded
+from models.training.graphs import MARGIN_NAME, copied
 
 CALIBRATION_GRASPS = 256
 """Training grasps by which static quantisation learns the ranges of what flows between layers."""
@@ -76,12 +76,7 @@ class GraphMargins:
     """Runs a graph to `margin` on many inputs."""
 
     def __init__(self, model: onnx.ModelProto) -> None:
-        options = ort.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        self._session = ort.InferenceSession(
-            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-        )
+        self._session = single_threaded(model.SerializeToString())
         self._name = model.graph.input[0].name
 
     def __call__(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -97,7 +92,7 @@ class GraphMargins:
 
 
 def _half(margin: onnx.ModelProto) -> onnx.ModelProto:
-    model = _copy(margin)
+    model = copied(margin)
     casts = []
     for constant in list(model.graph.initializer):
         if constant.data_type != onnx.TensorProto.FLOAT or len(constant.dims) < 2:
@@ -116,7 +111,7 @@ def _half(margin: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _low_rank(margin: onnx.ModelProto, rank: int) -> onnx.ModelProto:
-    model = _copy(margin)
+    model = copied(margin)
     constants = {constant.name: constant for constant in model.graph.initializer}
     dense = [node for node in model.graph.node if node.op_type == "Gemm"]
     if not dense:
@@ -157,7 +152,7 @@ def _integers(
         path = Path(folder) / "small.onnx"
         if static:
             quantize_static(
-                _copy(margin),
+                copied(margin),
                 path,
                 _Readings(margin.graph.input[0].name, inputs[:: _step(len(inputs))]),
                 # The margin itself must not saturate at what the calibration has seen.
@@ -167,7 +162,7 @@ def _integers(
                 weight_type=QuantType.QInt8,
             )
         else:
-            quantize_dynamic(_copy(margin), path, per_channel=True, weight_type=QuantType.QInt8)
+            quantize_dynamic(copied(margin), path, per_channel=True, weight_type=QuantType.QInt8)
         return onnx.load(path)
 
 
@@ -198,12 +193,6 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         root.setLevel(level)
-
-
-def _copy(model: onnx.ModelProto) -> onnx.ModelProto:
-    copied = onnx.ModelProto()
-    copied.CopyFrom(model)
-    return copied
 
 
 def _put_first(model: onnx.ModelProto, nodes: list[onnx.NodeProto]) -> None:

@@ -101,13 +101,18 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
 
 def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
     """A copy whose input has this name."""
-    copied = onnx.ModelProto()
-    copied.CopyFrom(model)
-    former = copied.graph.input[0].name
-    copied.graph.input[0].name = input_name
-    for node in copied.graph.node:
-        node.input[:] = [input_name if name == former else name for name in node.input]
-    return copied
+    other = copied(model)
+    former = other.graph.input[0].name
+    other.graph.input[0].name = input_name
+    _feed(other.graph, former, input_name)
+    return other
+
+
+def copied(model: onnx.ModelProto) -> onnx.ModelProto:
+    """One that may be changed."""
+    other = onnx.ModelProto()
+    other.CopyFrom(model)
+    return other
 
 
 def standardised(
@@ -116,8 +121,7 @@ def standardised(
     """The graph with `(input - mean) * scale` before it; both of the input's shape."""
     graph = model.graph
     given = graph.input[0].name
-    for node in graph.node:
-        node.input[:] = ["standardised" if name == given else name for name in node.input]
+    _feed(graph, given, "standardised")
     steps: _Steps = (
         ("Sub", (given, "input_mean"), "centred", {}),
         ("Mul", ("centred", "input_scale"), "standardised", {}),
@@ -127,6 +131,12 @@ def standardised(
     graph.node.extend(nodes)
     graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
     return model
+
+
+def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
+    """Let every node that takes `former` take `name` instead."""
+    for node in graph.node:
+        node.input[:] = [name if given == former else given for given in node.input]
 
 
 def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
