@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import json
+import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,7 +30,10 @@ from models.runtime import TactileModel
 if TYPE_CHECKING:
     from daemon.judge.grip import GripLimits
     from daemon.judge.joints import JointLimits
+    from daemon.session_keeper import SessionKeeper
     from drivers.recording_columns import Columns
+
+log = logging.getLogger("graspd")
 
 DEFAULT_MODEL = "small-session"
 
@@ -37,15 +42,15 @@ Clock = Callable[[], int]
 
 
 def model_path(scene: Scene) -> Path:
-    """File of the scene's model, of its hand's fingers alone where the zoo has such a form of it.
+    """File of the scene's model.
 
-    Raises `ModelError` if the zoo does not have it.
+    `model.name` is any name of the zoo; where the zoo has that model in a form for the hand's
+    fingers alone, it is that form. Raises `ModelError` if the zoo does not have it.
     """
     if scene.model.path is not None:
         return scene.model.path
     name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
-    for_the_hand = f"{name}-{'-'.join(scene.hand.fingers)}"
-    return zoo.find(for_the_hand if for_the_hand in zoo.names() else name)
+    return zoo.find(zoo.for_hand(name, scene.hand.fingers))
 
 
 def load_model(scene: Scene) -> TactileModel:
@@ -65,6 +70,7 @@ def build_pipeline(
     Raises `ModelError` if the model does not fit the hand or never is right as often as wanted,
     `SceneError` or `RecordingError` if recordings do not say whether they are grasps or streams.
     """
+    _refuse_other_fingers(scene, model)
     limits = Limits(
         max_age_ns=scene.max_age_ns,
         slip_threshold=scene.model.slip_threshold,
@@ -79,6 +85,32 @@ def build_pipeline(
         learns=learns,
         needs_session=scene.session.required,
     )
+
+
+def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
+    """Raise `ModelError` saying what to write, if the model is not for the hand's fingers."""
+    wanted, hand = model.contract.fingers, scene.hand.fingers
+    if hand == wanted:
+        return
+    if set(hand) == set(wanted):
+        advice = f"write hand.fingers = {json.dumps(wanted)}{_and_sensors(scene)}"
+    elif names := zoo.judging(hand):
+        advice = f"the zoo has {', '.join(names)} for these"
+    else:
+        advice = "the zoo has no model for these"
+    raise ModelError(
+        f"{model.path}: judges the fingers {', '.join(wanted)} in this order, "
+        f"the hand has {', '.join(hand)}: {advice}"
+    )
+
+
+def _and_sensors(scene: Scene) -> str:
+    """How sensors keep their places where the order of the hand's fingers is that of the wires."""
+    match scene.tactile:
+        case SpiTactile(sensors=None) | CanTactile(sensors=None, format="syntouch"):
+            return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"
+        case _:
+            return ""
 
 
 def gate_mode(scene: Scene) -> GateMode:
@@ -173,6 +205,30 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
         with _section("joints"):
             drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
     return drivers
+
+
+def build_keeper(
+    wanted: Scene, pipeline: Pipeline, tactile: Driver, stack: ExitStack
+) -> SessionKeeper | None:
+    """Who keeps the session; None if model or scene need none, or if there is no place for it."""
+    if pipeline.session is None or not wanted.keeps_session:
+        return None
+    from daemon.session_file import SessionFile, SessionFileError
+    from daemon.session_keeper import SessionKeeper
+
+    try:
+        file = SessionFile(wanted.session_path)
+    except SessionFileError as error:
+        log.warning("%s; every start begins a new session", error)
+        return None
+    stack.callback(file.close)
+    return SessionKeeper(
+        pipeline.session,
+        wanted.hand.fingers,
+        tactile,
+        file,
+        on_exchange=pipeline.sensors_exchanged,
+    )
 
 
 def open_driver(driver: Driver) -> None:

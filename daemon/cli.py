@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import functools
 import importlib
-import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
+
+from daemon import logs
 
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
@@ -28,6 +30,7 @@ COMMANDS = {
     "schema": ("daemon.commands.schema", "print the JSON Schema of the messages"),
     "models": ("daemon.commands.models", "list the models and show their cards"),
     "session": ("daemon.commands.session", "show, reset or seed what is known of the sensors"),
+    "keys": ("daemon.commands.keys", "make and list the keys of those who may connect by TCP"),
     "train": ("models.training.command", "train and export a model (extra: train)"),
     "evaluate": ("models.training.evaluate", "measure how good systems are (extra: train)"),
     "report": (
@@ -40,7 +43,6 @@ COMMANDS = {
 EXTRAS = {"train": "train", "evaluate": "train", "report": "train,report"}
 """Extras that a command needs."""
 WRONG = 2
-LOGGERS = ("graspd", "daemon", "drivers", "models")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,9 +69,7 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         if name == named:
             run = _load(name, module_name, command)
     args = parser.parse_args(arguments)
-    logging.basicConfig(level=logging.WARNING, format="graspd: %(levelname)s: %(message)s")
-    for ours in LOGGERS:  # libraries speak up only when something is wrong
-        logging.getLogger(ours).setLevel(logging.INFO)
+    logs.set_up(os.environ)
     if run is None:
         parser.error(f"'{args.command}' must come first")
     return functools.partial(run, args)

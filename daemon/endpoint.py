@@ -1,4 +1,4 @@
-"""Where ZeroMQ may be bound: on this computer, for this computer."""
+"""Where ZeroMQ can be bound, and who could connect there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ IPC_PATH_MAX_BYTES = 107
 
 
 def check_endpoint(endpoint: str) -> None:
-    """Raise ValueError unless ZeroMQ can bind here and only this computer can connect."""
+    """Raise ValueError unless ZeroMQ can bind here."""
     scheme, separator, address = endpoint.partition("://")
     if not separator or scheme not in {"ipc", "tcp"}:
         raise ValueError("must start with ipc:// or tcp://")
@@ -24,16 +24,23 @@ def check_endpoint(endpoint: str) -> None:
         raise ValueError("needs a path that subscribers can know, not '*'")
 
 
+def is_private(endpoint: str) -> bool:
+    """Whether only this computer can connect to an endpoint that ZeroMQ can bind to."""
+    scheme, _, address = endpoint.partition("://")
+    return scheme == "ipc" or _ip_address(address.rpartition(":")[0]).is_loopback
+
+
 def _check_tcp(address: str) -> None:
     host, _, port = address.rpartition(":")
     if not re.fullmatch(r"[0-9]{1,5}", port) or not 0 < int(port) < 65536:
         raise ValueError("needs a port of 1 to 65535, as in tcp://127.0.0.1:5555")
+    _ip_address(host)
+
+
+def _ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
     try:
         if host.startswith("[") and host.endswith("]"):
-            loopback = ipaddress.IPv6Address(host[1:-1]) == ipaddress.IPv6Address("::1")
-        else:
-            loopback = ipaddress.IPv4Address(host).is_loopback
+            return ipaddress.IPv6Address(host[1:-1])
+        return ipaddress.IPv4Address(host)
     except ValueError:
         raise ValueError(f"needs an IP address, 127.0.0.1 or [::1], not '{host}'") from None
-    if not loopback:
-        raise ValueError(f"{host} is not a loopback address; anyone could listen")

@@ -50,18 +50,9 @@ ELSEWHERE = (
 """Part and modules: what only some scenes import."""
 READINGS = 300
 """Readings that are timed: three grasps."""
+SILENCE_NS = 100_000_000
 ASK_EVERY = 20
 """Readings between two questions, where a grasp is judged on request only."""
-PERIOD_NS = 10_000_000
-"""Between two readings of the synthetic grasps, ns: 100 Hz, as the tare expects."""
-REST = 110
-"""Untouched readings before the first grasp; a tare takes 100."""
-GRASP_EVERY, CLOSING, HELD = 65, 5, 45
-"""Readings from one grasp to the next, and of it closing (and opening) and held."""
-FALL_COUNTS = 150.0
-"""A typical grasp lowers the electrodes here by none to three times as much."""
-COUNTS_MAX = 4000.0
-"""Of an electrode at rest: short of saturated."""
 WRONG = 2
 
 
@@ -214,19 +205,18 @@ def _around(
     stack: ExitStack,
 ) -> Reporter:
     """What `graspd run` puts around the judge."""
-    from daemon.commands.run import keeper, questions
-    from daemon.publisher import Publisher
+    from daemon import assembly
     from daemon.reporter import Reporter
+    from daemon.sockets import Sockets
+
+    if assembly.build_keeper(wanted, pipeline, drivers[0], stack) is not None:
+        meter.take("session file")
+    sockets = stack.enter_context(Sockets(wanted))
+    reporter = Reporter(wanted.hand.name, model.contract.name, model.sha256, sockets)
+    meter.take("sockets")
     from daemon.service import Service
     from daemon.stop import StopSignal
 
-    if keeper(wanted, pipeline, drivers[0], stack) is not None:
-        meter.take("session file")
-    publisher = stack.enter_context(Publisher(wanted.endpoint, wanted.publish.high_water_mark))
-    reporter = Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher)
-    meter.take("socket")
-    if questions(wanted, stack) is not None:
-        meter.take("questions")
     stop = stack.enter_context(StopSignal())
     Service(drivers, pipeline, reporter, stop, max_age_ns=wanted.max_age_ns)
     meter.take("loop")
@@ -240,7 +230,10 @@ def _feed(wanted: Scene, driver: Driver, contract: ModelContract) -> Iterator[Re
     if isinstance(wanted.tactile, ReplayTactile):
         return _played(driver)
     joints = wanted.joints is not None
-    return _synthetic(list(_grasps(contract)), joints=joints)
+    from daemon.rehearsal import grasps
+
+    counts = list(grasps(contract.seen, READINGS))
+    return _synthetic(counts, joints=joints)
 
 
 def _played(driver: Driver) -> Iterator[Reading]:
@@ -252,6 +245,7 @@ def _synthetic(counts: list[NDArray[np.uint16]], *, joints: bool) -> Iterator[Re
     """Readings of these counts made now, and with `joints` still angles before each."""
     import numpy as np
 
+    from daemon.rehearsal import PERIOD_NS
     from drivers.base import JointReading, TactileReading
 
     sound = np.zeros(counts[0].shape, dtype=np.uint8)
@@ -261,25 +255,6 @@ def _synthetic(counts: list[NDArray[np.uint16]], *, joints: bool) -> Iterator[Re
         if joints:
             yield JointReading(now_ns, number, ("FFJ3", "MFJ3"), angles, made_ns)
         yield TactileReading(now_ns, number, values, sound, recorded_ns=made_ns)
-
-
-def _grasps(contract: ModelContract) -> Iterator[NDArray[np.uint16]]:
-    """Counts (fingers, 24) of a hand that grasps what is typical of the model's training."""
-    import numpy as np
-
-    seen = contract.seen
-    # One standard deviation along each axis of the training: its very centre was never grasped.
-    sides = 1.0 - 2.0 * (np.arange(np.size(seen.centre)) % 2)
-    away = np.linalg.solve(seen.whitening_matrix().T, sides)
-    typical = np.array(seen.centre) + away.reshape(np.shape(seen.centre))
-    place_of = np.arange(typical.size).reshape(typical.shape)
-    rest = np.minimum(typical + FALL_COUNTS * (place_of % 4), COUNTS_MAX)
-    for number in range(REST + READINGS):
-        place = (number - REST) % GRASP_EVERY
-        far = min(place + 1, CLOSING, max(2 * CLOSING + HELD - 1 - place, 0)) / CLOSING
-        touch = 0.0 if number < REST else far
-        noise = (5 * number + 3 * place_of) % 7 - 3
-        yield (rest + touch * (typical - rest) + noise).astype(np.uint16)
 
 
 def _judge(
@@ -297,7 +272,7 @@ def _judge(
     begun_ns = time.thread_time_ns()
     judgement = pipeline.judge(reading)
     judged_ns = time.thread_time_ns()
-    reporter.verdict(judgement, judgement.t_ns, PERIOD_NS)
+    reporter.verdict(judgement, judgement.t_ns, SILENCE_NS)
     return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, judgement.judged
 
 

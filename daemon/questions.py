@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import zmq
 
-from daemon.binding import Bound, PublishError, bind
+from daemon.binding import Binding, Bound
 
 QUESTION = b"judge"
 FRAMES_MAX = 3
@@ -36,24 +36,24 @@ class Questions(Bound):
     socket in a folder of yours.
     """
 
-    def __init__(self, endpoint: str, patience_ns: int) -> None:
+    def __init__(self, endpoint: str, patience_ns: int, binding: Binding | None = None) -> None:
         """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
-        super().__init__(endpoint)
+        super().__init__(endpoint, binding)
         self.counters: Counter[str] = Counter()
         """`asked`, `answered`, `given_up`, `malformed`."""
         self._patience_ns = patience_ns
         self._waiting: deque[_Question] = deque()
         self._frames: list[bytes] = []
         """Of the message at hand, as far as it has been read."""
-        try:
-            self._socket = self._context.socket(zmq.ROUTER)
-            self._socket.linger = 0
-            self._socket.sndhwm = self._socket.rcvhwm = QUEUE_MAX
-            self._socket.maxmsgsize = MESSAGE_MAX_BYTES
-            bind(self._socket, endpoint, self._file)
-        except zmq.ZMQError as error:
-            self.close()
-            raise PublishError(f"cannot take questions on {endpoint}: {error.strerror}") from error
+        self.renew()
+
+    def _open(self) -> zmq.Socket[bytes]:
+        made = self._context.socket(zmq.ROUTER)
+        made.linger = 0
+        made.sndhwm = made.rcvhwm = QUEUE_MAX
+        made.maxmsgsize = MESSAGE_MAX_BYTES
+        self._bind(made, "take questions")
+        return made
 
     @property
     def waiting(self) -> int:
@@ -62,7 +62,7 @@ class Questions(Bound):
 
     def fileno(self) -> int:
         """Becomes readable when something may have come; call `take` before waiting for it."""
-        return int(self._socket.fileno())
+        return int(self.socket.fileno())
 
     def due_ns(self) -> int | None:
         """When the oldest question must be answered, monotonic ns."""
@@ -72,12 +72,12 @@ class Questions(Bound):
         """Take in what has come; how many questions it was."""
         taken = 0
         for _ in range(TAKEN_MAX):
-            if not int(self._socket.get(zmq.EVENTS)) & zmq.POLLIN:
+            if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:
                 break
-            frame = self._socket.recv(zmq.NOBLOCK)
+            frame = self.socket.recv(zmq.NOBLOCK)
             if len(self._frames) <= FRAMES_MAX:
                 self._frames.append(frame)
-            if not self._socket.get(zmq.RCVMORE):
+            if not self.socket.get(zmq.RCVMORE):
                 taken += self._take_message(now_ns)
                 self._frames.clear()
         self.counters["asked"] += taken
@@ -105,5 +105,5 @@ class Questions(Bound):
         """
         while self._waiting and (now_ns is None or self._waiting[0].due_ns <= now_ns):
             question = self._waiting.popleft()
-            self._socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
+            self.socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
             self.counters["answered"] += 1

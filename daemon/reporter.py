@@ -8,7 +8,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import (
@@ -24,6 +24,7 @@ from daemon.judge.verdict import (
 from daemon.latency import LatencyHistogram
 
 if TYPE_CHECKING:
+    from daemon.deadlines import Deadlines
     from daemon.judge.gate import GateChange
 
 SHA_DIGITS = 12
@@ -136,7 +137,8 @@ class Reporter:
         readings_hz: float,
         drivers: dict[str, dict[str, int]],
         pipeline: Pipeline,
-    ) -> None:
+        deadlines: Deadlines,
+    ) -> Status:
         """Send one status message."""
         session, grip = pipeline.session, pipeline.grip
         health = pipeline.health()
@@ -158,11 +160,10 @@ class Reporter:
             gate=None if grip is None else grip.state,
             tared=None if grip is None else list(grip.tared),
             health=health,
-            latency_us={
-                "p50": self.latency.quantile_us(0.5),
-                "p99": self.latency.quantile_us(0.99),
-                "max": self.latency.max_us,
-            },
+            latency_us=_spread_us(self.latency),
+            jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
+            late_readings=deadlines.late,
+            worst_age_ms=deadlines.worst_age_ms,
             model=self._model,
             model_sha=self._model_sha,
             versions=self._versions,
@@ -170,3 +171,12 @@ class Reporter:
         self._status_seq += 1
         if self._output is not None:
             self._output.send(self._status_topic, encode(message))
+        return message
+
+
+def _spread_us(durations: LatencyHistogram) -> dict[Literal["p50", "p99", "max"], float]:
+    return {
+        "p50": durations.quantile_us(0.5),
+        "p99": durations.quantile_us(0.99),
+        "max": durations.max_us,
+    }

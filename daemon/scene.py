@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     Field,
     ValidationError,
     ValidationInfo,
@@ -17,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.endpoint import check_endpoint
+from daemon.endpoint import check_endpoint, is_private
 from daemon.scene_drivers import (
     CanTactile,
     FilePath,
@@ -146,34 +147,63 @@ class Gate(Section):
     grasp, counts."""
 
 
+def _checked(endpoint: str) -> str:
+    check_endpoint(endpoint)
+    return endpoint
+
+
+Endpoint = Annotated[str, AfterValidator(_checked)]
+
+
 class Publish(Section):
     """`[publish]`: where verdicts go."""
 
-    endpoint: str | None = None
-    """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` is for loopback addresses only."""
+    endpoint: Endpoint | None = None
+    """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
+    addresses."""
+    latest_endpoint: Endpoint | None = None
+    """Where verdicts are published as messages of one frame too, for `ZMQ_CONFLATE`."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000)] = 1000
-    """Messages kept for a slow subscriber before its oldest are dropped."""
+    """Messages kept for a subscriber that is slow; those that come then are lost to it."""
+    file_mode: Annotated[str, Field(pattern=r"^0?[0-7]{3}$")] | None = None
+    """Of the files of `ipc://` sockets, as in chmod: who may write may connect. As the umask has it
+    unless given."""
+    group: Name | None = None
+    """Of the files of `ipc://` sockets; the process's unless given."""
 
-    @field_validator("endpoint")
+
+class Curve(Section):
+    """`[curve]`: who may connect by `tcp://` (`graspd keys`). All that do need keys then."""
+
+    secret_key: FilePath
+    """The daemon's own `.key_secret` file, of mode 0600; relative to the scene file."""
+    clients: FilePath
+    """Folder with the `.key` files of those who may connect; looked at once a second."""
+
+    @field_validator("secret_key", "clients")
     @classmethod
-    def _endpoint_is_local(cls, endpoint: str | None) -> str | None:
-        if endpoint is not None:
-            check_endpoint(endpoint)
-        return endpoint
+    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
+        base: Path = (info.context or {}).get("base", Path())
+        return base / path
 
 
 class Ask(Section):
     """`[ask]`: where the grasp controller asks for a verdict (deploy/wire/README.md)."""
 
-    endpoint: str | None = None
-    """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` is for loopback addresses only."""
+    endpoint: Endpoint | None = None
+    """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
+    addresses."""
 
-    @field_validator("endpoint")
-    @classmethod
-    def _endpoint_is_local(cls, endpoint: str | None) -> str | None:
-        if endpoint is not None:
-            check_endpoint(endpoint)
-        return endpoint
+
+class Realtime(Section):
+    """`[realtime]`: run before everything that is not. Without it nothing of this is done."""
+
+    priority: Annotated[int, Field(ge=1, le=98)] | None = 50
+    """Of SCHED_FIFO; below that of the hand's own controller."""
+    cpus: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] | None = None
+    """Processors to run on, numbered from 0; all unless given."""
+    lock_memory: bool = True
+    """Keep what was touched in memory (mlockall), so that no reading waits for a disk."""
 
 
 class Scene(Section):
@@ -187,6 +217,8 @@ class Scene(Section):
     gate: Gate = Gate()
     publish: Publish = Publish()
     ask: Ask | None = None
+    curve: Curve | None = None
+    realtime: Realtime | None = None
 
     @model_validator(mode="after")
     def _sections_fit_together(self) -> Self:
@@ -206,9 +238,26 @@ class Scene(Section):
                 raise ValueError("tactile.sensors is for syntouch: frames of sweep_fd say whose")
         if isinstance(tactile, CanTactile) and tactile.format == "syntouch" and len(fingers) > 3:
             raise ValueError("tactile.format syntouch carries three sensors, hand.fingers has more")
+        self._refuse_strangers()
         if isinstance(self.joints, PalmJoints) and not isinstance(tactile, PalmTactile):
             raise ValueError("joints.driver palm needs tactile.driver palm: it is the same stream")
         return self
+
+    def _refuse_strangers(self) -> None:
+        endpoints = {
+            "publish.endpoint": self.publish.endpoint,
+            "publish.latest_endpoint": self.publish.latest_endpoint,
+            "ask.endpoint": None if self.ask is None else self.ask.endpoint,
+        }
+        given = [endpoint for endpoint in endpoints.values() if endpoint is not None]
+        if len(set(given)) != len(given):
+            raise ValueError("publish.endpoint, latest_endpoint and ask.endpoint must differ")
+        for key, endpoint in endpoints.items():
+            if endpoint is not None and self.curve is None and not is_private(endpoint):
+                raise ValueError(
+                    f"{key} {endpoint} is not a loopback address; anyone could listen: [curve] "
+                    "says who may"
+                )
 
     @property
     def endpoint(self) -> str:

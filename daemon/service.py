@@ -5,10 +5,12 @@ from __future__ import annotations
 import selectors
 import time
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from enum import Enum
+from typing import TYPE_CHECKING, Protocol
 
+from daemon.deadlines import Deadlines
 from daemon.judge.pipeline import Pipeline
-from daemon.judge.verdict import State, Verdict
+from daemon.judge.verdict import State, Status, Verdict
 from daemon.reporter import Reporter
 from daemon.stop import StopSignal
 from drivers.base import Driver, JointReading, TactileReading
@@ -26,6 +28,43 @@ Listener = Callable[[Verdict, bytes, TactileReading | None], None]
 """Gets every verdict after it was published, with its payload and the reading it is about."""
 
 
+class Ended(Enum):
+    """Why the loop has ended."""
+
+    STOPPED = "stopped"
+    EXHAUSTED = "exhausted"
+    """The recording is over."""
+    RELOAD = "reload"
+    """Another scene is ready to take over."""
+
+
+class Watchdog(Protocol):
+    """Who wants to hear, now and then, that the loop goes round."""
+
+    def due_ns(self) -> int | None:
+        """When next, monotonic ns; None if never."""
+
+    def feed(self) -> None:
+        """The loop has gone round: drivers, timers and messages have been seen to."""
+
+
+class Peers(Protocol):
+    """The sockets, as far as others than the publisher's caller come to them."""
+
+    @property
+    def questions(self) -> Questions | None:
+        """Who takes questions, if anybody."""
+
+    def filenos(self) -> list[int]:
+        """Become readable when a peer may want something."""
+
+    def take(self) -> None:
+        """See to peers that come."""
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What peers did, by the part that counted it."""
+
+
 class Service:
     """Runs one hand in one thread until told to stop or until a recording ends."""
 
@@ -39,13 +78,19 @@ class Service:
         max_age_ns: int,
         listener: Listener | None = None,
         chore: Callable[[], None] | None = None,
-        questions: Questions | None = None,
+        sockets: Peers | None = None,
+        watchdog: Watchdog | None = None,
+        on_status: Callable[[Status], None] | None = None,
+        reload: Callable[[], bool] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
 
-        `chore` is done before readings are judged, and once a second. `questions` are answered
-        with the next verdict, or if a grasp is judged on request only, when it has been.
+        `chore` is done before readings are judged, and once a second. Questions that come by
+        `sockets` are answered with the next verdict, or if a grasp is judged on request only, when
+        it has been.
+        `on_status` gets every status once it is sent. `reload` is done when a reload is asked for,
+        and says whether the loop shall end for it.
         """
         self._drivers = drivers
         self._tactile = drivers[0]
@@ -54,8 +99,15 @@ class Service:
         self._stop = stop
         self._listener = listener
         self._chore = chore
-        self._questions = questions
+        self._sockets = sockets
+        self._questions = None if sockets is None else sockets.questions
+        self._watchdog = watchdog
+        self._on_status = on_status
+        self._reload = reload
         self._clock = clock
+        self._deadlines = Deadlines()
+        self._watched: set[int] = set()
+        """Descriptors of drivers and questions that the selector has."""
         self._max_age_ns = max_age_ns
         self._state = State.RUNNING
         now_ns = clock()
@@ -65,38 +117,53 @@ class Service:
         self._status_at_ns = now_ns
         self._readings_since_status = 0
 
-    def run(self) -> None:
+    def run(self) -> Ended:
         """Run. Raises `DriverError` if the driver gives up; sends a last status in any case."""
         try:
             with selectors.SelectSelector() as selector:
                 selector.register(self._stop, selectors.EVENT_READ)
-                while self._stop.received is None and not self._tactile.exhausted:
-                    # Now, and not when the descriptor says so: sending an answer quietens it.
-                    self._take_questions()
-                    self._wait(selector)
-                    if not self._take_readings():
-                        self._mind_silence()
-                    if self._clock() >= self._status_due_ns:
-                        self._send_status()
+                while self._stop.received is None:
+                    if self._tactile.exhausted:
+                        return Ended.EXHAUSTED
+                    if self._stop.take_reload() and self._reload is not None and self._reload():
+                        return Ended.RELOAD
+                    self._go_round(selector)
+            if self._tactile.fileno() is not None:
+                self._take_readings()  # what had come before the signal
+            return Ended.STOPPED
         finally:
             self._state = State.STOPPING
             self._send_status()
 
+    def _go_round(self, selector: selectors.BaseSelector) -> None:
+        # Now, and not when the descriptors say so: sending quietens them.
+        if self._sockets is not None:
+            self._sockets.take()
+            self._take_questions()
+        self._wait(selector)
+        if not self._take_readings():
+            self._mind_silence()
+        if self._clock() >= self._status_due_ns:
+            self._send_status()
+        if self._watchdog is not None:
+            self._watchdog.feed()
+
     def _wait(self, selector: selectors.BaseSelector) -> None:
         """Sleep until a driver, a timer or a signal wants attention."""
-        descriptors = (driver.fileno() for driver in self._drivers)
-        wanted = {descriptor for descriptor in descriptors if descriptor is not None}
-        if self._questions is not None:
-            wanted.add(self._questions.fileno())
-        watched = {key.fd for key in selector.get_map().values()} - {self._stop.fileno()}
-        for former in watched - wanted:
-            selector.unregister(former)
-        for descriptor in wanted - watched:
-            selector.register(descriptor, selectors.EVENT_READ)
-        dues_ns = [driver.due_ns() for driver in self._drivers]
-        due_ns = min(
-            self._silence_due_ns, self._status_due_ns, *(due for due in dues_ns if due is not None)
-        )
+        wanted = {fd for driver in self._drivers if (fd := driver.fileno()) is not None}
+        if self._sockets is not None:
+            wanted.update(self._sockets.filenos())
+        if wanted != self._watched:
+            for former in self._watched - wanted:
+                selector.unregister(former)
+            for descriptor in wanted - self._watched:
+                selector.register(descriptor, selectors.EVENT_READ)
+            self._watched = wanted
+        due_ns = min(self._silence_due_ns, self._status_due_ns)
+        for timer in (*self._drivers, self._watchdog):
+            timer_ns = None if timer is None else timer.due_ns()
+            if timer_ns is not None and timer_ns < due_ns:
+                due_ns = timer_ns
         selector.select(max(due_ns - self._clock(), 0) / 1e9)
 
     def _take_readings(self) -> bool:
@@ -112,6 +179,7 @@ class Service:
                 continue
             judgement = self._pipeline.judge(reading)
             verdict, payload = self._reporter.verdict(judgement, received_ns, self._silence_ns())
+            self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
             self._state = State.RUNNING
             self._last_t_ns = reading.t_ns
             self._silence_due_ns = received_ns + self._silence_ns()
@@ -157,18 +225,19 @@ class Service:
             self._chore()
         now_ns = self._clock()
         elapsed_s = max(now_ns - self._status_at_ns, 1) / 1e9
-        self._reporter.status(
+        status = self._reporter.status(
             self._state,
             self._readings_since_status / elapsed_s,
             self._counters(),
             self._pipeline,
+            self._deadlines,
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
+        if self._on_status is not None:
+            self._on_status(status)
 
     def _counters(self) -> dict[str, dict[str, int]]:
         counters = {driver.name: driver.counters.as_dict() for driver in self._drivers}
-        if self._questions is not None:
-            counters["ask"] = dict(self._questions.counters)
-        return counters
+        return counters if self._sockets is None else counters | self._sockets.counters()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
 import os
 import socket
 import stat
@@ -26,9 +27,15 @@ class SocketFile:
     the other is refused. `close` removes both files.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Raises `OccupiedError`, or `OSError` where no socket can be made; leaves no file then."""
+    def __init__(self, path: Path, mode: int | None = None, group: str | None = None) -> None:
+        """With a `mode` and a `group` of the file, or what the process's are.
+
+        Raises `OccupiedError`, `LookupError` for an unknown group, or `OSError` where no socket can
+        be made; leaves no file then.
+        """
         self.path = path
+        self._mode = mode
+        self._group = None if group is None else _group_id(group)
         self._lock_path = Path(f"{path}.lock")
         self._identity: tuple[int, int] | None = None
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
@@ -50,6 +57,11 @@ class SocketFile:
             self.path.unlink()
             self.listener.bind(str(self.path))
         self._identity = _identity(self.path)
+        if self._group is not None:
+            os.chown(self.path, -1, self._group)
+        if self._mode is not None:
+            os.chmod(self.path, self._mode)
+        # Not before: nobody can have connected while the file was everybody's.
         self.listener.listen(BACKLOG)
 
     def close(self) -> None:
@@ -61,6 +73,13 @@ class SocketFile:
         with contextlib.suppress(OSError):
             self._lock_path.unlink()
         os.close(self._lock)
+
+
+def _group_id(name: str) -> int:
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError:
+        raise LookupError(f"there is no group {name}") from None
 
 
 def _identity(path: Path) -> tuple[int, int]:

@@ -1,20 +1,26 @@
-"""Stopping on SIGINT and SIGTERM, in a form that a selector can wait on."""
+"""Stopping on SIGINT and SIGTERM, reloading on SIGHUP, in a form that a selector can wait on."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from types import FrameType
 from typing import Any, Self
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+STOPPING = (signal.SIGINT, signal.SIGTERM)
+WAKEUPS_MAX = 4096
+"""Bytes that a look takes out of the pipe: more signals than ever come between two."""
 
 
 class StopSignal:
     """Becomes set, and its descriptor readable, when the process is asked to stop."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, reloads: bool = False) -> None:
+        """With `reloads`, SIGHUP asks for a reload; else it does what it did before."""
         self.received: signal.Signals | None = None
+        self._reload = False
+        self._signals = (*STOPPING, signal.SIGHUP) if reloads else STOPPING
         self._former: dict[signal.Signals, Any] = {}
         self._former_wakeup = -1
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
@@ -23,10 +29,19 @@ class StopSignal:
         """Descriptor that becomes readable when a signal arrives."""
         return self._read
 
+    def take_reload(self) -> bool:
+        """Whether a reload was asked for since the last look."""
+        if not self._reload:
+            return False
+        self._reload = False
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._read, WAKEUPS_MAX)
+        return True
+
     def __enter__(self) -> Self:
         """Take over the signals; only the main thread can."""
         self._former_wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
-        self._former = {number: signal.signal(number, self._handle) for number in SIGNALS}
+        self._former = {number: signal.signal(number, self._handle) for number in self._signals}
         return self
 
     def __exit__(self, *_details: object) -> None:
@@ -37,4 +52,7 @@ class StopSignal:
         os.close(self._write)
 
     def _handle(self, number: int, _frame: FrameType | None) -> None:
-        self.received = signal.Signals(number)
+        if number == signal.SIGHUP:
+            self._reload = True
+        else:
+            self.received = signal.Signals(number)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
+
+from daemon.logs import JOURNAL_ERROR, is_journal
 
 
 def printable(text: str, length_max: int | None = None) -> str:
@@ -21,5 +24,8 @@ def printable(text: str, length_max: int | None = None) -> str:
 
 def complain(problem: object) -> None:
     """Say on stderr what is wrong, one line per line of the message."""
-    lines = map(printable, str(problem).split("\n"))
-    sys.stderr.write("graspd: " + "\n".join(lines) + "\n")
+    lines = [printable(line) for line in str(problem).split("\n")]
+    if is_journal(os.environ):
+        sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
+    else:
+        sys.stderr.write("graspd: " + "\n".join(lines) + "\n")

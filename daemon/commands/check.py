@@ -73,6 +73,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         assembly.build_pipeline(wanted, model)
         limits = assembly.grip_limits(wanted)
         _try_drivers(wanted)
+        _try_keys(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
         return _Checked(WRONG)
@@ -135,6 +136,18 @@ def _try_drivers(wanted: scene.Scene) -> None:
         load_calibration(joints.calibration)
 
 
+def _try_keys(wanted: scene.Scene) -> None:
+    if wanted.curve is None:
+        return
+    from daemon.keys import KeysError, load_clients, load_pair
+
+    try:
+        load_pair(wanted.curve.secret_key)
+        load_clients(wanted.curve.clients)
+    except KeysError as error:
+        raise scene.SceneError(str(error)) from error
+
+
 def _what_is_in(
     wanted: scene.Scene, model: TactileModel, limits: GripLimits | None
 ) -> dict[str, str]:
@@ -162,7 +175,20 @@ def _what_is_in(
         parts["joints"] = "those of the recordings"
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
+    if wanted.publish.latest_endpoint is not None:
+        parts["latest"] = f"the latest verdict alone on {wanted.publish.latest_endpoint}"
+    if wanted.curve is not None:
+        parts["curve"] = f"by tcp:// only keys of {wanted.curve.clients}"
+    if wanted.realtime is not None:
+        parts["realtime"] = _realtime(wanted.realtime)
     return parts
+
+
+def _realtime(wanted: scene.Realtime) -> str:
+    priority = "" if wanted.priority is None else f"SCHED_FIFO {wanted.priority}, "
+    cpus = "all processors" if wanted.cpus is None else f"processors {wanted.cpus}"
+    memory = ", memory locked" if wanted.lock_memory else ""
+    return f"{priority}{cpus}{memory}, no garbage collection on the hot path"
 
 
 def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
@@ -185,8 +211,11 @@ def _standing(model: TactileModel) -> str:
     found = zoo.standing(model.sha256)
     if found is None:
         return ""
-    speed = "" if found["speed"] is None else f", {found['speed']:.1f} times as fast as cnn1"
-    return f"; number {found['f1_rank']} of {found['models']} on known objects{speed}"
+    alone = found["models"] == 1
+    rank = "" if alone else f"number {found['f1_rank']} of {found['models']} on known objects"
+    speed = "" if found["speed"] is None else f"{found['speed']:.1f} times as fast as cnn1"
+    text = ", ".join(filter(None, (rank, speed)))
+    return f"; {text}" if text else ""
 
 
 def _rejects(wanted: scene.Scene, model: TactileModel) -> str:
@@ -220,6 +249,10 @@ def _what_is_left_out(
         left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
     if not isinstance(model.contract.input, SessionInput):
         left_out["session"] = f"{model.contract.name} needs no session calibration"
+    if wanted.curve is None:
+        left_out["curve"] = "no keys: sockets are for this computer alone"
+    if wanted.realtime is None:
+        left_out["realtime"] = "ordinary priority, memory not locked"
     without = [name for name in get_args(Finger) if name not in wanted.hand.fingers]
     if without:
         left_out["fingers"] = f"{', '.join(without)}: no channel in image or network"

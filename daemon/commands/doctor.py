@@ -136,7 +136,7 @@ def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list
     except ModelError as error:
         findings.append(Finding(Level.ERROR, str(error), "choose a model that fits the hand"))
     findings += _listen(wanted, report, listen_s)
-    return findings + _privileges(wanted.tactile.driver)
+    return findings + _privileges(wanted.tactile.driver, wanted.realtime)
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
@@ -195,14 +195,17 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     return (last_s - first_s) * statistics.readings / (statistics.readings - 1)
 
 
-def _privileges(driver: str | None = None) -> list[Finding]:
+def _privileges(driver: str | None = None, realtime: scene.Realtime | None = None) -> list[Finding]:
     findings = []
     group = GROUPS.get(driver or "")
     if group is not None and os.geteuid() != 0 and not _in_group(group):
         advice = f"sudo usermod -aG {group} $USER, then log in again"
         findings.append(Finding(Level.WARNING, f"you are not in the group {group}", advice))
-    priority = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    findings.append(Finding(Level.OK, f"realtime priority up to {priority} may be asked for"))
+    may = 98 if os.geteuid() == 0 else resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    wanted = 0 if realtime is None or realtime.priority is None else realtime.priority
+    level = Level.OK if wanted <= may else Level.WARNING
+    advice = "" if wanted <= may else f"as a service: LimitRTPRIO={wanted}; else limits.conf(5)"
+    findings.append(Finding(level, f"realtime priority up to {may} may be asked for", advice))
     return findings
 
 

@@ -10,14 +10,14 @@ from pathlib import Path
 from daemon import assembly, scene
 from daemon.arguments import positive, within
 from daemon.binding import PublishError
-from daemon.endpoint import check_endpoint
+from daemon.endpoint import check_endpoint, is_private
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import Verdict
 from daemon.printer import Printer
-from daemon.publisher import Publisher
 from daemon.reporter import Reporter
 from daemon.service import Listener, Service
 from daemon.session_file import SessionFileError, load, statistics_of
+from daemon.sockets import Sockets
 from daemon.stop import StopSignal
 from daemon.text import complain
 from drivers.base import DriverError, TactileReading
@@ -112,21 +112,22 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     if pipeline.session is not None and args.session != OFF:
         listener = _Comparison(wanted, printer).verdict
     with ExitStack() as stack:
-        publisher = None
+        sockets = None
         if args.publish is not None:
-            publisher = stack.enter_context(Publisher(args.publish, waits=args.wait is not None))
+            sockets = stack.enter_context(Sockets(wanted))
         for driver in drivers:
             stack.callback(driver.close)
             assembly.open_driver(driver)
-        if publisher is not None and args.wait is not None:
-            _wait(publisher, args.wait, stop)
+        if sockets is not None and args.wait is not None:
+            _wait(sockets, args.wait, stop)
         service = Service(
             drivers,
             pipeline,
-            Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
+            Reporter(wanted.hand.name, model.contract.name, model.sha256, sockets),
             stop,
             max_age_ns=wanted.max_age_ns,
             listener=listener,
+            sockets=sockets,
         )
         try:
             service.run()
@@ -173,8 +174,9 @@ class _Comparison:
             self._printer.without_session(self._pipeline.judge(reading), reading, verdict.grasp)
 
 
-def _wait(publisher: Publisher, timeout_s: float, stop: StopSignal) -> None:
+def _wait(sockets: Sockets, timeout_s: float, stop: StopSignal) -> None:
     """Raises `PublishError` if nobody subscribes in time."""
+    publisher = sockets.publisher
     if not publisher.wait_for_subscriber(timeout_s, stop) and stop.received is None:
         raise PublishError(f"nobody subscribed to {publisher.endpoint} within {timeout_s:g} s")
 
@@ -193,6 +195,7 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
         },
         "model": model,
         "gate": {"max_age_ms": MAX_AGE_MS, "mode": args.gate},
+        "publish": {"endpoint": args.publish},
     }
     return scene.parse(data, Path("command line"))
 
@@ -200,6 +203,8 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
 def _endpoint(text: str) -> str:
     try:
         check_endpoint(text)
+        if not is_private(text):
+            raise ValueError("not a loopback address; anyone could listen")
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text}: {error}") from error
     return text

@@ -3,28 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import logging
+import faulthandler
+import os
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon import assembly, scene
 from daemon.binding import PublishError
-from daemon.judge.pipeline import Pipeline
-from daemon.publisher import Publisher
-from daemon.reporter import Reporter
-from daemon.service import Service
+from daemon.running import Runner
+from daemon.scene import SceneError
 from daemon.stop import StopSignal
 from daemon.text import complain
-from drivers.base import Driver, DriverError, RecordingError
+from drivers.base import DriverError, RecordingError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
+    from daemon.notify import Systemd
     from daemon.printer import Printer
-    from daemon.questions import Questions
-    from daemon.session_keeper import SessionKeeper
-
-log = logging.getLogger("graspd")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,11 +30,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording."""
+    """Run until stopped; 0 after SIGINT, SIGTERM or the end of a recording.
+
+    SIGHUP reads the scene again, and a wrong one changes nothing. On a terminal it means that the
+    terminal is gone, as for any other command.
+    """
     try:
-        with StopSignal() as stop:
-            _run(scene.load(args.scene), _printer() if args.print else None, stop)
-    except (scene.SceneError, ModelError, RecordingError) as error:
+        with ExitStack() as stack:
+            stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
+            printer = _printer() if args.print else None
+            Runner(args.scene, stop, printer=printer, manager=_manager(stack)).run()
+    except (SceneError, ModelError, RecordingError) as error:
         complain(error)
         return 2
     except (PublishError, DriverError) as error:
@@ -47,72 +49,25 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _run(wanted: scene.Scene, printer: Printer | None, stop: StopSignal) -> None:
-    model = assembly.load_model(wanted)
-    pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session_learns)
-    drivers = assembly.build_drivers(wanted)
-    with ExitStack() as stack:
-        publisher = stack.enter_context(Publisher(wanted.endpoint, wanted.publish.high_water_mark))
-        for driver in drivers:
-            stack.callback(driver.close)
-            assembly.open_driver(driver)
-        log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-        kept = keeper(wanted, pipeline, drivers[0], stack)
-        service = Service(
-            drivers,
-            pipeline,
-            Reporter(wanted.hand.name, model.contract.name, model.sha256, publisher),
-            stop,
-            max_age_ns=wanted.max_age_ns,
-            listener=printer.verdict if printer else None,
-            chore=None if kept is None else kept.mind,
-            questions=questions(wanted, stack),
-        )
-        try:
-            service.run()
-        finally:
-            if kept is not None:
-                kept.save()
-            if printer is not None:
-                printer.summary()
+def _on_terminal() -> bool:
+    return sys.stdin is not None and not sys.stdin.closed and sys.stdin.isatty()
+
+
+def _manager(stack: ExitStack) -> Systemd | None:
+    """Whoever started this process, if it wants to be told how it goes."""
+    if "NOTIFY_SOCKET" not in os.environ:
+        return None
+    from daemon.notify import Systemd
+
+    manager = Systemd.of(os.environ)
+    if manager is not None:
+        faulthandler.enable()  # where the loop hung when the watchdog ended it
+        stack.callback(manager.close)
+        stack.callback(manager.stopping)
+    return manager
 
 
 def _printer() -> Printer:
     from daemon.printer import Printer
 
     return Printer(as_json=False, prompt=True)
-
-
-def questions(wanted: scene.Scene, stack: ExitStack) -> Questions | None:
-    """Who takes questions; None if the scene takes none. Raises `PublishError`."""
-    if wanted.ask_endpoint is None:
-        return None
-    from daemon.questions import Questions
-
-    log.info("questions on %s", wanted.ask_endpoint)
-    patience_ns = round(wanted.gate.request_ms * 1e6)
-    return stack.enter_context(Questions(wanted.ask_endpoint, patience_ns))
-
-
-def keeper(
-    wanted: scene.Scene, pipeline: Pipeline, tactile: Driver, stack: ExitStack
-) -> SessionKeeper | None:
-    """Who keeps the session; None if model or scene need none, or if there is no place for it."""
-    if pipeline.session is None or not wanted.keeps_session:
-        return None
-    from daemon.session_file import SessionFile, SessionFileError
-    from daemon.session_keeper import SessionKeeper
-
-    try:
-        file = SessionFile(wanted.session_path)
-    except SessionFileError as error:
-        log.warning("%s; every start begins a new session", error)
-        return None
-    stack.callback(file.close)
-    return SessionKeeper(
-        pipeline.session,
-        wanted.hand.fingers,
-        tactile,
-        file,
-        on_exchange=pipeline.sensors_exchanged,
-    )

@@ -232,6 +232,13 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     `model` or `session`, and why."""
     latency_us: dict[Literal["p50", "p99", "max"], Duration]
     """Reading to publish since start; all zero before the first verdict."""
+    jitter_us: dict[Literal["p50", "p99", "max"], Duration] = {}
+    """How far the time between two readings in a row was from the driver's period, since start;
+    empty while that is not known."""
+    late_readings: Count = 0
+    """Readings since start whose verdict came more than a period after their last byte."""
+    worst_age_ms: Duration = 0.0
+    """Longest time since start from a reading's last byte to its verdict, ms."""
     model: str
     model_sha: str
     versions: dict[str, str]

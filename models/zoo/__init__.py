@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-from models.contract import ModelError
+from models.contract import Finger, ModelError
 
 ZOO = Path(__file__).parent
 STANDING = ZOO / "standing.json"
@@ -16,6 +17,23 @@ STANDING = ZOO / "standing.json"
 def names() -> list[str]:
     """Names of the models in the zoo, sorted."""
     return sorted(path.stem for path in ZOO.glob("*.onnx"))
+
+
+def for_hand(name: str, fingers: Collection[Finger]) -> str:
+    """Name of the form of a model for a hand of these fingers alone, else the name as it is.
+
+    That of `small-session` for `ff` and `th`, in any order, is `small-session-ff-th`. What is such
+    a form itself has no other.
+    """
+    hand = [finger for finger in get_args(Finger) if finger in fingers]
+    form = "-".join((name, *hand))
+    is_form = name.endswith(tuple(f"-{finger}" for finger in get_args(Finger)))
+    return form if form in names() and not is_form else name
+
+
+def judging(fingers: Collection[Finger]) -> list[str]:
+    """Names of the models that judge these fingers and no others. Raises `ModelError`."""
+    return [name for name in names() if set(card(name)["contract"]["fingers"]) == set(fingers)]
 
 
 def card(name: str) -> dict[str, Any]:
@@ -33,8 +51,9 @@ def card(name: str) -> dict[str, Any]:
 def standing(sha256: str) -> dict[str, Any] | None:
     """What `graspd report error-vs-time` found of the model file with this digest, if it was there.
 
-    `f1` on known objects, 0..1, `f1_rank` and `models` that were compared, `paced_p50_us` and
-    `speed`, how many times as fast as `cnn1`. Raises `ModelError` if the file is broken.
+    `f1` on known objects, 0..1, `f1_rank` among the `models` of the same fingers that were
+    compared, `paced_p50_us` and `speed`, how many times as fast as `cnn1`. Raises `ModelError` if
+    the file is broken.
     """
     try:
         content = json.loads(STANDING.read_bytes())

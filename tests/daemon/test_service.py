@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pytest
 
 from daemon.judge.verdict import Outcome, Reason, State, Status, Verdict, decode_status
 from daemon.reporter import Reporter
-from daemon.service import Service
+from daemon.service import Ended, Service, Watchdog
 from daemon.stop import StopSignal
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
 from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, pipeline, reading
@@ -48,6 +48,8 @@ class Bench:
         clock: Clock,
         stop: StopSignal,
         model: FakeModel | None = None,
+        watchdog: Watchdog | None = None,
+        reload: Callable[[], bool] | None = None,
     ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
@@ -61,6 +63,8 @@ class Bench:
             stop,
             max_age_ns=100 * MS,
             listener=self._listen,
+            watchdog=watchdog,
+            reload=reload,
             clock=clock,
         )
 
@@ -263,3 +267,85 @@ def test_a_driver_with_a_descriptor_is_read_when_bytes_are_there(stop: StopSigna
     os.close(read)
     os.close(write)
     assert len(bench.verdicts) == 2
+
+
+def test_what_had_come_before_the_signal_is_still_judged(stop: StopSignal) -> None:
+    """A reading and the signal arrive while the loop sleeps: the reading is not lost."""
+    clock = Clock()
+    bytes_there, write = os.pipe()
+
+    class Last(FakeDriver):
+        def fileno(self) -> int | None:
+            return bytes_there
+
+        def read_ready(self) -> list[Reading]:
+            if stop.received is None:
+                os.kill(os.getpid(), signal.SIGTERM)
+                return []
+            return [self.queue.pop(0)] if self.queue else []  # type: ignore[list-item]
+
+    bench = Bench(Last([reading(clock())], clock), clock, stop)
+    assert bench.service.run() is Ended.STOPPED
+    os.close(bytes_there)
+    os.close(write)
+    assert len(bench.verdicts) == 1
+    assert bench.output.statuses()[-1].state is State.STOPPING
+
+
+class TestWatchdog:
+    """Counts how often it is fed."""
+
+    __test__ = False
+
+    def __init__(self) -> None:
+        self.fed = 0
+
+    def due_ns(self) -> int | None:
+        return None
+
+    def feed(self) -> None:
+        self.fed += 1
+
+
+def test_the_watchdog_is_fed_after_each_round_and_not_after_a_failed_one(stop: StopSignal) -> None:
+    clock = Clock()
+    queue: list[Reading | DriverError] = [
+        *(reading(clock(), seed) for seed in (1, 2)),
+        LinkError("gone"),
+    ]
+    watchdog = TestWatchdog()
+    bench = Bench(FakeDriver(queue, clock), clock, stop, watchdog=watchdog)
+    with pytest.raises(LinkError):
+        bench.service.run()
+    assert watchdog.fed == 2
+
+
+@pytest.mark.parametrize("fine", [True, False])
+def test_a_hangup_reads_the_scene_again_and_a_wrong_one_changes_nothing(fine: bool) -> None:
+    clock = Clock()
+    asked = []
+
+    def reload() -> bool:
+        asked.append(True)
+        return fine
+
+    with StopSignal(reloads=True) as stop:
+        bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, reload=reload)
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert bench.service.run() is (Ended.RELOAD if fine else Ended.EXHAUSTED)
+        assert not stop.take_reload()
+    assert asked == [True]
+    assert len(bench.verdicts) == (0 if fine else 1)
+
+
+def test_every_status_tells_jitter_late_readings_and_the_worst_age(stop: StopSignal) -> None:
+    clock = Clock()
+    start_ns = clock()
+    came = [reading(start_ns + t * MS, seq=seq) for seq, t in enumerate((0, 10, 22))]
+    clock.now_ns += 25 * MS
+    bench = Bench(FakeDriver(came, clock), clock, stop)
+    bench.service.run()
+    status = bench.output.statuses()[-1]
+    assert status.jitter_us["max"] == pytest.approx(2000.0)
+    assert status.late_readings == 2  # 25 and 15 ms old, of a period of 10 ms
+    assert status.worst_age_ms == pytest.approx(25.0)

@@ -1,0 +1,72 @@
+"""`graspd keys`: make and list the CURVE keys of a daemon and of those who may connect to it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from daemon import keys
+from daemon.keys import KeysError
+from daemon.text import complain, printable
+
+FOLDER = Path("/etc/graspd/keys")
+CLIENTS = "clients"
+"""Folder, beside the daemon's own keys, with the public keys of those who may connect."""
+WRONG = 2
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    make = actions.add_parser("make", help="make a pair of keys: NAME.key and NAME.key_secret")
+    make.add_argument("name", help="whose keys: `daemon`, or the name of a computer")
+    listing = actions.add_parser("list", help="list the keys, and what is wrong with them")
+    listing.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    for action in (make, listing):
+        action.add_argument(
+            "--dir", type=Path, default=FOLDER, metavar="DIR", help=f"(default: {FOLDER})"
+        )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make or list; 2 if keys cannot be made, or those that are there are wrong."""
+    return _make(args) if args.action == "make" else _list(args)
+
+
+def _make(args: argparse.Namespace) -> int:
+    try:
+        public, secret = keys.make(args.dir, args.name)
+    except KeysError as error:
+        complain(error)
+        return WRONG
+    sys.stdout.write(
+        f"{printable(str(public))}: public; a client's goes into {CLIENTS}/ beside the daemon's\n"
+        f"{printable(str(secret))}: secret; stays with its owner\n"
+    )
+    return 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    found: dict[str, dict[str, str]] = {"own": {}, CLIENTS: {}}
+    problems = []
+    for path in sorted(args.dir.glob(f"*{keys.SECRET}")):
+        try:
+            found["own"][path.stem] = keys.load_pair(path)[0].decode()
+        except KeysError as error:
+            problems.append(str(error))
+    folder = args.dir / CLIENTS
+    try:
+        if folder.is_dir():
+            found[CLIENTS] = {name: key.decode() for key, name in keys.load_clients(folder).items()}
+    except KeysError as error:
+        problems.append(str(error))
+    if args.json:
+        sys.stdout.write(json.dumps({**found, "wrong": problems}) + "\n")
+    else:
+        for kind, entries in found.items():
+            sys.stdout.writelines(f"{kind:8} {printable(n)}  {key}\n" for n, key in entries.items())
+    for problem in problems:
+        complain(problem)
+    return WRONG if problems else 0

@@ -1,0 +1,190 @@
+"""Who may connect over TCP: peers are asked for keys (ZAP, RFC 27), and refusals are told."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import socket
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import zmq
+from zmq.utils import z85
+from zmq.utils.monitor import parse_monitor_message
+
+log = logging.getLogger("graspd")
+
+ZAP_ENDPOINT = "inproc://zeromq.zap.01"
+ZAP_VERSION = b"1.0"
+REQUEST_FRAMES = 9
+"""Of a CURVE request: who asks (2), version, id, domain, address, identity, mechanism, key."""
+TAKEN_MAX = 64
+"""Requests and events looked at in one round, so that a flood does not hold up readings."""
+REMEMBERED_MAX = 1000
+"""Connections of which the address is kept until they have shown their keys."""
+EVENTS = (
+    zmq.EVENT_ACCEPTED
+    | zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_SUCCEEDED
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+)
+KERNEL_PERIOD_S = 1.0
+"""The kernel's table may be long: it is read so often at most, s."""
+TIME_WAIT = "06"
+"""State of a connection that this side has closed."""
+FAILED = (zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
+
+
+class Gatekeeper:
+    """Answers libzmq's questions whether a peer may connect, and watches who does not even ask.
+
+    Must be there before the sockets of its context are bound. Never blocks.
+    """
+
+    def __init__(
+        self, context: zmq.Context[zmq.Socket[bytes]], admitted: Mapping[bytes, str]
+    ) -> None:
+        """`admitted` has names by public key, Z85."""
+        self.counters = Counter(admitted=0, turned_away=0)
+        self._admitted = dict(admitted)
+        self._context = context
+        self._requests = context.socket(zmq.ROUTER)
+        self._requests.linger = 0
+        self._requests.bind(ZAP_ENDPOINT)
+        self._monitors: list[tuple[zmq.Socket[bytes], zmq.Socket[bytes]]] = []
+        self._addresses: dict[int, str] = {}
+        """Of connections by their descriptor."""
+        self._failed = 0
+        """Handshakes that have failed and whose connection has not gone yet."""
+        self._asked_kernel_s = -math.inf
+
+    def watch(self, listening: zmq.Socket[bytes]) -> None:
+        """Hear of peers of this socket that fail without asking: those without keys."""
+        endpoint = f"inproc://graspd-monitor-{id(listening)}"
+        listening.monitor(endpoint, EVENTS)
+        monitor = self._context.socket(zmq.PAIR)
+        monitor.linger = 0
+        monitor.connect(endpoint)
+        self._monitors.append((listening, monitor))
+
+    def admit(self, admitted: Mapping[bytes, str]) -> bool:
+        """Take another list; whether somebody is no longer on it."""
+        gone = self._admitted.keys() - admitted.keys()
+        self._admitted = dict(admitted)
+        return bool(gone)
+
+    def filenos(self) -> list[int]:
+        """Become readable when there may be something; call `take` before waiting for them."""
+        monitors = (monitor for _, monitor in self._monitors)
+        return [int(each.fileno()) for each in (self._requests, *monitors)]
+
+    def take(self) -> None:
+        """Answer who asks, and see who failed."""
+        for _ in range(TAKEN_MAX):
+            if not int(self._requests.get(zmq.EVENTS)) & zmq.POLLIN:
+                break
+            self._answer(self._requests.recv_multipart(zmq.NOBLOCK))
+        for _, monitor in self._monitors:
+            for _ in range(TAKEN_MAX):
+                if not int(monitor.get(zmq.EVENTS)) & zmq.POLLIN:
+                    break
+                event = parse_monitor_message(monitor.recv_multipart(zmq.NOBLOCK))
+                self._note(event["event"], event["value"])
+
+    def _answer(self, frames: list[bytes]) -> None:
+        if len(frames) != REQUEST_FRAMES or frames[2] != ZAP_VERSION or frames[7] != b"CURVE":
+            return  # libzmq alone can reach this socket, and asks so only for sockets with keys
+        envelope, number, address, key = frames[:2], frames[3], frames[5], frames[8]
+        name = self._admitted.get(z85.encode(key))
+        if name is None:
+            self.counters["turned_away"] += 1
+            log.warning("turned away %s: its key is not on the list", address.decode("ascii"))
+        else:
+            self.counters["admitted"] += 1
+            log.info("%s is %s", address.decode("ascii"), name)
+        status = (b"400", b"not on the list") if name is None else (b"200", b"OK")
+        user = b"" if name is None else name.encode()
+        self._requests.send_multipart([*envelope, ZAP_VERSION, number, *status, user, b""])
+
+    def _note(self, event: int, value: int) -> None:
+        if event == zmq.EVENT_ACCEPTED:
+            address = _peer(value)
+            if address is not None and len(self._addresses) < REMEMBERED_MAX:
+                self._addresses[value] = address
+        elif event in FAILED:
+            self._failed += 1
+        elif event == zmq.EVENT_DISCONNECTED:
+            address = self._addresses.pop(value, None)
+            if self._failed:
+                self._failed -= 1
+                self.counters["turned_away"] += 1
+                who = address or self._who_was_it()
+                log.warning("turned away %s: it has no keys, or not the daemon's", who)
+
+    def _who_was_it(self) -> str:
+        """A connection may be gone before anybody looks; the kernel remembers it for a minute."""
+        now_s = time.monotonic()
+        if now_s - self._asked_kernel_s < KERNEL_PERIOD_S:
+            return "somebody"
+        self._asked_kernel_s = now_s
+        ports = {_port(listening) for listening, _ in self._monitors}
+        return " or ".join(sorted(gone_peers(ports))) or "somebody"
+
+    def unwatch(self) -> None:
+        """Watch no socket any more: they are about to be closed."""
+        for listening, monitor in self._monitors:
+            if not listening.closed:
+                listening.disable_monitor()
+            monitor.close(linger=0)
+        self._monitors.clear()
+        self._addresses.clear()
+        self._failed = 0
+
+    def close(self) -> None:
+        """Answer nobody any more."""
+        self.unwatch()
+        self._requests.close(linger=0)
+
+
+def _peer(descriptor: int) -> str | None:
+    """Address of a connection that libzmq has; it may have gone already."""
+    try:
+        with socket.socket(fileno=os.dup(descriptor)) as connection:
+            host, *_ = connection.getpeername()
+    except (OSError, ValueError):
+        return None
+    return str(host)
+
+
+def _port(listening: zmq.Socket[bytes]) -> int:
+    endpoint = listening.last_endpoint
+    return int(endpoint.rpartition(b":")[2]) if isinstance(endpoint, bytes) else 0
+
+
+def gone_peers(ports: set[int]) -> set[str]:
+    """Addresses of connections to local TCP ports that were closed lately (proc_pid_net(5))."""
+    found = set()
+    for table, family in (("tcp", socket.AF_INET), ("tcp6", socket.AF_INET6)):
+        try:
+            lines = Path("/proc/net", table).read_text(encoding="utf-8").splitlines()[1:]
+        except OSError:
+            continue
+        for line in lines:
+            _, local, remote, state, *_ = line.split()
+            if state == TIME_WAIT and int(local.rpartition(":")[2], 16) in ports:
+                found.add(_address(remote.rpartition(":")[0], family))
+    return found
+
+
+def _address(words: str, family: socket.AddressFamily) -> str:
+    """Words of 32 bits, each in the order of the machine's bytes."""
+    raw = bytes.fromhex(words)
+    if sys.byteorder == "little":
+        raw = b"".join(raw[start : start + 4][::-1] for start in range(0, len(raw), 4))
+    return socket.inet_ntop(family, raw)

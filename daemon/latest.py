@@ -1,0 +1,33 @@
+"""A socket for those who want the newest verdict and nothing else (`ZMQ_CONFLATE`)."""
+
+from __future__ import annotations
+
+import zmq
+
+from daemon.binding import Binding, Bound
+from daemon.publisher import SUBSCRIPTION_MAX_BYTES, SUBSCRIPTIONS_WAITING_MAX
+
+LINGER_MS = 0
+"""What is late is not the newest."""
+
+
+class Latest(Bound):
+    """Publishes verdicts as messages of one frame, which a conflating subscriber needs."""
+
+    def __init__(self, endpoint: str, binding: Binding | None = None) -> None:
+        """Bind to `endpoint`. Raises `PublishError`."""
+        super().__init__(endpoint, binding)
+        self.renew()
+
+    def _open(self) -> zmq.Socket[bytes]:
+        made = self._context.socket(zmq.PUB)
+        made.linger = LINGER_MS
+        made.conflate = True
+        made.rcvhwm = SUBSCRIPTIONS_WAITING_MAX
+        made.maxmsgsize = SUBSCRIPTION_MAX_BYTES
+        self._bind(made, "publish")
+        return made
+
+    def send(self, payload: bytes) -> None:
+        """Hand one payload to ZeroMQ; never blocks."""
+        self.socket.send(payload, flags=zmq.NOBLOCK)

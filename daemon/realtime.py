@@ -1,0 +1,117 @@
+"""Realtime: priority, processors, locked memory, no garbage collector on the hot path."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import logging
+import os
+import resource
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+from daemon.scene import Realtime
+
+log = logging.getLogger("graspd")
+
+MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT = 1, 2, 4
+"""Flags of mlockall(2)."""
+CAP_IPC_LOCK = 14
+"""Bit of the capability to lock any amount of memory (linux/capability.h)."""
+
+
+class Hot:
+    """A process that runs in realtime from `__enter__` to `__exit__`.
+
+    What cannot be had is left out, and told in one warning that says what to grant.
+    """
+
+    def __init__(self, wanted: Realtime) -> None:
+        self._wanted = wanted
+        self._processors = os.sched_getaffinity(0)
+        self.lacking: list[str] = []
+        """What could not be had, each with what to grant."""
+
+    def __enter__(self) -> Self:
+        """Take what the scene wants, for all threads that there are."""
+        wanted = self._wanted
+        if wanted.cpus is not None:
+            self._pin(set(wanted.cpus))
+        if wanted.lock_memory:
+            self._lock()
+        if wanted.priority is not None:
+            self._raise(wanted.priority)
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        if self.lacking:
+            log.warning("not quite realtime: %s", "; ".join(self.lacking))
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        _value: BaseException | None,
+        _trace: TracebackType | None,
+    ) -> None:
+        """Be an ordinary process again."""
+        gc.enable()
+        gc.unfreeze()
+        for thread in _threads():
+            with suppress(OSError):
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+                os.sched_setaffinity(thread, self._processors)
+        _libc().munlockall()
+
+    def tidy(self) -> None:
+        """Collect garbage, for which there is time after a status, once a second."""
+        gc.collect()
+
+    def _pin(self, processors: set[int]) -> None:
+        try:
+            for thread in _threads():
+                os.sched_setaffinity(thread, processors)
+        except OSError as error:
+            have = ", ".join(map(str, sorted(self._processors)))
+            self.lacking.append(f"realtime.cpus: {error.strerror} (there are {have})")
+
+    def _raise(self, priority: int) -> None:
+        try:
+            for thread in _threads():
+                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+        except OSError as error:
+            self.lacking.append(
+                f"realtime.priority {priority}: {error.strerror} (grant LimitRTPRIO={priority} in "
+                f"the unit, or `rtprio {priority}` in limits.conf)"
+            )
+
+    def _lock(self) -> None:
+        # With a limit, memory that is wanted later would be refused: worse than not to lock.
+        unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
+        problem = "limited"
+        if unlimited or _may_lock():
+            # Only what is touched: the rest of a library of 20 MB is never needed.
+            if _libc().mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) == 0:
+                return
+            problem = os.strerror(ctypes.get_errno())
+        self.lacking.append(
+            f"realtime.lock_memory: {problem} (grant LimitMEMLOCK=infinity in the unit, or "
+            "`memlock unlimited` in limits.conf)"
+        )
+
+
+def _threads() -> list[int]:
+    """Threads of this process; one that has just ended is none."""
+    return [int(name) for name in os.listdir("/proc/self/task")]
+
+
+def _may_lock() -> bool:
+    """Whether this process has the capability to lock any amount of memory."""
+    with open("/proc/self/status", encoding="utf-8") as file:
+        effective = next((line for line in file if line.startswith("CapEff:")), "CapEff: 0")
+    return bool(int(effective.split()[1], 16) >> CAP_IPC_LOCK & 1)
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)

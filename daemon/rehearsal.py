@@ -1,0 +1,54 @@
+"""Grasps that are typical of what a model has seen, to try the whole chain before it counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.pipeline import Pipeline
+from drivers.base import TactileReading
+from models.contract import SeenCounts
+
+PERIOD_NS = 10_000_000
+"""Between two readings, ns: 100 Hz, as the tare expects."""
+REST = 110
+"""Untouched readings before the first grasp; a tare takes 100."""
+GRASP_EVERY, CLOSING, HELD = 65, 5, 45
+"""Readings from one grasp to the next, and of it closing (and opening) and held."""
+FALL_COUNTS = 150.0
+"""A typical grasp lowers the electrodes here by none to three times as much."""
+COUNTS_MAX = 4000.0
+"""Of an electrode at rest: short of saturated."""
+
+
+def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
+    """Counts (fingers, 24) of a hand that rests, and then grasps for so many readings."""
+    # One standard deviation along each axis of the training: its very centre was never grasped.
+    sides = 1.0 - 2.0 * (np.arange(np.size(seen.centre)) % 2)
+    away = np.linalg.solve(seen.whitening_matrix().T, sides)
+    typical = np.array(seen.centre) + away.reshape(np.shape(seen.centre))
+    place_of = np.arange(typical.size).reshape(typical.shape)
+    rest = np.minimum(typical + FALL_COUNTS * (place_of % 4), COUNTS_MAX)
+    for number in range(REST + readings):
+        place = (number - REST) % GRASP_EVERY
+        far = min(place + 1, CLOSING, max(2 * CLOSING + HELD - 1 - place, 0)) / CLOSING
+        touch = 0.0 if number < REST else far
+        noise = (5 * number + 3 * place_of) % 7 - 3
+        yield (rest + touch * (typical - rest) + noise).astype(np.uint16)
+
+
+def rehearse(make: Callable[[Callable[[], int]], Pipeline], seen: SeenCounts) -> Pipeline:
+    """Judge one grasp, so that what the first real one needs is imported and allocated.
+
+    `make` makes a pipeline with a clock of its own; it is returned as the rehearsal left it.
+    `seen` is what its model was trained on.
+    """
+    now_ns = 0
+    pipeline = make(lambda: now_ns)
+    for seq, counts in enumerate(grasps(seen, GRASP_EVERY)):
+        now_ns = (seq + 1) * PERIOD_NS
+        faults = np.zeros(counts.shape, dtype=np.uint8)
+        pipeline.judge(TactileReading(t_ns=now_ns, seq=seq, counts=counts, faults=faults))
+    return pipeline

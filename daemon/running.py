@@ -1,0 +1,204 @@
+"""Running a scene file until told to stop, and taking it anew when told to."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from daemon import assembly, scene
+from daemon.binding import PublishError
+from daemon.judge.pipeline import Pipeline
+from daemon.judge.verdict import Status
+from daemon.reporter import Reporter
+from daemon.service import Ended, Service, Watchdog
+from daemon.sockets import Sockets, plan
+from daemon.stop import StopSignal
+from drivers.base import Driver, DriverError, RecordingError
+from models.contract import ModelError
+from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.printer import Printer
+    from daemon.realtime import Hot
+
+log = logging.getLogger("graspd")
+
+
+class Manager(Watchdog, Protocol):
+    """Who started the daemon and looks after it: systemd."""
+
+    def ready(self, what: str) -> None:
+        """Model and drivers are there."""
+
+    def reloading(self) -> None:
+        """The scene is read again; `ready` follows."""
+
+    def status(self, status: Status) -> None:
+        """How it goes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """A scene and what it needs, nothing of it open yet."""
+
+    scene: scene.Scene
+    model: TactileModel
+    pipeline: Pipeline
+    drivers: list[Driver]
+
+
+def prepare(path: Path) -> Parts:
+    """Read a scene, load its model and warm it.
+
+    Raises `SceneError`, `ModelError` or `RecordingError`.
+    """
+    wanted = scene.load(path)
+    model = assembly.load_model(wanted)
+    pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session_learns)
+    return Parts(wanted, model, pipeline, assembly.build_drivers(wanted))
+
+
+class Runner:
+    """Runs what a scene file says."""
+
+    def __init__(
+        self,
+        path: Path,
+        stop: StopSignal,
+        *,
+        printer: Printer | None = None,
+        manager: Manager | None = None,
+    ) -> None:
+        self._path = path
+        self._stop = stop
+        self._printer = printer
+        self._manager = manager
+        self._sockets: Sockets | None = None
+        self._next: Parts | None = None
+        self._running = False
+
+    def run(self) -> None:
+        """Run until stopped or until a recording ends.
+
+        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`; at a
+        reload it logs them, and what ran before goes on.
+        """
+        try:
+            self._run(prepare(self._path))
+        finally:
+            if self._sockets is not None:
+                self._sockets.close()
+        if self._printer is not None:
+            self._printer.summary()
+
+    def _run(self, parts: Parts) -> None:
+        former: Parts | None = None
+        while True:
+            self._running = False
+            try:
+                ended = self._work(parts)
+            except (scene.SceneError, RecordingError, PublishError, DriverError) as error:
+                if former is None or self._running:
+                    raise
+                self._refuse(error)
+                parts, former = former, None
+                continue
+            if ended is not Ended.RELOAD or self._next is None:
+                return
+            parts, former = self._next, parts
+
+    def _open_sockets(self, wanted: scene.Scene) -> Sockets:
+        """Those that are open, if the scene wants the same ones."""
+        if self._sockets is not None and self._sockets.plan == plan(wanted):
+            return self._sockets
+        if self._sockets is not None:
+            self._sockets.close()
+            self._sockets = None
+        self._sockets = Sockets(wanted)
+        log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
+        if wanted.publish.latest_endpoint is not None:
+            log.info("the latest verdict alone on %s", wanted.publish.latest_endpoint)
+        if wanted.ask_endpoint is not None:
+            log.info("questions on %s", wanted.ask_endpoint)
+        return self._sockets
+
+    def _work(self, parts: Parts) -> Ended:
+        """Open everything and go round until something ends it."""
+        wanted = parts.scene
+        with ExitStack() as stack:
+            sockets = self._open_sockets(wanted)
+            for driver in parts.drivers:
+                stack.callback(driver.close)
+                assembly.open_driver(driver)
+            kept = assembly.build_keeper(wanted, parts.pipeline, parts.drivers[0], stack)
+            if kept is not None:
+                stack.callback(kept.save)
+            hot = self._hot(parts, stack)
+            reporter = Reporter(
+                wanted.hand.name, parts.model.contract.name, parts.model.sha256, sockets
+            )
+            service = Service(
+                parts.drivers,
+                parts.pipeline,
+                reporter,
+                self._stop,
+                max_age_ns=wanted.max_age_ns,
+                listener=None if self._printer is None else self._printer.verdict,
+                chore=None if kept is None else kept.mind,
+                sockets=sockets,
+                watchdog=self._manager,
+                on_status=self._on_status(sockets, hot),
+                reload=self._reload,
+            )
+            self._running = True
+            if self._manager is not None:
+                self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
+            return service.run()
+
+    def _on_status(self, sockets: Sockets, hot: Hot | None) -> Callable[[Status], None]:
+        """What there is time for once a second."""
+
+        def once_a_second(status: Status) -> None:
+            if self._manager is not None:
+                self._manager.status(status)
+            sockets.mind_keys()
+            if hot is not None:
+                hot.tidy()
+
+        return once_a_second
+
+    def _hot(self, parts: Parts, stack: ExitStack) -> Hot | None:
+        """Realtime, rehearsed; None if the scene wants none. Imported only where it does."""
+        if parts.scene.realtime is None:
+            return None
+        from daemon.realtime import Hot
+        from daemon.rehearsal import rehearse
+
+        rehearse(
+            lambda clock: assembly.build_pipeline(parts.scene, parts.model, clock),
+            parts.model.contract.seen,
+        )
+        return stack.enter_context(Hot(parts.scene.realtime))
+
+    def _reload(self) -> bool:
+        """Prepare what the scene file says now; whether that is fine."""
+        if self._manager is not None:
+            self._manager.reloading()
+        try:
+            self._next = prepare(self._path)
+        except (scene.SceneError, ModelError, RecordingError) as error:
+            self._refuse(error)
+            if self._manager is not None:
+                self._manager.ready("the new scene is wrong, the former one goes on")
+            return False
+        log.info("%s: taken anew", self._path)
+        return True
+
+    def _refuse(self, error: Exception) -> None:
+        for line in str(error).splitlines():
+            log.error("%s", line)
+        log.error("%s: not taken anew, the former scene goes on", self._path)

@@ -1,0 +1,165 @@
+"""All sockets of a scene: where messages go, where questions come from, who is let in."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import zmq
+
+from daemon.binding import Binding
+from daemon.publisher import Publisher
+from daemon.scene import Curve, Scene, SceneError
+
+if TYPE_CHECKING:
+    from daemon.gatekeeper import Gatekeeper
+    from daemon.latest import Latest
+    from daemon.questions import Questions
+
+log = logging.getLogger("graspd")
+
+VERDICT = b"verdict."
+
+
+class Sockets:
+    """Open from the start until `close`."""
+
+    def __init__(self, wanted: Scene) -> None:
+        """Raises `PublishError`, and `SceneError` for keys that are wrong."""
+        self.plan = plan(wanted)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        self._curve = wanted.curve
+        self._keys_seen: object = None
+        self.gatekeeper: Gatekeeper | None = None
+        self.publisher: Publisher
+        self.latest: Latest | None = None
+        self.questions: Questions | None = None
+        try:
+            self._open(wanted)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, wanted: Scene) -> None:
+        pair = None
+        if wanted.curve is not None:
+            pair = self._let_in_only_known(wanted.curve)
+        publish = wanted.publish
+        mode = None if publish.file_mode is None else int(publish.file_mode, 8)
+        binding = Binding(self._context, mode, publish.group, pair)
+        self.publisher = Publisher(wanted.endpoint, publish.high_water_mark, binding)
+        if publish.latest_endpoint is not None:
+            from daemon.latest import Latest
+
+            self.latest = Latest(publish.latest_endpoint, binding)
+        if wanted.ask_endpoint is not None:
+            from daemon.questions import Questions
+
+            patience_ns = round(wanted.gate.request_ms * 1e6)
+            self.questions = Questions(wanted.ask_endpoint, patience_ns, binding)
+        self._watch()
+
+    def _let_in_only_known(self, curve: Curve) -> tuple[bytes, bytes]:
+        from daemon.gatekeeper import Gatekeeper
+        from daemon.keys import KeysError, load_clients, load_pair
+
+        try:
+            pair, admitted = load_pair(curve.secret_key), load_clients(curve.clients)
+        except KeysError as error:
+            raise SceneError(str(error)) from error
+        self._keys_seen = _state(curve.clients)
+        self.gatekeeper = Gatekeeper(self._context, admitted)
+        return pair
+
+    def _watch(self) -> None:
+        if self.gatekeeper is not None:
+            for bound in self._bound():
+                if bound.endpoint.startswith("tcp://"):
+                    self.gatekeeper.watch(bound.socket)
+
+    def _bound(self) -> list[Publisher | Latest | Questions]:
+        wanted = (getattr(self, "publisher", None), self.latest, self.questions)
+        return [each for each in wanted if each is not None]
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Publish one message."""
+        self.publisher.send(topic, payload)
+        if self.latest is not None and topic.startswith(VERDICT):
+            self.latest.send(payload)
+
+    def filenos(self) -> list[int]:
+        """Become readable when a peer may want something; call `take` before waiting for them."""
+        found = [self.publisher.fileno()]
+        if self.questions is not None:
+            found.append(self.questions.fileno())
+        return found if self.gatekeeper is None else found + self.gatekeeper.filenos()
+
+    def take(self) -> None:
+        """See to peers that come; questions are taken by themselves."""
+        self.publisher.take()
+        if self.gatekeeper is not None:
+            self.gatekeeper.take()
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What peers did, by the part that counted it."""
+        parts = {"publish": self.publisher, "ask": self.questions, "keys": self.gatekeeper}
+        return {name: dict(part.counters) for name, part in parts.items() if part is not None}
+
+    def mind_keys(self) -> None:
+        """If the list of those who may connect has changed, take it; who is off it is cut off.
+
+        A list that cannot be read changes nothing. Raises `PublishError` if a port is lost to
+        somebody else meanwhile.
+        """
+        if self._curve is None or self.gatekeeper is None:
+            return
+        now = _state(self._curve.clients)
+        if now == self._keys_seen:
+            return
+        self._keys_seen = now
+        from daemon.keys import KeysError, load_clients
+
+        try:
+            admitted = load_clients(self._curve.clients)
+        except KeysError as error:
+            log.error("%s; the former list stands", error)
+            return
+        log.info("%d keys may connect", len(admitted))
+        if self.gatekeeper.admit(admitted):
+            self.gatekeeper.unwatch()
+            for bound in self._bound():
+                if bound.endpoint.startswith("tcp://"):
+                    bound.renew()  # libzmq cannot cut off one peer alone
+            self._watch()
+
+    def close(self) -> None:
+        """Close them all. May be called again."""
+        for bound in self._bound():
+            bound.close()
+        if self.gatekeeper is not None:
+            self.gatekeeper.close()
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()
+
+
+def plan(wanted: Scene) -> object:
+    """What of a scene is about its sockets: equal for scenes that can share them."""
+    asked = (wanted.ask_endpoint, wanted.gate.request_ms)
+    return wanted.hand.name, wanted.publish, wanted.curve, asked
+
+
+def _state(folder: Path) -> object:
+    """Differs from one look to the next when a file in the folder was put, changed or removed."""
+    try:
+        with os.scandir(folder) as entries:
+            found = [(entry.name, entry.stat()) for entry in entries]
+    except OSError as error:
+        return error.errno
+    return sorted((name, status.st_mtime_ns, status.st_size) for name, status in found)

@@ -1,0 +1,42 @@
+"""Whether readings come in time: counted by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from daemon.deadlines import Deadlines
+from tests.daemon.fakes import MS, reading
+
+PERIOD_NS = 10 * MS
+
+
+def test_jitter_is_the_distance_from_the_period() -> None:
+    deadlines = Deadlines()
+    for seq, t_ms in enumerate((100, 110, 121, 130)):
+        deadlines.add(reading(t_ms * MS, seq=seq), 0.5, PERIOD_NS)
+    assert deadlines.jitter.count == 3
+    assert deadlines.jitter.max_us == pytest.approx(1000.0)
+
+
+def test_a_lost_reading_is_not_jitter() -> None:
+    deadlines = Deadlines()
+    for seq, t_ms in ((0, 100), (2, 120), (3, 130)):
+        deadlines.add(reading(t_ms * MS, seq=seq), 0.5, PERIOD_NS)
+    assert deadlines.jitter.count == 1
+    assert deadlines.jitter.max_us == 0.0
+
+
+def test_a_verdict_more_than_a_period_after_its_reading_is_late() -> None:
+    deadlines = Deadlines()
+    for seq, age_ms in enumerate((0.5, 10.0, 10.5, 2.0)):
+        deadlines.add(reading(seq * PERIOD_NS, seq=seq), age_ms, PERIOD_NS)
+    assert deadlines.late == 1
+    assert deadlines.worst_age_ms == 10.5
+
+
+def test_without_a_period_nothing_is_late() -> None:
+    deadlines = Deadlines()
+    for seq in range(3):
+        deadlines.add(reading(seq * PERIOD_NS, seq=seq), 500.0, None)
+    assert (deadlines.late, deadlines.jitter.count) == (0, 0)
+    assert deadlines.worst_age_ms == 500.0

@@ -1,0 +1,224 @@
+"""Keys: who has none, the wrong ones, or is off the list does not get in, and that is told."""
+
+from __future__ import annotations
+
+import logging
+import os
+import stat
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon import scene
+from daemon.keys import KeysError, load_clients, load_pair, make
+from daemon.scene import SceneError
+from daemon.sockets import Sockets
+from tests.daemon.processes import graspd
+
+PORT = 45931
+ENDPOINT = f"tcp://127.0.0.1:{PORT}"
+PATIENCE_S = 10.0
+QUIET_S = 0.5
+"""How long nothing may come to who is not let in, s."""
+
+Keys = tuple[bytes, bytes]
+
+
+class Door:
+    """A daemon's sockets with keys, and clients at it."""
+
+    def __init__(self, folder: Path) -> None:
+        make(folder, "daemon")
+        self.clients = folder / "clients"
+        self.known = self.client("controller", folder / "theirs")
+        (folder / "theirs" / "controller.key").rename(self.clients / "controller.key")
+        text = {
+            "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+            "publish": {"endpoint": ENDPOINT},
+            "ask": {"endpoint": f"tcp://127.0.0.1:{PORT + 1}"},
+            "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
+        }
+        self.sockets = Sockets(scene.parse(text, folder / "scene.toml"))
+        self.public = load_pair(folder / "daemon.key_secret")[0]
+        self.context = zmq.Context()
+        self.connected: list[zmq.Socket[bytes]] = []
+
+    def close(self) -> None:
+        for each in self.connected:
+            each.close(linger=0)
+        self.context.term()
+        self.sockets.close()
+
+    def client(self, name: str, folder: Path) -> Keys:
+        self.clients.mkdir(exist_ok=True)
+        return load_pair(make(folder, name)[1])
+
+    def connect(
+        self, keys: Keys | None, kind: int = zmq.SUB, server: bytes | None = None
+    ) -> zmq.Socket[bytes]:
+        made = self.context.socket(kind)
+        self.connected.append(made)
+        made.linger = 0
+        if keys is not None:
+            made.curve_publickey, made.curve_secretkey = keys
+            made.curve_serverkey = server or self.public
+        made.connect(ENDPOINT if kind == zmq.SUB else f"tcp://127.0.0.1:{PORT + 1}")
+        if kind == zmq.SUB:
+            made.subscribe("")
+        return made
+
+    def hears(self, subscriber: zmq.Socket[bytes], patience_s: float) -> bool:
+        deadline_s = time.monotonic() + patience_s
+        while time.monotonic() < deadline_s:
+            self.sockets.take()
+            self.sockets.send(b"verdict.right", b"{}")
+            if subscriber.poll(5):
+                subscriber.recv_multipart()
+                return True
+        return False
+
+    def until(self, done: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not done():
+            assert time.monotonic() < deadline_s
+            self.sockets.take()
+            time.sleep(0.005)
+
+    def counted(self, what: str) -> int:
+        return self.sockets.counters()["keys"][what]
+
+
+@pytest.fixture
+def door(tmp_path: Path) -> Iterator[Door]:
+    door = Door(tmp_path)
+    yield door
+    door.close()
+
+
+def test_who_is_on_the_list_gets_messages_and_may_ask(
+    door: Door, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+    asker = door.connect(door.known, zmq.REQ)
+    asker.send(b"judge")
+    questions = door.sockets.questions
+    assert questions is not None
+    door.until(lambda: questions.take(time.monotonic_ns()) == 1)
+    questions.answer(b"{}")
+    assert asker.poll(int(PATIENCE_S * 1e3))
+    assert asker.recv() == b"{}"
+    assert door.counted("admitted") == 2
+    assert "127.0.0.1 is controller" in caplog.text
+
+
+def test_a_key_that_is_not_on_the_list_is_turned_away_by_address(
+    door: Door, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    stranger = door.connect(door.client("stranger", tmp_path / "elsewhere"))
+    assert not door.hears(stranger, QUIET_S)
+    assert door.counted("turned_away") > 0
+    assert "turned away 127.0.0.1: its key is not on the list" in caplog.text
+
+
+def test_who_has_no_key_is_turned_away_by_address(
+    door: Door, caplog: pytest.LogCaptureFixture
+) -> None:
+    stranger = door.connect(None)
+    assert not door.hears(stranger, QUIET_S)
+    door.until(lambda: door.counted("turned_away") > 0)
+    assert "turned away 127.0.0.1: it has no keys" in caplog.text
+
+
+def test_who_takes_another_daemon_for_this_one_is_turned_away(
+    door: Door, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other = door.client("other-daemon", tmp_path / "other")[0]
+    assert not door.hears(door.connect(door.known, server=other), QUIET_S)
+    door.until(lambda: door.counted("turned_away") > 0)
+    assert "or not the daemon's" in caplog.text
+
+
+def test_a_key_that_is_taken_off_the_list_is_cut_off_while_connected(
+    door: Door, tmp_path: Path
+) -> None:
+    friend = door.client("friend", tmp_path / "friends")
+    (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
+    door.sockets.mind_keys()
+    leaving, staying = door.connect(friend), door.connect(door.known)
+    assert door.hears(leaving, PATIENCE_S)
+    assert door.hears(staying, PATIENCE_S)
+    (door.clients / "friend.key").unlink()
+    door.sockets.mind_keys()
+    while leaving.poll(100):
+        leaving.recv_multipart()
+    assert not door.hears(leaving, QUIET_S)
+    assert door.hears(staying, PATIENCE_S)
+
+
+def test_a_list_that_cannot_be_read_changes_nothing(
+    door: Door, caplog: pytest.LogCaptureFixture
+) -> None:
+    (door.clients / "broken.key").write_text("nothing")
+    door.sockets.mind_keys()
+    assert "the former list stands" in caplog.text
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+
+
+def test_a_secret_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
+    secret = make(tmp_path, "daemon")[1]
+    assert stat.S_IMODE(secret.stat().st_mode) == 0o600
+    for mode in (0o640, 0o604, 0o660):
+        secret.chmod(mode)
+        with pytest.raises(KeysError, match="chmod 600"):
+            load_pair(secret)
+
+
+@pytest.mark.parametrize("content", ["", "public-key = 'short'", 'curve\n    public-key = "é"\n'])
+def test_a_file_that_is_no_key_is_named(tmp_path: Path, content: str) -> None:
+    (tmp_path / "broken.key").write_text(content)
+    with pytest.raises(KeysError, match=r"broken\.key"):
+        load_clients(tmp_path)
+
+
+def test_a_public_key_is_no_secret_one_and_keys_are_never_overwritten(tmp_path: Path) -> None:
+    public, secret = make(tmp_path, "daemon")
+    with pytest.raises(KeysError, match="has no secret key"):
+        load_pair(public)
+    before = secret.read_bytes()
+    with pytest.raises(KeysError, match="there already"):
+        make(tmp_path, "daemon")
+    assert secret.read_bytes() == before
+    with pytest.raises(KeysError, match="no name"):
+        make(tmp_path, "../daemon")
+
+
+def test_another_address_without_keys_is_refused(tmp_path: Path) -> None:
+    text = {
+        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        "publish": {"endpoint": "tcp://0.0.0.0:5555"},
+    }
+    with pytest.raises(SceneError, match="not a loopback address"):
+        scene.parse(text, tmp_path / "scene.toml")
+    scene.parse({**text, "curve": {"secret_key": "a", "clients": "b"}}, tmp_path / "scene.toml")
+
+
+def test_the_command_makes_lists_and_complains(tmp_path: Path) -> None:
+    made = graspd("keys", "make", "daemon", "--dir", tmp_path)
+    assert made.returncode == 0
+    assert stat.S_IMODE(os.stat(tmp_path / "daemon.key_secret").st_mode) == 0o600
+    (tmp_path / "clients").mkdir()
+    graspd("keys", "make", "laptop", "--dir", tmp_path / "laptop")
+    (tmp_path / "laptop" / "laptop.key").rename(tmp_path / "clients" / "laptop.key")
+    listed = graspd("keys", "list", "--dir", tmp_path)
+    assert listed.returncode == 0
+    assert [line.split()[:2] for line in listed.stdout.splitlines()] == [
+        ["own", "daemon"],
+        ["clients", "laptop"],
+    ]
+    (tmp_path / "daemon.key_secret").chmod(0o644)
+    assert graspd("keys", "list", "--dir", tmp_path).returncode == 2
+    assert graspd("keys", "make", "daemon", "--dir", tmp_path).returncode == 2

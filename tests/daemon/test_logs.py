@@ -1,0 +1,97 @@
+"""The log: priorities for the journal, and no flood."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daemon.logs import BURST, KINDS_MAX, WINDOW_S, JournalFormatter, RateLimit, is_journal
+
+
+def record(level: int, text: str, *values: object) -> logging.LogRecord:
+    return logging.LogRecord("graspd", level, __file__, 1, text, values, None)
+
+
+@pytest.mark.parametrize(
+    ("level", "number"),
+    [
+        (logging.CRITICAL, 3),
+        (logging.ERROR, 3),
+        (logging.WARNING, 4),
+        (logging.INFO, 6),
+        (logging.DEBUG, 7),
+    ],
+)
+def test_the_journal_gets_syslog_priorities(level: int, number: int) -> None:
+    """As in syslog(3): LOG_ERR 3, LOG_WARNING 4, LOG_INFO 6, LOG_DEBUG 7."""
+    assert JournalFormatter().format(record(level, "link lost")) == f"<{number}>link lost"
+
+
+def test_every_line_has_its_priority() -> None:
+    assert JournalFormatter().format(record(logging.ERROR, "a\nb")) == "<3>a\n<3>b"
+
+
+def test_a_pipe_is_no_journal_and_the_named_stream_is() -> None:
+    there = os.fstat(2)
+    assert is_journal({"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"})
+    assert not is_journal({"JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino + 1}"})
+    assert not is_journal({})
+
+
+def test_a_complaint_in_the_journal_is_an_error(tmp_path: Path) -> None:
+    """Standard error is a file that is named as the journal's stream."""
+    log = tmp_path / "journal"
+    with log.open("wb") as stream:
+        there = os.fstat(stream.fileno())
+        code = subprocess.run(
+            [sys.executable, "-m", "daemon", "run", str(tmp_path / "missing.toml")],
+            stderr=stream,
+            env={**os.environ, "JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"},
+            check=False,
+            timeout=50,
+        ).returncode
+    assert code == 2
+    assert log.read_text().startswith("<3>")
+    assert "missing.toml" in log.read_text()
+
+
+def test_a_burst_passes_and_the_rest_of_the_window_is_counted() -> None:
+    now_s = 100.0
+    limit = RateLimit(lambda: now_s)
+    passed = [limit.filter(record(logging.WARNING, "lost %d", n)) for n in range(BURST + 7)]
+    assert passed == [True] * BURST + [False] * 7
+    now_s += WINDOW_S
+    late = record(logging.WARNING, "lost %d", 99)
+    assert limit.filter(late)
+    assert late.getMessage() == "lost 99 (and 7 more like it before)"
+    assert limit.filter(record(logging.WARNING, "lost %d", 100))
+
+
+def test_other_messages_are_not_held_back() -> None:
+    limit = RateLimit(lambda: 0.0)
+    for _ in range(BURST + 1):
+        limit.filter(record(logging.WARNING, "lost"))
+    assert limit.filter(record(logging.WARNING, "found"))
+
+
+def test_a_message_with_a_percent_sign_survives_being_counted() -> None:
+    now_s = 0.0
+    limit = RateLimit(lambda: now_s)
+    for _ in range(BURST + 1):
+        limit.filter(record(logging.WARNING, "%s", "100 %"))
+    now_s = WINDOW_S
+    late = record(logging.WARNING, "%s", "100 %")
+    limit.filter(late)
+    assert late.getMessage() == "100 % (and 1 more like it before)"
+
+
+def test_kinds_without_number_cost_no_memory_without_number() -> None:
+    limit = RateLimit(lambda: 0.0)
+    for number in range(3 * KINDS_MAX):
+        assert limit.filter(record(logging.WARNING, f"kind {number}"))
+    assert len(limit._kinds) == KINDS_MAX
