@@ -9,6 +9,8 @@ from daemon.publisher import SUBSCRIPTION_MAX_BYTES, SUBSCRIPTIONS_WAITING_MAX
 
 LINGER_MS = 0
 """What is late is not the newest."""
+WAITING_MAX = 100
+"""Messages that wait for a peer that does not read, a second's; it conflates at its own end."""
 
 
 class Latest(Bound):
@@ -22,7 +24,7 @@ class Latest(Bound):
     def _open(self) -> zmq.Socket[bytes]:
         made = self._context.socket(zmq.PUB)
         made.linger = LINGER_MS
-        made.conflate = True
+        made.sndhwm = WAITING_MAX
         made.rcvhwm = SUBSCRIPTIONS_WAITING_MAX
         made.maxmsgsize = SUBSCRIPTION_MAX_BYTES
         self._bind(made, "publish")
