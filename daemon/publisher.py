@@ -80,6 +80,7 @@ class Publisher(Bound):
         made.rcvhwm = SUBSCRIPTIONS_WAITING_MAX
         made.maxmsgsize = SUBSCRIPTION_MAX_BYTES
         made.setsockopt(zmq.XPUB_NODROP, 1)
+        made.setsockopt(zmq.XPUB_VERBOSE, 1)  # else only the first who wants a topic is heard of
         if self.endpoint.startswith("tcp://"):
             made.heartbeat_ivl = HEARTBEAT_MS
             made.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS

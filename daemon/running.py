@@ -119,11 +119,6 @@ class Runner:
             self._sockets.close()
             self._sockets = None
         self._sockets = Sockets(wanted)
-        log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-        if wanted.publish.latest_endpoint is not None:
-            log.info("the latest verdict alone on %s", wanted.publish.latest_endpoint)
-        if wanted.ask_endpoint is not None:
-            log.info("questions on %s", wanted.ask_endpoint)
         return self._sockets
 
     def _work(self, parts: Parts) -> Ended:
@@ -155,6 +150,7 @@ class Runner:
                 reload=self._reload,
             )
             self._running = True
+            _announce(wanted)
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
             return service.run()
@@ -202,3 +198,12 @@ class Runner:
         for line in str(error).splitlines():
             log.error("%s", line)
         log.error("%s: not taken anew, the former scene goes on", self._path)
+
+
+def _announce(wanted: scene.Scene) -> None:
+    """Say where everything is."""
+    log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
+    if wanted.publish.latest_endpoint is not None:
+        log.info("the latest verdict alone on %s", wanted.publish.latest_endpoint)
+    if wanted.ask_endpoint is not None:
+        log.info("questions on %s", wanted.ask_endpoint)

@@ -65,7 +65,8 @@ class Model(Section):
     """`[model]`: which network judges."""
 
     name: Name | None = None
-    """A model of the zoo; `small-session` when neither name nor path is given."""
+    """A model of the zoo, `small-session` when neither name nor path is given; for a hand of fewer
+    fingers in its form for these, where the zoo has one."""
     path: FilePath | None = None
     """A model file of your own, relative to the scene file."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _listing(cards: dict[str, dict[str, Any]]) -> Iterator[str]:
     titles = "".join(f"{title:>16}" for title in SHOWN)
-    yield f"{'F1, %':26}{'MB':>6}{'numbers':>10}{titles}"
+    yield f"{'F1, %':26}{'fingers':10}{'MB':>6}{'numbers':>10}{titles}"
     for name, card in cards.items():
         f1 = {
             measured["protocol"]: f"{100 * measured['f1_mean']:.1f} +- "
@@ -65,7 +65,8 @@ def _listing(cards: dict[str, dict[str, Any]]) -> Iterator[str]:
         chosen = (next(filter(None, map(f1.get, group)), "-") for group in SHOWN.values())
         figures = "".join(f"{text:>16}" for text in chosen)
         size = card["file"]["size_bytes"] / 1e6
-        yield f"{name + default:26}{size:6.1f}{card['parameters']:>10}{figures}"
+        fingers = " ".join(card["contract"]["fingers"])
+        yield f"{name + default:26}{fingers:10}{size:6.1f}{card['parameters']:>10}{figures}"
     yield ""
     for name, card in cards.items():
         yield f"{name}: {card['what']}"

@@ -27,7 +27,8 @@ from daemon.reports.reference import Reference, UnknownOperatorError
 from daemon.reports.timing import Step, bandwidth_bytes_per_s, measure
 from daemon.text import complain
 from models import zoo
-from models.contract import ModelError
+from models.bts3 import FINGERS
+from models.contract import Finger, ModelError
 from models.runtime import TactileModel
 from models.training.datasets import DatasetError, Grasps, read_all
 
@@ -61,6 +62,8 @@ class Row:
     name: str
     kind: str
     """`model`, `peer` or `floor`."""
+    fingers: tuple[Finger, ...] = ()
+    """That it judges; none for a floor."""
     error: dict[str, Any] = field(default_factory=dict)
     """By protocol: `f1` with `low` and `high` (95 %), accuracy, brier, ece; all in 0..1."""
     numerical: dict[str, Any] = field(default_factory=dict)
@@ -132,8 +135,9 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> d
         grasps = grasps.rows(chosen.astype(np.int64))
     paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
     models = {path.stem: TactileModel(path) for path in paths}
-    rows = {name: _model_row(model, grasps) for name, model in models.items()}
-    steps: dict[str, Step] = {name: _step(model, grasps.counts) for name, model in models.items()}
+    counts = {name: _counts(model, grasps) for name, model in models.items()}
+    rows = {name: _model_row(model, counts[name]) for name, model in models.items()}
+    steps: dict[str, Step] = {name: _step(model, counts[name]) for name, model in models.items()}
     _add_peers(rows, steps, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
     times = measure(steps, readings, paced)
@@ -142,28 +146,37 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> d
         row.time = times[name].quantiles()
         if row.bytes is not None:
             row.floor_us = row.bytes / bandwidth * 1e6
-    default = models.get("small-session") or next(iter(models.values()))
+    default = "small-session" if "small-session" in models else next(iter(models))
     return {
         "machine": {"processor": _processor(), "python": platform.python_version()}
         | {package: version(package) for package in ("numpy", "onnxruntime")},
         "readings": {"hot": readings, "paced": paced},
         "bandwidth_bytes_per_s": bandwidth,
         "stages": {
-            "model": default.contract.name,
-            "us": stages.measure(default, grasps.counts, readings),
+            "model": models[default].contract.name,
+            "us": stages.measure(models[default], counts[default], readings),
         },
         "rows": [asdict(row) for row in rows.values()],
     }
 
 
-def _model_row(model: TactileModel, grasps: Grasps) -> Row:
+def _counts(model: TactileModel, grasps: Grasps) -> NDArray[np.uint16]:
+    """Counts (N, fingers, 24) of the model's own fingers."""
+    try:
+        return grasps.of_fingers(model.contract.fingers).counts
+    except ValueError as error:
+        raise ModelError(f"{model.path}: {error}") from error
+
+
+def _model_row(model: TactileModel, counts: NDArray[np.uint16]) -> Row:
     card = _card(model.path)
     start_ms, memory_mib = _start(model.path)
     return Row(
         model.contract.name,
         "model",
+        model.contract.fingers,
         error={name: _errors(figures) for name, figures in card["protocols"].items()},
-        numerical=_numerical(model, grasps.counts),
+        numerical=_numerical(model, counts),
         sha256=model.sha256,
         bytes=model.path.stat().st_size,
         parameters=card["parameters"],
@@ -230,7 +243,7 @@ def _add_peers(rows: dict[str, Row], steps: dict[str, Step], grasps: Grasps) -> 
 
     for name, step in peers(grasps):
         same = rows.get(PEER_OF[name])
-        rows[name] = Row(name, "peer", error={} if same is None else same.error)
+        rows[name] = Row(name, "peer", FINGERS, error={} if same is None else same.error)
         steps[name] = step
     rows["empty session"] = Row("empty session", "floor")
     steps["empty session"] = empty_session()

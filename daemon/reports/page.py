@@ -18,6 +18,8 @@ Row = dict[str, Any]
 
 PROTOCOL = "cv"
 COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
+FEWER_FINGERS = "#9a8f2f"
+"""Colour of models for hands with fewer sensors: no alternative to those of the whole hand."""
 MARKERS = {"model": "o", "peer": "s"}
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 90rem; margin: 2rem auto; padding: 0 1rem;
@@ -43,8 +45,8 @@ def write(found: Found, folder: Path) -> None:
 
 def standing(found: Found) -> dict[str, Any]:
     """Where each model stands, by the digest of its file; see `models.zoo.standing`."""
-    models = [row for row in _sorted(found["rows"]) if row["kind"] == "model"]
-    base = next((row for row in models if row["name"] == "cnn1"), None)
+    groups = _by_fingers(found["rows"])
+    base = next((row for alike in groups for row in alike if row["name"] == "cnn1"), None)
     return {
         "machine": found["machine"],
         "models": {
@@ -52,16 +54,27 @@ def standing(found: Found) -> dict[str, Any]:
                 "name": row["name"],
                 "f1": row["error"][PROTOCOL]["f1"],
                 "f1_rank": rank,
-                "models": len(models),
+                "models": len(alike),
                 "paced_p50_us": row["time"]["paced_p50_us"],
                 "speed": None
                 if base is None
                 else base["time"]["paced_p50_us"] / row["time"]["paced_p50_us"],
             }
-            for rank, row in enumerate(models, start=1)
+            for alike in groups
+            for rank, row in enumerate(alike, start=1)
             if PROTOCOL in row["error"]
         },
     }
+
+
+def _by_fingers(rows: Sequence[Row]) -> list[list[Row]]:
+    """The rows of models, those of the same fingers together: only between them is a choice.
+
+    The whole hand's are first, and in each list the most exact.
+    """
+    models = [row for row in _sorted(rows) if row["kind"] == "model"]
+    kinds = sorted({tuple(row["fingers"]) for row in models}, key=lambda kind: (-len(kind), kind))
+    return [[row for row in models if tuple(row["fingers"]) == kind] for kind in kinds] or [[]]
 
 
 def table(found: Found) -> str:
@@ -74,6 +87,7 @@ def table(found: Found) -> str:
 
 COLUMNS = (
     "model",
+    "fingers",
     "F1, known objects (95 %)",
     "other objects",
     "Brier",
@@ -98,6 +112,7 @@ def _cells(row: Row) -> list[str]:
     exact, took = row["numerical"], row["time"]
     return [
         f"`{row['name']}`" if row["kind"] == "model" else row["name"],
+        " ".join(row["fingers"]) or "-",
         _interval(error),
         "-" if not other else f"{100 * other['f1']:.1f}",
         "-" if not error else f"{error['brier']:.3f}",
@@ -148,7 +163,7 @@ def _lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str
 
 def advice(rows: Sequence[Row]) -> Iterator[str]:
     """Which model for which need, by these figures."""
-    models = [row for row in rows if row["kind"] == "model"]
+    models, *fewer = _by_fingers(rows)
     for protocol, need in (
         ("cv", "objects that are known, no other day"),
         ("objects", "new objects"),
@@ -162,6 +177,10 @@ def advice(rows: Sequence[Row]) -> Iterator[str]:
         if judged:
             f1, name = max(judged)
             yield f"For {need}: `{name}`, F1 {100 * f1:.1f} %."
+    for best, *_ in fewer:
+        if PROTOCOL in best["error"]:
+            f1, alone = best["error"][PROTOCOL]["f1"], " and ".join(best["fingers"])
+            yield f"For {alone} alone, known objects: `{best['name']}`, F1 {100 * f1:.1f} %."
     base = next((row for row in models if row["name"] == "cnn1" and row["error"]), None)
     if base is None:
         return
@@ -181,18 +200,21 @@ def draw(found: Found) -> str:
     figure = Figure(figsize=(11.0, 5.6), layout="constrained")
     axes, names = figure.subplots(1, 2, width_ratios=(3, 1))
     shown = [row for row in _sorted(found["rows"]) if PROTOCOL in row["error"]]
+    whole, *fewer = _by_fingers(shown)
+    colours = {row["name"]: COLOURS[row["kind"]] for row in shown}
+    colours |= {row["name"]: FEWER_FINGERS for alike in fewer for row in alike}
     for number, row in enumerate(shown, start=1):
-        _draw_row(axes, row, number)
+        _draw_row(axes, row, number, colours[row["name"]])
         names.text(
             0.0,
             1.0 - (number - 1) / max(len(shown), 24),
             f"{number:2d}  {row['name']}",
             fontsize=8,
             va="top",
-            color=COLOURS[row["kind"]],
+            color=colours[row["name"]],
             transform=names.transAxes,
         )
-    _draw_front(axes, [row for row in shown if row["kind"] == "model"])
+    _draw_front(axes, whole)
     for row in found["rows"]:
         if row["kind"] == "floor":
             x = row["time"]["paced_p50_us"]
@@ -211,8 +233,8 @@ def draw(found: Found) -> str:
     return text.getvalue()
 
 
-def _draw_row(axes: Any, row: Row, number: int) -> None:  # noqa: ANN401 - matplotlib's own
-    error, colour = row["error"][PROTOCOL], COLOURS[row["kind"]]
+def _draw_row(axes: Any, row: Row, number: int, colour: str) -> None:  # noqa: ANN401 - matplotlib's
+    error = row["error"][PROTOCOL]
     x, y = row["time"]["paced_p50_us"], 100 * (1 - error["f1"])
     reach = [[100 * (error["high"] - error["f1"])], [100 * (error["f1"] - error["low"])]]
     axes.errorbar(x, y, yerr=reach, fmt="none", ecolor=colour, alpha=0.25, lw=0.8)

@@ -26,8 +26,9 @@ READINGS = 20
 def repair_row(name: str, seen: SeenCounts) -> StepRow:
     """As many broken electrodes as may be repaired, neighbours among them."""
     error = _error(seen)
+    number = BROKEN_MAX if len(seen.centre) > 1 else BROKEN_FINGER_MAX
     return StepRow(
-        f"repair of {BROKEN_MAX} electrodes, {name}",
+        f"repair of {number} electrodes, {name}",
         f"counts to {ERROR_MAX_COUNTS:.0e}",
         f"{error:.1e}",
         error <= ERROR_MAX_COUNTS,

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
+import re
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from daemon import assembly
 from daemon.judge.verdict import Outcome
-from daemon.scene import parse
+from daemon.scene import Scene, parse
 from drivers.replay import DEMO_TABLE, ReplayDriver
 from drivers.spi_bridge import SpiBridgeDriver
+from models.contract import ModelError
 from tests.daemon.fakes import Clock, reading
 
 REPLAY = {"driver": "replay", "recordings": [str(DEMO_TABLE)]}
@@ -57,3 +62,92 @@ def test_the_port_of_the_scene_arrives_at_the_bridge() -> None:
     (driver,) = assembly.build_drivers(scene)
     assert isinstance(driver, SpiBridgeDriver)
     assert driver.describe()["port"] == "/dev/serial/by-id/mine"
+
+
+SPI: dict[str, Any] = {"driver": "spi", "port": "/nowhere"}
+PALM: dict[str, Any] = {"driver": "palm", "source": "udp://127.0.0.1:9870"}
+OTHERS = "cnn1, cnn1-session, mlp, rf, small-electrodes, small-session, svm"
+
+
+def hand(fingers: tuple[str, ...], tactile: dict[str, Any] = SPI, **model: str) -> Scene:
+    content = {"hand": {"fingers": fingers}, "tactile": tactile, "model": model}
+    return parse(content, Path("scene.toml"))
+
+
+@pytest.mark.parametrize(
+    "fingers",
+    [
+        fingers
+        for number in (1, 2)
+        for fingers in itertools.permutations(("ff", "mf", "th"), number)
+    ],
+    ids="-".join,
+)
+def test_a_hand_with_fewer_sensors_gets_the_model_of_just_these_fingers(
+    fingers: tuple[str, ...],
+) -> None:
+    in_order = sorted(fingers)  # the alphabet happens to go from the first finger to the thumb
+    assert assembly.model_path(hand(fingers)).stem == "-".join(("small-session", *in_order))
+    assert assembly.load_model(hand(fingers)).contract.fingers == tuple(in_order)
+
+
+@pytest.mark.parametrize(
+    ("name", "fingers", "file"),
+    [
+        ("small-session", ("ff", "mf", "th"), "small-session"),
+        ("small-session", ("th", "mf", "ff"), "small-session"),
+        ("small-session-ff-th", ("ff", "th"), "small-session-ff-th"),
+        # A form has no forms: this is not `small-session-ff` for a thumb.
+        ("small-session-ff", ("th",), "small-session-ff"),
+        ("cnn1", ("ff", "th"), "cnn1"),
+        ("small-session", ("ff", "rf"), "small-session"),
+    ],
+)
+def test_a_name_that_has_no_form_for_the_hand_is_taken_as_it_is(
+    name: str, fingers: tuple[str, ...], file: str
+) -> None:
+    assert assembly.model_path(hand(fingers, name=name)).name == f"{file}.onnx"
+
+
+@pytest.mark.parametrize(
+    ("scene", "says"),
+    [
+        (hand(("ff", "th"), name="cnn1"), "the zoo has small-session-ff-th for these"),
+        (hand(("ff", "mf", "th"), name="small-session-ff-th"), f"the zoo has {OTHERS} for these"),
+        (hand(("th",), name="small-session-ff"), "the zoo has small-session-th for these"),
+        (hand(("ff", "rf")), "the zoo has no model for these"),
+    ],
+    ids=["cnn1", "two of three", "thumb", "ring finger"],
+)
+def test_a_model_of_other_fingers_is_refused_and_those_that_fit_are_named(
+    scene: Scene, says: str
+) -> None:
+    with pytest.raises(ModelError, match=r"judges the fingers .* the hand has ") as refusal:
+        assembly.build_pipeline(scene, assembly.load_model(scene))
+    assert str(refusal.value).endswith(f": {says}")
+
+
+@pytest.mark.parametrize(
+    ("tactile", "sensors"),
+    [
+        (SPI, ["th", "ff"]),
+        ({"driver": "can"}, ["th", "ff"]),
+        ({"driver": "can", "format": "sweep_fd"}, None),
+        (SPI | {"sensors": ["mf", "th", "ff"]}, ["mf", "th", "ff"]),
+        (PALM, None),
+    ],
+    ids=["spi", "can", "can-fd", "spi-sensors", "palm"],
+)
+def test_fingers_in_another_order_are_told_what_to_write_instead(
+    tactile: dict[str, Any], sensors: list[str] | None
+) -> None:
+    scene = hand(("th", "ff"), tactile)
+    with pytest.raises(ModelError, match="write ") as refusal:
+        assembly.build_pipeline(scene, assembly.load_model(scene))
+    advice = str(refusal.value).partition("write ")[2]
+    wanted = tomllib.loads("\n".join(re.findall(r"[a-z]+\.[a-z]+ = \[[^]]*\]", advice)))
+    assert wanted["hand"] == {"fingers": ["ff", "th"]}
+    # What was wired in the order th, ff stays so.
+    as_written = hand(("ff", "th"), tactile | wanted.get("tactile", {}))
+    assembly.build_pipeline(as_written, assembly.load_model(as_written))
+    assert (tactile | wanted.get("tactile", {})).get("sensors") == sensors

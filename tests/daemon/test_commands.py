@@ -169,12 +169,12 @@ def test_check_refuses_a_palm_file_that_is_not_there(tmp_path: Path) -> None:
 def test_check_refuses_a_hand_that_the_model_does_not_know(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(
-        f'[hand]\nfingers = ["ff", "th"]\n[tactile]\ndriver = "replay"\n'
+        f'[hand]\nfingers = ["ff", "rf"]\n[tactile]\ndriver = "replay"\n'
         f'recordings = ["{DEMO_TABLE}"]\n'
     )
     result = graspd("check", scene)
     assert result.returncode == 2
-    assert "judges the fingers ff, mf, th in this order, the hand has ff, th" in result.stderr
+    assert "judges the fingers ff, mf, th in this order, the hand has ff, rf" in result.stderr
 
 
 def test_the_schema_is_printed() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,12 +14,16 @@ pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
 from daemon.reports import page
-from daemon.reports.error_vs_time import _errors
+from daemon.reports.error_vs_time import _counts, _errors
 from daemon.reports.peers import loop_image
 from daemon.reports.timing import measure
 from models import zoo
+from models.contract import ModelError
+from models.runtime import TactileModel
 from models.tactile_image import TactileImager
+from tests.daemon.fakes import FakeModel, contract
 from tests.daemon.processes import graspd
+from tests.models.evaluation_samples import sessions
 
 
 @pytest.fixture(scope="module")
@@ -104,11 +108,15 @@ def test_candidates_take_turns_and_each_reading_is_timed() -> None:
     assert order[40:44] == ["a", "a", "b", "b"], "after the warm-up: two of each per round"
 
 
-def row(name: str, f1: float, paced_us: float) -> dict[str, Any]:
+def row(
+    name: str, f1: float, paced_us: float, fingers: tuple[str, ...] = ("ff", "mf", "th")
+) -> dict[str, Any]:
     error = {"f1": f1, "low": f1 - 0.01, "high": f1 + 0.01}
     return {
         "name": name,
         "kind": "model",
+        "fingers": fingers,
+        "sha256": f"digest of {name}",
         "error": {"cv": error, "objects": error},
         "time": {"paced_p50_us": paced_us},
     }
@@ -119,6 +127,42 @@ def test_the_advice_names_the_fastest_within_the_interval_of_cnn1() -> None:
     texts = list(page.advice(rows))
     assert texts[0] == "For objects that are known, no other day: `cnn1`, F1 94.0 %."
     assert "`good`, 8.0 times as fast as `cnn1`" in texts[-1]
+
+
+HANDS = [
+    row("cnn1", 0.94, 800.0),
+    row("quick", 0.92, 200.0),
+    row("quick-ff", 0.93, 100.0, ("ff",)),
+    row("quick-ff-th", 0.95, 160.0, ("ff", "th")),
+    row("slow-ff-th", 0.96, 400.0, ("ff", "th")),
+]
+
+
+def test_models_stand_among_those_of_the_same_fingers() -> None:
+    found = page.standing({"machine": {}, "rows": HANDS})["models"]
+    ranks = {of["name"]: (of["f1_rank"], of["models"], of["speed"]) for of in found.values()}
+    assert ranks == {
+        "cnn1": (1, 2, 1.0),
+        "quick": (2, 2, 4.0),
+        "quick-ff": (1, 1, 8.0),
+        "quick-ff-th": (2, 2, 5.0),
+        "slow-ff-th": (1, 2, 2.0),
+    }
+
+
+def test_advice_for_a_hand_is_of_models_of_its_own_fingers() -> None:
+    texts = list(page.advice(HANDS))
+    assert texts[0].endswith("`cnn1`, F1 94.0 %.")
+    assert "For ff and th alone, known objects: `slow-ff-th`, F1 96.0 %." in texts
+    assert "For ff alone, known objects: `quick-ff`, F1 93.0 %." in texts
+    assert "interval of `cnn1`: `cnn1`, 1.0 times" in texts[-1]
+
+
+def test_a_model_of_fingers_that_were_never_recorded_is_refused() -> None:
+    model = FakeModel()
+    model.contract = contract(("ff", "lf"))
+    with pytest.raises(ModelError, match="have not the fingers ff, lf"):
+        _counts(cast(TactileModel, model), sessions(20))
 
 
 def test_wrong_folders_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
