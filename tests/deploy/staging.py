@@ -1,0 +1,69 @@
+"""What the tests of the installer need: small wheels, and installations below a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+DEPLOY = Path(__file__).parents[2] / "deploy"
+INSTALLER = DEPLOY / "install.sh"
+TIMEOUT_S = 50
+
+
+def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:
+    """A folder with one wheel: a stand-in for graspd that tells its version, and needs nothing.
+
+    The real one needs 100 MB of other wheels; tests/system installs it. With `starts` false it
+    fails as soon as it is run.
+    """
+    folder.mkdir(parents=True)
+    info = f"graspd-{version}.dist-info"
+    answer = f'    print("graspd {version}")\n' if starts else '    raise SystemExit("broken")\n'
+    files = {
+        "daemon/__init__.py": "",
+        "daemon/__main__.py": f"def main() -> None:\n{answer}\n\nmain()\n",
+        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: graspd\nVersion: {version}\n",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        f"{info}/entry_points.txt": "[console_scripts]\ngraspd = daemon.__main__:main\n",
+    }
+    record = "".join(f"{name},,\n" for name in [*files, f"{info}/RECORD"])
+    with zipfile.ZipFile(folder / f"graspd-{version}-py3-none-any.whl", "w") as wheel:
+        for name, content in {**files, f"{info}/RECORD": record}.items():
+            wheel.writestr(name, content)
+    return folder
+
+
+def installer(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run it, with this Python for the environment."""
+    command = [str(part) for part in (INSTALLER, "--python", sys.executable, *arguments)]
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+
+def install(root: Path, wheels: Path, *arguments: str) -> str:
+    """Install below `root`; what it said."""
+    done = installer("--root", root, "--wheelhouse", wheels, *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def content(root: Path) -> dict[str, str]:
+    """Every file and link below `root`: its path, with what it holds or where it leads."""
+    return {
+        f"/{path.relative_to(root)}": str(path.readlink())
+        if path.is_symlink()
+        else hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in root.rglob("*")
+        if path.is_symlink() or path.is_file()
+    }
+
+
+def version_below(root: Path, prefix: str = "/opt/graspd") -> str:
+    """What the graspd that is installed below `root` says of itself."""
+    python = f"{root}{prefix}/venv/bin/python"
+    done = subprocess.run(
+        [python, "-I", "-m", "daemon", "--version"], capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()

@@ -1,0 +1,255 @@
+"""The installer, staged below a folder: no root, no service manager, nothing of this computer."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.deploy.staging import (
+    DEPLOY,
+    INSTALLER,
+    content,
+    install,
+    installer,
+    version_below,
+    wheelhouse,
+)
+
+FILES = {
+    "/usr/local/bin/graspd",
+    "/usr/local/lib/systemd/system/graspd@.service",
+    "/usr/local/lib/sysusers.d/graspd.conf",
+    "/usr/local/lib/tmpfiles.d/graspd.conf",
+    "/usr/local/lib/udev/rules.d/70-graspd.rules",
+    "/etc/graspd/right.toml",
+}
+"""Installed everywhere, outside the prefix."""
+BACKOFF = "/usr/local/lib/systemd/system/graspd@.service.d/backoff.conf"
+"""Installed where systemd is new enough."""
+NETWORK = "/usr/local/lib/systemd/network/80-graspd-can.network"
+"""Installed on demand."""
+
+pytest.importorskip("ensurepip", reason="no venv: apt install python3-venv")
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return wheelhouse(tmp_path_factory.mktemp("wheels") / "first", "0.1.0")
+
+
+@pytest.fixture(scope="module")
+def pristine(wheels: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A staged installation that no test changes."""
+    root = tmp_path_factory.mktemp("pristine")
+    install(root, wheels)
+    return root
+
+
+@pytest.fixture
+def staged(pristine: Path, tmp_path: Path) -> Path:
+    """A staged installation of the test's own."""
+    return shutil.copytree(pristine, tmp_path / "root", symlinks=True)
+
+
+def outside_the_prefix(root: Path) -> set[str]:
+    return {path for path in content(root) if not path.startswith("/opt/")} - {BACKOFF}
+
+
+def test_every_file_goes_to_its_place(pristine: Path) -> None:
+    assert outside_the_prefix(pristine) == FILES
+    link = pristine / "usr/local/bin/graspd"
+    assert str(link.readlink()) == "/opt/graspd/venv/bin/graspd"
+    assert version_below(pristine) == "graspd 0.1.0"
+
+
+def test_nothing_that_is_staged_names_the_stage(pristine: Path) -> None:
+    files = [path for path in pristine.rglob("*") if path.is_file() and not path.is_symlink()]
+    assert [path for path in files if str(pristine).encode() in path.read_bytes()] == []
+    environment = (pristine / "opt/graspd/venv").readlink()
+    program = (pristine / "opt/graspd/venv/bin/graspd").read_text()
+    assert program.startswith(f"#!/opt/graspd/{environment}/bin/python")
+
+
+def test_the_byte_code_is_there_before_the_service_may_not_write_it(pristine: Path) -> None:
+    assert list(pristine.glob("opt/graspd/venv/lib/*/site-packages/daemon/__pycache__/__main__*"))
+
+
+def test_a_second_run_changes_nothing_and_says_so(staged: Path, wheels: Path) -> None:
+    before = content(staged)
+    assert install(staged, wheels) == "graspd: nothing to change in /opt/graspd\n"
+    assert content(staged) == before
+
+
+def test_a_scene_is_never_overwritten(staged: Path, wheels: Path) -> None:
+    scene = staged / "etc/graspd/right.toml"
+    scene.write_text("# mine\n")
+    install(staged, wheels)
+    assert scene.read_text() == "# mine\n"
+    scene.rename(scene.with_name("left.toml"))
+    install(staged, wheels)
+    assert not scene.exists(), "an example was put beside a scene that is in use"
+
+
+def test_an_environment_is_made_anew_on_demand(staged: Path, wheels: Path) -> None:
+    former = (staged / "opt/graspd/venv").readlink()
+    install(staged, wheels, "--rebuild")
+    assert (staged / "opt/graspd/venv").readlink() != former
+    assert version_below(staged) == "graspd 0.1.0"
+
+
+def test_a_newer_graspd_takes_the_place_of_the_former_once_that_has_ended(
+    staged: Path, tmp_path: Path
+) -> None:
+    folder = staged / "opt/graspd"
+    former = folder / (folder / "venv").readlink()
+    newer = wheelhouse(tmp_path / "second", "0.2.0")
+    with something_that_uses(former):
+        assert f"kept /opt/graspd/{former.name}" in install(staged, newer)
+        assert former.is_dir()
+        assert version_below(staged) == "graspd 0.2.0"
+    assert f"removed the former /opt/graspd/{former.name}" in install(staged, newer)
+    current = str((folder / "venv").readlink())
+    assert sorted(path.name for path in folder.iterdir()) == ["venv", current]
+
+
+@contextlib.contextmanager
+def something_that_uses(environment: Path) -> Iterator[None]:
+    """A process that has a file of it mapped, as a daemon has its libraries."""
+    code = (
+        "import mmap, sys\n"
+        "with open(sys.argv[1], 'rb') as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ):\n"
+        "    print('mapped', flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    command = [sys.executable, "-c", code, str(environment / "inputs.sha256")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "mapped\n"
+        yield
+
+
+@pytest.mark.parametrize("kind", ["no wheel at all", "one that does not start"])
+def test_a_graspd_that_fails_leaves_the_former_as_it_was(
+    kind: str, staged: Path, tmp_path: Path
+) -> None:
+    newer = wheelhouse(tmp_path / "second", "0.2.0", starts=False)
+    if kind == "no wheel at all":
+        (newer / "graspd-0.2.0-py3-none-any.whl").write_text("junk")
+    before = content(staged)
+    done = installer("--root", staged, "--wheelhouse", newer)
+    assert done.returncode == 1
+    assert "nothing has changed" in done.stderr
+    assert content(staged) == before
+    assert version_below(staged) == "graspd 0.1.0"
+
+
+def test_an_uninstall_leaves_the_scenes_and_what_was_learned(staged: Path) -> None:
+    session = staged / "var/lib/graspd/right.session.json"
+    session.parent.mkdir(parents=True)
+    session.write_text("{}")
+    done = installer("--root", staged, "--uninstall")
+    assert done.returncode == 0, done.stderr
+    assert set(content(staged)) == {
+        "/etc/graspd/right.toml",
+        "/var/lib/graspd/right.session.json",
+    }
+    again = installer("--root", staged, "--uninstall")
+    assert again.stdout.endswith("graspd: nothing to remove\n")
+
+
+def test_a_purge_leaves_nothing(staged: Path, wheels: Path) -> None:
+    install(staged, wheels, "--can")
+    done = installer("--root", staged, "--uninstall", "--purge")
+    assert done.returncode == 0, done.stderr
+    assert content(staged) == {}
+    assert not [path for path in staged.rglob("*") if "graspd" in path.name]
+
+
+def test_another_prefix_is_named_everywhere_and_remembered(wheels: Path, tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    install(root, wheels, "--prefix", "/srv/hand")
+    unit = (root / "usr/local/lib/systemd/system/graspd@.service").read_text()
+    assert "ExecStart=/srv/hand/venv/bin/graspd run" in unit
+    assert "/opt/graspd" not in unit
+    assert version_below(root, "/srv/hand") == "graspd 0.1.0"
+    assert install(root, wheels) == "graspd: nothing to change in /srv/hand\n"
+    elsewhere = installer("--root", root, "--wheelhouse", wheels, "--prefix", "/opt/graspd")
+    assert elsewhere.returncode == 1
+    assert "uninstall that first" in elsewhere.stderr
+    assert installer("--root", root, "--uninstall").returncode == 0
+    assert set(content(root)) == {"/etc/graspd/right.toml"}
+
+
+def test_can0_is_brought_up_only_for_those_who_ask(staged: Path, wheels: Path) -> None:
+    install(staged, wheels, "--can")
+    file = staged / NETWORK.lstrip("/")
+    assert file.read_text() == (DEPLOY / "network/80-graspd-can.network").read_text()
+    file.write_text("# of a former version\n")
+    assert f"wrote {NETWORK}" in install(staged, wheels)
+
+
+def test_the_file_of_somebody_else_is_not_replaced(tmp_path: Path, wheels: Path) -> None:
+    foreign = tmp_path / "usr/local/bin/graspd"
+    foreign.parent.mkdir(parents=True)
+    foreign.write_text("theirs")
+    for action in (["--wheelhouse", str(wheels)], ["--uninstall"]):
+        done = installer("--root", tmp_path, *action)
+        assert done.returncode == 1
+        assert "was not made here" in done.stderr
+    assert set(content(tmp_path)) == {"/usr/local/bin/graspd"}
+
+
+def test_a_python_that_is_too_old_is_refused(tmp_path: Path, wheels: Path) -> None:
+    old = tmp_path / "python3.10"
+    old.write_text('#!/bin/sh\ncase $* in --version) echo "Python 3.10.0" ;; *) exit 1 ;; esac\n')
+    old.chmod(0o755)
+    root = tmp_path / "root"
+    done = installer("--root", root, "--wheelhouse", wheels, "--python", old)
+    assert done.returncode == 1
+    assert "Python 3.10.0; graspd needs Python 3.11 or newer" in done.stderr
+    assert content(root) == {}
+
+
+def test_wheels_without_graspd_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    done = installer("--root", tmp_path / "root", "--wheelhouse", tmp_path / "empty")
+    assert done.returncode == 1
+    assert "has no wheel of graspd" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--unknown"],
+        ["--prefix"],
+        ["--prefix", "relative"],
+        ["--prefix", "/"],
+        ["--prefix", "/opt/with space"],
+        ["--root", "/"],
+        ["--purge"],
+        ["--enable", "right", "--root", "staged"],
+        ["--enable", "Right; reboot"],
+        ["--extras", "a b"],
+    ],
+    ids=" ".join,
+)
+def test_a_wrong_command_line_is_refused(arguments: list[str]) -> None:
+    done = installer(*arguments)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert "--help" in done.stderr
+
+
+def test_the_help_tells_every_option() -> None:
+    done = installer("--help")
+    assert done.returncode == 0
+    options = {word for word in INSTALLER.read_text().split() if word.startswith("--")}
+    ours = {option.rstrip(")") for option in options if option.endswith(")")} - {"--help"}
+    assert "--uninstall" in ours
+    assert {option for option in ours if option not in done.stdout} == set()

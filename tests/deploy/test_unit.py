@@ -1,0 +1,125 @@
+"""The unit and its companions, as the tools of systemd and the daemon itself see them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from daemon.scene import STATE_DIRECTORY, Hand, Realtime, Scene
+from daemon.scene_drivers import SpiTactile
+from tests.deploy.staging import DEPLOY, INSTALLER
+
+UNIT = DEPLOY / "systemd/graspd@.service"
+EXPOSURE_MAX_TENTHS = 25
+"""Of `systemd-analyze security`, from 0, nothing is exposed, to 100."""
+
+
+def settings(path: Path) -> dict[str, list[str]]:
+    """Values of each key of a file in the syntax of systemd.syntax(7)."""
+    found: dict[str, list[str]] = {}
+    for key, value in re.findall(r"^(\w+)=(.*)$", path.read_text(), re.MULTILINE):
+        found.setdefault(key, []).append(value)
+    return found
+
+
+def tool(name: str, package: str) -> str:
+    path = shutil.which(name)
+    if path is None:
+        pytest.skip(f"no {name}: apt install {package}")
+    return path
+
+
+def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    words = [str(word) for word in command]
+    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=50)
+
+
+def test_systemd_understands_the_unit(tmp_path: Path) -> None:
+    analyze = tool("systemd-analyze", "systemd")
+    program = tmp_path / "venv/bin/graspd"
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    unit = tmp_path / UNIT.name
+    unit.write_text(UNIT.read_text().replace("/opt/graspd", str(tmp_path)))
+    done = run(analyze, "verify", "--recursive-errors=no", unit)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_the_service_is_exposed_to_little() -> None:
+    analyze = tool("systemd-analyze", "systemd")
+    options = ["--offline=true", f"--threshold={EXPOSURE_MAX_TENTHS}", "--no-pager"]
+    done = run(analyze, "security", *options, UNIT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Overall exposure level for graspd@" in done.stdout
+
+
+def test_systemd_makes_the_user_and_its_groups(tmp_path: Path) -> None:
+    sysusers = tool("systemd-sysusers", "systemd")
+    (tmp_path / "etc").mkdir()
+    done = run(sysusers, f"--root={tmp_path}", DEPLOY / "sysusers.d/graspd.conf")
+    assert done.returncode == 0, done.stderr
+    passwd = (tmp_path / "etc/passwd").read_text()
+    group = (tmp_path / "etc/group").read_text()
+    assert re.search(r"^graspd:.*:/var/lib/graspd:\S*nologin$", passwd, re.MULTILINE)
+    assert re.search(r"^dialout:.*:graspd$", group, re.MULTILINE)
+
+
+def test_udev_understands_the_rules() -> None:
+    udevadm = tool("udevadm", "udev")
+    if "verify" not in run(udevadm, "--help").stdout:
+        pytest.skip("udevadm verify came with systemd 254")
+    done = run(udevadm, "verify", DEPLOY / "udev/70-graspd.rules")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_unit_keeps_what_the_daemon_needs() -> None:
+    unit = settings(UNIT)
+    scene = Scene(hand=Hand(name="left"), tactile=SpiTactile(driver="spi", port="/dev/ttyACM0"))
+    (runtime,), (state,) = unit["RuntimeDirectory"], unit["StateDirectory"]
+    assert scene.endpoint == f"ipc:///run/{runtime}/left.ipc"
+    assert Path("/var/lib") / state == STATE_DIRECTORY
+    assert unit["RestartPreventExitStatus"] == ["2"]
+    assert unit["ExecStart"][0].endswith(" run /etc/graspd/%i.toml")
+
+
+def test_every_priority_that_a_scene_may_name_is_granted() -> None:
+    (limit,) = settings(UNIT)["LimitRTPRIO"]
+    assert Realtime(priority=int(limit)).priority == int(limit)
+    with pytest.raises(ValueError, match="priority"):
+        Realtime(priority=int(limit) + 1)
+
+
+def test_folders_have_the_same_rights_whoever_makes_them_first() -> None:
+    unit = settings(UNIT)
+    wanted = {
+        f"/run/{unit['RuntimeDirectory'][0]}": unit["RuntimeDirectoryMode"][0],
+        f"/var/lib/{unit['StateDirectory'][0]}": unit["StateDirectoryMode"][0],
+    }
+    lines = (DEPLOY / "tmpfiles.d/graspd.conf").read_text().splitlines()
+    made = [line.split() for line in lines if not line.startswith("#")]
+    assert {path: mode for _, path, mode, *_ in made} == wanted
+    owner = [unit["User"][0], unit["Group"][0]]
+    assert all([kind, *rest] == ["d", *owner, "-"] for kind, _, _, *rest in made)
+
+
+def test_the_bus_has_the_rate_of_the_protocol() -> None:
+    network = settings(DEPLOY / "network/80-graspd-can.network")
+    protocol = (DEPLOY / "can/PROTOCOL.md").read_text()
+    assert "ip link set can0 type can bitrate 1000000 restart-ms 100 " in protocol
+    assert (network["BitRate"], network["RestartSec"]) == (["1M"], ["100ms"])
+
+
+@pytest.mark.parametrize("shell", ["dash", "bash"])
+def test_shells_understand_the_installer(shell: str) -> None:
+    done = run(tool(shell, shell), "-n", INSTALLER)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_shellcheck_finds_nothing_in_the_installer() -> None:
+    done = run(tool("shellcheck", "shellcheck"), INSTALLER)
+    assert (done.returncode, done.stdout) == (0, "")
