@@ -212,7 +212,9 @@ def _around(
     if assembly.build_keeper(wanted, pipeline, drivers[0], stack) is not None:
         meter.take("session file")
     sockets = stack.enter_context(Sockets(wanted))
-    reporter = Reporter(wanted.hand.name, model.contract.name, model.sha256, sockets)
+    reporter = Reporter(
+        wanted.hand.name, wanted.hand.fingers, model.contract.name, model.sha256, sockets
+    )
     meter.take("sockets")
     from daemon.service import Service
     from daemon.stop import StopSignal

@@ -12,8 +12,10 @@ import zmq
 
 from daemon.binding import Binding, Bound
 
-SUBSCRIBED = 1
-"""First byte of a subscription message on an XPUB socket."""
+SUBSCRIBED, UNSUBSCRIBED = 1, 0
+"""First byte of a message on an XPUB socket: somebody wants a topic, nobody does any more."""
+SUBSCRIBED_MAX = 100
+"""Topics that are remembered as wanted; the daemon has five."""
 SUBSCRIPTION_MAX_BYTES = 128
 """A peer that sends more is no subscriber and is disconnected. A topic has 40 bytes, a greeting
 with an identity of 80 bytes just fits."""
@@ -68,6 +70,8 @@ class Publisher(Bound):
         self._clock = clock
         self._last: dict[bytes, bytes] = {}
         """Last payload by topic; the daemon has three."""
+        self._subscribed: set[bytes] = set()
+        """What topics that somebody wants begin with."""
         self._owed: set[bytes] = set()
         """Topics whose last message somebody waits for."""
         self._repeat_due_ns = 0
@@ -115,10 +119,18 @@ class Publisher(Bound):
         if self._owed:
             self._repeat()
 
+    def wanted(self, topic: bytes) -> bool:
+        """Whether somebody subscribes to a topic, as far as `take` has seen."""
+        return any(topic.startswith(prefix) for prefix in self._subscribed)
+
     def _note(self, message: bytes) -> None:
+        if message[:1] == bytes([UNSUBSCRIBED]):
+            self._subscribed.discard(message[1:])
         if message[:1] != bytes([SUBSCRIBED]):
             return
         self.counters["subscriptions"] += 1
+        if len(self._subscribed) < SUBSCRIBED_MAX:
+            self._subscribed.add(message[1:])
         self._owed.update(topic for topic in self._last if topic.startswith(message[1:]))
 
     def _repeat(self) -> None:

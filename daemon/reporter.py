@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 import uuid
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal, Protocol
 
@@ -18,10 +19,13 @@ from daemon.judge.verdict import (
     Reason,
     State,
     Status,
+    Tactile,
     Verdict,
     encode,
 )
 from daemon.latency import LatencyHistogram
+from drivers.base import JointReading, TactileReading
+from models.contract import Finger
 
 if TYPE_CHECKING:
     from daemon.deadlines import Deadlines
@@ -36,6 +40,9 @@ class Output(Protocol):
     def send(self, topic: bytes, payload: bytes) -> None:
         """Pass one message on, without blocking."""
 
+    def wanted(self, topic: bytes) -> bool:
+        """Whether anybody gets what is sent on a topic."""
+
 
 class Reporter:
     """Makes the verdict and status messages of one run of the daemon."""
@@ -43,19 +50,22 @@ class Reporter:
     def __init__(
         self,
         hand: str,
+        fingers: Sequence[Finger],
         model: str,
         model_sha256: str,
         output: Output | None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], float] = time.time,
     ) -> None:
-        """`clock` gives monotonic ns, `wall_clock` seconds since 1970."""
+        """`hand` is its name; `clock` gives monotonic ns, `wall_clock` seconds since 1970."""
         self.latency = LatencyHistogram()
         self.outcomes: Counter[Outcome] = Counter()
         self.reasons: Counter[Reason] = Counter()
         self._repaired: Counter[str] = Counter()
         self._verdict_topic = f"verdict.{hand}".encode()
         self._gate_topic = f"gate.{hand}".encode()
+        self._tactile_topic = f"tactile.{hand}".encode()
+        self._fingers = tuple(fingers)
         self._status_topic = f"status.{hand}".encode()
         self._model = model
         self._model_sha = model_sha256[:SHA_DIGITS]
@@ -65,6 +75,7 @@ class Reporter:
         self._boot_id = uuid.uuid4().hex
         self._verdict_seq = 0
         self._gate_seq = 0
+        self._tactile_seq = 0
         self._status_seq = 0
         self._versions = {
             "graspd": version("graspd"),
@@ -115,6 +126,23 @@ class Reporter:
         self.reasons.update(judgement.reasons)
         self._repaired.update(judgement.repaired)
         return message, payload
+
+    def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
+        """Send one reading, with the newest joint angles, if somebody wants it."""
+        if self._output is None or not self._output.wanted(self._tactile_topic):
+            return
+        message = Tactile(
+            boot_id=self._boot_id,
+            seq=self._tactile_seq,
+            t=self._wall_clock(),
+            t_mono_ns=reading.t_ns,
+            fingers=list(self._fingers),
+            counts=reading.counts.tolist(),
+            faults=reading.faults.tolist(),
+            joints={} if joints is None else _angles(joints),
+        )
+        self._tactile_seq += 1
+        self._output.send(self._tactile_topic, encode(message))
 
     def _gate_change(self, t_ns: int, change: GateChange) -> None:
         message = GateMessage(
@@ -172,6 +200,12 @@ class Reporter:
         if self._output is not None:
             self._output.send(self._status_topic, encode(message))
         return message
+
+
+def _angles(joints: JointReading) -> dict[str, float]:
+    """The joints that have an angle, rad: JSON has no NaN."""
+    pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
+    return {name: angle for name, angle in pairs if math.isfinite(angle)}
 
 
 def _spread_us(durations: LatencyHistogram) -> dict[Literal["p50", "p99", "max"], float]:

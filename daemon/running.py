@@ -134,7 +134,11 @@ class Runner:
                 stack.callback(kept.save)
             hot = self._hot(parts, stack)
             reporter = Reporter(
-                wanted.hand.name, parts.model.contract.name, parts.model.sha256, sockets
+                wanted.hand.name,
+                wanted.hand.fingers,
+                parts.model.contract.name,
+                parts.model.sha256,
+                sockets,
             )
             service = Service(
                 parts.drivers,

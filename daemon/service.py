@@ -106,6 +106,7 @@ class Service:
         self._reload = reload
         self._clock = clock
         self._deadlines = Deadlines()
+        self._joints: JointReading | None = None
         self._watched: set[int] = set()
         """Descriptors of drivers and questions that the selector has."""
         self._max_age_ns = max_age_ns
@@ -176,7 +177,9 @@ class Service:
         for reading in readings:
             if isinstance(reading, JointReading):
                 self._pipeline.turn(reading)
+                self._joints = reading
                 continue
+            self._reporter.tactile(reading, self._joints)
             judgement = self._pipeline.judge(reading)
             verdict, payload = self._reporter.verdict(judgement, received_ns, self._silence_ns())
             self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)

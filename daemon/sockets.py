@@ -89,6 +89,10 @@ class Sockets:
         if self.latest is not None and topic.startswith(VERDICT):
             self.latest.send(payload)
 
+    def wanted(self, topic: bytes) -> bool:
+        """Whether somebody subscribes to a topic."""
+        return self.publisher.wanted(topic)
+
     def filenos(self) -> list[int]:
         """Become readable when a peer may want something; call `take` before waiting for them."""
         found = [self.publisher.fileno()]

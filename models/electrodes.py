@@ -8,6 +8,8 @@ closed form from the inverse covariance P: the residual is `(P d)_i / P_ii`, its
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +28,7 @@ class Electrodes:
         self._centre = np.array(seen.centre).ravel()
         whitening = seen.whitening_matrix()
         self._precision = whitening @ whitening.T
-        self._limit_square = IMPLAUSIBLE**2 * np.diag(self._precision)
+        self._limits = IMPLAUSIBLE * np.sqrt(np.diag(self._precision))
         self.centre = self._centre.reshape(np.shape(seen.centre))
         """Mean of each electrode in the training, counts, shape (fingers, 24)."""
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
@@ -40,22 +42,23 @@ class Electrodes:
         `values` are counts (fingers, 24); those of `broken` are not looked at. The worst one goes
         first, then the rest is looked at without it, until all fit or `at_most` are broken.
         """
-        found = broken.ravel().copy()
-        deviations = np.where(found, 0.0, values.ravel() - self._centre)
+        deviations = values.ravel() - self._centre
+        if np.count_nonzero(broken):
+            deviations[broken.ravel()] = 0.0
         residuals = self._precision @ deviations
-        if not found.any() and (residuals**2 <= self._limit_square).all():
+        fit = np.abs(residuals) <= self._limits
+        if np.count_nonzero(fit) == fit.size and not np.count_nonzero(broken):
             return broken
-        precision = self._precision.copy()
-        for electrode in np.flatnonzero(found):
-            _forget(int(electrode), precision, residuals)
-        while np.count_nonzero(found) < at_most:
-            weight = np.where(found, np.inf, np.diag(precision))
-            squares = residuals**2 / weight
-            worst = int(squares.argmax())
-            if not squares[worst] > IMPLAUSIBLE**2:
+        found = broken.ravel().copy()
+        others = _Others(self._precision, residuals)
+        for electrode in np.flatnonzero(found).tolist():
+            others.forget(electrode)
+        for _ in range(at_most - len(others.forgotten)):
+            worst = others.worst()
+            if worst is None:
                 break
             found[worst] = True
-            _forget(worst, precision, residuals)
+            others.forget(worst)
         return found.reshape(broken.shape)
 
     def repaired(
@@ -63,19 +66,43 @@ class Electrodes:
     ) -> NDArray[np.float64]:
         """`values` with what the sound electrodes let expect in place of the broken ones."""
         out = broken.ravel()
+        deviations = values.ravel() - self._centre
+        deviations[out] = 0.0
+        precision = self._precision[out]
         flat = values.ravel().copy()
-        sound = ~out
-        pull = self._precision[np.ix_(out, sound)] @ (flat[sound] - self._centre[sound])
-        flat[out] = self._centre[out] - np.linalg.solve(self._precision[np.ix_(out, out)], pull)
+        flat[out] = self._centre[out] - np.linalg.solve(precision[:, out], precision @ deviations)
         return flat.reshape(values.shape)
 
 
-def _forget(electrode: int, precision: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
-    """Take an electrode out of precision and residuals, in place: what is left is of the others.
+class _Others:
+    """Precision and residuals of the electrodes that are left when some are forgotten.
 
-    The inverse covariance of the others is the Schur complement; whatever the electrode's own
-    value added to their residuals goes out with it.
+    The inverse covariance of the others is the Schur complement. Of it only the diagonal and the
+    columns of those that go are needed: a Cholesky decomposition, one column for each.
     """
-    column = precision[:, electrode] / precision[electrode, electrode]
-    residuals -= column * residuals[electrode]
-    precision -= np.outer(column, precision[electrode])
+
+    def __init__(self, precision: NDArray[np.float64], residuals: NDArray[np.float64]) -> None:
+        """Of all electrodes, shapes (electrodes, electrodes) and (electrodes,)."""
+        self._precision = precision
+        self._residuals = residuals.copy()
+        self._diagonal = np.diag(precision).copy()
+        self._columns = np.zeros((len(precision), len(precision)))
+        self.forgotten: list[int] = []
+
+    def worst(self) -> int | None:
+        """The electrode that fits the others least; None if all of them fit."""
+        squares = self._residuals**2 / self._diagonal
+        worst = int(squares.argmax())
+        return worst if squares[worst] > IMPLAUSIBLE**2 else None
+
+    def forget(self, electrode: int) -> None:
+        """Leave an electrode out; whatever its value added to the others' residuals goes too."""
+        number = len(self.forgotten)
+        columns = self._columns[:number]
+        pivot = math.sqrt(self._diagonal[electrode])
+        column = (self._precision[electrode] - columns[:, electrode] @ columns) / pivot
+        self._residuals -= column * (self._residuals[electrode] / pivot)
+        self._diagonal -= column**2
+        self._diagonal[electrode] = np.inf  # never the worst again
+        self._columns[number] = column
+        self.forgotten.append(electrode)

@@ -18,11 +18,11 @@ from models.contract import (
 )
 from models.layout import ELECTRODES, LAYOUTS
 from models.tactile_image import (
-    SPREAD_FLOOR_COUNTS,
     Composition,
     Fill,
     Normalisation,
     TactileImager,
+    scale_of,
 )
 
 
@@ -151,7 +151,9 @@ class SessionBuilder:
 
     def _standardise(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
         standard: NDArray[np.float64] = (features - self._mean) * self._scale
-        return np.clip(standard, -self._clip, self._clip, out=standard)
+        # What `np.clip` does, in half its time.
+        np.maximum(standard, -self._clip, out=standard)
+        return np.minimum(standard, self._clip, out=standard)
 
 
 def raw_features(counts: NDArray[np.generic]) -> NDArray[np.float64]:
@@ -173,12 +175,8 @@ def _z_scores(
     In two passes, so that large counts that hardly differ cancel before they are squared: for
     counts of 12 bits the error is below 1e-9 of the largest magnitude, 6e-8 once it is float32.
     """
-    mean = counts.mean(axis=-1)
+    mean = np.add.reduce(counts, axis=-1) / ELECTRODES
     centred = counts - mean[..., np.newaxis]
-    spread: NDArray[np.float64] = np.sqrt(
-        np.einsum("...e,...e->...", centred, centred) / ELECTRODES
-    )
-    spread[np.isinf(spread)] = np.nan  # overflowed: no number to judge by
-    judgeable = spread >= SPREAD_FLOOR_COUNTS
-    scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
-    return centred * scale[..., np.newaxis], mean, spread
+    spread: NDArray[np.float64] = np.sqrt(np.add.reduce(centred**2, axis=-1) / ELECTRODES)
+    centred *= scale_of(spread)[..., np.newaxis]
+    return centred, mean, spread

@@ -59,7 +59,8 @@ class TactileModel:
             self._session.run_with_iobinding(self._binding)
         except Exception as error:  # onnxruntime's exceptions share no narrower base
             raise ModelError(f"{self.path}: {_one_line(error)}") from error
-        return float(self._probability[0, 0]), float(self._probability[0, 1])
+        p_stable, p_slip = self._probability[0].tolist()
+        return p_stable, p_slip
 
 
 def _read(path: Path) -> bytes:

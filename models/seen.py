@@ -38,9 +38,21 @@ class SeenCheck:
         never: NDArray[np.bool_] = outside | ~within
         return never
 
+    def is_seen(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
+        """The opposite of `never_seen` for one reading, (fingers, 24), in a third of the time."""
+        inside = (values >= self._low) & (values <= self._high)
+        return (
+            np.count_nonzero(inside) == self._electrodes
+            and self._square_min <= self._square(values, repaired) <= self._square_max
+        )
+
     def is_far(self, counts: NDArray[np.float64]) -> bool:
         """Whether counts (fingers, 24) fit the training covariance; the ranges do not matter."""
-        return not self._squares(counts[np.newaxis], 0)[0] <= self._square_max
+        return not self._square(counts, 0) <= self._square_max
+
+    def _square(self, values: NDArray[np.float64], repaired: int) -> float:
+        deviations = (values.ravel() - self._centre) @ self._whitening
+        return float(deviations @ deviations) / (self._electrodes - repaired)
 
     def _squares(self, values: NDArray[np.float64], repaired: int) -> NDArray[np.float64]:
         deviations = (values.reshape(len(values), -1) - self._centre) @ self._whitening

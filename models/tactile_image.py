@@ -71,6 +71,18 @@ def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
     return matrix.reshape(height * width, ELECTRODES + 1)
 
 
+def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What deviations are multiplied by: one over the spread, 0 where that must not be judged.
+
+    Writes NaN into `spread` where it is infinite: it overflowed, so it is no number to judge by.
+    """
+    if np.count_nonzero((spread >= SPREAD_FLOOR_COUNTS) & (spread < np.inf)) == spread.size:
+        return 1.0 / spread
+    spread[np.isinf(spread)] = np.nan
+    judgeable = spread >= SPREAD_FLOOR_COUNTS
+    return np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
+
+
 class TactileImager:
     """Builds normalised tactile images without allocating an image per reading.
 
@@ -137,13 +149,11 @@ class TactileImager:
             spread = np.sqrt(squares / len(pixels))
         else:
             spread = electrodes.std(axis=0)
-        spread[np.isinf(spread)] = np.nan  # overflowed: no number to judge by
-        judgeable = spread >= SPREAD_FLOOR_COUNTS
-        scale = np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
+        scale = scale_of(spread)
         planes = out.reshape(self._split).transpose(self._axes)
         np.multiply(pixels.reshape(self._planes), scale, out=planes, casting="same_kind")
-        if not judgeable.all():
-            planes[..., ~judgeable] = 0.0
+        if np.count_nonzero(scale) < scale.size:
+            planes[..., scale == 0.0] = 0.0  # and not NaN
         return spread
 
     def build_batch(

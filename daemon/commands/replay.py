@@ -123,7 +123,9 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         service = Service(
             drivers,
             pipeline,
-            Reporter(wanted.hand.name, model.contract.name, model.sha256, sockets),
+            Reporter(
+                wanted.hand.name, wanted.hand.fingers, model.contract.name, model.sha256, sockets
+            ),
             stop,
             max_age_ns=wanted.max_age_ns,
             listener=listener,

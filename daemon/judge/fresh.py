@@ -12,16 +12,20 @@ from numpy.typing import NDArray
 
 from daemon.judge.health import NO_COUNT
 
+VALUES = 3
+
 
 class FreshMedian:
     """Keeps three fresh values per electrode; constant memory, no clock."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
-        self._values = np.zeros((3, *shape), dtype=np.uint16)
+        self._oldest, self._middle, self._newest = np.zeros((3, *shape), dtype=np.uint16)
         self._last = np.zeros(shape, dtype=np.uint16)
         self._held = np.zeros(shape, dtype=np.bool_)
         self._number = np.zeros(shape, dtype=np.uint8)
+        self.counts = np.zeros(shape, dtype=np.uint16)
+        """Median of the last three fresh values, shape (fingers, 24); 0 where there is none."""
         self.reset()
 
     def reset(self) -> None:
@@ -29,6 +33,7 @@ class FreshMedian:
         self._last.fill(NO_COUNT)
         self._held.fill(False)
         self._number.fill(0)
+        self._all_full = False
 
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
         """Take in one sweep, shape (fingers, 24); what is not `usable` is forgotten.
@@ -38,27 +43,32 @@ class FreshMedian:
         itself in one sweep of ten without being held.
         """
         self._held = (counts == self._last) & ~self._held
-        fresh = usable & ~self._held
-        self._number[~usable] = 0
-        oldest, middle, newest = self._values
-        first = fresh & (self._number == 0)
-        np.copyto(oldest, middle, where=fresh)
-        np.copyto(middle, newest, where=fresh)
-        np.copyto(newest, counts, where=fresh)
-        # Until there are three, the first one stands for those that are missing.
-        np.copyto(oldest, counts, where=first)
-        np.copyto(middle, counts, where=first)
-        self._number += fresh & (self._number < len(self._values))
+        fresh = ~self._held
+        all_usable = np.count_nonzero(usable) == usable.size
+        if not all_usable:
+            fresh &= usable
+        np.copyto(self._oldest, self._middle, where=fresh)
+        np.copyto(self._middle, self._newest, where=fresh)
+        np.copyto(self._newest, counts, where=fresh)
+        if not (all_usable and self._all_full):
+            self._fill(counts, usable, fresh)
         np.copyto(self._last, counts, where=usable)
+        # A new array each time: what was handed out stays.
+        low = np.minimum(self._oldest, self._middle)
+        high = np.maximum(self._oldest, self._middle)
+        self.counts = np.maximum(low, np.minimum(high, self._newest))
+
+    def _fill(
+        self, counts: NDArray[np.uint16], usable: NDArray[np.bool_], fresh: NDArray[np.bool_]
+    ) -> None:
+        """Count the fresh values; until there are three, the first stands for those missing."""
+        self._number[~usable] = 0
+        first = fresh & (self._number == 0)
+        np.copyto(self._oldest, counts, where=first)
+        np.copyto(self._middle, counts, where=first)
+        self._number += fresh & (self._number < VALUES)
+        self._all_full = bool((self._number == VALUES).all())
 
     def is_full(self, usable: NDArray[np.bool_]) -> bool:
         """Whether each `usable` electrode, shape (fingers, 24), has three fresh values."""
-        return bool((self._number[usable] == len(self._values)).all())
-
-    @property
-    def counts(self) -> NDArray[np.uint16]:
-        """Median of the last three fresh values, shape (fingers, 24); 0 where there is none."""
-        oldest, middle, newest = self._values
-        low, high = np.minimum(oldest, middle), np.maximum(oldest, middle)
-        median: NDArray[np.uint16] = np.maximum(low, np.minimum(high, newest))
-        return median
+        return self._all_full or bool((self._number[usable] == VALUES).all())

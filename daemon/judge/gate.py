@@ -68,11 +68,11 @@ class Gate:
 
         With `on_request` a settled grasp waits until somebody asks.
         """
-        self._required = required
+        self._required: list[int] = np.flatnonzero(required).tolist()
         self._limits = limits
         self._on_request = on_request
-        self._stillness = Stillness(limits.rate_window_ns)
-        self._reference: NDArray[np.uint16] | None = None
+        self._stillness = Stillness(limits.rate_window_ns, len(required))
+        self._reference: NDArray[np.float32] | None = None
         self._last_ns: int | None = None
         self._held_since_ns: int | None = None
         self._released_ns = 0
@@ -118,7 +118,7 @@ class Gate:
 
     def judged(self, t_ns: int, median: NDArray[np.uint16]) -> None:
         """The settled grasp was judged, by the reading of `t_ns` with these counts."""
-        self._reference = median
+        self._reference = median.astype(np.float32)
         self._asked = False
         self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
 
@@ -147,12 +147,14 @@ class Gate:
         self.skip(t_ns)
         self._last_ns = t_ns
         self._follow_question(t_ns)
-        self._stillness.add(t_ns, median)
-        self.in_contact = bool(touching[self._required].all())
-        reasons = self._disturbances(t_ns, median, usable, against)
-        self._follow_contact(t_ns, bool(touching.any()))
+        counts = median.astype(np.float32)
+        self._stillness.add(t_ns, counts)
+        touches = touching.tolist()
+        self.in_contact = all(touches[finger] for finger in self._required)
+        reasons = self._disturbances(t_ns, counts, usable, against)
+        self._follow_contact(t_ns, any(touches))
         if self.state is GateState.JUDGED:
-            self._follow_judged(t_ns, median, usable)
+            self._follow_judged(t_ns, counts, usable)
         elif self.state is GateState.SETTLED and reasons:
             cause = GateCause.MOVED if self.in_contact else GateCause.CONTACT_LOST
             self._enter(GateState.CLOSING, t_ns, cause)
@@ -171,7 +173,7 @@ class Gate:
     def _disturbances(
         self,
         t_ns: int,
-        median: NDArray[np.uint16],
+        counts: NDArray[np.float32],
         usable: NDArray[np.bool_],
         against: tuple[Reason, ...],
     ) -> tuple[Reason, ...]:
@@ -180,10 +182,10 @@ class Gate:
                 *(reason for reason in against if reason is Reason.NOT_TARED),
                 Reason.NO_CONTACT,
             )
-        rate = self._stillness.rate(t_ns, median, usable)
+        rate = self._stillness.rate(t_ns, counts, usable)
         if rate is None:
             return (*against, Reason.SEQUENCE_GAP)
-        if not (rate <= self._limits.rate_counts_per_s).all():
+        if not max(rate.tolist()) <= self._limits.rate_counts_per_s:
             return (*against, Reason.MOVING)
         return against
 
@@ -198,21 +200,21 @@ class Gate:
             self._enter(GateState.RELEASED, t_ns, GateCause.CONTACT_LOST)
 
     def _follow_judged(
-        self, t_ns: int, median: NDArray[np.uint16], usable: NDArray[np.bool_]
+        self, t_ns: int, counts: NDArray[np.float32], usable: NDArray[np.bool_]
     ) -> None:
         if not self.in_contact:
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
-        elif self._reference is None or self._has_changed(median, usable, self._reference):
+        elif self._reference is None or self._has_changed(counts, usable, self._reference):
             self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
 
     def _has_changed(
         self,
-        median: NDArray[np.uint16],
+        counts: NDArray[np.float32],
         usable: NDArray[np.bool_],
-        reference: NDArray[np.uint16],
+        reference: NDArray[np.float32],
     ) -> bool:
-        distance = mean_distance(median, reference, usable)
-        return bool((distance > self._limits.change_counts).any())
+        distance = mean_distance(counts, reference, usable)
+        return bool(max(distance.tolist()) > self._limits.change_counts)
 
     def _hold(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:
         """Wait for the hold time; what speaks against settling besides what disturbs."""

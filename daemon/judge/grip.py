@@ -50,13 +50,14 @@ class Grip:
         self.on_request = limits.on_request
         """Whether a settled grasp is judged only when somebody asks."""
         self._fingers = tuple(fingers)
-        self._required = np.array([finger in required for finger in fingers])
+        self._required = [place for place, finger in enumerate(fingers) if finger in required]
         self._gap_ns = limits.gate.gap_ns
         self._judges_median = limits.sweeps == MEDIAN_SWEEPS
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
         self._contact = Contact(len(fingers), limits.contact)
         self._joints = None if limits.joints is None else _joint_motion(limits.joints)
-        self._gate = Gate(self._required, limits.gate, on_request=limits.on_request)
+        must_touch = np.array([finger in required for finger in fingers])
+        self._gate = Gate(must_touch, limits.gate, on_request=limits.on_request)
         self._last_ns: int | None = None
 
     @property
@@ -145,8 +146,7 @@ class Grip:
         self, reading: TactileReading, watched: Watched
     ) -> NDArray[np.uint16] | None:
         """Shape (fingers, 24), if this reading is the moment to judge the grasp; else None."""
-        usable = ~watched.broken
-        if not self._gate.wants_judgement or not self._fresh.is_full(usable):
+        if not self._gate.wants_judgement or not self._fresh.is_full(~watched.broken):
             return None
         return self._fresh.counts if self._judges_median else reading.counts
 
@@ -157,7 +157,8 @@ class Grip:
 
     def _against(self, t_ns: int) -> tuple[Reason, ...]:
         against: list[Reason] = []
-        if not self._contact.tared[self._required].all():
+        tared = self._contact.tared.tolist()
+        if not all(tared[finger] for finger in self._required):
             against.append(Reason.NOT_TARED)
         joints = None if self._joints is None else self._joints.against(t_ns)
         if joints is not None:
@@ -165,7 +166,8 @@ class Grip:
         return tuple(against)
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
-        return tuple(self._fingers[index] for index in np.flatnonzero(which))
+        chosen = zip(self._fingers, which.tolist(), strict=True)
+        return tuple(finger for finger, is_chosen in chosen if is_chosen)
 
 
 def _joint_motion(limits: JointLimits) -> JointMotion:

@@ -34,7 +34,7 @@ class Network:
     def judge(self, counts: NDArray[np.generic]) -> tuple[float | None, tuple[Reason, ...]]:
         """Probability of slip of counts (fingers, 24), or None and why there is none."""
         spread = self._model.inputs.build(counts, self._model.input)
-        if not (spread >= SPREAD_FLOOR_COUNTS).all():
+        if np.count_nonzero(spread >= SPREAD_FLOOR_COUNTS) < len(spread):
             return None, (Reason.FLAT,)
         try:
             p_stable, p_slip = self._model.run()

@@ -88,21 +88,27 @@ class Pipeline:
                 f"in this order, the hand has {', '.join(fingers)}"
             )
         electrodes = Electrodes(model.contract.seen)
-        self.session = _session(model, electrodes)
-        """None for a model that needs none."""
+        self._session = _session(model, electrodes)
         self._limits = limits
         self._clock = clock
         self._learns = learns
         self._needs_session = needs_session
         self._fingers = tuple(fingers)
         self._health = Health(len(fingers))
-        self._plausibility = Plausibility(model.contract.seen, electrodes, self.session)
-        self._network = Network(model, self.session, limits.slip_threshold)
+        self._plausibility = Plausibility(model.contract.seen, electrodes, self._session)
+        self._network = Network(model, self._session, limits.slip_threshold)
         self.grip = None if grip is None else _grip(fingers, grip)
         """None where each reading is a grasp."""
         self._readings = 0
         self._learnt_grasp = 0
+        self._to_learn: NDArray[np.generic] | None = None
         self._opinion = NO_OPINION
+
+    @property
+    def session(self) -> SessionCalibration | None:
+        """With all that was judged; None for a model that needs none."""
+        self._learn()
+        return self._session
 
     @property
     def on_request(self) -> bool:
@@ -117,8 +123,9 @@ class Pipeline:
     def sensors_exchanged(self) -> None:
         """What is known of the sensors, and of what they hold, no longer counts."""
         self._opinion = NO_OPINION
-        if self.session is not None:
-            self.session.reset()
+        self._to_learn = None
+        if self._session is not None:
+            self._session.reset()
         if self.grip is not None:
             self.grip.forget()
 
@@ -129,6 +136,7 @@ class Pipeline:
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
+        self._learn()
         self._readings += 1
         watched = self._health.watch(reading)
         counts = self._counts_to_judge(reading, watched)
@@ -141,9 +149,8 @@ class Pipeline:
         elif self.grip is None or self.grip.state is not GateState.JUDGED:
             self._opinion = NO_OPINION
         judgement = self._judgement(reading.t_ns, watched.reasons, self._opinion, judged=judged)
-        # Last, so that a grasp is judged by what came before it.
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
-            self._learn(grasp, judgement.grasp)
+            self._note(grasp, judgement.grasp)
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
@@ -152,6 +159,7 @@ class Pipeline:
 
     def health(self) -> dict[str, Reason]:
         """What is not well now: electrodes such as `ff_7`, fingers, joints, model, session."""
+        self._learn()
         broken = self._health.electrodes()
         found = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
         found |= {self._name(*place): reason for place, reason in broken.items()}
@@ -162,7 +170,7 @@ class Pipeline:
                 found["joints"] = Reason.JOINTS_LATE
         if Reason.MODEL_FAILED in self._opinion.reasons:
             found["model"] = Reason.MODEL_FAILED
-        if self.session is not None and not self.session.calibrated:
+        if self._session is not None and not self._session.calibrated:
             found["session"] = Reason.NOT_CALIBRATED
         return found
 
@@ -185,22 +193,33 @@ class Pipeline:
         p_slip, reasons = None, findings.reasons
         if not reasons:
             p_slip, reasons = self._network.judge(findings.counts)
-        repaired = () if findings.repaired is None else np.argwhere(findings.repaired)
-        names = tuple(self._name(int(finger), int(place)) for finger, place in repaired)
+        repaired = [] if findings.repaired is None else np.argwhere(findings.repaired).tolist()
+        names = tuple(self._name(finger, place) for finger, place in repaired)
         return _Opinion(p_slip, reasons, names), findings.grasp
 
-    def _learn(self, counts: NDArray[np.generic], grasp: int) -> None:
-        """Take a grasp into the session, as it was before the lift and not as it changed since."""
-        if self.session is not None and grasp != self._learnt_grasp:
+    def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
+        """Remember to learn a grasp, as it was before the lift and not as it changed since."""
+        if self._session is not None and grasp != self._learnt_grasp:
             self._learnt_grasp = grasp
-            self.session.observe(counts)
+            self._to_learn = counts
+
+    def _learn(self) -> None:
+        """Take what was judged last into the session.
+
+        That takes as long as judging, so it waits until the verdict is out; and a grasp must be
+        judged by what came before it.
+        """
+        if self._session is not None and self._to_learn is not None:
+            counts, self._to_learn = self._to_learn, None
+            self._session.observe(counts)
 
     def _judgement(
         self, t_ns: int, against: tuple[Reason, ...], opinion: _Opinion, *, judged: bool
     ) -> Judgement:
         grip = self.grip
         health = (*against, *opinion.reasons)
-        if self._needs_session and self.session is not None and not self.session.calibrated:
+        calibrated = None if self._session is None else self._session.calibrated
+        if self._needs_session and calibrated is False:
             health = (*health, Reason.NOT_CALIBRATED)
         case = Case(
             p_slip=opinion.p_slip,
@@ -220,7 +239,7 @@ class Pipeline:
             reasons=tuple(dict.fromkeys(reasons)),
             judged=judged,
             repaired=opinion.repaired,
-            session_calibrated=None if self.session is None else self.session.calibrated,
+            session_calibrated=calibrated,
             gate=None if grip is None else grip.state,
             contact=None if grip is None else grip.touching,
             changes=() if grip is None else tuple(grip.take_changes()),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.health import too_many
 from daemon.judge.verdict import Reason
-from drivers.base import COUNT_MAX
+from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import SeenCounts
 from models.electrodes import Electrodes
 from models.seen import SeenCheck
@@ -25,6 +25,7 @@ and with a limit of four a tenth would be."""
 FLAT_SPREAD_COUNTS = 70.0
 """Standard deviation of a finger's electrodes below which it is not touching, or not working: half
 of the smallest of 4682 real grasps, 148."""
+ONES = np.ones(ELECTRODES)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,15 +63,16 @@ class Plausibility:
         grasp, values = self._repair(counts, values, broken)
         at_most = int(np.count_nonzero(broken)) + CONTRADICTING_MAX + 1
         found = self._electrodes.implausible(values, broken, at_most)
-        if np.count_nonzero(found) == at_most or too_many(found):
+        number = int(np.count_nonzero(found))
+        if number == at_most or too_many(found):
             # So much does not fit that the reading as a whole is like nothing in the training.
             return self._never_seen(counts, grasp)
         repaired, values = self._repair(counts, values, found)
         if self._session is not None and self._is_odd(self._session, repaired):
             return self._never_seen(counts, grasp)
-        if self._seen.never_seen(values[np.newaxis], int(np.count_nonzero(found))).any():
+        if not self._seen.is_seen(values, number):
             return self._never_seen(counts, grasp)
-        return Findings((), repaired, found if found.any() else None, grasp)
+        return Findings((), repaired, found if number else None, grasp)
 
     def _never_seen(self, counts: NDArray[np.uint16], grasp: NDArray[np.generic]) -> Findings:
         """Refused; a session learns from it only while it is young: that is how drift begins.
@@ -97,7 +99,7 @@ class Plausibility:
         broken: NDArray[np.bool_],
     ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Counts, and their values with the training's sensors, with the broken ones repaired."""
-        if not broken.any():
+        if not np.count_nonzero(broken):
             return counts, values
         values = self._electrodes.repaired(values, broken)
         return np.where(broken, self._from_training(values), counts), values
@@ -110,13 +112,19 @@ class Plausibility:
 
     def _from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         counts = values if self._session is None else self._session.from_training(values)
-        return np.clip(counts, 0.0, COUNT_MAX)
+        return np.minimum(np.maximum(counts, 0.0), COUNT_MAX)
 
 
 def _is_flat(counts: NDArray[np.uint16], broken: NDArray[np.bool_]) -> bool:
     """Whether the sound electrodes of a finger read about the same."""
-    values, sound = counts.astype(np.float64), ~broken
-    number = sound.sum(axis=1)
-    mean = (values * sound).sum(axis=1) / number
-    squares = ((values - mean[:, np.newaxis]) ** 2 * sound).sum(axis=1) / number
-    return bool((squares < FLAT_SPREAD_COUNTS**2).any())
+    values, numbers = counts.astype(np.float64), [ELECTRODES] * len(counts)
+    if np.count_nonzero(broken):
+        values[broken] = 0.0
+        numbers = (~broken).sum(axis=1).tolist()
+    sums = (values @ ONES).tolist()
+    squares = (values**2 @ ONES).tolist()
+    # Sums of whole numbers are exact, so nothing is lost when they cancel.
+    return any(
+        number * square - total * total < (number * FLAT_SPREAD_COUNTS) ** 2
+        for number, total, square in zip(numbers, sums, squares, strict=True)
+    )

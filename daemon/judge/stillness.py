@@ -5,48 +5,69 @@ The window is remembered in few sweeps however fast they come, so memory is cons
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.base import ELECTRODES
+
 SWEEPS = 16
 """Sweeps remembered of a window; of faster readings, some are left out."""
+KEPT = SWEEPS + 2
+"""And one at each end of the window."""
+ONES = np.ones(ELECTRODES, dtype=np.float32)
 
 
 def mean_distance(
-    one: NDArray[np.uint16], other: NDArray[np.uint16], usable: NDArray[np.bool_]
+    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Of the `usable` electrodes (fingers, 24), counts, shape (..., fingers).
 
-    Counts of shape (..., fingers, 24).
+    Counts of shape (..., fingers, 24), whole numbers below 2**16: float32 adds 24 of them exactly.
     """
-    distance = np.abs(one.astype(np.int32) - other) * usable
-    number = np.maximum(usable.sum(axis=1), 1)
-    mean: NDArray[np.float64] = distance.sum(axis=-1) / number
+    distance = one - other
+    np.abs(distance, out=distance)
+    if np.count_nonzero(usable) == usable.size:
+        return (distance @ ONES).astype(np.float64) / ELECTRODES
+    distance *= usable
+    mean: NDArray[np.float64] = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
     return mean
 
 
 class Stillness:
     """Remembers the medians of the last window."""
 
-    def __init__(self, window_ns: int) -> None:
+    def __init__(self, window_ns: int, fingers: int) -> None:
         """`window_ns` is how far back a sweep is compared with, at least, ns."""
         self._window_ns = window_ns
-        self._past: deque[tuple[int, NDArray[np.uint16]]] = deque(maxlen=SWEEPS + 2)
+        self._times_ns: list[int] = []
+        """Of the sweeps of the window, oldest first."""
+        # Twice as long as it must be: the window is a slice of it that moves to the right, and goes
+        # back to the left when it has come to the end.
+        self._sweeps = np.zeros((2 * KEPT, fingers, ELECTRODES), dtype=np.float32)
+        self._first = 0
+        """Where in `_sweeps` the window begins."""
 
     def reset(self) -> None:
         """Forget: what comes next does not continue what came before."""
-        self._past.clear()
+        self._times_ns.clear()
+        self._first = 0
 
-    def add(self, t_ns: int, median: NDArray[np.uint16]) -> None:
+    def add(self, t_ns: int, median: NDArray[np.float32]) -> None:
         """Take in the median of `t_ns`, shape (fingers, 24)."""
-        if self._past and t_ns - self._past[-1][0] < self._window_ns // SWEEPS:
+        times_ns = self._times_ns
+        if times_ns and t_ns - times_ns[-1] < self._window_ns // SWEEPS:
             return
-        self._past.append((t_ns, median))
+        if len(times_ns) == KEPT:
+            self._drop_oldest()
+        place = self._first + len(times_ns)
+        if place == len(self._sweeps):
+            self._sweeps[: len(times_ns)] = self._sweeps[self._first :]
+            self._first, place = 0, len(times_ns)
+        self._sweeps[place] = median
+        times_ns.append(t_ns)
 
     def rate(
-        self, t_ns: int, median: NDArray[np.uint16], usable: NDArray[np.bool_]
+        self, t_ns: int, median: NDArray[np.float32], usable: NDArray[np.bool_]
     ) -> NDArray[np.float64] | None:
         """How far each finger's `usable` electrodes were away, counts/s, shape (fingers,).
 
@@ -54,13 +75,18 @@ class Stillness:
         before it, over its age: two moments alone would miss what swings. None while no sweep is
         that old.
         """
-        while len(self._past) > 1 and t_ns - self._past[1][0] >= self._window_ns:
-            self._past.popleft()
-        if not self._past or t_ns - self._past[0][0] < self._window_ns:
+        times_ns, window_ns = self._times_ns, self._window_ns
+        while len(times_ns) > 1 and t_ns - times_ns[1] >= window_ns:
+            self._drop_oldest()
+        if not times_ns or t_ns - times_ns[0] < window_ns:
             return None
-        then = np.array([past for _, past in self._past])
-        distance = mean_distance(then, median, usable)
-        ages_ns = np.array([max(t_ns - at_ns, self._window_ns) for at_ns, _ in self._past])
-        rates = distance / (ages_ns[:, np.newaxis] / 1e9)
-        rate: NDArray[np.float64] = rates.max(axis=0)
+        past = self._sweeps[self._first : self._first + len(times_ns)]
+        rates = mean_distance(past, median, usable)
+        rates[0] /= (t_ns - times_ns[0]) / 1e9
+        rates[1:] /= window_ns / 1e9
+        rate: NDArray[np.float64] = np.maximum.reduce(rates, axis=0)
         return rate
+
+    def _drop_oldest(self) -> None:
+        del self._times_ns[0]
+        self._first += 1

@@ -1,4 +1,4 @@
-"""The messages on the wire, version 1: verdict, gate and status, as JSON objects without NaN.
+"""The messages on the wire, version 1, as JSON objects without NaN.
 
 `graspd schema` prints their JSON Schema; golden messages stand in `tests/daemon/golden/`. Fields
 are only ever added; `v` changes when a meaning does.
@@ -18,6 +18,8 @@ WIRE_VERSION: Final = 1
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0.0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+_HAND = msgspec.Meta(max_length=5)
+"""A hand has five fingers."""
 
 
 class Outcome(StrEnum):
@@ -190,6 +192,43 @@ class GateMessage(msgspec.Struct, frozen=True, kw_only=True):
     cause: GateCause
 
 
+class Tactile(msgspec.Struct, frozen=True, kw_only=True):
+    """A reading as it was judged, on topic `tactile.<hand>`; comes before its verdict.
+
+    Made only while somebody subscribes to it.
+    """
+
+    v: Literal[1] = WIRE_VERSION
+    boot_id: str
+    seq: Count
+    """Counts up by one per message of this topic; a gap is a loss, or nobody wanted it."""
+    t: float
+    t_mono_ns: Count
+    """Monotonic time, ns, of the reading's last byte, as in its verdict."""
+    fingers: Annotated[list[Finger], msgspec.Meta(max_length=5)]
+    counts: Annotated[list[Annotated[list[Count], msgspec.Meta(max_length=24)]], _HAND]
+    """By finger, electrodes 1 to 24, 0..4095; as read, nothing repaired."""
+    faults: Annotated[list[Annotated[list[Count], msgspec.Meta(max_length=24)]], _HAND]
+    """By finger and electrode, bits of what is wrong with a count: 1 missing, 2 not a count, 4
+    parity, 8 error word, 16 held, 32 cut off; 0 is well."""
+    joints: dict[str, float] = {}
+    """Newest angle of each joint that has one, rad."""
+
+
+class OutcomeMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """How a lift ended, as the controller has told it, on topic `outcome.<hand>`."""
+
+    v: Literal[1] = WIRE_VERSION
+    boot_id: str
+    seq: Count
+    t: float
+    t_mono_ns: Count
+    """Monotonic time, ns, when the controller told it."""
+    grasp: Count
+    """Of the verdict that the lift was made by."""
+    outcome: Literal["stable", "slip"]
+
+
 class State(StrEnum):
     """What the daemon is doing."""
 
@@ -244,15 +283,17 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
 
 
-MESSAGES = (Verdict, GateMessage, Status)
+MESSAGES = (Verdict, GateMessage, Tactile, OutcomeMessage, Status)
 
 _verdict_decoder = msgspec.json.Decoder(Verdict)
 _gate_decoder = msgspec.json.Decoder(GateMessage)
+_tactile_decoder = msgspec.json.Decoder(Tactile)
+_outcome_decoder = msgspec.json.Decoder(OutcomeMessage)
 _status_decoder = msgspec.json.Decoder(Status)
 _encoder = msgspec.json.Encoder()
 
 
-def encode(message: Verdict | GateMessage | Status) -> bytes:
+def encode(message: Verdict | GateMessage | Tactile | OutcomeMessage | Status) -> bytes:
     """JSON payload of a message."""
     return _encoder.encode(message)
 
@@ -265,6 +306,16 @@ def decode_verdict(payload: bytes) -> Verdict:
 def decode_gate(payload: bytes) -> GateMessage:
     """Parse and check a gate payload. Raises `msgspec.DecodeError`."""
     return _gate_decoder.decode(payload)
+
+
+def decode_tactile(payload: bytes) -> Tactile:
+    """Parse and check a tactile payload. Raises `msgspec.DecodeError`."""
+    return _tactile_decoder.decode(payload)
+
+
+def decode_outcome(payload: bytes) -> OutcomeMessage:
+    """Parse and check an outcome payload. Raises `msgspec.DecodeError`."""
+    return _outcome_decoder.decode(payload)
 
 
 def decode_status(payload: bytes) -> Status:

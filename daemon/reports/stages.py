@@ -58,7 +58,9 @@ def _stages(
     electrodes = Electrodes(model.contract.seen)
     plausibility = Plausibility(model.contract.seen, electrodes)
     pipeline = Pipeline(model, fingers, limits, time.monotonic_ns, learns=False)
-    reporter = Reporter("report", model.contract.name, model.sha256, publisher)
+    reporter = Reporter(
+        "report", model.contract.fingers, model.contract.name, model.sha256, publisher
+    )
     readings = [
         TactileReading(now[0] + i * PERIOD_NS, i, row, np.zeros(row.shape, dtype=np.uint8))
         for i, row in enumerate(counts)

@@ -10,12 +10,20 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import pytest
 
-from daemon.judge.verdict import Outcome, Reason, State, Status, Verdict, decode_status
+from daemon.judge.verdict import (
+    Outcome,
+    Reason,
+    State,
+    Status,
+    Verdict,
+    decode_status,
+    decode_tactile,
+)
 from daemon.reporter import Reporter
 from daemon.service import Ended, Service, Watchdog
 from daemon.stop import StopSignal
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
-from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, pipeline, reading
+from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 
 
 class TestOutput:
@@ -25,9 +33,13 @@ class TestOutput:
 
     def __init__(self) -> None:
         self.sent: list[tuple[bytes, bytes]] = []
+        self.wants = False
 
     def send(self, topic: bytes, payload: bytes) -> None:
         self.sent.append((topic, payload))
+
+    def wanted(self, _topic: bytes) -> bool:
+        return self.wants
 
     def statuses(self) -> list[Status]:
         return [decode_status(payload) for topic, payload in self.sent if topic == b"status.right"]
@@ -55,7 +67,7 @@ class Bench:
         self.verdicts: list[Verdict] = []
         self.payloads: list[bytes] = []
         self.clock = clock
-        reporter = Reporter("right", "fake", "ab" * 32, self.output, clock, lambda: 1.79e9)
+        reporter = Reporter("right", FINGERS, "fake", "ab" * 32, self.output, clock, lambda: 1.79e9)
         self.service = Service(
             [driver],
             pipeline(model or FakeModel(), clock),
@@ -349,3 +361,29 @@ def test_every_status_tells_jitter_late_readings_and_the_worst_age(stop: StopSig
     assert status.jitter_us["max"] == pytest.approx(2000.0)
     assert status.late_readings == 2  # 25 and 15 ms old, of a period of 10 ms
     assert status.worst_age_ms == pytest.approx(25.0)
+
+
+def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it(
+    stop: StopSignal,
+) -> None:
+    clock = Clock()
+    angles = JointReading(clock(), 0, ("FFJ3", "MFJ3"), np.array([0.5, np.nan]))
+    came = [reading(clock(), 1), angles, reading(clock(), 2), reading(clock(), 3)]
+    bench = Bench(FakeDriver(came, clock), clock, stop)
+    send = bench.output.send
+
+    def wants_from_the_second_verdict_on(topic: bytes, payload: bytes) -> None:
+        send(topic, payload)
+        bench.output.wants = len(bench.output.sent) == 1
+
+    bench.output.send = wants_from_the_second_verdict_on  # type: ignore[method-assign]
+    bench.service.run()
+    topics = [topic for topic, _ in bench.output.sent[:-1]]
+    assert topics == [b"verdict.right", b"tactile.right", b"verdict.right", b"verdict.right"]
+    message = decode_tactile(bench.output.sent[1][1])
+    second = came[2]
+    assert isinstance(second, TactileReading)
+    assert message.counts == second.counts.tolist()
+    assert message.faults == second.faults.tolist()
+    assert message.fingers == list(FINGERS)
+    assert message.joints == {"FFJ3": 0.5}

@@ -19,12 +19,16 @@ from daemon.judge.verdict import (
     GateMessage,
     GateState,
     Outcome,
+    OutcomeMessage,
     Reason,
     State,
     Status,
+    Tactile,
     Verdict,
     decode_gate,
+    decode_outcome,
     decode_status,
+    decode_tactile,
     decode_verdict,
     encode,
     schema,
@@ -34,7 +38,7 @@ GOLDEN = Path(__file__).parent / "golden"
 SCHEMA_FILE = Path(__file__).parents[2] / "deploy" / "wire" / "messages.schema.json"
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"
-MESSAGES: dict[str, Verdict | GateMessage | Status] = {
+MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] = {
     "verdict_stable": Verdict(
         boot_id=BOOT,
         seq=41,
@@ -136,6 +140,24 @@ MESSAGES: dict[str, Verdict | GateMessage | Status] = {
         state=GateState.JUDGED,
         cause=GateCause.JUDGED,
     ),
+    "tactile": Tactile(
+        boot_id=BOOT,
+        seq=5,
+        t=1790000000.25,
+        t_mono_ns=123456789012345,
+        fingers=["ff", "th"],
+        counts=[list(range(2000, 2024)), [4095, 0, *range(3000, 3022)]],
+        faults=[[0] * 24, [0, 1, *[0] * 22]],
+        joints={"FFJ3": 0.5},
+    ),
+    "outcome": OutcomeMessage(
+        boot_id=BOOT,
+        seq=1,
+        t=1790000003.5,
+        t_mono_ns=123459789012345,
+        grasp=42,
+        outcome="slip",
+    ),
     "status": Status(
         boot_id=BOOT,
         seq=7,
@@ -163,9 +185,11 @@ MESSAGES: dict[str, Verdict | GateMessage | Status] = {
 }
 
 
-DECODE: dict[type, Callable[[bytes], Verdict | GateMessage | Status]] = {
+DECODE: dict[type, Callable[[bytes], object]] = {
     Verdict: decode_verdict,
     GateMessage: decode_gate,
+    Tactile: decode_tactile,
+    OutcomeMessage: decode_outcome,
     Status: decode_status,
 }
 
@@ -237,7 +261,7 @@ def test_the_documentation_names_every_field_and_every_reason_with_its_advice() 
     text = (SCHEMA_FILE.parent / "README.md").read_text()
     for reason in Reason:
         assert f"| `{reason}` | {ADVICE[reason]} |" in text
-    for message in (Verdict, GateMessage, Status):
+    for message in (Verdict, GateMessage, Tactile, OutcomeMessage, Status):
         for field in message.__struct_fields__:
             assert f"`{field}`" in text, field
     for name in (*GateState, *GateCause):

@@ -96,6 +96,32 @@ def test_several_wrong_electrodes_are_found_although_each_hides_the_others() -> 
     assert np.flatnonzero(marked).tolist() == wrong
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_the_search_takes_out_the_worst_of_those_left_one_by_one(seed: int) -> None:
+    mean, covariance, seen = correlated(seed)
+    random = np.random.default_rng(seed)
+    values = random.multivariate_normal(mean, covariance)
+    values[random.permutation(72)[:6]] += random.choice([-900.0, 900.0], 6)
+    out = np.zeros(72, dtype=np.bool_)
+    out[random.permutation(72)[:2]] = True
+    broken = out.copy()
+    while out.sum() < 6:
+        off = np.zeros(72)  # in conditional standard deviations, each given all others left
+        for place in np.flatnonzero(~out):
+            alone = np.zeros(72, dtype=np.bool_)
+            alone[place] = True
+            left = ~out | alone
+            (expected,), (variance,) = conditional(
+                mean[left], covariance[np.ix_(left, left)], values[left], alone[left]
+            )
+            off[place] = abs(values[place] - expected) / np.sqrt(variance)
+        if off.max() <= IMPLAUSIBLE:
+            break
+        out[off.argmax()] = True
+    marked = Electrodes(seen).implausible(values.reshape(SHAPE), broken.reshape(SHAPE), 6)
+    assert np.flatnonzero(marked).tolist() == np.flatnonzero(out).tolist()
+
+
 def test_what_is_known_to_be_broken_is_not_looked_at() -> None:
     mean, covariance, seen = correlated()
     values = np.random.default_rng(6).multivariate_normal(mean, covariance).reshape(SHAPE)
