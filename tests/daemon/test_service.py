@@ -368,7 +368,8 @@ def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it(
 ) -> None:
     clock = Clock()
     angles = JointReading(clock(), 0, ("FFJ3", "MFJ3"), np.array([0.5, np.nan]))
-    came = [reading(clock(), 1), angles, reading(clock(), 2), reading(clock(), 3)]
+    first, second, third = (reading(clock(), seed) for seed in (1, 2, 3))
+    came: list[Reading | DriverError] = [first, angles, second, third]
     bench = Bench(FakeDriver(came, clock), clock, stop)
     send = bench.output.send
 
@@ -381,8 +382,6 @@ def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it(
     topics = [topic for topic, _ in bench.output.sent[:-1]]
     assert topics == [b"verdict.right", b"tactile.right", b"verdict.right", b"verdict.right"]
     message = decode_tactile(bench.output.sent[1][1])
-    second = came[2]
-    assert isinstance(second, TactileReading)
     assert message.counts == second.counts.tolist()
     assert message.faults == second.faults.tolist()
     assert message.fingers == list(FINGERS)
