@@ -78,6 +78,7 @@ class Publisher(Bound):
         self.renew()
 
     def _open(self) -> zmq.Socket[bytes]:
+        self._subscribed.clear()
         made = self._context.socket(zmq.XPUB)
         made.linger = LINGER_MS
         made.sndhwm = self._high_water_mark

@@ -191,6 +191,8 @@ class Service:
             self._answer(verdict, payload)
             if self._listener is not None:
                 self._listener(verdict, payload, reading)
+        if taken:
+            self._pipeline.learn()  # what there is time for only now
         return taken
 
     def _take_questions(self) -> None:

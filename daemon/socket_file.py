@@ -57,7 +57,7 @@ class SocketFile:
             self.path.unlink()
             self.listener.bind(str(self.path))
         self._identity = _identity(self.path)
-        if self._group is not None:
+        if self._group not in (None, self.path.stat().st_gid):
             os.chown(self.path, -1, self._group)
         if self._mode is not None:
             os.chmod(self.path, self._mode)

@@ -107,7 +107,7 @@ class Pipeline:
     @property
     def session(self) -> SessionCalibration | None:
         """With all that was judged; None for a model that needs none."""
-        self._learn()
+        self.learn()
         return self._session
 
     @property
@@ -136,7 +136,7 @@ class Pipeline:
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
-        self._learn()
+        self.learn()
         self._readings += 1
         watched = self._health.watch(reading)
         counts = self._counts_to_judge(reading, watched)
@@ -159,7 +159,7 @@ class Pipeline:
 
     def health(self) -> dict[str, Reason]:
         """What is not well now: electrodes such as `ff_7`, fingers, joints, model, session."""
-        self._learn()
+        self.learn()
         broken = self._health.electrodes()
         found = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
         found |= {self._name(*place): reason for place, reason in broken.items()}
@@ -203,8 +203,8 @@ class Pipeline:
             self._learnt_grasp = grasp
             self._to_learn = counts
 
-    def _learn(self) -> None:
-        """Take what was judged last into the session.
+    def learn(self) -> None:
+        """Take what was judged last into the session; at the latest the next reading does it.
 
         That takes as long as judging, so it waits until the verdict is out; and a grasp must be
         judged by what came before it.
