@@ -5,6 +5,9 @@ from __future__ import annotations
 from daemon.latency import LatencyHistogram
 from drivers.base import TactileReading
 
+OUTAGE_PERIODS = 10
+"""So long without a reading is an outage and no jitter; it is told as silence."""
+
 
 class Deadlines:
     """Counts since start; costs no memory that grows."""
@@ -24,6 +27,8 @@ class Deadlines:
         self.worst_age_ms = max(self.worst_age_ms, age_ms)
         if period_ns is not None:
             self.late += age_ms * 1e6 > period_ns
-            if reading.seq == self._last_seq + 1 and self._last_seq >= 0:
-                self.jitter.add(abs(reading.t_ns - self._last_ns - period_ns) / 1e3)
+            elapsed_ns = reading.t_ns - self._last_ns
+            in_a_row = reading.seq == self._last_seq + 1 and self._last_seq >= 0
+            if in_a_row and elapsed_ns < OUTAGE_PERIODS * period_ns:
+                self.jitter.add(abs(elapsed_ns - period_ns) / 1e3)
         self._last_seq, self._last_ns = reading.seq, reading.t_ns

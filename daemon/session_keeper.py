@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import threading
 import time
 from collections.abc import Callable, Sequence
 
 from daemon.judge.session import SessionCalibration
 from daemon.session_file import SessionFile, SessionFileError, exchanged, statistics_of
 from drivers.base import Driver
+from models.session import SessionState
 
 log = logging.getLogger("graspd")
 
@@ -44,21 +48,46 @@ class SessionKeeper:
         self._saved = self._what_is_known()
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._warned = False
+        self._thread: threading.Thread | None = None
 
     def mind(self) -> None:
         """Before readings are judged: has a sensor been exchanged? And save if it is time."""
         self._mind_serials()
-        if self._clock() >= self._save_due_ns:
-            self.save()
+        if self._clock() >= self._save_due_ns and not self._saving():
+            self._begin_to_save()
 
     def save(self) -> None:
-        """Save if there is anything new; one warning if that cannot be done."""
+        """Save if there is anything new, now; one warning if that cannot be done."""
+        self.wait()
+        self._begin_to_save()
+        self.wait()
+
+    def wait(self) -> None:
+        """Until what is being saved is on the disk, or is not."""
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _saving(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def _begin_to_save(self) -> None:
+        """In a thread: a disk may take its time, and readings do not wait."""
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
         known = self._what_is_known()
         if known == self._saved:
             return
+        what = (self._session.state(), dict(self._serials), known)
+        self._thread = threading.Thread(target=self._write, args=what, name="session")
+        self._thread.start()
+
+    def _write(
+        self, state: SessionState, serials: dict[str, str], known: tuple[int, dict[str, str]]
+    ) -> None:
+        with contextlib.suppress(OSError):  # a thread begins with the priority of the loop
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
-            self._file.save(self._session.state(), self._fingers, self._serials)
+            self._file.save(state, self._fingers, serials)
         except SessionFileError as error:
             if not self._warned:
                 log.warning("%s; the next start begins a new session", error)

@@ -11,8 +11,6 @@ import argparse
 import contextlib
 import queue
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -21,22 +19,14 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-import zmq
 
 from daemon.judge.verdict import Outcome, Verdict, decode_verdict
 from drivers.joint_message import JointMessage
-from drivers.twins.grasp_script import Durations
-from drivers.twins.grasps import Counts
 from drivers.twins.spi import SpiTwin
-from drivers.twins.whole_grasps import synthetic_grasps
+from tests.live import PATIENCE_S, Child, Subscriber, held_grasp, start_daemon, tactile_section
 
-PATIENCE_S = 30.0
-HELD = Durations(first_rest_s=(1.5, 1.5), settle_s=(600.0, 600.0))
-"""A grasp that is closed once and then held."""
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
 JOINT_PERIOD_S = 0.01
-SEED = 1
-"""A synthetic grasp that `cnn1` judges."""
 
 
 class Bench:
@@ -51,16 +41,14 @@ class Bench:
         self.joints_flow = threading.Event()
         self.joints_flow.set()
         self.twin = SpiTwin(folder / "bridge", held_grasp())
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
+        self._subscriber = Subscriber(f"ipc://{folder}/graspd")
         self.last: Verdict | None = None
         self.last_s = 0.0
         """When the last message came, s."""
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
-            stack.callback(self._context.term)
-            stack.callback(self._socket.close, 0)
+            stack.enter_context(self._subscriber)
             stack.enter_context(self.twin)
             joint_socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -75,15 +63,7 @@ class Bench:
                 thread.start()
                 stack.callback(thread.join)
             stack.callback(self._stop.set)
-            self.daemon = subprocess.Popen(
-                [sys.executable, "-m", "daemon", "run", str(self._scene(port))],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            stack.callback(self.daemon.wait)
-            stack.callback(self.daemon.kill)
-            self._socket.connect(f"ipc://{self._folder}/graspd")
-            self._socket.subscribe("verdict.")
+            self.daemon: Child = stack.enter_context(start_daemon(self._scene(port)))
             self._stack = stack.pop_all()
         return self
 
@@ -110,7 +90,7 @@ class Bench:
     def _scene(self, port: int) -> Path:
         path = self._folder / "scene.toml"
         path.write_text(
-            f'[tactile]\ndriver = "spi"\nport = "{self._folder}/bridge"\n'
+            f"{tactile_section('spi', str(self._folder / 'bridge'))}"
             f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
             f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{self._folder}/graspd"\n'
         )
@@ -127,16 +107,17 @@ class Bench:
 
     def take(self, timeout_s: float = PATIENCE_S) -> Verdict | None:
         """The next verdict; None if none comes in time."""
-        if not self._socket.poll(round(timeout_s * 1e3)):
+        message = self._subscriber.take(timeout_s)
+        if message is None:
             return None
-        self.last_s = time.monotonic()
-        self.last = decode_verdict(self._socket.recv_multipart()[1])
+        self.last_s = self._subscriber.received_ns / 1e9
+        self.last = decode_verdict(message[1])
         return self.last
 
     def wait_for(self, wanted: Callable[[Verdict], bool]) -> Verdict:
         """The first verdict like that from now on. Raises `TimeoutError`."""
-        while self._socket.poll(0):
-            self._socket.recv_multipart()
+        while self._subscriber.take(0.0):
+            pass
         deadline_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline_s:
             verdict = self.take(deadline_s - time.monotonic())
@@ -167,11 +148,6 @@ def is_valid(verdict: Verdict) -> bool:
     return verdict.valid
 
 
-def held_grasp() -> Iterator[Counts]:
-    """Counts of a grasp that is held for ten minutes."""
-    return (moment.counts for moment in synthetic_grasps(1, durations=HELD, seed=SEED))
-
-
 def outages(bench: Bench) -> Iterator[tuple[str, float, tuple[str, ...]]]:
     """Cause each outage once: its name, s until unknown, and the reasons given."""
     twin = bench.twin
@@ -187,7 +163,7 @@ def outages(bench: Bench) -> Iterator[tuple[str, float, tuple[str, ...]]]:
     bench.wait_for(is_valid)
     yield "joints, and judged without them", took_s + bench.last_s - began_s, ()
     bench.joints_flow.set()
-    yield "daemon", bench.until_silence_s(bench.daemon.kill), ()
+    yield "daemon", bench.until_silence_s(bench.daemon.process.kill), ()
 
 
 def main() -> None:

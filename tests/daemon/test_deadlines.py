@@ -26,6 +26,14 @@ def test_a_lost_reading_is_not_jitter() -> None:
     assert deadlines.jitter.max_us == 0.0
 
 
+def test_an_outage_is_not_jitter() -> None:
+    deadlines = Deadlines()
+    for seq, t_ms in ((0, 100), (1, 110), (2, 3110), (3, 3120)):
+        deadlines.add(reading(t_ms * MS, seq=seq), 0.5, PERIOD_NS)
+    assert deadlines.jitter.count == 2
+    assert deadlines.jitter.max_us == 0.0
+
+
 def test_a_verdict_more_than_a_period_after_its_reading_is_late() -> None:
     deadlines = Deadlines()
     for seq, age_ms in enumerate((0.5, 10.0, 10.5, 2.0)):

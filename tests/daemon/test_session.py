@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,7 @@ def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
         assert load(file.path) is None  # not every second
         clock.now_ns += SAVE_PERIOD_NS
         keeper.mind()
+        keeper.wait()
     second = calibration()
     with SessionFile(tmp_path / "right.json") as file:
         SessionKeeper(second, FINGERS, sensors(), file, clock)
@@ -129,6 +131,7 @@ def test_an_exchanged_sensor_ends_the_session(
         assert again.grasps == 30
         driver.known = {"ff": "A", "mf": "X", "th": "C"}
         keeper.mind()
+        keeper.wait()
         assert again.grasps == 0
         assert "new sensor on mf" in caplog.text
         kept = file.load()
@@ -223,6 +226,7 @@ def test_a_full_disk_is_one_warning_and_no_crash(
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
             keeper.mind()
+            keeper.wait()
         assert caplog.text.count("No space left on device") == 1
         monkeypatch.undo()
         keeper.save()
@@ -230,6 +234,30 @@ def test_a_full_disk_is_one_warning_and_no_crash(
     assert kept is not None
     assert kept.statistics.grasps == 9
     assert sorted(path.name for path in tmp_path.iterdir()) == ["right.json", "right.json.lock"]
+
+
+def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session, clock = calibration(), Clock()
+    hangs, asked = threading.Event(), []
+
+    def slow(_descriptor: int) -> None:
+        asked.append(True)
+        hangs.wait()
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+        for seed in range(3):
+            observe(session, 3, seed)
+            clock.now_ns += SAVE_PERIOD_NS
+            keeper.mind()  # comes back, though nothing is on the disk yet
+        assert file.load() is None
+        hangs.set()
+        keeper.save()
+        kept = file.load()
+    assert kept is not None
+    assert kept.statistics.grasps == 9
+    assert len(asked) == 2
 
 
 KILLED = """
@@ -403,7 +431,9 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
         assert kept is not None
         assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
         later = calibration()
-        SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock).mind()
+        keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
+        keeper.mind()
+        keeper.wait()
     assert later.grasps == 0
 
 
