@@ -20,6 +20,7 @@ from daemon import logs
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
     "replay": ("daemon.commands.replay", "judge recordings and print the verdicts"),
+    "watch": ("daemon.commands.watch", "see it live, in a terminal (extra: watch) or a browser"),
     "check": ("daemon.commands.check", "say whether a scene is right and what it needs"),
     "doctor": (
         "daemon.commands.doctor",
@@ -30,6 +31,10 @@ COMMANDS = {
     "schema": ("daemon.commands.schema", "print the JSON Schema of the messages"),
     "models": ("daemon.commands.models", "list the models and show their cards"),
     "session": ("daemon.commands.session", "show, reset or seed what is known of the sensors"),
+    "export-grasps": (
+        "daemon.commands.export_grasps",
+        "make a grasp table of what was recorded, for train (extra: record)",
+    ),
     "keys": ("daemon.commands.keys", "make and list the keys of those who may connect by TCP"),
     "train": ("models.training.command", "train and export a model (extra: train)"),
     "evaluate": ("models.training.evaluate", "measure how good systems are (extra: train)"),
@@ -40,7 +45,13 @@ COMMANDS = {
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
-EXTRAS = {"train": "train", "evaluate": "train", "report": "train,report"}
+EXTRAS = {
+    "export-grasps": "record",
+    "train": "train",
+    "evaluate": "train",
+    "report": "train,report",
+    "watch": "watch",
+}
 """Extras that a command needs."""
 WRONG = 2
 

@@ -24,8 +24,16 @@ NEVER = {
     *("rich", "distributed", "mcap", "msgpack", "pydantic.v1", "pydantic_settings", "yaml"),
     *("models.training", "drivers.twins", "daemon.reports", "daemon.printer", "daemon.summary"),
     *("daemon.scene_errors", "daemon.cost", "daemon.doctor"),
-    *("daemon.realtime", "daemon.notify", "daemon.latest"),
-    *("daemon.gatekeeper", "daemon.keys", "zmq.auth", "zmq.utils.monitor"),
+    *("daemon.realtime", "daemon.notify", "daemon.latest", "daemon.watch"),
+    *(
+        "daemon.recorder",
+        "daemon.record_files",
+        "daemon.recording",
+        "daemon.playback",
+        "daemon.captures",
+    ),
+    *("drivers.mcap_recording", "drivers.mcap_replay", "drivers.candump", "drivers.capture_replay"),
+    *("zstandard", "lz4", "daemon.gatekeeper", "daemon.keys", "zmq.auth", "zmq.utils.monitor"),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or the latest verdict alone."""

@@ -1,0 +1,136 @@
+"""The subscriber: connects to a daemon like anybody else, and takes what has come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, Self
+
+import zmq
+import zmq.auth
+from zmq.utils.monitor import recv_monitor_message
+
+from daemon.keys import Z85_KEY, KeysError, load_pair
+
+TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
+WAITING_MAX = 2000
+"""Messages that wait here; at 100 Hz those of seven seconds. More are lost, and seen as lost."""
+TAKEN_MAX = 5000
+"""Messages taken at a time, more than can wait: after a pause the newest is there at once."""
+MESSAGE_MAX_BYTES = 1 << 20
+"""A status has some kilobytes; who sends more is no daemon."""
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
+"""On TCP, as the daemon has them, ms."""
+RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
+"""Before connecting again, at first and at most, ms."""
+NOT_CONNECTED: Final = "not connected"
+EVENTS: Final = {
+    int(zmq.EVENT_HANDSHAKE_SUCCEEDED): "connected",
+    int(zmq.EVENT_DISCONNECTED): NOT_CONNECTED,
+    int(zmq.EVENT_CONNECT_RETRIED): NOT_CONNECTED,
+    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): (
+        "turned away: the daemon does not know this key; start again when it does"
+    ),
+}
+"""What the connection is like after an event."""
+REFUSALS: Final = {
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): (
+        "turned away: the daemon wants a key (--keys)",
+        "turned away: this daemon takes no keys",
+    ),
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): (
+        "turned away: the daemon wants a key (--keys)",
+        "turned away: is the daemon's key right?",
+    ),
+}
+"""The same without keys and with keys."""
+FOLLOW = 2
+"""Events that follow when one is turned away, and say less: disconnected, will be tried again."""
+
+
+class Feed:
+    """Subscribed to all topics of an endpoint until `close`; connects again by itself."""
+
+    def __init__(self, endpoint: str, keys: tuple[bytes, bytes, bytes] | None = None) -> None:
+        """`keys`: own public and secret key and the daemon's public one, Z85, where it needs them.
+
+        Raises `zmq.ZMQError` for an endpoint that is none.
+        """
+        self.link = "connecting"
+        """What the connection is like, in words."""
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.SUB)
+        self._socket.linger = 0
+        self._socket.rcvhwm = WAITING_MAX
+        self._socket.maxmsgsize = MESSAGE_MAX_BYTES
+        self._socket.reconnect_ivl = RECONNECT_MS
+        self._socket.reconnect_ivl_max = RECONNECT_MAX_MS
+        if keys is not None:
+            self._socket.curve_publickey, self._socket.curve_secretkey = keys[:2]
+            self._socket.curve_serverkey = keys[2]
+        if endpoint.startswith("tcp://"):
+            self._socket.heartbeat_ivl = HEARTBEAT_MS
+            self._socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+        self._monitor = self._socket.get_monitor_socket(sum(EVENTS) + sum(REFUSALS))
+        self._events = EVENTS | {event: says[keys is not None] for event, says in REFUSALS.items()}
+        self._follow = 0
+        try:
+            self._socket.connect(endpoint)
+        except zmq.ZMQError:
+            self.close()
+            raise
+        for topic in TOPICS:
+            self._socket.subscribe(topic)
+
+    def take(self) -> Iterator[tuple[bytes, bytes]]:
+        """Topic and payload of each message that has come; never waits."""
+        self._look_at_link()
+        for _ in range(TAKEN_MAX):
+            try:
+                frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            if len(frames) == 2:
+                yield frames[0], frames[1]
+
+    def _look_at_link(self) -> None:
+        while self._monitor.poll(0):
+            event = int(recv_monitor_message(self._monitor)["event"])
+            link = self._events.get(event, self.link)
+            if link == NOT_CONNECTED and self._follow:
+                self._follow -= 1
+                continue
+            self._follow = FOLLOW if link.startswith("turned away") else 0
+            self.link = link
+
+    def close(self) -> None:
+        """Let go of the endpoint. May be called again."""
+        if not self._socket.closed:
+            self._socket.disable_monitor()
+            self._monitor.close(0)
+            self._socket.close(0)
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()
+
+
+def load_keys(own: Path, daemon: Path) -> tuple[bytes, bytes, bytes]:
+    """Own public and secret key, and the daemon's public one, Z85.
+
+    `own` is a `.key_secret` file of mode 0600, `daemon` the daemon's `.key`. Raises `KeysError`.
+    """
+    public, secret = load_pair(own)
+    try:
+        server, _ = zmq.auth.load_certificate(daemon)
+    except OSError as error:
+        reason = error.strerror or "there is no such file"
+        raise KeysError(f"{daemon}: cannot read the daemon's key: {reason}") from error
+    except ValueError as error:
+        raise KeysError(f"{daemon}: has no public key") from error
+    if not Z85_KEY.fullmatch(server):
+        raise KeysError(f"{daemon}: a key must have 40 characters of Z85")
+    return public, secret, server

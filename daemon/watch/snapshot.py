@@ -1,0 +1,113 @@
+"""All that is shown at one moment; the terminal draws it, and the page gets it as JSON."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import msgspec
+
+from daemon.watch.fingers import FingerImage
+
+
+class Tone(StrEnum):
+    """What an operator has to know in a second; it has a colour."""
+
+    STABLE = "stable"
+    SLIP = "slip"
+    WAITING = "waiting"
+    """Unknown, as it should be: nothing is grasped, or the grasp has not settled yet."""
+    TROUBLE = "trouble"
+    """Unknown, because something is wrong or out of the ordinary."""
+    SILENT = "silent"
+    """Unknown, because no message comes."""
+
+
+TONE_CODE = {
+    Tone.STABLE: "s",
+    Tone.SLIP: "x",
+    Tone.WAITING: "w",
+    Tone.TROUBLE: "t",
+    Tone.SILENT: ".",
+}
+"""In `Snapshot.history`."""
+
+
+class Line(msgspec.Struct, frozen=True):
+    """Something that is to be known, and what to do about it."""
+
+    what: str
+    advice: str
+
+
+class Judged(msgspec.Struct, frozen=True, kw_only=True):
+    """The last judgement, which may not stand any more."""
+
+    verdict: str
+    p_slip: float | None
+    grasp: int
+    ago_s: float
+    ended: str | None
+    """How the lift ended, if the controller has told it: `stable` or `slip`."""
+
+
+class Session(msgspec.Struct, frozen=True, kw_only=True):
+    """How far the session is calibrated."""
+
+    grasps: int
+    calibrated: bool
+
+
+class Timing(msgspec.Struct, frozen=True, kw_only=True):
+    """Rates as they arrive here, delays as the daemon tells them."""
+
+    verdicts_hz: float
+    readings_hz: float | None
+    age_ms: float | None
+    latency_us: float | None
+    p50_us: float | None
+    p99_us: float | None
+    max_us: float | None
+    jitter_p99_us: float | None
+    late: int | None
+    worst_age_ms: float | None
+    lost: int
+    """Verdicts that did not arrive, by gaps of `seq`."""
+    not_understood: int
+    """Messages that are not of this version, or not of graspd."""
+
+
+class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known now."""
+
+    endpoint: str
+    link: str
+    hand: str | None
+    t: float
+    """Wall-clock seconds since 1970 here."""
+    tone: Tone
+    verdict: str
+    """`stable`, `slip` or `unknown`; unknown too when no message comes."""
+    p_slip: float | None
+    why: list[Line]
+    grasp: int | None
+    gate: str | None
+    contact: list[str] | None
+    judged: Judged | None
+    fingers: list[FingerImage]
+    joints: dict[str, float]
+    """Angles, rad."""
+    health: list[Line]
+    repaired: list[str]
+    session: Session | None
+    timing: Timing
+    state: str | None
+    """Of the daemon: `running`, `silent` or `stopping`."""
+    counts: dict[str, int]
+    """Verdicts since the daemon's start, by outcome."""
+    drivers: dict[str, dict[str, int]]
+    model: str | None
+    versions: dict[str, str]
+    history: str
+    """Tones of the last half minute, oldest first, ten per second; see `TONE_CODE`."""
+    history_p: list[int]
+    """The same for the probability of slip, %; -1 where there is none."""

@@ -1,0 +1,270 @@
+"""What is known of one hand by its messages, and by their absence."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.verdict import (
+    ADVICE,
+    GateMessage,
+    GateState,
+    Outcome,
+    OutcomeMessage,
+    Reason,
+    Status,
+    Tactile,
+    Verdict,
+    decode_gate,
+    decode_outcome,
+    decode_status,
+    decode_tactile,
+    decode_verdict,
+)
+from daemon.watch.fingers import FingerImage, Rest, image
+from daemon.watch.snapshot import TONE_CODE, Judged, Line, Session, Snapshot, Timing, Tone
+from models.layout import ELECTRODES
+
+SNAPSHOTS_HZ = 10
+"""How often a snapshot is taken, 1/s."""
+HISTORY = 30 * SNAPSHOTS_HZ
+"""Snapshots that are remembered: half a minute, longer than a grasp takes."""
+RATE_OVER = SNAPSHOTS_HZ
+"""Snapshots that a rate is taken over: a second."""
+TACTILE_OLD_NS = 1_000_000_000
+"""Images older than this are not shown: they would look alive."""
+AS_IT_SHOULD_BE = {
+    Reason.NO_CONTACT,
+    Reason.MOVING,
+    Reason.SETTLING,
+    Reason.NOT_TARED,
+    Reason.NOT_ASKED,
+}
+"""Reasons of a grasp that is on its way."""
+NOTHING_CAME = "no message has come yet: is graspd running on this endpoint?"
+
+Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
+DECODERS: dict[str, Callable[[bytes], Message]] = {
+    "verdict": decode_verdict,
+    "gate": decode_gate,
+    "tactile": decode_tactile,
+    "outcome": decode_outcome,
+    "status": decode_status,
+}
+"""By what a topic begins with."""
+
+
+class View:
+    """Takes messages, and tells at any time what is to be seen. Constant memory, no socket."""
+
+    def __init__(
+        self, endpoint: str, hand: str | None = None, wall: Callable[[], float] = time.time
+    ) -> None:
+        """Of one `hand`, or of the first that is heard of."""
+        self.link = "connecting"
+        self._endpoint = endpoint
+        self._hand = hand
+        self._wall = wall
+        self._verdict: Verdict | None = None
+        self._verdict_ns = 0
+        self._gate: GateState | None = None
+        self._tactile: Tactile | None = None
+        self._tactile_ns = 0
+        self._status: Status | None = None
+        self._judged: tuple[Verdict, int] | None = None
+        self._outcome: OutcomeMessage | None = None
+        self._rests: dict[str, Rest] = {}
+        self._received = self._lost = self._not_understood = 0
+        self._rate_marks: deque[tuple[int, int]] = deque(maxlen=RATE_OVER + 1)
+        self._history: deque[tuple[str, int]] = deque(maxlen=HISTORY)
+
+    def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
+        """Take one message that arrived at `now_ns`, monotonic ns here."""
+        kind, _, hand = topic.decode("ascii", "replace").partition(".")
+        decode = DECODERS.get(kind)
+        if decode is None or (self._hand is not None and hand != self._hand):
+            return
+        try:
+            message = decode(payload)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            self._not_understood += 1
+            return
+        self._hand = hand
+        match message:
+            case Verdict():
+                self._take_verdict(message, now_ns)
+            case GateMessage():
+                self._gate = message.state
+            case Tactile():
+                self._take_tactile(message, now_ns)
+            case OutcomeMessage():
+                self._outcome = message
+            case Status():
+                self._status = message
+
+    def _take_verdict(self, verdict: Verdict, now_ns: int) -> None:
+        last = self._verdict
+        if last is not None and verdict.boot_id == last.boot_id:
+            if verdict.seq <= last.seq:
+                return  # repeated for somebody else: no sign of life
+            self._lost += verdict.seq - last.seq - 1
+        self._received += 1
+        self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
+        if verdict.judged and verdict.valid:
+            self._judged = verdict, now_ns
+
+    def _take_tactile(self, tactile: Tactile, now_ns: int) -> None:
+        if not len(tactile.fingers) == len(tactile.counts) == len(tactile.faults):
+            self._not_understood += 1
+            return
+        self._tactile, self._tactile_ns = tactile, now_ns
+        tared = () if self._status is None else self._status.tared or ()
+        if self._gate is not GateState.IDLE:
+            return
+        for index, finger in enumerate(tactile.fingers):
+            counts, sound = _arrays(tactile, index)
+            if finger in tared and counts is not None:
+                self._rests.setdefault(finger, Rest()).learn(counts, sound)
+
+    def snapshot(self, now_ns: int) -> Snapshot:
+        """What is to be seen at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
+        tone, why = self._finding(now_ns)
+        verdict = self._verdict
+        stands = verdict is not None and tone in {Tone.STABLE, Tone.SLIP}
+        p_slip = verdict.p_slip if verdict is not None and stands else None
+        self._history.append((TONE_CODE[tone], -1 if p_slip is None else round(100 * p_slip)))
+        self._rate_marks.append((now_ns, self._received))
+        silent = tone is Tone.SILENT
+        status = self._status
+        return Snapshot(
+            endpoint=self._endpoint,
+            link=self.link,
+            hand=self._hand,
+            t=self._wall(),
+            tone=tone,
+            verdict=verdict.verdict.value if verdict is not None and stands else "unknown",
+            p_slip=p_slip,
+            why=why,
+            grasp=None if verdict is None else verdict.grasp,
+            gate=None if self._gate is None or silent else self._gate.value,
+            contact=None if verdict is None or silent else _names(verdict.contact),
+            judged=self._last_judgement(now_ns),
+            fingers=[] if silent else self._images(now_ns),
+            joints={} if self._tactile is None or silent else self._tactile.joints,
+            health=[] if status is None or silent else _health(status),
+            repaired=[] if verdict is None or silent else verdict.repaired,
+            session=_session(status),
+            timing=self._timing(),
+            state=None if status is None or silent else status.state.value,
+            counts={} if status is None else {k.value: n for k, n in status.verdicts.items()},
+            drivers={} if status is None else status.drivers,
+            model=None if verdict is None else f"{verdict.model} {verdict.model_sha}",
+            versions={} if status is None else status.versions,
+            history="".join(code for code, _ in self._history),
+            history_p=[p for _, p in self._history],
+        )
+
+    def _finding(self, now_ns: int) -> tuple[Tone, list[Line]]:
+        """What holds now, by the rule for subscribers: silence means unknown."""
+        verdict = self._verdict
+        if verdict is None:
+            return Tone.SILENT, [Line("unknown", NOTHING_CAME), Line("link", self.link)]
+        silent_ms = (now_ns - self._verdict_ns) / 1e6
+        if silent_ms > verdict.silence_ms:
+            silence = Line("unknown", f"no message for {silent_ms:.0f} ms")
+            return Tone.SILENT, [silence, Line("link", self.link)]
+        if verdict.verdict is Outcome.UNKNOWN:
+            quiet = all(reason in AS_IT_SHOULD_BE for reason in verdict.reasons)
+            why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]
+            return Tone.WAITING if quiet else Tone.TROUBLE, why
+        less_sure = [Line("less sure", ADVICE[Reason.NOT_CALIBRATED])]
+        also = less_sure if verdict.session_calibrated is False else []
+        if verdict.verdict is Outcome.STABLE:
+            return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
+        return Tone.SLIP, [Line("do not lift", "it is judged to slip; grasp again"), *also]
+
+    def _images(self, now_ns: int) -> list[FingerImage]:
+        tactile, verdict = self._tactile, self._verdict
+        if tactile is None or now_ns - self._tactile_ns > TACTILE_OLD_NS:
+            return []
+        contact = None if verdict is None else verdict.contact
+        images = []
+        for index, finger in enumerate(tactile.fingers):
+            counts, sound = _arrays(tactile, index)
+            if counts is None:
+                continue
+            rest = self._rests.get(finger)
+            images.append(
+                image(
+                    finger,
+                    counts,
+                    sound,
+                    None if rest is None else rest.counts,
+                    touches=None if contact is None else finger in contact,
+                    repaired=() if verdict is None else verdict.repaired,
+                )
+            )
+        return images
+
+    def _last_judgement(self, now_ns: int) -> Judged | None:
+        if self._judged is None:
+            return None
+        verdict, judged_ns = self._judged
+        told = self._outcome
+        same = told and told.boot_id == verdict.boot_id and told.grasp == verdict.grasp
+        return Judged(
+            verdict=verdict.verdict.value,
+            p_slip=verdict.p_slip,
+            grasp=verdict.grasp,
+            ago_s=(now_ns - judged_ns) / 1e9,
+            ended=told.outcome if told and same else None,
+        )
+
+    def _timing(self) -> Timing:
+        verdict, status = self._verdict, self._status
+        (first_ns, before), (last_ns, received) = self._rate_marks[0], self._rate_marks[-1]
+        elapsed_s = (last_ns - first_ns) / 1e9
+        delays = {} if status is None else status.latency_us
+        return Timing(
+            verdicts_hz=(received - before) / elapsed_s if elapsed_s > 0.0 else 0.0,
+            readings_hz=None if status is None else status.readings_hz,
+            age_ms=None if verdict is None else verdict.age_ms,
+            latency_us=None if verdict is None else verdict.latency_us,
+            p50_us=delays.get("p50"),
+            p99_us=delays.get("p99"),
+            max_us=delays.get("max"),
+            jitter_p99_us=None if status is None else status.jitter_us.get("p99"),
+            late=None if status is None else status.late_readings,
+            worst_age_ms=None if status is None else status.worst_age_ms,
+            lost=self._lost,
+            not_understood=self._not_understood,
+        )
+
+
+def _arrays(tactile: Tactile, index: int) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
+    """Counts of a finger, None if they are not 24, and which of them are sound; shapes (24,)."""
+    counts, faults = tactile.counts[index], tactile.faults[index]
+    if not len(counts) == len(faults) == ELECTRODES:
+        return None, np.zeros(ELECTRODES, dtype=np.bool_)
+    return np.array(counts, dtype=np.float64), np.array(faults) == 0
+
+
+def _names(fingers: Sequence[str] | None) -> list[str] | None:
+    return None if fingers is None else list(fingers)
+
+
+def _health(status: Status) -> list[Line]:
+    return [
+        Line(f"{part} {reason.value}", ADVICE[reason]) for part, reason in status.health.items()
+    ]
+
+
+def _session(status: Status | None) -> Session | None:
+    if status is None or status.session_grasps is None:
+        return None
+    return Session(grasps=status.session_grasps, calibrated=bool(status.session_calibrated))

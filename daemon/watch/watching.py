@@ -1,0 +1,25 @@
+"""Snapshots as time goes by: takes what a feed has into a view, and looks at it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+from daemon.watch.feed import Feed
+from daemon.watch.snapshot import Snapshot
+from daemon.watch.view import SNAPSHOTS_HZ, View
+
+TICK_S = 0.02
+"""Between two looks at what has come: how exactly silence is timed, s."""
+
+
+def snapshots(feed: Feed, view: View, is_over: Callable[[], bool]) -> Iterator[Snapshot]:
+    """Ten times a second what is to be seen, until `is_over`, which waits `TICK_S` each time."""
+    due_s = 0.0
+    while not is_over():
+        for topic, payload in feed.take():
+            view.take(topic, payload, time.monotonic_ns())
+        view.link = feed.link
+        if time.monotonic() >= due_s:
+            due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
+            yield view.snapshot(time.monotonic_ns())

@@ -1,0 +1,133 @@
+"""A headless Chromium, told what to do by the DevTools protocol over a pipe."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import Any, Literal, Self
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+"""Where it is; None where there is none."""
+PATIENCE_S = 30.0
+"""Longest wait for what must come, s."""
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
+    *("--no-first-run", "--disable-extensions", "--disable-background-networking"),
+    *("--remote-debugging-pipe", "--hide-scrollbars"),
+)
+Answer = dict[str, Any]
+
+
+class Browser:
+    """One page. Ends with the block."""
+
+    def __init__(self, profile: Path) -> None:
+        """`profile` is an empty folder for what the browser keeps."""
+        self._profile = profile
+        self._number = 0
+        self._buffer = b""
+        self.complaints: list[str] = []
+        """What the page logged as an error, and what it was not allowed."""
+
+    def __enter__(self) -> Self:
+        told, self._tell = os.pipe()
+        self._hear, said = os.pipe()
+        command = [str(CHROMIUM), *FLAGS, f"--user-data-dir={self._profile}", "about:blank"]
+        self._process = subprocess.Popen(
+            ["bash", "-c", f'exec "$@" 3<&{told} 4>&{said}', "bash", *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            pass_fds=(told, said),
+        )
+        os.close(told)
+        os.close(said)
+        targets = self._ask("Target.getTargets")["targetInfos"]
+        page = next(each["targetId"] for each in targets if each["type"] == "page")
+        attached = self._ask("Target.attachToTarget", targetId=page, flatten=True)
+        self._session = attached["sessionId"]
+        for domain in ("Page", "Runtime", "Log"):
+            self.ask(f"{domain}.enable")
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        with contextlib.suppress(OSError):
+            self._send("Browser.close", {})
+        os.close(self._tell)
+        try:
+            self._process.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._hear)
+
+    def ask(self, method: str, **parameters: object) -> Answer:
+        """What the page answers."""
+        return self._ask(method, self._session, **parameters)
+
+    def look(self, width: int, height: int, theme: Literal["light", "dark"] = "light") -> None:
+        """Make the window so large, and prefer a theme."""
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.ask("Emulation.setDeviceMetricsOverride", **size)
+        feature = {"name": "prefers-color-scheme", "value": theme}
+        self.ask("Emulation.setEmulatedMedia", features=[feature])
+
+    def go(self, address: str) -> None:
+        """Open a page."""
+        self.ask("Page.navigate", url=address)
+
+    def value(self, expression: str) -> Any:  # noqa: ANN401
+        """Of a script in the page; None if it fails."""
+        answer = self.ask("Runtime.evaluate", expression=expression, returnByValue=True)
+        return answer["result"].get("value")
+
+    def wait_for(self, expression: str, patience_s: float = PATIENCE_S) -> None:
+        """Wait until a script is true."""
+        deadline_s = time.monotonic() + patience_s
+        while not self.value(expression):
+            text = self.value("document.body.innerText")
+            assert time.monotonic() < deadline_s, f"not true: {expression}\n{text}"
+            time.sleep(0.05)
+
+    def picture(self, path: Path) -> None:
+        """Save what is seen."""
+        data = self.ask("Page.captureScreenshot", format="png")["data"]
+        path.write_bytes(base64.b64decode(data))
+
+    def _ask(self, method: str, session: str | None = None, **parameters: object) -> Answer:
+        number = self._send(method, parameters, session)
+        while True:
+            message = self._next()
+            if message.get("id") == number:
+                assert "error" not in message, f"{method}: {message['error']}"
+                return dict(message["result"])
+            self._note(message)
+
+    def _send(self, method: str, parameters: object, session: str | None = None) -> int:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        os.write(self._tell, json.dumps(message).encode() + b"\0")
+        return self._number
+
+    def _next(self) -> Answer:
+        while b"\0" not in self._buffer:
+            part = os.read(self._hear, 1 << 16)
+            assert part, "the browser has gone"
+            self._buffer += part
+        message, _, self._buffer = self._buffer.partition(b"\0")
+        return dict(json.loads(message))
+
+    def _note(self, message: Answer) -> None:
+        details = message.get("params", {})
+        if message.get("method") == "Runtime.exceptionThrown":
+            self.complaints.append(json.dumps(details["exceptionDetails"])[:500])
+        if message.get("method") == "Log.entryAdded" and details["entry"]["level"] == "error":
+            self.complaints.append(details["entry"]["text"])

@@ -1,0 +1,232 @@
+"""The page's server: only for browsers of this computer, and none of them can hold it up."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+
+import msgspec
+import pytest
+
+from daemon.watch.view import View
+from daemon.watch.web import CONNECTIONS_MAX, PAGES_MAX, Newest, Server, load_page
+
+PATIENCE_S = 10.0
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    made = Server(0, Newest())
+    thread = threading.Thread(target=made.serve_forever, args=(0.01,))
+    thread.start()
+    yield made
+    made.shutdown()
+    thread.join()
+    made.server_close()
+
+
+def ask(server: Server, path: str = "/", method: str = "GET", **headers: str) -> tuple[int, bytes]:
+    """Status and body."""
+    with closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)) as link:
+        link.putrequest(method, path, skip_host=True)
+        for name, value in {"Host": f"127.0.0.1:{server.server_port}", **headers}.items():
+            link.putheader(name.replace("_", "-"), value)
+        link.endheaders()
+        answer = link.getresponse()
+        return answer.status, answer.read()
+
+
+def opened(server: Server, stack: ExitStack) -> socket.socket:
+    """A page's stream of snapshots, its head read."""
+    link = stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 10))
+    link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    head = b""
+    while b"retry: " not in head:
+        head += link.recv(1)
+        assert not head.startswith(b"HTTP/1.0 503"), head
+    return link
+
+
+def has_ended(link: socket.socket) -> bool:
+    try:
+        return link.recv(1) == b""
+    except ConnectionResetError:
+        return True
+
+
+def events(link: socket.socket) -> Iterator[object]:
+    with link.makefile("rb") as lines:
+        for line in lines:
+            if line.startswith(b"data: "):
+                yield json.loads(line.removeprefix(b"data: "))
+
+
+def test_the_page_comes_whole_and_may_load_nothing(server: Server) -> None:
+    status, body = ask(server)
+    assert status == 200
+    page, policy = load_page()
+    assert body == page
+    assert b"<canvas" in body
+    assert re.findall(rb"(?:https?:)?//[a-z]", body.replace(b"// ", b"")) == []
+    assert policy.startswith("default-src 'none'; ")
+    assert "unsafe" not in policy
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1", "localhost", "LOCALHOST:8377", "localhost:9000", "[::1]:8377"]
+)
+def test_names_of_this_computer_are_answered(server: Server, host: str) -> None:
+    assert ask(server, Host=host)[0] == 200
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *("evil.example", "evil.example:8377", "localhost.evil.example", "127.0.0.1.evil.example"),
+        *("192.168.1.2", "0.0.0.0", "", "localhost:", "localhost:x", "localhost@evil.example"),
+    ],
+)
+def test_another_name_that_leads_here_is_refused(server: Server, host: str) -> None:
+    assert ask(server, Host=host)[0] == 421
+    assert ask(server, "/events", Host=host)[0] == 421
+
+
+def test_two_names_or_none_are_refused(server: Server) -> None:
+    for head in (b"", b"Host: localhost\r\nHost: evil.example\r\n"):
+        with socket.create_connection(("127.0.0.1", server.server_port), 10) as link:
+            link.sendall(b"GET / HTTP/1.1\r\n" + head + b"\r\n")
+            assert link.recv(100).startswith(b"HTTP/1.0 421 ")
+
+
+def test_pages_of_other_sites_are_refused(server: Server) -> None:
+    assert ask(server, "/events", Sec_Fetch_Site="cross-site")[0] == 403
+    assert ask(server, "/events", Sec_Fetch_Site="same-site")[0] == 403
+    assert ask(server, Sec_Fetch_Site="none")[0] == 200
+    assert ask(server, Sec_Fetch_Site="same-origin")[0] == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "HEAD", "CONNECT", "X"])
+def test_whoever_does_more_than_ask_is_refused(server: Server, method: str) -> None:
+    assert ask(server, method=method)[0] == 405
+
+
+@pytest.mark.parametrize("path", ["/other", "/x//", "/../page.html", "/%2e%2e/view.py", "/events/"])
+def test_nothing_else_is_there(server: Server, path: str) -> None:
+    assert ask(server, path)[0] == 404
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [b"\0" * 100, b"GET\r\n\r\n", b"GET / HTTP/9.9\r\n\r\n", b"a" * 70_000, b"\x16\x03\x01" * 9],
+)
+def test_what_is_no_request_ends_the_connection_and_nothing_else(
+    server: Server, sent: bytes
+) -> None:
+    with socket.create_connection(("127.0.0.1", server.server_port), 10) as link:
+        link.sendall(sent)
+        link.shutdown(socket.SHUT_WR)
+        try:
+            while link.recv(4096):
+                pass
+        except ConnectionResetError:
+            pass
+    assert ask(server)[0] == 200
+
+
+def test_it_listens_on_loopback_alone(server: Server) -> None:
+    assert server.server_address[0] == "127.0.0.1"
+
+
+def test_a_page_gets_the_newest_at_once_and_then_all_that_follow(server: Server) -> None:
+    server.newest.put(b'{"n":1}')
+    server.newest.put(b'{"n":2}')
+    with ExitStack() as stack:
+        coming = events(opened(server, stack))
+        assert next(coming) == {"n": 2}
+        for number in range(3, 10):
+            server.newest.put(b'{"n":%d}' % number)
+            assert next(coming) == {"n": number}
+
+
+def test_a_snapshot_is_one_line(server: Server) -> None:
+    seen = View("ipc:///tmp/line\nbreak").snapshot(0)
+    server.newest.put(msgspec.json.encode(seen))
+    with ExitStack() as stack:
+        found = next(events(opened(server, stack)))
+    assert isinstance(found, dict)
+    assert found["endpoint"] == "ipc:///tmp/line\nbreak"
+
+
+def test_a_browser_that_does_not_read_misses_snapshots_and_holds_up_nobody(server: Server) -> None:
+    with ExitStack() as stack:
+        slow, quick = opened(server, stack), events(opened(server, stack))
+        for number in range(2000):
+            server.newest.put(b'{"n":%d,"x":"%s"}' % (number, b"x" * 4000))
+            if number % 100 == 99:
+                while True:
+                    found = next(quick)
+                    assert isinstance(found, dict)
+                    if found["n"] == number:
+                        break
+        server.newest.put(b'{"n":-1}')
+        seen = 0
+        for found in events(slow):
+            assert isinstance(found, dict)
+            if found["n"] == -1:
+                break
+            seen += 1
+        assert seen < 1900  # what the sockets of both sides hold, 8 MB would be all
+
+
+def test_pages_are_limited_and_a_place_becomes_free_again(server: Server) -> None:
+    with ExitStack() as stack:
+        for _ in range(PAGES_MAX):
+            opened(server, stack)
+        assert ask(server, "/events")[0] == 503
+        assert ask(server)[0] == 200
+    server.newest.put(b"{}")
+    deadline_s = time.monotonic() + PATIENCE_S
+    with ExitStack() as stack:
+        while True:
+            server.newest.put(b"{}")
+            try:
+                opened(server, stack)
+            except AssertionError:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.05)
+                continue
+            break
+
+
+def test_connections_are_limited(server: Server) -> None:
+    with ExitStack() as stack:
+        links = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 10))
+            for _ in range(CONNECTIONS_MAX + 1)
+        ]
+        assert has_ended(links[-1])  # one too many: closed at once
+        links[0].sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        assert links[0].recv(12) == b"HTTP/1.0 200"
+
+
+def test_closing_ends_pages_that_wait_and_connections_that_say_nothing() -> None:
+    server = Server(0, Newest())
+    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+    thread.start()
+    with ExitStack() as stack:
+        waiting = opened(server, stack)
+        silent = stack.enter_context(
+            socket.create_connection(("127.0.0.1", server.server_port), PATIENCE_S)
+        )
+        server.newest.put(b"{}")
+        server.shutdown()
+        thread.join()
+        server.server_close()
+        assert list(events(waiting)) in ([], [{}])
+        assert has_ended(silent)

@@ -1,0 +1,125 @@
+"""Messages to watch, and somebody who publishes them for as long as he is asked to."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Self
+
+from daemon.judge.verdict import (
+    OUTCOME_CODE,
+    GateState,
+    Outcome,
+    Reason,
+    State,
+    Status,
+    Tactile,
+    Verdict,
+    encode,
+)
+from daemon.publisher import Publisher
+
+BOOT = "0f0e0d0c0b0a09080706050403020100"
+MS = 1_000_000
+PERIOD_S = 0.02
+
+
+def verdict(seq: int, outcome: Outcome = Outcome.UNKNOWN, **other: Any) -> bytes:  # noqa: ANN401
+    p_slip = {Outcome.STABLE: 0.25, Outcome.SLIP: 0.75, Outcome.UNKNOWN: None}[outcome]
+    content: dict[str, Any] = {
+        "boot_id": BOOT,
+        "seq": seq,
+        "t": 1790000000.0,
+        "t_mono_ns": 123456789012345,
+        "grasp": 7,
+        "verdict": outcome,
+        "verdict_code": OUTCOME_CODE[outcome],
+        "p_slip": p_slip,
+        "valid": p_slip is not None,
+        "reasons": [] if p_slip is not None else [Reason.NO_CONTACT],
+        "age_ms": 0.5,
+        "latency_us": 250.0,
+        "judged": p_slip is not None,
+        "gate": GateState.IDLE if p_slip is None else GateState.JUDGED,
+        "contact": [] if p_slip is None else ["ff", "th"],
+        "silence_ms": 100.0,
+        "model": "small-session",
+        "model_sha": "0123456789ab",
+    }
+    return encode(Verdict(**{**content, **other}))
+
+
+def tactile(seq: int, *counts: list[int], faulty: tuple[int, ...] = ()) -> bytes:
+    """Of the fingers `ff` and `th`; the electrodes of `ff` that are `faulty`, from 0."""
+    faults = [[0] * 24 for _ in counts]
+    for electrode in faulty:
+        faults[0][electrode] = 1
+    return encode(
+        Tactile(
+            boot_id=BOOT,
+            seq=seq,
+            t=1790000000.0,
+            t_mono_ns=123456789012345,
+            fingers=["ff", "th"],
+            counts=list(counts),
+            faults=faults,
+            joints={"FFJ3": 0.5},
+        )
+    )
+
+
+def status(seq: int, **other: Any) -> bytes:  # noqa: ANN401
+    content: dict[str, Any] = {
+        "boot_id": BOOT,
+        "seq": seq,
+        "t": 1790000000.0,
+        "t_mono_ns": 123456789012345,
+        "state": State.RUNNING,
+        "readings_hz": 100.0,
+        "verdicts": {Outcome.STABLE: 3},
+        "reasons": {},
+        "drivers": {"replay": {"readings": 3}},
+        "session_grasps": 12,
+        "session_calibrated": False,
+        "gate": GateState.IDLE,
+        "tared": ["ff", "th"],
+        "health": {"ff_7": Reason.ELECTRODE_DEAD},
+        "latency_us": {"p50": 250.0, "p99": 500.0, "max": 750.0},
+        "model": "small-session",
+        "model_sha": "0123456789ab",
+        "versions": {"graspd": "0.1.0"},
+    }
+    return encode(Status(**{**content, **other}))
+
+
+class Talker:
+    """A daemon that says what it is told, fifty times a second, until the block ends."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.outcome: Outcome | None = Outcome.UNKNOWN
+        """What the verdicts are; none come if None."""
+        self._publisher = Publisher(endpoint)
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._talk)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self._over.set()
+        self._thread.join()
+        self._publisher.close()
+
+    def _talk(self) -> None:
+        seq = 0
+        while not self._over.wait(PERIOD_S):
+            self._publisher.take()
+            outcome = self.outcome
+            if outcome is None:
+                continue
+            pressed = 0 if outcome is Outcome.UNKNOWN else 400
+            counts = [3000 - pressed] * 12 + [3000] * 12
+            self._publisher.send(b"status.right", status(seq))
+            self._publisher.send(b"tactile.right", tactile(seq, counts, counts, faulty=(6,)))
+            self._publisher.send(b"verdict.right", verdict(seq, outcome))
+            seq += 1
