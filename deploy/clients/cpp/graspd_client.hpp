@@ -1,0 +1,548 @@
+// May the hand lift? The newest verdict of a graspd daemon, and `unknown` where there is none.
+//
+// One header to copy: C++17, Linux, cppzmq and nlohmann-json (apt install cppzmq-dev
+// nlohmann-json3-dev, link with -lzmq). The messages are those of deploy/wire/README.md, version 1;
+// the rules are those of ../python/graspd_client.py, step by step.
+//
+//     graspd::Client client({"ipc:///run/graspd/right.ipc"});
+//     if (client.may_i_lift(0.5)) lift();
+//
+// Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that
+// made it. Only `verdict(wait_s)` and `may_i_lift(deadline_s)` wait, and no longer than told.
+#pragma once
+
+#include <algorithm>
+#include <cerrno>
+#include <cmath>
+#include <cstdint>
+#include <ctime>
+#include <deque>
+#include <fstream>
+#include <iterator>
+#include <limits>
+#include <memory>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include <nlohmann/json.hpp>
+#include <zmq_addon.hpp>
+
+namespace graspd {
+
+using Nanoseconds = std::int64_t;
+
+constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not understood
+constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
+// A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected.
+constexpr std::int64_t MESSAGE_MAX_BYTES = 1 << 16;
+constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
+// Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
+constexpr Nanoseconds READ_WITHIN_NS = 5'000'000'000;
+// Longest wait in one piece: so well is it known when a message came from another computer.
+constexpr std::int64_t SLICE_MS = 10;
+// What a message may come from the future by before the clocks are taken for different ones.
+constexpr Nanoseconds CLOCK_SLACK_NS = 1'000'000;
+// By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
+constexpr double DRIFT = 1e-3;
+constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembered as over
+// On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
+constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
+
+enum class Outcome { unknown = 0, stable = 1, slip = 2 };  // as `verdict_code`
+
+inline const char* name(Outcome outcome) {
+    constexpr const char* names[] = {"unknown", "stable", "slip"};
+    return names[static_cast<int>(outcome)];
+}
+
+// What is known of the grasp. True in an `if` exactly when it is stable.
+struct Verdict {
+    Outcome outcome = Outcome::unknown;
+    // Why it is unknown: the daemon's reasons, or one of those in deploy/clients/README.md.
+    std::vector<std::string> reasons;
+    std::optional<double> p_slip;        // probability of slip; none when unknown
+    std::optional<std::int64_t> grasp;   // number of the contact episode
+    std::optional<std::int64_t> seq;
+    std::string boot_id;                 // empty before the first message
+    std::optional<double> age_ms;        // since the reading's last byte, at least
+
+    explicit operator bool() const { return outcome == Outcome::stable; }
+};
+
+// Whether to lift. True in an `if` exactly when the hand may.
+struct LiftAnswer {
+    Verdict verdict;  // what it was decided by; besides its usual reasons `no-answer` and `late`
+    double waited_s = 0.0;
+
+    explicit operator bool() const { return static_cast<bool>(verdict); }
+};
+
+// What came since the start.
+struct Counts {
+    std::int64_t messages = 0;   // new ones of this hand
+    std::uint64_t lost = 0;      // gaps in `seq`, in messages
+    std::int64_t repeats = 0;    // messages that were known already
+    std::int64_t malformed = 0;  // messages that are not understood, answers too
+    std::int64_t restarts = 0;   // times that the daemon was started anew
+    std::int64_t former = 0;     // messages of a start that is over
+};
+
+// The value of `public-key` or `secret-key` in a file that `graspd keys` made.
+// Throws `std::runtime_error`.
+inline std::string load_key(const std::string& path, const std::string& which) {
+    std::ifstream file(path);
+    for (std::string line; std::getline(file, line);) {
+        const auto at = line.find(which + " = \"");
+        const auto from = line.find('"') + 1;
+        const auto to = line.rfind('"');
+        if (at != std::string::npos && to > from) return line.substr(from, to - from);
+    }
+    throw std::runtime_error(path + ": no " + which);
+}
+
+// CURVE keys, Z85: the daemon's public one, and one's own two.
+struct Keys {
+    std::string server, public_key, secret;
+};
+
+struct Options {
+    std::string endpoint;
+    std::string hand = "right";
+    double max_age_ms = 100.0;  // how old a reading may be that a lift relies on
+    std::string ask_endpoint = {};  // `[ask]`; with it `may_i_lift` asks for a judgement as well
+    // Whether the daemon's monotonic clock is one's own. Unless given, it is with ipc:// and on
+    // loopback addresses: say false through a tunnel.
+    std::optional<bool> same_computer = {};
+    std::optional<Keys> keys = {};
+};
+
+namespace detail {
+
+using nlohmann::json;
+
+inline Nanoseconds now_ns() {
+    timespec now{};
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return static_cast<Nanoseconds>(now.tv_sec) * 1'000'000'000 + now.tv_nsec;
+}
+
+inline bool is_same_computer(std::string_view endpoint) {
+    for (const std::string_view local : {"ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"})
+        if (endpoint.substr(0, local.size()) == local) return true;
+    return false;
+}
+
+// What matters of a verdict message.
+struct Message {
+    std::string boot_id;
+    std::int64_t seq = 0, grasp = 0;
+    Outcome outcome = Outcome::unknown;
+    std::optional<double> p_slip;
+    std::vector<std::string> reasons;
+    Nanoseconds read_ns = 0;       // by the daemon's clock: when the reading's last byte came ...
+    Nanoseconds published_ns = 0;  // ... and when the message went out
+    Nanoseconds silence_ns = 0;
+};
+
+struct Malformed {};
+
+inline const json& field(const json& told, const char* name) {
+    const auto found = told.find(name);
+    if (found == told.end()) throw Malformed{};
+    return *found;
+}
+
+inline std::int64_t integer(const json& told, const char* name) {
+    const json& value = field(told, name);
+    if (!value.is_number_integer()) throw Malformed{};
+    if (value.is_number_unsigned() && value.get<std::uint64_t>() > INTEGER_MAX) throw Malformed{};
+    const auto number = value.get<std::int64_t>();
+    if (number < 0) throw Malformed{};
+    return number;
+}
+
+inline double number(const json& told, const char* name, double most) {
+    const json& value = field(told, name);
+    if (!value.is_number()) throw Malformed{};
+    const auto number = value.get<double>();
+    if (!(number >= 0.0 && number <= most)) throw Malformed{};
+    return number;
+}
+
+inline Nanoseconds milliseconds(const json& told, const char* name) {
+    return std::llrint(number(told, name, 1e12) * 1e6);  // at most thirty years
+}
+
+inline std::string text(const json& value) {
+    if (!value.is_string()) throw Malformed{};
+    return value.get<std::string>();
+}
+
+inline Message message(const json& told) {
+    Message found;
+    const auto code = integer(told, "verdict_code");
+    if (code > 2 || text(field(told, "verdict")) != name(static_cast<Outcome>(code)))
+        throw Malformed{};
+    found.outcome = static_cast<Outcome>(code);
+    const bool known = found.outcome != Outcome::unknown;
+    const json& valid = field(told, "valid");
+    if (!valid.is_boolean() || valid.get<bool>() != known) throw Malformed{};
+    if (field(told, "p_slip").is_null() == known) throw Malformed{};
+    if (known) found.p_slip = number(told, "p_slip", 1.0);
+    const json& reasons = field(told, "reasons");
+    if (!reasons.is_array() || reasons.empty() != known) throw Malformed{};
+    for (const json& reason : reasons) found.reasons.push_back(text(reason));
+    found.boot_id = text(field(told, "boot_id"));
+    found.seq = integer(told, "seq");
+    found.grasp = integer(told, "grasp");
+    found.read_ns = integer(told, "t_mono_ns");
+    found.published_ns = found.read_ns + milliseconds(told, "age_ms");
+    found.silence_ns = milliseconds(told, "silence_ms");
+    return found;
+}
+
+// A verdict message, or why it is none: `malformed` or `version`.
+inline std::pair<std::optional<Message>, std::string> read(std::string_view payload) {
+    if (payload.empty() || payload.front() == '\xEF') return {std::nullopt, "malformed"};  // BOM
+    const json told = json::parse(payload, nullptr, false);
+    if (!told.is_object()) return {std::nullopt, "malformed"};
+    try {
+        if (integer(told, "v") != VERSION) return {std::nullopt, "version"};
+        return {message(told), ""};
+    } catch (const Malformed&) {
+        return {std::nullopt, "malformed"};
+    }
+}
+
+// What the newest message says; no socket and no clock of its own.
+class Newest {
+public:
+    Newest(std::string topic, Nanoseconds max_age_ns, bool same_computer)
+        : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer) {}
+
+    Counts counts;
+
+    // Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
+    // Whether it is a new one. A repeated one is not; one that is not understood is.
+    bool take(const std::vector<std::string_view>& frames, Nanoseconds empty_ns,
+              Nanoseconds now_ns) {
+        if (frames.empty() || frames[0] != topic_) return false;
+        auto [found, why] = frames.size() == 2
+            ? read(frames[1]) : std::pair(std::optional<Message>{}, std::string("malformed"));
+        if (!found) {
+            ++counts.malformed;
+            message_.reset();
+            why_ = why;
+            return true;
+        }
+        if (!is_new(*found)) return false;
+        ++counts.messages;
+        published_ns_ = same_computer_ ? found->published_ns
+                                       : by_arrival(found->published_ns, empty_ns, now_ns);
+        message_ = std::move(found);
+        return true;
+    }
+
+    // What is known at a time (own clock).
+    Verdict at(Nanoseconds now_ns) const {
+        if (!message_) return {Outcome::unknown, {why_}, {}, {}, {}, {}, {}};
+        const Nanoseconds age_ns = published_ns_ ? now_ns - *published_ns_ : 0;
+        const Nanoseconds reading_age_ns = age_ns + message_->published_ns - message_->read_ns;
+        const bool known = message_->outcome != Outcome::unknown;
+        std::vector<std::string> reasons = message_->reasons;
+        if (!published_ns_) reasons = {"joining"};
+        else if (age_ns < -CLOCK_SLACK_NS) reasons = {"clock"};
+        else if (age_ns > message_->silence_ns) reasons = {"silent"};
+        else if (known && reading_age_ns > max_age_ns_) reasons = {"stale"};
+        const bool unknown = !reasons.empty();
+        return {unknown ? Outcome::unknown : message_->outcome,
+                std::move(reasons),
+                unknown ? std::nullopt : message_->p_slip,
+                message_->grasp,
+                message_->seq,
+                message_->boot_id,
+                static_cast<double>(reading_age_ns) / 1e6};
+    }
+
+    // An answer; none if it is not understood.
+    std::optional<Message> answered(std::string_view payload) {
+        auto found = read(payload).first;
+        if (!found) ++counts.malformed;
+        return found;
+    }
+
+private:
+    bool is_former(const std::string& boot_id) const {
+        return std::find(former_.begin(), former_.end(), boot_id) != former_.end();
+    }
+
+    bool is_new(const Message& found) {
+        if (boot_id_ != found.boot_id) {
+            if (is_former(found.boot_id)) return ++counts.former, false;
+            if (boot_id_) {
+                former_.push_back(*boot_id_);
+                if (former_.size() > FORMER_MAX) former_.pop_front();
+                ++counts.restarts;
+            }
+            boot_id_ = found.boot_id;
+            seq_ = found.seq;
+            best_.reset();
+            return true;
+        }
+        if (found.seq <= seq_) return ++counts.repeats, false;
+        counts.lost += static_cast<std::uint64_t>(found.seq - seq_ - 1);
+        seq_ = found.seq;
+        return true;
+    }
+
+    // When a message went out, by one's own clock: what it took longer than the fastest is age.
+    // None for the first: it may have been kept for those who come late.
+    std::optional<Nanoseconds> by_arrival(Nanoseconds published_ns, Nanoseconds empty_ns,
+                                          Nanoseconds now_ns) {
+        const std::pair here{now_ns - published_ns, now_ns};
+        if (!best_) {
+            best_ = here;
+            return std::nullopt;
+        }
+        const auto [best_ns, at_ns] = *best_;
+        const Nanoseconds late_ns =
+            here.first - best_ns - std::llrint(static_cast<double>(now_ns - at_ns) * DRIFT);
+        if (late_ns <= 0) best_ = here;
+        return std::min(empty_ns, now_ns - std::max<Nanoseconds>(late_ns, 0));
+    }
+
+    std::string topic_;
+    Nanoseconds max_age_ns_;
+    bool same_computer_;
+    std::optional<Message> message_;
+    std::optional<Nanoseconds> published_ns_;  // of the message, by one's own clock, not later
+    std::string why_ = "no-message";
+    std::optional<std::string> boot_id_;
+    std::int64_t seq_ = -1;
+    std::deque<std::string> former_;
+    std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
+};
+
+// The sockets.
+class Link {
+public:
+    explicit Link(const Options& options)
+        : options_(options), socket_(connected(zmq::socket_type::sub, options.endpoint)) {}
+
+    // The next message, if one waits.
+    bool receive(std::vector<zmq::message_t>& frames) { return received(socket_, frames); }
+
+    // Until a message or an answer waits, so long at most; a signal ends it sooner.
+    void wait(std::int64_t timeout_ms) {
+        zmq_pollitem_t items[] = {{socket_.handle(), 0, ZMQ_POLLIN, 0},
+                                  {asking_.handle(), 0, ZMQ_POLLIN, 0}};
+        zmq_poll(items, asking_ ? 2 : 1, static_cast<long>(timeout_ms));
+    }
+
+    // Connect anew, and forget what waits.
+    void renew() {
+        socket_.close();
+        socket_ = connected(zmq::socket_type::sub, options_.endpoint);
+    }
+
+    // Ask; before the answer is there, not again.
+    void ask() {
+        if (!asking_) asking_ = connected(zmq::socket_type::dealer, options_.ask_endpoint);
+        asking_.send(zmq::str_buffer("judge"), zmq::send_flags::dontwait);
+    }
+
+    // The answer, if it is there; empty if it is none.
+    std::optional<std::string> answer() {
+        std::vector<zmq::message_t> frames;
+        if (!asking_ || !received(asking_, frames)) return std::nullopt;
+        return frames.size() == 1 ? frames[0].to_string() : std::string();
+    }
+
+    // An answer that is late must not be taken for one to the next question.
+    void hang_up() {
+        asking_.close();
+        asking_ = zmq::socket_t();
+    }
+
+private:
+    zmq::socket_t connected(zmq::socket_type kind, const std::string& endpoint) {
+        zmq::socket_t made(context_, kind);
+        made.set(zmq::sockopt::linger, 0);
+        made.set(zmq::sockopt::rcvhwm, QUEUE_MAX);
+        made.set(zmq::sockopt::maxmsgsize, MESSAGE_MAX_BYTES);
+        if (options_.keys) {
+            made.set(zmq::sockopt::curve_serverkey, options_.keys->server);
+            made.set(zmq::sockopt::curve_publickey, options_.keys->public_key);
+            made.set(zmq::sockopt::curve_secretkey, options_.keys->secret);
+        }
+        if (endpoint.rfind("tcp://", 0) == 0) {
+            made.set(zmq::sockopt::heartbeat_ivl, HEARTBEAT_MS);
+            made.set(zmq::sockopt::heartbeat_timeout, HEARTBEAT_TIMEOUT_MS);
+        }
+        if (kind == zmq::socket_type::sub)
+            made.set(zmq::sockopt::subscribe, "verdict." + options_.hand);
+        made.connect(endpoint);
+        return made;
+    }
+
+    static bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames) {
+        frames.clear();
+        try {
+            return zmq::recv_multipart(socket, std::back_inserter(frames),
+                                       zmq::recv_flags::dontwait).has_value();
+        } catch (const zmq::error_t& error) {
+            if (error.num() != EINTR) throw;  // a signal; there will be another look
+            return false;
+        }
+    }
+
+    Options options_;
+    zmq::context_t context_;
+    zmq::socket_t socket_, asking_;
+};
+
+// Whether the message that is the answer is still to come.
+inline bool is_behind(const Verdict& newest, const Message& answer) {
+    return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < answer.seq;
+}
+
+// One question at a time, until the newest message confirms a stable answer.
+class Question {
+public:
+    Question(Newest& newest, Link& link) : newest_(newest), link_(link) {}
+    Question(const Question&) = delete;
+    Question& operator=(const Question&) = delete;
+    ~Question() { link_.hang_up(); }
+
+    // The newest message, if it confirms the answer; unknown otherwise. Asks if need be.
+    Verdict decided(Verdict newest) {
+        if (const auto payload = asked_ ? link_.answer() : std::nullopt) {
+            asked_ = false;
+            stable_ = newest_.answered(*payload);
+            if (stable_ && stable_->outcome == Outcome::slip)
+                return {Outcome::slip, {}, stable_->p_slip, stable_->grasp,
+                        stable_->seq,  stable_->boot_id, {}};
+            if (stable_ && stable_->outcome != Outcome::stable) stable_.reset();
+        }
+        if (stable_ && !is_behind(newest, *stable_)) {
+            if (newest && newest.grasp == stable_->grasp) return newest;
+            stable_.reset();
+        }
+        if (!asked_ && !stable_) {
+            link_.ask();
+            asked_ = true;
+        }
+        if (newest.reasons.empty()) newest.reasons = {"no-answer"};
+        newest.outcome = Outcome::unknown;
+        newest.p_slip.reset();
+        return newest;
+    }
+
+private:
+    Newest& newest_;
+    Link& link_;
+    bool asked_ = false;
+    std::optional<Message> stable_;  // the answer that is to be confirmed
+};
+
+}  // namespace detail
+
+// Subscribes to the verdicts of one hand. Use it in one thread.
+class Client {
+public:
+    // Throws `zmq::error_t` for an endpoint that is none, `std::invalid_argument` for such an age.
+    explicit Client(const Options& options)
+        : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
+                  options.same_computer.value_or(detail::is_same_computer(options.endpoint))),
+          link_(options), asks_(!options.ask_endpoint.empty()) {}
+
+    const Counts& counts() const { return newest_.counts; }
+
+    // The newest verdict; waits at most `wait_s` seconds for a new message.
+    Verdict verdict(double wait_s = 0.0) {
+        const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
+        while (!drain() && wait(due_ns)) {}
+        if (behind_) return {Outcome::unknown, {"behind"}, {}, {}, {}, {}, {}};
+        return newest_.at(detail::now_ns());
+    }
+
+    // Whether the current grasp is stable, known within `deadline_s` seconds from now.
+    //
+    // Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
+    // answer and the newest message of the same grasp must both say so; an unknown answer is asked
+    // for again. Whatever else happens until the deadline is a no.
+    LiftAnswer may_i_lift(double deadline_s) {
+        const Nanoseconds began_ns = detail::now_ns();
+        const Nanoseconds due_ns = began_ns + duration_ns(deadline_s);
+        std::optional<detail::Question> question;
+        if (asks_) question.emplace(newest_, link_);
+        const auto decide = [&] { return question ? question->decided(verdict()) : verdict(); };
+        Verdict decided = decide();
+        while (decided.outcome == Outcome::unknown && wait(due_ns)) {
+            decided = decide();
+            if (detail::now_ns() > due_ns && decided) {
+                decided.outcome = Outcome::unknown;
+                decided.reasons = {"late"};
+                decided.p_slip.reset();
+            }
+        }
+        const auto waited_ns = static_cast<double>(detail::now_ns() - began_ns);
+        return {std::move(decided), waited_ns / 1e9};
+    }
+
+private:
+    static Nanoseconds age_ns(double max_age_ms) {
+        if (!(max_age_ms > 0.0)) throw std::invalid_argument("max_age_ms must be above 0");
+        return duration_ns(max_age_ms / 1e3);
+    }
+
+    static Nanoseconds duration_ns(double seconds) {
+        if (!(seconds >= 0.0 && seconds <= 1e9))
+            throw std::invalid_argument("a time must be 0 s or more, and finite");
+        return std::llrint(seconds * 1e9);
+    }
+
+    // Read all that waits, without waiting; whether there was anything new.
+    bool drain() {
+        bool anything_new = false;
+        if (detail::now_ns() - read_ns_ > READ_WITHIN_NS) {
+            link_.renew();
+            empty_ns_ = detail::now_ns();
+        }
+        behind_ = true;
+        for (int taken = 0; behind_ && taken < QUEUE_MAX; ++taken) {
+            const Nanoseconds before_ns = detail::now_ns();
+            if (link_.receive(frames_)) {
+                std::vector<std::string_view> views;
+                for (const zmq::message_t& frame : frames_) views.push_back(frame.to_string_view());
+                anything_new |= newest_.take(views, empty_ns_, detail::now_ns());
+            } else {
+                empty_ns_ = before_ns;
+                behind_ = false;
+            }
+        }
+        read_ns_ = detail::now_ns();
+        return anything_new;
+    }
+
+    // Wait for a message, but not for long; false when it is time to end.
+    bool wait(Nanoseconds due_ns) {
+        const Nanoseconds left_ns = due_ns - detail::now_ns();
+        if (left_ns <= 0) return false;
+        link_.wait(std::min<std::int64_t>(left_ns / 1'000'000, SLICE_MS));
+        return true;
+    }
+
+    detail::Newest newest_;
+    detail::Link link_;
+    bool asks_;
+    bool behind_ = false;
+    Nanoseconds read_ns_ = detail::now_ns(), empty_ns_ = read_ns_;
+    std::vector<zmq::message_t> frames_;
+};
+
+}  // namespace graspd

@@ -1,0 +1,63 @@
+// Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not.
+//
+//     lift_gate ENDPOINT DEADLINE_S [ASK_ENDPOINT]    one question
+//     lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]
+//                                                     each change of the verdict, until it is killed
+#include "graspd_client.hpp"
+
+#include <iostream>
+
+namespace {
+
+void print(const graspd::Verdict& verdict, const graspd::Counts& counts) {
+    std::cout << graspd::name(verdict.outcome) << " [";
+    for (const std::string& reason : verdict.reasons) std::cout << ' ' << reason;
+    std::cout << " ] grasp " << verdict.grasp.value_or(0) << " boot " << verdict.boot_id << " lost "
+              << counts.lost << std::endl;
+}
+
+int watch(const graspd::Options& options) {
+    graspd::Client client(options);
+    for (graspd::Verdict former, now;; former = now) {
+        now = client.verdict(0.02);
+        if (now.outcome != former.outcome || now.reasons != former.reasons ||
+            now.boot_id != former.boot_id)
+            print(now, client.counts());
+    }
+}
+
+int ask(const graspd::Options& options, double deadline_s) {
+    graspd::Client client(options);
+    const graspd::LiftAnswer answer = client.may_i_lift(deadline_s);
+    print(answer.verdict, client.counts());
+    std::cout << (answer ? "lift" : "do not lift") << " after " << answer.waited_s << " s\n";
+    return answer ? 0 : 1;
+}
+
+}  // namespace
+
+int main(int count, char** given) {
+    const std::vector<std::string> words(given + 1, given + count);
+    graspd::Options options;
+    try {
+        if (!words.empty() && words[0] == "--watch" && (words.size() == 2 || words.size() == 4)) {
+            options.endpoint = words[1];
+            if (words.size() == 4)
+                options.keys = graspd::Keys{graspd::load_key(words[2], "public-key"),
+                                            graspd::load_key(words[3], "public-key"),
+                                            graspd::load_key(words[3], "secret-key")};
+            return watch(options);
+        }
+        if (words.size() == 2 || words.size() == 3) {
+            options.endpoint = words[0];
+            if (words.size() == 3) options.ask_endpoint = words[2];
+            return ask(options, std::stod(words[1]));
+        }
+    } catch (const std::exception& error) {
+        std::cerr << "lift_gate: " << error.what() << '\n';
+        return 2;
+    }
+    std::cerr << "lift_gate ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
+                 "lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]\n";
+    return 2;
+}

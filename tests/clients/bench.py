@@ -1,0 +1,94 @@
+"""A real daemon for the clients' tests: a hand that holds on, for as long as the test lasts."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+from drivers.replay import DEMO_RECORDING, DEMO_TABLE
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
+
+PATIENCE_S = 45.0
+REST, GRASP = slice(0, 160), slice(1484, 1770)
+"""Rows of the demo recording: the open hand, and a whole grasp that is stable."""
+RATE_HZ = 100
+
+
+class Daemon:
+    """`graspd run`, with sockets in a folder."""
+
+    def __init__(
+        self,
+        folder: Path,
+        more: str = "",
+        *,
+        whole_grasps: bool = False,
+        endpoint: str | None = None,
+    ) -> None:
+        """Judges each row of the demo table; with `whole_grasps`, one from touch to lift.
+
+        `more` is what else there is in the scene, from `[tactile]` on.
+        """
+        self.endpoint = endpoint or f"ipc://{folder}/graspd"
+        self.latest_endpoint = f"ipc://{folder}/latest"
+        self.ask_endpoint = f"ipc://{folder}/ask"
+        self._folder = folder
+        self._scene = folder / "scene.toml"
+        recording = _one_grasp(folder / "grasp.csv") if whole_grasps else DEMO_TABLE
+        self._scene.write_text(
+            f'[publish]\nendpoint = "{self.endpoint}"\n'
+            f'latest_endpoint = "{self.latest_endpoint}"\n[ask]\nendpoint = "{self.ask_endpoint}"\n'
+            f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\nloop = true\n{more}'
+        )
+        self.start()
+
+    def start(self) -> None:
+        """Start it, and wait until it can be heard."""
+        bound = self._folder / "latest"
+        bound.unlink(missing_ok=True)
+        self._process = start("run", self._scene)
+        wait_for(bound)
+
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        os.kill(self._process.pid, number)
+
+    def kill(self) -> None:
+        """End it without a word."""
+        self._process.kill()
+        self._process.communicate(timeout=TIMEOUT_S)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.kill()
+
+
+def _one_grasp(path: Path) -> Path:
+    """Write a recording of a grasp that is stable, so that nobody waits for it."""
+    head, *rows = DEMO_RECORDING.read_text().splitlines()
+    kept = [row.partition(",")[2] for row in rows[REST] + rows[GRASP]]
+    lines = [f"{number / RATE_HZ},{row}" for number, row in enumerate(kept)]
+    path.write_text("\n".join([head, *lines, ""]))
+    return path
+
+
+def free_endpoint() -> str:
+    """A place on the loopback address that nobody has just now."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return f"tcp://127.0.0.1:{found.getsockname()[1]}"
+
+
+def until(wanted: Callable[[], bool], patience_s: float = PATIENCE_S) -> float:
+    """Look until it is so; seconds that it took."""
+    began_s = time.monotonic()
+    while not wanted():
+        assert time.monotonic() - began_s < patience_s, "it did not come"
+    return time.monotonic() - began_s

@@ -1,0 +1,121 @@
+"""Verdict messages for the clients' tests: as deploy/wire/README.md has them, and broken ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from hypothesis import strategies as st
+
+TOPIC = b"verdict.right"
+MS = 1_000_000
+"""In ns."""
+NEEDED = (
+    "v", "boot_id", "seq", "t_mono_ns", "grasp", "verdict", "verdict_code", "p_slip", "valid",
+    "reasons", "age_ms", "silence_ms",
+)  # fmt: skip
+"""Fields that a lift relies on."""
+
+
+def verdict(
+    seq: int = 0,
+    read_ns: int = 0,
+    outcome: str = "stable",
+    *,
+    boot_id: str = "a",
+    grasp: int = 1,
+    age_ms: float = 1.0,
+    silence_ms: float = 100.0,
+) -> dict[str, Any]:
+    """A message as the daemon makes it."""
+    known = outcome != "unknown"
+    return {
+        "v": 1,
+        "boot_id": boot_id,
+        "seq": seq,
+        "t": 1.7e9,
+        "t_mono_ns": read_ns,
+        "grasp": grasp,
+        "verdict": outcome,
+        "verdict_code": {"unknown": 0, "stable": 1, "slip": 2}[outcome],
+        "p_slip": 0.125 if known else None,
+        "valid": known,
+        "reasons": [] if known else ["moving"],
+        "age_ms": age_ms,
+        "latency_us": 300.0,
+        "silence_ms": silence_ms,
+        "model": "small-session",
+        "model_sha": "0123456789ab",
+        "of_a_later_version": [1.5],
+    }
+
+
+def frames(message: dict[str, Any]) -> list[bytes]:
+    """As they come from the socket."""
+    return [TOPIC, json.dumps(message).encode()]
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something comes, and then time passes."""
+
+    frames: list[bytes]
+    wait_ns: int
+
+
+_anything = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-3, 3),
+    st.sampled_from([1e12, 1.1e12, 2**60, 2**60 + 1, 2**63, 2**64, -1]),
+    st.floats(),
+    st.sampled_from(["", "stable", "slip", "unknown", "b"]),
+    st.lists(st.sampled_from(["moving", "", "x"]), max_size=2),
+    st.dictionaries(st.just("x"), st.integers(0, 1)),
+)
+
+
+@st.composite
+def events(draw: st.DrawFn, broken: bool = True) -> list[Event]:
+    """What may come in a while that begins at 1 s; times of readings are those of one clock."""
+    now_ns = 1000 * MS
+    seqs = {"a": 0, "b": 0, "c": 0}
+    found = []
+    for _ in range(draw(st.integers(1, 12))):
+        boot_id = draw(st.sampled_from("aaaabc"))
+        seqs[boot_id] += draw(st.sampled_from([1, 1, 1, 0, -1, 3]))
+        seq = max(seqs[boot_id], 0)
+        age_ms = draw(st.sampled_from([0, 1, 1, 1, 60, 120, 300]))
+        behind_ns = draw(st.sampled_from([0, 0, 0, 30, 90, 110, -10])) * MS
+        message = verdict(
+            seq,
+            max(now_ns - behind_ns - age_ms * MS, 0),
+            draw(st.sampled_from(["stable"] * 4 + ["slip", "unknown"])),
+            boot_id=boot_id,
+            grasp=draw(st.integers(1, 2)),
+            age_ms=age_ms,
+            silence_ms=draw(st.sampled_from([100, 100, 20])),
+        )
+        sent = draw(_spoiled(message)) if broken and draw(st.booleans()) else frames(message)
+        wait_ns = draw(st.sampled_from([0, 1, 10, 10, 40, 100, 101, 250])) * MS
+        found.append(Event(sent, wait_ns))
+        now_ns += wait_ns
+    return found
+
+
+@st.composite
+def _spoiled(draw: st.DrawFn, message: dict[str, Any]) -> list[bytes]:
+    name = draw(st.sampled_from(NEEDED))
+    kind = draw(st.sampled_from(["field", "field", "field", "gone", "cut", "noise", "frames"]))
+    if kind == "field":
+        return frames(message | {name: draw(_anything)})
+    if kind == "gone":
+        return frames({key: value for key, value in message.items() if key != name})
+    topic, payload = frames(message)
+    if kind == "cut":
+        return [topic, payload[: draw(st.integers(0, len(payload) - 1))]]
+    if kind == "noise":
+        return [topic, draw(st.binary(max_size=30))]
+    others = [[topic], [], [topic, payload, b""], [b"verdict.right2", payload], [b"", payload]]
+    return draw(st.sampled_from(others))

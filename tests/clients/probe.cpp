@@ -1,0 +1,54 @@
+// The C++ client's rules, line by line, for comparison with the Python client's.
+//
+// `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
+// takes a message; `at NOW_NS` answers with a line.
+#include "graspd_client.hpp"
+
+#include <iostream>
+#include <sstream>
+
+namespace {
+
+std::string unhexed(const std::string& text) {
+    std::string bytes;
+    for (std::size_t i = 0; i + 1 < text.size(); i += 2)
+        bytes.push_back(static_cast<char>(std::stoi(text.substr(i, 2), nullptr, 16)));
+    return bytes;
+}
+
+void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
+    std::cout << graspd::name(verdict.outcome) << ' ' << verdict.reasons.size();
+    for (const std::string& reason : verdict.reasons) std::cout << ' ' << reason;
+    std::cout << ' ' << verdict.grasp.value_or(-1) << ' ' << verdict.seq.value_or(-1) << ' '
+              << (verdict.boot_id.empty() ? "-" : verdict.boot_id) << ' '
+              << std::llrint(verdict.age_ms.value_or(-1) * 1e6) << ' ' << counts.messages << ' '
+              << counts.lost << ' ' << counts.repeats << ' ' << counts.malformed << ' '
+              << counts.restarts << ' ' << counts.former << std::endl;
+}
+
+}  // namespace
+
+int main() {
+    graspd::detail::Newest newest("verdict.right", 0, true);
+    for (std::string line; std::getline(std::cin, line);) {
+        std::istringstream words(line);
+        std::string order;
+        words >> order;
+        if (order == "new") {
+            graspd::Nanoseconds max_age_ns = 0;
+            bool same_computer = false;
+            words >> max_age_ns >> same_computer;
+            newest = graspd::detail::Newest("verdict.right", max_age_ns, same_computer);
+        } else if (order == "take") {
+            graspd::Nanoseconds empty_ns = 0, now_ns = 0;
+            words >> empty_ns >> now_ns;
+            std::vector<std::string> frames;
+            for (std::string frame; words >> frame;) frames.push_back(unhexed(frame));
+            newest.take({frames.begin(), frames.end()}, empty_ns, now_ns);
+        } else {
+            graspd::Nanoseconds now_ns = 0;
+            words >> now_ns;
+            say(newest.at(now_ns), newest.counts);
+        }
+    }
+}

@@ -1,0 +1,132 @@
+"""The Python client against daemons in processes of their own."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon.keys import make
+from deploy.clients.python import graspd_client
+from deploy.clients.python.graspd_client import Graspd, Keys
+from tests.clients.bench import PATIENCE_S, Daemon, free_endpoint, until
+
+SILENCE_S = 0.1
+"""`silence_ms` of a daemon at 100 Hz with the default age limit."""
+
+
+def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_path: Path) -> None:
+    with (
+        Daemon(tmp_path, whole_grasps=True) as daemon,
+        Graspd(daemon.endpoint) as listening,
+        Graspd(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asking,
+        Graspd(daemon.endpoint, ask_endpoint=f"{daemon.ask_endpoint}.nobody") as unanswered,
+    ):
+        assert listening.may_i_lift(0.0).verdict.reasons == ("no-message",)
+        until(lambda: bool(asking.may_i_lift(0.5)))
+        assert listening.verdict(0.1)
+        answer = unanswered.may_i_lift(0.2)
+        assert (bool(answer), answer.verdict.reasons) == (False, ("no-answer",))
+        assert answer.waited_s >= 0.2
+        for client in (listening, asking):
+            assert client.counts.messages > 0
+            assert client.counts.malformed == 0
+
+
+def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Graspd(daemon.endpoint) as graspd:
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        daemon.send(signal.SIGSTOP)
+        time.sleep(SILENCE_S)
+        silent = graspd.verdict()
+        answer = graspd.may_i_lift(0.2)
+        daemon.send(signal.SIGCONT)
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+    assert silent.reasons == ("silent",)
+    assert (bool(answer), answer.verdict.reasons) == (False, ("silent",))
+
+
+def test_a_new_start_forgets_the_former(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Graspd(daemon.endpoint) as graspd:
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        former = graspd.verdict(0.1)
+        daemon.kill()
+        daemon.start()
+        until(lambda: graspd.verdict(0.1).boot_id not in (None, former.boot_id))
+        assert graspd.counts.restarts == 1
+        assert graspd.counts.malformed == 0
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+
+
+def test_messages_that_are_lost_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(graspd_client, "READ_WITHIN_NS", 200_000_000)
+    with Daemon(tmp_path) as daemon, Graspd(daemon.endpoint) as graspd:
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        before = graspd.counts.lost
+        seq = graspd.verdict().seq
+        time.sleep(0.5)  # longer than it may be without reading: what came is given up
+        until(lambda: graspd.verdict(0.1).seq != seq)
+        assert graspd.counts.lost > before
+
+
+@pytest.mark.parametrize(
+    "fault",
+    ["garbage_probability = 1.0", "delayed_s = 0.3", "off_from = 0", "stuck_from = 1"],
+)
+def test_a_sensor_that_is_broken_lifts_nothing(tmp_path: Path, fault: str) -> None:
+    with (
+        Daemon(tmp_path, f"[tactile.faults]\n{fault}\n") as daemon,
+        Graspd(daemon.endpoint) as graspd,
+    ):
+        until(lambda: graspd.verdict(0.1) is not None and graspd.counts.messages > 5)
+        answer = graspd.may_i_lift(0.3)
+    assert not answer
+    assert answer.verdict.reasons
+
+
+def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    with (
+        Daemon(tmp_path, endpoint=endpoint),
+        Graspd(endpoint, same_computer=False) as graspd,
+    ):
+        until(lambda: bool(graspd.may_i_lift(1.0)))
+        assert graspd.counts.lost == 0
+
+
+def test_only_who_has_keys_is_told(tmp_path: Path) -> None:
+    public, secret = make(tmp_path, "daemon")
+    own_public, own_secret = make(tmp_path / "clients", "lab")
+    endpoint = free_endpoint()
+    curve = f'[curve]\nsecret_key = "{secret}"\nclients = "{own_public.parent}"\n'
+    with (
+        Daemon(tmp_path, curve, endpoint=endpoint),
+        Graspd(endpoint, keys=Keys.load(public, own_secret)) as admitted,
+        Graspd(endpoint) as stranger,
+    ):
+        until(lambda: admitted.verdict(0.1).p_slip is not None)
+        assert stranger.verdict(0.2).reasons == ("no-message",)
+    with pytest.raises(ValueError, match="no secret key"):
+        Keys.load(public, own_public)
+
+
+def test_the_latest_endpoint_is_no_place_for_this_client(tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, Graspd(daemon.latest_endpoint) as graspd:
+        assert graspd.verdict(0.5).reasons == ("no-message",)
+
+
+def test_an_endpoint_that_is_none_leaves_nothing_behind() -> None:
+    with pytest.raises(zmq.ZMQError):
+        Graspd("nowhere")
+
+
+def test_waiting_ends_when_it_is_told_to(tmp_path: Path) -> None:
+    with Graspd(f"ipc://{tmp_path}/nobody") as graspd:
+        began_s = time.monotonic()
+        assert graspd.verdict(0.2).reasons == ("no-message",)
+        assert 0.2 <= time.monotonic() - began_s < PATIENCE_S

@@ -1,0 +1,111 @@
+"""The C++ client against daemons in processes of their own."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from daemon.keys import make
+from tests.clients.bench import Daemon, free_endpoint
+
+MAY, MAY_NOT, WRONG = 0, 1, 2
+"""Exit codes of `lift_gate`."""
+
+
+def asked(lift_gate: Path, *words: object) -> tuple[int, str]:
+    """Exit code and output of one question."""
+    result = subprocess.run(
+        [lift_gate, *map(str, words)], capture_output=True, text=True, timeout=50, check=False
+    )
+    return result.returncode, result.stdout + result.stderr
+
+
+@contextmanager
+def watching(lift_gate: Path, *words: str | Path) -> Iterator[subprocess.Popen[str]]:
+    """`lift_gate --watch`, as long as the block lasts."""
+    command = [lift_gate, "--watch", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def line_with(process: subprocess.Popen[str], *wanted: str) -> list[str]:
+    """Words of the next line with one of these."""
+    assert process.stdout is not None
+    while True:
+        words = process.stdout.readline().split()
+        assert words, "it has ended"
+        if set(wanted) & set(words):
+            return words
+
+
+def boot_id(words: list[str]) -> str:
+    return words[words.index("boot") + 1]
+
+
+def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(
+    lift_gate: Path, tmp_path: Path
+) -> None:
+    with Daemon(tmp_path, whole_grasps=True) as daemon:
+        for ask in ([daemon.ask_endpoint], []):
+            code, text = MAY_NOT, ""
+            while code == MAY_NOT:
+                code, text = asked(lift_gate, daemon.endpoint, 1.0, *ask)
+                assert text.startswith("stable") == (code == MAY) == ("\nlift after" in text)
+            assert code == MAY, text
+
+
+def test_nobody_there_is_no_at_the_deadline(lift_gate: Path, tmp_path: Path) -> None:
+    began_s = time.monotonic()
+    code, text = asked(lift_gate, f"ipc://{tmp_path}/nobody", 0.3)
+    assert time.monotonic() - began_s >= 0.3
+    assert (code, text.startswith("unknown [ no-message ]")) == (MAY_NOT, True)
+
+
+def test_stopped_restarted_and_slow_it_says_so(lift_gate: Path, tmp_path: Path) -> None:
+    with Daemon(tmp_path) as daemon, watching(lift_gate, daemon.endpoint) as watch:
+        former = boot_id(line_with(watch, "stable", "slip"))
+        daemon.send(signal.SIGSTOP)
+        line_with(watch, "silent")
+        daemon.send(signal.SIGCONT)
+        line_with(watch, "stable", "slip")
+        daemon.kill()
+        line_with(watch, "silent")
+        daemon.start()
+        words = line_with(watch, "stable", "slip")
+        assert boot_id(words) != former
+        assert words[-2:] == ["lost", "0"]
+        watch.send_signal(signal.SIGSTOP)
+        time.sleep(5.5)  # longer than it may be without reading
+        watch.send_signal(signal.SIGCONT)
+        while line_with(watch, "stable", "slip")[-1] == "0":
+            pass
+
+
+def test_only_who_has_keys_is_told(lift_gate: Path, tmp_path: Path) -> None:
+    public, secret = make(tmp_path, "daemon")
+    own_public, own_secret = make(tmp_path / "clients", "lab")
+    endpoint = free_endpoint()
+    curve = f'[curve]\nsecret_key = "{secret}"\nclients = "{own_public.parent}"\n'
+    with Daemon(tmp_path, curve, endpoint=endpoint):
+        with watching(lift_gate, endpoint, public, own_secret) as watch:
+            line_with(watch, "stable", "slip")
+        code, text = asked(lift_gate, endpoint, 0.3)
+    assert (code, text.startswith("unknown [ no-message ]")) == (MAY_NOT, True)
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["ipc:///x"], ["ipc:///x", "-1"], ["nowhere", "1"], ["--watch"]]
+)
+def test_a_wrong_command_line_is_no_yes(lift_gate: Path, words: list[str]) -> None:
+    code, text = asked(lift_gate, *words)
+    assert code == WRONG
+    assert "lift_gate" in text

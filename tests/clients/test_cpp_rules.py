@@ -1,0 +1,91 @@
+"""The C++ client's rules say what the Python client's say."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from deploy.clients.python.graspd_client import Newest
+from tests.clients.building import compiled_probe
+from tests.clients.messages import MS, TOPIC, Event, events
+from tests.clients.oracle import MAX_AGE_NS
+
+START_NS = 1000 * MS
+
+
+class Probe:
+    """The C++ rules, in a process of their own."""
+
+    def __init__(self, binary: Path) -> None:
+        self._process = subprocess.Popen(
+            [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def tell(self, *words: object) -> None:
+        """Give it a line."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(" ".join(map(str, words)) + "\n")
+
+    def at(self, now_ns: int) -> str:
+        """What it says at a time."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self.tell("at", now_ns)
+        self._process.stdin.flush()
+        return self._process.stdout.readline().rstrip("\n")
+
+    def close(self) -> int:
+        """End it; its exit code."""
+        self._process.communicate(timeout=10)
+        return self._process.returncode
+
+
+@pytest.fixture(scope="module")
+def binary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return compiled_probe(tmp_path_factory.mktemp("probe"))
+
+
+@pytest.fixture
+def probe(binary: Path) -> Iterator[Probe]:
+    made = Probe(binary)
+    yield made
+    assert made.close() == 0, "the sanitizers found something"
+
+
+def said(newest: Newest, now_ns: int) -> str:
+    """What the Python client says, in the words of the probe."""
+    verdict = newest.at(now_ns)
+    place = [-1 if number is None else number for number in (verdict.grasp, verdict.seq)]
+    age_ns = round((-1.0 if verdict.age_ms is None else verdict.age_ms) * 1e6)
+    words = [verdict.verdict, len(verdict.reasons), *verdict.reasons, *place]
+    words += [verdict.boot_id or "-", age_ns, *astuple(newest.counts)]
+    return " ".join(map(str, words))
+
+
+def as_hex(frame: bytes) -> str:
+    """A frame for the probe."""
+    return frame.hex() or "-"
+
+
+@settings(
+    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(events(), st.booleans(), st.sampled_from([0, 5, 77_000]))
+def test_both_clients_say_the_same(
+    probe: Probe, sequence: Sequence[Event], same_computer: bool, ahead_ms: int
+) -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, same_computer)
+    probe.tell("new", MAX_AGE_NS, int(same_computer))
+    empty_ns = now_ns = START_NS - ahead_ms * MS * (not same_computer)
+    for event in sequence:
+        newest.take(event.frames, empty_ns, now_ns)
+        probe.tell("take", empty_ns, now_ns, *map(as_hex, event.frames))
+        assert probe.at(now_ns) == said(newest, now_ns)
+        empty_ns, now_ns = now_ns, now_ns + event.wait_ns
+        assert probe.at(now_ns) == said(newest, now_ns)

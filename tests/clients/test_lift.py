@@ -1,0 +1,264 @@
+"""May the hand lift? With a clock and sockets that the tests move."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deploy.clients.python import graspd_client
+from deploy.clients.python.graspd_client import Graspd
+from tests.clients.messages import MS, Event, events, frames, verdict
+from tests.clients.oracle import is_stable, newest, told
+
+START_NS = 1000 * MS
+ASK = "ipc:///nowhere.ask"
+LOOK_NS = 1000
+"""What each look at the clock takes."""
+
+
+@dataclass
+class World:
+    """A clock, and sockets where things come in time."""
+
+    coming: list[tuple[int, list[bytes]]]
+    """When what comes, ns."""
+    answers: list[tuple[int, bytes]] = field(default_factory=list)
+    """How long after its question each comes, ns; then none any more."""
+    now_ns: int = START_NS
+    came: list[list[bytes]] = field(default_factory=list)
+    answered: list[bytes] = field(default_factory=list)
+    questions: int = 0
+    renewed: int = 0
+    _answer: tuple[int, bytes] | None = None
+
+    def monotonic_ns(self) -> int:
+        self.now_ns += LOOK_NS
+        return self.now_ns
+
+    def receive(self) -> list[bytes] | None:
+        if not self.coming or self.coming[0][0] > self.now_ns:
+            return None
+        self.came.append(self.coming.pop(0)[1])
+        return self.came[-1]
+
+    def wait(self, timeout_ms: int) -> None:
+        due_ns = [due for due, _ in self.coming[:1]] + ([self._answer[0]] if self._answer else [])
+        self.now_ns = max(self.now_ns, min([self.now_ns + timeout_ms * MS, *due_ns]))
+
+    def ask(self) -> None:
+        assert self._answer is None, "one question at a time"
+        self.questions += 1
+        if self.answers:
+            delay_ns, payload = self.answers.pop(0)
+            self._answer = self.now_ns + delay_ns, payload
+
+    def answer(self) -> bytes | None:
+        if self._answer is None or self._answer[0] > self.now_ns:
+            return None
+        self.answered.append(self._answer[1])
+        self._answer = None
+        return self.answered[-1]
+
+    def hang_up(self) -> None:
+        self._answer = None
+
+    def renew(self) -> None:
+        self.renewed += 1
+
+    def close(self) -> None:
+        pass
+
+
+@contextmanager
+def client(world: World, ask: bool = False) -> Iterator[Graspd]:
+    """A client in that world."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(graspd_client, "_Link", lambda *_: world)
+        patch.setattr(graspd_client, "time", SimpleNamespace(monotonic_ns=world.monotonic_ns))
+        with Graspd("ipc:///nowhere", ask_endpoint=ASK if ask else None) as made:
+            yield made
+
+
+def stream(*outcomes: str, grasp: int = 1) -> list[tuple[int, list[bytes]]]:
+    """One message every 10 ms, from now on."""
+    times = [START_NS + number * 10 * MS for number in range(len(outcomes))]
+    return [
+        (at_ns, frames(verdict(seq, at_ns - MS, outcome, grasp=grasp)))
+        for seq, (at_ns, outcome) in enumerate(zip(times, outcomes, strict=True))
+    ]
+
+
+def payload(seq: int, outcome: str = "stable", *, boot_id: str = "a", grasp: int = 1) -> bytes:
+    """An answer."""
+    message = verdict(seq, START_NS, outcome, boot_id=boot_id, grasp=grasp)
+    return json.dumps(message).encode()
+
+
+def test_a_fresh_stable_is_a_yes_at_once() -> None:
+    with client(World(stream("stable"))) as graspd:
+        answer = graspd.may_i_lift(0.0)
+    assert answer
+    assert answer.waited_s < 1e-3
+
+
+def test_it_waits_for_the_grasp_to_settle() -> None:
+    with client(World(stream(*["unknown"] * 5, "stable"))) as graspd:
+        answer = graspd.may_i_lift(0.5)
+    assert answer
+    assert answer.waited_s == pytest.approx(0.05, abs=0.002)
+
+
+def test_slip_is_a_no_at_once() -> None:
+    with client(World(stream("unknown", "slip", "stable"))) as graspd:
+        answer = graspd.may_i_lift(0.5)
+    assert not answer
+    assert (answer.verdict.verdict, answer.verdict.seq) == ("slip", 1)
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "reasons"),
+    [([], ("no-message",)), (["unknown"] * 100, ("moving",)), (["unknown"], ("silent",))],
+)
+def test_at_the_deadline_it_is_no_and_why(outcomes: list[str], reasons: tuple[str, ...]) -> None:
+    with client(World(stream(*outcomes))) as graspd:
+        answer = graspd.may_i_lift(0.3)
+    assert (bool(answer), answer.verdict.reasons) == (False, reasons)
+    assert answer.waited_s == pytest.approx(0.3, abs=1e-3)
+
+
+def test_stable_that_came_after_the_deadline_is_late() -> None:
+    world = World([(START_NS + 50 * MS, frames(verdict(0, START_NS + 49 * MS)))])
+    world.wait = lambda timeout_ms: setattr(world, "now_ns", START_NS + 60 * MS)  # type: ignore[method-assign]
+    with client(world) as graspd:
+        answer = graspd.may_i_lift(0.02)
+    assert (bool(answer), answer.verdict.reasons) == (False, ("late",))
+
+
+@pytest.mark.parametrize("deadline_s", [-1.0, float("nan"), float("inf")])
+def test_a_deadline_that_is_none_is_refused(deadline_s: float) -> None:
+    with client(World([])) as graspd, pytest.raises(ValueError, match="deadline"):
+        graspd.may_i_lift(deadline_s)
+
+
+@pytest.mark.parametrize("max_age_ms", [0.0, float("nan"), float("inf")])
+def test_an_age_that_is_none_is_refused(max_age_ms: float) -> None:
+    with pytest.raises(ValueError, match="max_age_ms"):
+        Graspd("ipc:///nowhere", max_age_ms=max_age_ms)
+
+
+def test_a_closed_client_says_no_without_waiting() -> None:
+    world = World(stream("stable"))
+    with client(world, ask=True) as graspd:
+        graspd.close()
+        assert graspd.verdict().reasons == ("closed",)
+        assert not graspd.may_i_lift(1.0)
+    assert world.questions == 0
+
+
+def test_with_a_question_both_must_say_stable() -> None:
+    with client(World(stream("stable", "stable"), [(5 * MS, payload(1))]), ask=True) as graspd:
+        answer = graspd.may_i_lift(0.1)
+    assert answer
+    assert answer.verdict.seq == 1  # it waits for the message that is the answer
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [],
+        [payload(1, "unknown")],
+        [payload(1, grasp=2)],
+        [payload(1, boot_id="b")],
+        [payload(99)],
+        [b""],
+        [b"stable"],
+    ],
+    ids=["none", "unknown", "other-grasp", "other-start", "to-come", "empty", "noise"],
+)
+def test_without_an_answer_that_fits_it_is_no(answers: list[bytes]) -> None:
+    world = World(stream(*["stable"] * 20), [(MS, answer) for answer in answers])
+    with client(world, ask=True) as graspd:
+        answer = graspd.may_i_lift(0.1)
+    assert (bool(answer), answer.verdict.reasons) == (False, ("no-answer",))
+
+
+def test_an_answer_that_is_slip_is_a_no_at_once() -> None:
+    world = World(stream(*["stable"] * 20), [(3 * MS, payload(1, "slip"))])
+    with client(world, ask=True) as graspd:
+        answer = graspd.may_i_lift(0.1)
+    assert (bool(answer), answer.verdict.verdict) == (False, "slip")
+    assert answer.waited_s == pytest.approx(0.003, abs=1e-3)
+
+
+def test_an_unknown_answer_is_asked_for_again() -> None:
+    answers = [(MS, payload(0, "unknown")), (MS, payload(1))]
+    world = World(stream(*["stable"] * 9), answers)
+    with client(world, ask=True) as graspd:
+        assert graspd.may_i_lift(0.1)
+    assert world.questions == 2
+
+
+def test_an_answer_does_not_outlive_the_moment_in_which_nothing_is_known() -> None:
+    answers = [(MS, payload(0))]
+    world = World(stream("unknown", *["stable"] * 9), answers)
+    with client(world, ask=True) as graspd:
+        assert not graspd.may_i_lift(0.09)
+    assert world.questions == 2
+
+
+def test_who_has_not_read_for_long_connects_anew() -> None:
+    world = World(stream("stable"))
+    with client(world) as graspd:
+        graspd.verdict()
+        world.now_ns += 5001 * MS
+        assert graspd.verdict().reasons == ("silent",)
+    assert world.renewed == 1
+
+
+def test_a_flood_does_not_hold_it_up() -> None:
+    world = World([(START_NS, [b"verdict.right"])] * 1500)
+    with client(world) as graspd:
+        assert graspd.verdict().reasons == ("behind",)
+        assert graspd.verdict().reasons == ("malformed",)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    events(),
+    st.lists(st.tuples(st.integers(0, 60), events()), max_size=4),
+    st.booleans(),
+    st.sampled_from([0, 10, 150]),
+)
+def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
+    sequence: Sequence[Event],
+    answers: Sequence[tuple[int, Sequence[Event]]],
+    ask: bool,
+    deadline_ms: int,
+) -> None:
+    coming, at_ns = [], START_NS
+    for event in sequence:
+        coming.append((at_ns, event.frames))
+        at_ns += event.wait_ns
+    said = [(delay * MS, sent[-1].frames[-1:]) for delay, sent in answers]
+    world = World(coming, [(delay, found[0] if found else b"") for delay, found in said])
+    with client(world, ask) as graspd:
+        answer = graspd.may_i_lift(deadline_ms / 1e3)
+    assert answer.waited_s <= deadline_ms / 1e3 + 1e-3
+    if not answer:
+        return
+    assert is_stable(world.came, world.now_ns - 20 * LOOK_NS)
+    last = newest(world.came)
+    assert last is not None
+    if ask:
+        told_so = told(world.answered[-1])
+        assert told_so is not None
+        assert (told_so.verdict, told_so.boot_id) == ("stable", last.boot_id)
+        assert told_so.grasp == last.grasp
+        assert told_so.seq <= last.seq

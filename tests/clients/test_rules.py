@@ -1,0 +1,198 @@
+"""No path turns bad, stale or missing data into `stable`: the clients' rules against an oracle."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from deploy.clients.python import graspd_client
+from deploy.clients.python.graspd_client import Newest, is_same_computer
+from tests.clients.messages import MS, TOPIC, Event, events, frames, verdict
+from tests.clients.oracle import MAX_AGE_NS, is_stable
+
+START_NS = 1000 * MS
+
+
+def local() -> Newest:
+    """The rules for a daemon on the same computer."""
+    return Newest(TOPIC, MAX_AGE_NS, True)
+
+
+@settings(max_examples=300, deadline=None)
+@given(events())
+def test_it_says_stable_exactly_when_all_that_came_says_so(sequence: Sequence[Event]) -> None:
+    newest, now_ns, came = local(), START_NS, []
+    for event in sequence:
+        came.append(event.frames)
+        newest.take(event.frames, now_ns, now_ns)
+        assert bool(newest.at(now_ns)) == is_stable(came, now_ns)
+        now_ns += event.wait_ns
+        assert bool(newest.at(now_ns)) == is_stable(came, now_ns)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode))
+def test_noise_is_counted_and_never_stable(payload: bytes) -> None:
+    newest = local()
+    newest.take([TOPIC, payload], START_NS, START_NS)
+    assert newest.at(START_NS).reasons in [("malformed",), ("version",)]
+    assert newest.counts.malformed == 1
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"[" * 60_000,
+        json.dumps(verdict(0, START_NS)).replace("0.125", "NaN").encode(),
+        json.dumps(verdict(0, START_NS)).replace("1700000000.0", "Infinity").encode(),
+        json.dumps(verdict(0, START_NS)).replace("1700000000.0", "1e999").encode(),
+        json.dumps(verdict(0, START_NS)).encode("utf-16"),
+        b"\xef\xbb\xbf" + json.dumps(verdict(0, START_NS)).encode(),
+        json.dumps([verdict(0, START_NS)]).encode(),
+    ],
+    ids=["deep", "nan", "infinity", "huge", "utf-16", "bom", "list"],
+)
+def test_what_only_some_readers_take_for_json_is_malformed(payload: bytes) -> None:
+    newest = local()
+    newest.take([TOPIC, payload], START_NS, START_NS)
+    assert newest.at(START_NS).reasons == ("malformed",)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"reasons": ["moving"]},
+        {"reasons": None},
+        {"valid": False},
+        {"valid": 1},
+        {"verdict_code": 2},
+        {"verdict_code": True},
+        {"verdict": "Stable"},
+        {"p_slip": None},
+        {"p_slip": 1.01},
+        {"p_slip": True},
+        {"silence_ms": 1.1e12},
+        {"silence_ms": -1.0},
+        {"age_ms": "1"},
+        {"seq": 0.0},
+        {"seq": -1},
+        {"grasp": None},
+        {"boot_id": 7},
+        {"verdict": "unknown", "verdict_code": 0, "valid": False, "reasons": ["moving"]},
+        {"verdict": "unknown", "verdict_code": 0, "valid": False, "p_slip": None},
+    ],
+    ids=str,
+)
+def test_a_message_that_contradicts_itself_is_malformed(change: dict[str, object]) -> None:
+    newest = local()
+    newest.take(frames(verdict(0, START_NS) | change), START_NS, START_NS)
+    assert newest.at(START_NS).reasons == ("malformed",)
+
+
+def test_another_version_is_unknown_until_this_one_comes_again() -> None:
+    newest = local()
+    newest.take(frames(verdict(0, START_NS) | {"v": 2}), START_NS, START_NS)
+    assert newest.at(START_NS).reasons == ("version",)
+    newest.take(frames(verdict(1, START_NS)), START_NS, START_NS)
+    assert newest.at(START_NS)
+
+
+@pytest.mark.parametrize(
+    ("later_ms", "reasons"), [(99, ()), (100, ("stale",)), (101, ("silent",)), (-2, ("clock",))]
+)
+def test_a_message_that_gets_old_says_why(later_ms: int, reasons: tuple[str, ...]) -> None:
+    newest = local()  # read at 1 s, published 1 ms later
+    newest.take(frames(verdict(0, START_NS)), START_NS, START_NS)
+    assert newest.at(START_NS + MS + later_ms * MS).reasons == reasons
+
+
+def test_gaps_repeats_and_restarts_are_counted() -> None:
+    newest = local()
+    for seq, boot_id in [(5, "a"), (6, "a"), (9, "a"), (9, "a"), (0, "b"), (10, "a"), (1, "b")]:
+        newest.take(frames(verdict(seq, START_NS, boot_id=boot_id)), START_NS, START_NS)
+    assert dataclasses.asdict(newest.counts) == {
+        "messages": 5,
+        "lost": 2,
+        "repeats": 1,
+        "malformed": 0,
+        "restarts": 1,
+        "former": 1,
+    }
+    assert (newest.at(START_NS).boot_id, newest.at(START_NS).seq) == ("b", 1)
+
+
+OFFSET_NS = 77_000 * MS
+"""By which the other computer's clock is ahead."""
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.integers(0, 400), max_size=60), st.sampled_from([0.0, 5e-4, -5e-4]))
+def test_from_another_computer_nothing_that_the_network_held_up_is_stable(
+    delays_ms: list[int], drift: float
+) -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    empty_ns = arrived_ns = START_NS
+    for seq, delay_ms in enumerate([1, 1, 1, *delays_ms]):  # at first the network is well
+        sent_ns = START_NS + seq * 10 * MS
+        arrived_ns = max(arrived_ns, sent_ns + delay_ms * MS)  # TCP keeps the order
+        theirs_ns = OFFSET_NS + sent_ns + round((sent_ns - START_NS) * drift)
+        newest.take(frames(verdict(seq, theirs_ns - MS)), empty_ns, arrived_ns)
+        for now_ns in (arrived_ns, arrived_ns + 50 * MS):
+            if newest.at(now_ns):
+                assert now_ns - sent_ns <= MAX_AGE_NS + 2 * MS
+        if delay_ms <= 1 and seq and arrived_ns == sent_ns + delay_ms * MS:
+            assert newest.at(arrived_ns) or arrived_ns - empty_ns > MAX_AGE_NS - MS
+        empty_ns = arrived_ns
+
+
+def test_from_another_computer_the_first_message_may_be_an_old_one() -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    newest.take(frames(verdict(7, OFFSET_NS)), START_NS, START_NS)
+    assert newest.at(START_NS).reasons == ("joining",)
+    newest.take(frames(verdict(8, OFFSET_NS + 10 * MS)), START_NS, START_NS + 10 * MS)
+    assert newest.at(START_NS + 10 * MS)
+
+
+def test_another_computer_that_was_rebooted_is_heard_again() -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    for number, boot_id in enumerate("aabb"):
+        now_ns = START_NS + number * 10 * MS
+        theirs_ns = (OFFSET_NS if boot_id == "a" else 0) + number * 10 * MS
+        newest.take(frames(verdict(number, theirs_ns, boot_id=boot_id)), now_ns - MS, now_ns)
+        assert bool(newest.at(now_ns)) == (number in (1, 3))
+
+
+def test_what_waited_while_nobody_read_has_no_time_of_arrival() -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    now_ns = START_NS + 3000 * MS
+    for seq in range(50):  # came in the first half second, read after three
+        newest.take(frames(verdict(seq, OFFSET_NS + seq * 10 * MS)), START_NS, now_ns)
+    assert newest.at(now_ns).reasons == ("silent",)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "same"),
+    [
+        ("ipc:///run/graspd/right.ipc", True),
+        ("tcp://127.0.0.1:5555", True),
+        ("tcp://[::1]:5555", True),
+        ("tcp://localhost:5555", True),
+        ("tcp://localhost.example:5555", False),
+        ("tcp://192.0.2.7:5555", False),
+    ],
+)
+def test_only_endpoints_of_this_computer_share_its_clock(endpoint: str, same: bool) -> None:
+    assert is_same_computer(endpoint) is same
+
+
+def test_the_file_is_python_3_9() -> None:
+    source = Path(graspd_client.__file__).read_text()
+    ast.parse(source, feature_version=(3, 9))
+    assert "from __future__ import annotations" in source
