@@ -18,6 +18,7 @@ from daemon.scene_drivers import (
     CanTactile,
     PalmJoints,
     PalmTactile,
+    ReplayFaultsSection,
     ReplayTactile,
     SpiTactile,
     StreamJoints,
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 DEFAULT_MODEL = "small-session"
+MCAP = ".mcap"
+"""Ending of graspd's own recordings."""
+CAPTURES = (".log", ".serial")
+"""Endings of what came over a link: candump text, serial bytes."""
 
 Clock = Callable[[], int]
 """Gives monotonic ns."""
@@ -119,6 +124,8 @@ def gate_mode(scene: Scene) -> GateMode:
         return scene.gate.mode
     if not isinstance(scene.tactile, ReplayTactile):
         return "settled"
+    if is_mcap(scene.tactile):
+        return "settled"
     streams = {columns.time is not None for columns in _columns(scene, scene.tactile)}
     if len(streams) > 1:
         raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
@@ -158,12 +165,26 @@ def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
     return [columns_of(path, scene.hand.fingers) for path in options.recordings]
 
 
+def is_mcap(options: ReplayTactile) -> bool:
+    """Whether graspd itself recorded what is replayed. Raises `SceneError` if only some of it."""
+    found = {path.suffix == MCAP for path in options.recordings}
+    if len(found) > 1:
+        raise SceneError("tactile.recordings: both CSV and MCAP files")
+    return True in found
+
+
+def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
+    if not is_mcap(options):
+        return any(columns.joints for columns in _columns(scene, options))
+    from drivers.mcap_recording import header_of
+
+    return any(header_of(path).joints for path in options.recordings)
+
+
 def joint_limits(scene: Scene) -> JointLimits | None:
     """None if the scene has no joints, not even in its recordings."""
     tactile = scene.tactile
-    recorded = isinstance(tactile, ReplayTactile) and any(
-        c.joints for c in _columns(scene, tactile)
-    )
+    recorded = isinstance(tactile, ReplayTactile) and _has_joints(scene, tactile)
     if scene.joints is None and not recorded:
         return None
     from daemon.judge.joints import JointLimits
@@ -283,6 +304,8 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
 
 
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
+    if is_mcap(options):
+        return _replay_mcap(scene, options, clock)
     from drivers.faults import ReplayFaults
     from drivers.replay import Pace, ReplayDriver
 
@@ -297,3 +320,17 @@ def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
         faults=ReplayFaults(**options.faults.model_dump()),
         clock=clock,
     )
+
+
+def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
+    if options.loop or options.strict or options.faults != ReplayFaultsSection():
+        raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
+    try:
+        from drivers.mcap_replay import McapReplayDriver
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
+            "folder of graspd's source"
+        ) from error
+    speed = options.speed if options.pace == "realtime" else None
+    return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed, clock=clock)

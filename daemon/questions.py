@@ -1,15 +1,21 @@
-"""The socket on which a grasp controller asks: is the grasp stable, now?"""
+"""The socket on which a grasp controller asks whether it may lift, and tells how lifts ended."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import zmq
 
 from daemon.binding import Binding, Bound
 
 QUESTION = b"judge"
+TELLING = b"outcome"
+"""First word of `outcome <boot_id> <grasp> <stable|slip>`."""
 FRAMES_MAX = 3
 """Of a question: who asks, an empty frame from a REQ socket, the question."""
 MESSAGE_MAX_BYTES = 64
@@ -18,6 +24,9 @@ WAITING_MAX = 16
 """Questions that wait for an answer; the oldest is given up for a newer one."""
 QUEUE_MAX = 16
 """Messages queued per peer in either direction."""
+_TOLD = re.compile(rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)")
+MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip>"
+NOBODY = "nobody takes outcomes here"
 TAKEN_MAX = 64
 """Messages, and at most so many frames, taken in one round: a flood must not hold up readings."""
 
@@ -40,7 +49,10 @@ class Questions(Bound):
         """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
         super().__init__(endpoint, binding)
         self.counters: Counter[str] = Counter()
-        """`asked`, `answered`, `given_up`, `malformed`."""
+        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken and
+        `outcomes_refused`."""
+        self.on_outcome: Callable[[str, int, Literal["stable", "slip"]], str | None] | None = None
+        """Takes a boot id, a grasp and how its lift ended; None, or why it does not."""
         self._patience_ns = patience_ns
         self._waiting: deque[_Question] = deque()
         self._frames: list[bytes] = []
@@ -85,11 +97,11 @@ class Questions(Bound):
 
     def _take_message(self, now_ns: int) -> bool:
         *envelope, question = self._frames
-        if (
-            question != QUESTION
-            or len(self._frames) > FRAMES_MAX
-            or envelope[1:] not in ([], [b""])
-        ):
+        well = len(self._frames) <= FRAMES_MAX and envelope[1:] in ([], [b""])
+        if well and question.partition(b" ")[0] == TELLING:
+            self._tell(envelope, question)
+            return False
+        if question != QUESTION or not well:
             self.counters["malformed"] += 1
             return False
         if len(self._waiting) >= WAITING_MAX:
@@ -97,6 +109,22 @@ class Questions(Bound):
             self.counters["given_up"] += 1
         self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
         return True
+
+    def _tell(self, envelope: list[bytes], question: bytes) -> None:
+        """Pass on how a lift ended, and say at once whether that was of use."""
+        told = _TOLD.fullmatch(question)
+        if told is None:
+            why: str | None = MALFORMED
+        elif self.on_outcome is None:
+            why = NOBODY
+        else:
+            outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
+            why = self.on_outcome(told[1].decode(), int(told[2]), outcome)
+        refused = "malformed" if why == MALFORMED else "outcomes_refused"
+        self.counters["outcomes" if why is None else refused] += 1
+        said = {"v": 1, "ok": True} if why is None else {"v": 1, "ok": False, "why": why}
+        answer = json.dumps(said, separators=(",", ":")).encode()
+        self.socket.send_multipart((*envelope, answer), flags=zmq.NOBLOCK)
 
     def answer(self, payload: bytes, now_ns: int | None = None) -> None:
         """Answer all questions, or with `now_ns` those that can wait no longer.

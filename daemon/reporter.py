@@ -16,6 +16,7 @@ from daemon.judge.verdict import (
     OUTCOME_CODE,
     GateMessage,
     Outcome,
+    OutcomeMessage,
     Reason,
     State,
     Status,
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from daemon.judge.gate import GateChange
 
 SHA_DIGITS = 12
+JUDGED_MAX = 1024
+"""Grasps of which it is remembered that they were judged: those of hours, or of ten seconds where
+every reading is one."""
 
 
 class Output(Protocol):
@@ -56,8 +60,13 @@ class Reporter:
         output: Output | None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], float] = time.time,
+        *,
+        boot_id: str | None = None,
     ) -> None:
-        """`hand` is its name; `clock` gives monotonic ns, `wall_clock` seconds since 1970."""
+        """`hand` is its name; `clock` gives monotonic ns, `wall_clock` seconds since 1970.
+
+        `boot_id` is a new one unless given.
+        """
         self.latency = LatencyHistogram()
         self.outcomes: Counter[Outcome] = Counter()
         self.reasons: Counter[Reason] = Counter()
@@ -72,11 +81,15 @@ class Reporter:
         self._output = output
         self._clock = clock
         self._wall_clock = wall_clock
-        self._boot_id = uuid.uuid4().hex
+        self._boot_id = uuid.uuid4().hex if boot_id is None else boot_id
         self._verdict_seq = 0
         self._gate_seq = 0
         self._tactile_seq = 0
         self._status_seq = 0
+        self._outcome_topic = f"outcome.{hand}".encode()
+        self._outcome_seq = 0
+        self._judged: dict[int, None] = {}
+        """Grasps that were judged last, oldest first."""
         self._versions = {
             "graspd": version("graspd"),
             "onnxruntime": version("onnxruntime"),
@@ -125,7 +138,33 @@ class Reporter:
         self.outcomes[judgement.outcome] += 1
         self.reasons.update(judgement.reasons)
         self._repaired.update(judgement.repaired)
+        if judgement.judged:
+            self._remember(judgement.grasp)
         return message, payload
+
+    def _remember(self, grasp: int) -> None:
+        self._judged[grasp] = None
+        if len(self._judged) > JUDGED_MAX:
+            del self._judged[next(iter(self._judged))]
+
+    def outcome(self, boot_id: str, grasp: int, outcome: Literal["stable", "slip"]) -> str | None:
+        """Send how the lift of a grasp ended; or say why not."""
+        if boot_id != self._boot_id:
+            return "unknown boot_id: not of this start"
+        if grasp not in self._judged:
+            return "unknown grasp: not judged, or too long ago"
+        message = OutcomeMessage(
+            boot_id=boot_id,
+            seq=self._outcome_seq,
+            t=self._wall_clock(),
+            t_mono_ns=self._clock(),
+            grasp=grasp,
+            outcome=outcome,
+        )
+        self._outcome_seq += 1
+        if self._output is not None:
+            self._output.send(self._outcome_topic, encode(message))
+        return None
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
         """Send one reading, with the newest joint angles, if somebody wants it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -24,6 +25,8 @@ from models.runtime import TactileModel
 if TYPE_CHECKING:
     from daemon.printer import Printer
     from daemon.realtime import Hot
+    from daemon.record_raw import Tap
+    from daemon.recorder import Recorded, Recorder
 
 log = logging.getLogger("graspd")
 
@@ -126,6 +129,7 @@ class Runner:
         wanted = parts.scene
         with ExitStack() as stack:
             sockets = self._open_sockets(wanted)
+            tap = _tap(parts)
             for driver in parts.drivers:
                 stack.callback(driver.close)
                 assembly.open_driver(driver)
@@ -133,12 +137,20 @@ class Runner:
             if kept is not None:
                 stack.callback(kept.save)
             hot = self._hot(parts, stack)
+            boot_id = uuid.uuid4().hex
+            recorder = self._recorder(parts, boot_id, tap, stack)
+            output: Sockets | Recorded = sockets
+            if recorder is not None:
+                from daemon.recorder import Recorded
+
+                output = Recorded(sockets, recorder)
             reporter = Reporter(
                 wanted.hand.name,
                 wanted.hand.fingers,
                 parts.model.contract.name,
                 parts.model.sha256,
-                sockets,
+                output,
+                boot_id=boot_id,
             )
             service = Service(
                 parts.drivers,
@@ -148,7 +160,9 @@ class Runner:
                 max_age_ns=wanted.max_age_ns,
                 listener=None if self._printer is None else self._printer.verdict,
                 chore=None if kept is None else kept.mind,
-                sockets=sockets,
+                on_joints=None if recorder is None else recorder.joints,
+                on_asked=None if recorder is None else recorder.asked,
+                sockets=output,
                 watchdog=self._manager,
                 on_status=self._on_status(sockets, hot),
                 reload=self._reload,
@@ -158,6 +172,19 @@ class Runner:
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
             return service.run()
+
+    def _recorder(
+        self, parts: Parts, boot_id: str, tap: Tap | None, stack: ExitStack
+    ) -> Recorder | None:
+        """Who records; None if the scene wants nobody to. Imported only where it does."""
+        if parts.scene.record is None:
+            return None
+        from daemon.recording import build_recorder
+
+        recorder = build_recorder(parts.scene, parts.model, parts.pipeline, boot_id, tap)
+        if recorder is not None:
+            stack.callback(recorder.close)
+        return recorder
 
     def _on_status(self, sockets: Sockets, hot: Hot | None) -> Callable[[Status], None]:
         """What there is time for once a second."""
@@ -202,6 +229,16 @@ class Runner:
         for line in str(error).splitlines():
             log.error("%s", line)
         log.error("%s: not taken anew, the former scene goes on", self._path)
+
+
+def _tap(parts: Parts) -> Tap | None:
+    """What holds all that comes over the link from its opening on; None if the scene wants none."""
+    record = parts.scene.record
+    if record is None or not record.raw:
+        return None
+    from daemon.record_raw import tap_of
+
+    return tap_of(parts.drivers[0], parts.scene.tactile)
 
 
 def _announce(wanted: scene.Scene) -> None:

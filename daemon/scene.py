@@ -207,6 +207,32 @@ class Realtime(Section):
     """Keep what was touched in memory (mlockall), so that no reading waits for a disk."""
 
 
+class Record(Section):
+    """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
+
+    directory: Annotated[FilePath | None, Field(strict=False)] = None
+    """`/var/lib/graspd/record` unless given; relative to the scene file. Made if it is not there.
+    """
+    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0)] = 1000.0
+    """What a killed daemon or a power cut may cost, ms."""
+    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0)] = 256.0
+    """A file that is larger is followed by the next, MB."""
+    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0)] = 60.0
+    """So is one that is older, minutes."""
+    keep_files: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    """Of this hand; the oldest are removed."""
+    keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0)] = 4096.0
+    """All files of this hand together, the one being written included, MB."""
+    raw: bool = False
+    """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
+
+    @field_validator("directory")
+    @classmethod
+    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        base: Path = (info.context or {}).get("base", Path())
+        return None if path is None else base / path
+
+
 class Scene(Section):
     """The whole file."""
 
@@ -220,6 +246,7 @@ class Scene(Section):
     ask: Ask | None = None
     curve: Curve | None = None
     realtime: Realtime | None = None
+    record: Record | None = None
 
     @model_validator(mode="after")
     def _sections_fit_together(self) -> Self:
@@ -240,6 +267,9 @@ class Scene(Section):
         if isinstance(tactile, CanTactile) and tactile.format == "syntouch" and len(fingers) > 3:
             raise ValueError("tactile.format syntouch carries three sensors, hand.fingers has more")
         self._refuse_strangers()
+        raw = self.record is not None and self.record.raw
+        if raw and not isinstance(tactile, SpiTactile | CanTactile):
+            raise ValueError("record.raw is for tactile.driver spi and can")
         if isinstance(self.joints, PalmJoints) and not isinstance(tactile, PalmTactile):
             raise ValueError("joints.driver palm needs tactile.driver palm: it is the same stream")
         return self
@@ -277,6 +307,13 @@ class Scene(Section):
     def session_path(self) -> Path:
         """Where the session is kept."""
         return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
+
+    @property
+    def record_directory(self) -> Path | None:
+        """Where recordings are kept; None if nothing is recorded."""
+        if self.record is None:
+            return None
+        return self.record.directory or STATE_DIRECTORY / "record"
 
     @property
     def keeps_session(self) -> bool:

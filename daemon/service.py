@@ -78,6 +78,8 @@ class Service:
         max_age_ns: int,
         listener: Listener | None = None,
         chore: Callable[[], None] | None = None,
+        on_joints: Callable[[JointReading], None] | None = None,
+        on_asked: Callable[[], None] | None = None,
         sockets: Peers | None = None,
         watchdog: Watchdog | None = None,
         on_status: Callable[[Status], None] | None = None,
@@ -86,7 +88,8 @@ class Service:
     ) -> None:
         """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
 
-        `chore` is done before readings are judged, and once a second. Questions that come by
+        `chore` is done before readings are judged, and once a second. `on_joints` gets every joint
+        reading, `on_asked` is done when somebody has asked. Questions that come by
         `sockets` are answered with the next verdict, or if a grasp is judged on request only, when
         it has been.
         `on_status` gets every status once it is sent. `reload` is done when a reload is asked for,
@@ -99,8 +102,12 @@ class Service:
         self._stop = stop
         self._listener = listener
         self._chore = chore
+        self._on_joints = on_joints
+        self._on_asked = on_asked
         self._sockets = sockets
         self._questions = None if sockets is None else sockets.questions
+        if self._questions is not None:
+            self._questions.on_outcome = reporter.outcome
         self._watchdog = watchdog
         self._on_status = on_status
         self._reload = reload
@@ -178,6 +185,8 @@ class Service:
             if isinstance(reading, JointReading):
                 self._pipeline.turn(reading)
                 self._joints = reading
+                if self._on_joints is not None:
+                    self._on_joints(reading)
                 continue
             self._reporter.tactile(reading, self._joints)
             judgement = self._pipeline.judge(reading)
@@ -198,6 +207,8 @@ class Service:
     def _take_questions(self) -> None:
         if self._questions is not None and self._questions.take(self._clock()):
             self._pipeline.ask()
+            if self._on_asked is not None:
+                self._on_asked()
 
     def _answer(self, verdict: Verdict, payload: bytes) -> None:
         """Answer who asked, if this verdict is what they wait for or they have waited too long."""

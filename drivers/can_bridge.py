@@ -169,6 +169,10 @@ class CanBridgeDriver:
         self._link.start()
         self._try_to_open()
 
+    def tap(self, taker: Callable[[list[Stamped]], None]) -> None:
+        """Hand all frames that come from now on to `taker` too."""
+        self._bus.tap = taker
+
     def close(self) -> None:
         """Let go of the bus."""
         self._bus.close()

@@ -97,6 +97,8 @@ class CanBus:
         """Why the bus is of no use any more, None while it is."""
         self.more = False
         """Whether the last drain left frames behind."""
+        self.tap: Callable[[list[Stamped]], None] | None = None
+        """Gets what every drain brings, if it brings anything."""
         self._malformed = 0
         self._kernel_drops = 0
         self._interface = interface
@@ -164,11 +166,13 @@ class CanBus:
             elif self._bus is not None:
                 self._drain_bus(self._bus, frames)
         except BlockingIOError:
-            return frames
+            pass
         except Exception as error:  # noqa: BLE001 (python-can lets any exception through)
             self.failure = f"{type(error).__name__}: {error}"
-            return frames
-        self.more = len(frames) >= FRAMES_PER_DRAIN
+        else:
+            self.more = len(frames) >= FRAMES_PER_DRAIN
+        if self.tap is not None and frames:
+            self.tap(frames)
         return frames
 
     def _use_socket(self, bus: can.BusABC) -> None:

@@ -8,10 +8,12 @@ import os
 import select
 import termios
 import time
+from collections.abc import Callable
 
 import serial
 
 from drivers.base import DriverError, LinkError
+from drivers.raw_capture import Way
 
 READ_BYTES = 4096
 """A terminal hands over no more than this at once."""
@@ -37,6 +39,8 @@ class SerialLine:
         self.port = port
         self.drained = True
         """Whether the last `read` left nothing behind."""
+        self.tap: Callable[[Way, bytes], None] | None = None
+        """Gets all bytes that are read, and those that are about to be written."""
         self._baud = baud
         self._serial: serial.Serial | None = None
         self._fileno: int | None = None
@@ -58,6 +62,8 @@ class SerialLine:
             raise DriverError(f"{self.port}: {error}") from error
         self._fileno = self._descriptor()
         self._lower_latency()
+        if self.tap is not None:
+            self.tap(Way.OPENED, b"")
 
     def close(self) -> None:
         """Give the port back. May be called more than once; a device that is gone is no error."""
@@ -101,7 +107,10 @@ class SerialLine:
         except (OSError, termios.error) as error:
             if not chunks:  # else the next call says so, after these bytes
                 raise LinkError(f"{self.port}: {_loss(error)}") from error
-        return b"".join(chunks)
+        data = b"".join(chunks)
+        if self.tap is not None and data:
+            self.tap(Way.RECEIVED, data)
+        return data
 
     def write(self, data: bytes) -> bool:
         """Write a few bytes if there is room; False if not. Raises `LinkError`."""
@@ -109,6 +118,8 @@ class SerialLine:
         try:
             if self._fileno is not None and not select.select([], [self._fileno], [], 0)[1]:
                 return False
+            if self.tap is not None:
+                self.tap(Way.SENT, data)
             port.write(data)
         except serial.SerialTimeoutException:
             return False

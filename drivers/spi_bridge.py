@@ -31,6 +31,7 @@ from drivers.bridge_session import BridgeCounters, BridgeSession, about
 from drivers.clock import DeviceClock
 from drivers.framing import DELIMITER
 from drivers.link import Link, LinkState
+from drivers.raw_capture import Way
 from drivers.serial_line import SerialLine
 
 BAUD = 921_600
@@ -178,6 +179,10 @@ class SpiBridgeDriver:
         self._reset()
         self._link.start()
         self._connect()
+
+    def tap(self, taker: Callable[[Way, bytes], None]) -> None:
+        """Hand all bytes that come and go from now on to `taker` too."""
+        self._line.tap = taker
 
     def close(self) -> None:
         """Stop the bridge and give the port back."""

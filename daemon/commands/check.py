@@ -177,11 +177,19 @@ def _what_is_in(
         parts["session"] = _session(wanted, contract.input)
     if wanted.publish.latest_endpoint is not None:
         parts["latest"] = f"the latest verdict alone on {wanted.publish.latest_endpoint}"
+    if wanted.record is not None:
+        parts["record"] = _record(wanted.record)
     if wanted.curve is not None:
         parts["curve"] = f"by tcp:// only keys of {wanted.curve.clients}"
     if wanted.realtime is not None:
         parts["realtime"] = _realtime(wanted.realtime)
     return parts
+
+
+def _record(wanted: scene.Record) -> str:
+    where = wanted.directory or "/var/lib/graspd/record"
+    raw = ", and what came over the link" if wanted.raw else ""
+    return f"in {where}, at most {wanted.keep_mb:g} MB, flushed every {wanted.flush_ms:g} ms{raw}"
 
 
 def _realtime(wanted: scene.Realtime) -> str:
@@ -249,6 +257,8 @@ def _what_is_left_out(
         left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
     if not isinstance(model.contract.input, SessionInput):
         left_out["session"] = f"{model.contract.name} needs no session calibration"
+    if wanted.record is None:
+        left_out["record"] = "nothing is written but what the session has learned"
     if wanted.curve is None:
         left_out["curve"] = "no keys: sockets are for this computer alone"
     if wanted.realtime is None:

@@ -6,6 +6,7 @@ import argparse
 import sys
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any, Protocol
 
 from daemon import assembly, scene
 from daemon.arguments import positive, within
@@ -15,18 +16,22 @@ from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import Verdict
 from daemon.printer import Printer
 from daemon.reporter import Reporter
+from daemon.scene import Scene, SceneError
 from daemon.service import Listener, Service
 from daemon.session_file import SessionFileError, load, statistics_of
 from daemon.sockets import Sockets
 from daemon.stop import StopSignal
 from daemon.text import complain
-from drivers.base import DriverError, TactileReading
+from drivers.base import Driver, DriverError, TactileReading
 from drivers.replay import DEMO_RECORDING
 from models.contract import ModelError
 from models.runtime import TactileModel
 
 MAX_AGE_MS = 1000.0
 """Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
+
+NO_SILENCE_NS = 3_600_000_000_000
+"""A recording of graspd has its own silences: that this machine is busy now is none of them."""
 
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
@@ -39,10 +44,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="*",
         type=Path,
         metavar="RECORDING",
-        help="grasp tables or streams (CSV); without any, the synthetic demo recording",
+        help="grasp tables or streams (CSV); what `graspd run` has recorded (.mcap); what came "
+        "over a link (candump text .log, serial bytes .serial); without any, the synthetic demo "
+        "recording",
     )
     parser.add_argument(
-        "--model", default=assembly.DEFAULT_MODEL, help="model of the zoo, or an .onnx file"
+        "--scene", type=Path, help="of .log and .serial: the scene that says how to decode them"
+    )
+    parser.add_argument(
+        "--model",
+        help=f"model of the zoo, or an .onnx file (default: {assembly.DEFAULT_MODEL}; of an MCAP "
+        "recording, the one that judged then)",
     )
     parser.add_argument(
         "--speed",
@@ -68,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--gate",
         choices=("settled", "every"),
         help="judge each grasp once it has settled, or every reading as a grasp of its own "
-        "(default: settled for streams, every for grasp tables)",
+        "(default: settled for streams, every for grasp tables, as then for MCAP recordings)",
     )
     parser.add_argument(
         "--publish", type=_endpoint, metavar="ENDPOINT", help="publish too, as `graspd run` does"
@@ -92,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         with StopSignal() as stop:
             return _replay(args, stop)
-    except (scene.SceneError, ModelError, DriverError, SessionFileError) as error:
+    except (SceneError, ModelError, DriverError, SessionFileError) as error:
         sys.stdout.flush()
         complain(error)
         return 2
@@ -102,11 +114,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
-    wanted = _scene(args)
+    recorded = _recorded(args)
+    wanted = _scene(args, recorded)
     model = assembly.load_model(wanted)
-    wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
-    pipeline = _pipeline(wanted, model, args.session)
-    drivers = assembly.build_drivers(wanted)
+    if recorded is None:
+        wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
+        drivers = assembly.build_drivers(wanted)
+    else:
+        drivers = [recorded.build_driver(wanted, args.speed)]
+    pipeline = _pipeline(args, wanted, model, recorded)
     printer = Printer(as_json=args.json, prompt=args.speed is not None)
     listener: Listener = printer.verdict
     if pipeline.session is not None and args.session != OFF:
@@ -127,7 +143,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
                 wanted.hand.name, wanted.hand.fingers, model.contract.name, model.sha256, sockets
             ),
             stop,
-            max_age_ns=wanted.max_age_ns,
+            max_age_ns=wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
             listener=listener,
             sockets=sockets,
         )
@@ -138,17 +154,64 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     return 0 if stop.received is None else 128 + stop.received
 
 
-def _pipeline(wanted: scene.Scene, model: TactileModel, session: str) -> Pipeline:
-    """The judge; a session model's begins with the kept session if `session` is a file.
+class Recorded(Protocol):
+    """What graspd has recorded: it says itself how it was judged, as far as it knows."""
+
+    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
+        """The scene that was recorded, with another model or gate mode if they are given."""
+
+    def build_driver(self, wanted: Scene, speed: float | None) -> Driver:
+        """The driver that plays it."""
+
+    def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
+        """The judge of what that driver plays."""
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Begin with the session that the daemon began with, if that is known."""
+
+
+def _recorded(args: argparse.Namespace) -> Recorded | None:
+    """What graspd has recorded, if that is replayed. Imported only where it is."""
+    endings = {path.suffix for path in args.recordings}
+    if endings.isdisjoint({assembly.MCAP, *assembly.CAPTURES}):
+        if args.scene is not None:
+            raise SceneError("--scene is for what came over a link")
+        return None
+    if args.loop or args.strict:
+        raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
+    if assembly.MCAP not in endings:
+        from daemon.captures import Captures
+
+        return Captures(args.recordings, args.scene)
+    try:
+        from daemon.playback import Playback
+    except ModuleNotFoundError as error:
+        raise SceneError(
+            f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
+            "folder of graspd's source"
+        ) from error
+    return Playback(args.recordings)
+
+
+def _pipeline(
+    args: argparse.Namespace, wanted: Scene, model: TactileModel, recorded: Recorded | None
+) -> Pipeline:
+    """The judge; a session model's begins with the kept session if `--session` is a file.
 
     Raises `SessionFileError` if that is no session of this hand.
     """
-    pipeline = assembly.build_pipeline(wanted, model, learns=session != OFF)
-    if session in (RUNNING, OFF):
+    learns = args.session != OFF and wanted.session_learns
+    if recorded is None:
+        pipeline = assembly.build_pipeline(wanted, model, learns=learns)
+    else:
+        pipeline = recorded.pipeline(wanted, model, learns=learns)
+    if args.session == RUNNING and recorded is not None:
+        recorded.restore(pipeline)
+    if args.session in (RUNNING, OFF):
         return pipeline
     if pipeline.session is None:
         raise ModelError(f"the model {model.contract.name} keeps no session")
-    path = Path(session)
+    path = Path(args.session)
     kept = load(path)
     if kept is None:
         raise SessionFileError(f"{path}: cannot read the session: No such file or directory")
@@ -162,7 +225,7 @@ def _pipeline(wanted: scene.Scene, model: TactileModel, session: str) -> Pipelin
 class _Comparison:
     """Judges every reading once more without session calibration, for the summary alone."""
 
-    def __init__(self, wanted: scene.Scene, printer: Printer) -> None:
+    def __init__(self, wanted: Scene, printer: Printer) -> None:
         model = assembly.load_model(wanted)
         # What it judges is what the other one judged: it has no joints to know the moment by.
         every = wanted.model_copy(update={"gate": wanted.gate.model_copy(update={"mode": "every"})})
@@ -183,8 +246,11 @@ def _wait(sockets: Sockets, timeout_s: float, stop: StopSignal) -> None:
         raise PublishError(f"nobody subscribed to {publisher.endpoint} within {timeout_s:g} s")
 
 
-def _scene(args: argparse.Namespace) -> scene.Scene:
-    model = {"path": args.model} if args.model.endswith(".onnx") else {"name": args.model}
+def _scene(args: argparse.Namespace, recorded: Recorded | None) -> Scene:
+    publish = {"endpoint": args.publish}
+    model = {} if args.model is None else _model(args.model)
+    if recorded is not None:
+        return recorded.scene(publish, model, args.gate)
     data = {
         "tactile": {
             "driver": "replay",
@@ -195,11 +261,15 @@ def _scene(args: argparse.Namespace) -> scene.Scene:
             "loop": args.loop,
             "strict": args.strict,
         },
-        "model": model,
+        "model": model or {"name": assembly.DEFAULT_MODEL},
         "gate": {"max_age_ms": MAX_AGE_MS, "mode": args.gate},
-        "publish": {"endpoint": args.publish},
+        "publish": publish,
     }
     return scene.parse(data, Path("command line"))
+
+
+def _model(name: str) -> dict[str, Any]:
+    return {"path": name} if name.endswith(".onnx") else {"name": name}
 
 
 def _endpoint(text: str) -> str:

@@ -1,0 +1,88 @@
+"""`graspd export-grasps RECORDING...`: recorded grasps with known outcomes, for `graspd train`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+
+from daemon.export import Export, collect, write
+from daemon.text import complain
+from drivers.base import RecordingError
+
+WRONG, FAILED = 2, 1
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the command's arguments."""
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        type=Path,
+        metavar="RECORDING",
+        help="what `graspd run` with [record] has written (MCAP), in the order of time",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
+    )
+    parser.add_argument(
+        "--object", type=_name, default="unknown", metavar="NAME", help="what was grasped"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the table; 0 if it has a grasp, 1 if it cannot be written or none has an outcome."""
+    try:
+        found = collect(args.recordings)
+    except RecordingError as error:
+        complain(error)
+        return WRONG
+    sys.stdout.write(_summary(found) + "\n")
+    if not found.grasps:
+        complain("no judged grasp with an outcome: nothing is written")
+        return FAILED
+    try:
+        _store(found, args.out, args.object)
+    except OSError as error:
+        complain(f"{args.out}: {error.strerror or error}")
+        return FAILED
+    return 0
+
+
+def _summary(found: Export) -> str:
+    slipped = sum(grasp.slipped for grasp in found.grasps.values())
+    parts = [f"{len(found.grasps)} grasps, {slipped} slipped"]
+    parts += [
+        f"{number} {what}"
+        for number, what in (
+            (found.without_outcome, "left out without an outcome"),
+            (found.repaired, "left out with repaired electrodes"),
+            (found.unjoined, "outcomes of grasps that are not in the recordings"),
+            (found.cut_off, "files that were cut off"),
+        )
+        if number
+    ]
+    return "; ".join(parts)
+
+
+def _store(found: Export, target: Path, object_name: str) -> None:
+    """Replace the table in one step. Raises `OSError`."""
+    handle, part = tempfile.mkstemp(dir=target.parent, prefix=f"{target.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
+            write(file, found, object_name)
+        os.chmod(part, 0o644)
+        os.replace(part, target)
+    except OSError:
+        with suppress(OSError):
+            os.unlink(part)
+        raise
+
+
+def _name(text: str) -> str:
+    if not text.strip() or not text.isprintable():
+        raise argparse.ArgumentTypeError("an object needs a name that can be printed")
+    return text.strip()

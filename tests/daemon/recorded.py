@@ -1,0 +1,88 @@
+"""A daemon that records while a controller tells it how its lifts ended, as processes."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import zmq
+
+from daemon.judge.verdict import Verdict, decode_verdict
+from drivers.mcap_recording import McapRecording
+from drivers.recording import open_recording
+from drivers.replay import DEMO_RECORDING
+from tests.daemon.processes import TIMEOUT_S, start, wait_for
+
+
+@dataclass
+class Lab:
+    """What was recorded, and what the controller saw and told."""
+
+    folder: Path
+    told: dict[int, str] = field(default_factory=dict)
+    """How each lift ended, by grasp."""
+    answers: list[dict[str, Any]] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
+    """As a subscriber got them."""
+
+    @property
+    def files(self) -> list[Path]:
+        """The recordings, oldest first."""
+        return sorted((self.folder / "record").glob("*.mcap"))
+
+
+def scene(folder: Path, record: str = "", more: str = "") -> Path:
+    """A scene that plays the demo recording and records."""
+    path = folder / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
+        f'[record]\ndirectory = "record"\n{record}\n{more}'
+    )
+    return path
+
+
+def messages(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Kind and content of each message of a recording."""
+    with open_recording(path) as stream:
+        recording = McapRecording(path, stream)
+        return [(message.kind, json.loads(message.payload)) for message in recording]
+
+
+def work(folder: Path, grasps: int, more: str = "", record: str = "") -> Lab:
+    """Run until so many grasps were judged, telling of each but the first."""
+    lab = Lab(folder)
+    with start("run", scene(folder, record, more)) as daemon, zmq.Context() as context:
+        wait_for(folder / "ask")
+        with context.socket(zmq.SUB) as listener, context.socket(zmq.REQ) as teller:
+            listener.connect(f"ipc://{folder}/graspd")
+            listener.subscribe("verdict.")
+            teller.connect(f"ipc://{folder}/ask")
+            teller.linger = 0
+            _lift(lab, grasps, listener, teller)
+        daemon.terminate()
+        _, said = daemon.communicate(timeout=TIMEOUT_S)
+    assert daemon.returncode == 0, said
+    return lab
+
+
+def _lift(lab: Lab, grasps: int, listener: zmq.Socket[bytes], teller: zmq.Socket[bytes]) -> None:
+    deadline_s = time.monotonic() + 40
+    seen: set[int] = set()
+    while len(seen) < grasps:
+        assert time.monotonic() < deadline_s
+        assert listener.poll(10_000)
+        verdict = decode_verdict(listener.recv_multipart()[1])
+        lab.verdicts.append(verdict)
+        if not verdict.judged or verdict.grasp in seen:
+            continue
+        seen.add(verdict.grasp)
+        if len(seen) == 1:
+            continue
+        outcome = lab.told[verdict.grasp] = "slip" if len(seen) % 2 else "stable"
+        teller.send(f"outcome {verdict.boot_id} {verdict.grasp} {outcome}".encode())
+        assert teller.poll(5000)
+        lab.answers.append(json.loads(teller.recv()))

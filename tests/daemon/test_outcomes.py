@@ -1,0 +1,185 @@
+"""A controller tells how its lifts ended: what fits is published, what does not is refused."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import jsonschema
+import pytest
+import zmq
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.judge.pipeline import Judgement
+from daemon.judge.verdict import Outcome, OutcomeMessage, Reason, decode_outcome, schema
+from daemon.questions import MESSAGE_MAX_BYTES, Questions
+from daemon.reporter import JUDGED_MAX, Reporter
+from tests.daemon.fakes import FINGERS, Clock
+
+BOOT = "0123456789abcdef" * 2
+NOW_NS = 10**12
+BOTH: tuple[Literal["stable", "slip"], ...] = ("stable", "slip")
+
+
+class Output:
+    """Keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bytes, bytes]] = []
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        self.sent.append((topic, payload))
+
+    def wanted(self, _topic: bytes) -> bool:
+        return True
+
+
+def reporter(output: Output) -> Reporter:
+    return Reporter(
+        "right", FINGERS, "fake", "0" * 64, output, Clock(NOW_NS), lambda: 5.0, boot_id=BOOT
+    )
+
+
+def judge(reporter: Reporter, grasp: int, *, judged: bool = True) -> None:
+    outcome = Outcome.SLIP if judged else Outcome.UNKNOWN
+    reasons = () if judged else (Reason.MOVING,)
+    p_slip = 0.9 if judged else None
+    reporter.verdict(Judgement(NOW_NS, grasp, outcome, p_slip, reasons, judged), NOW_NS, 10**8)
+
+
+def test_an_outcome_of_a_judged_grasp_is_published_as_the_schema_says() -> None:
+    output = Output()
+    sender = reporter(output)
+    judge(sender, 3)
+    assert sender.outcome(BOOT, 3, "stable") is None
+    assert sender.outcome(BOOT, 3, "slip") is None
+    messages = [payload for topic, payload in output.sent if topic == b"outcome.right"]
+    assert [decode_outcome(payload) for payload in messages] == [
+        OutcomeMessage(boot_id=BOOT, seq=seq, t=5.0, t_mono_ns=NOW_NS, grasp=3, outcome=outcome)
+        for seq, outcome in enumerate(BOTH)
+    ]
+    for payload in messages:
+        jsonschema.validate(json.loads(payload), schema() | {"$ref": "#/$defs/OutcomeMessage"})
+
+
+def test_an_outcome_of_another_start_or_of_a_grasp_that_was_not_judged_is_refused() -> None:
+    output = Output()
+    sender = reporter(output)
+    judge(sender, 3)
+    judge(sender, 4, judged=False)
+    for boot_id, grasp, why in (
+        ("f" * 32, 3, "unknown boot_id"),
+        (BOOT, 4, "unknown grasp"),
+        (BOOT, 5, "unknown grasp"),
+        (BOOT, 0, "unknown grasp"),
+    ):
+        said = sender.outcome(boot_id, grasp, "slip")
+        assert said is not None
+        assert said.startswith(why)
+    assert not [topic for topic, _ in output.sent if topic == b"outcome.right"]
+
+
+def test_only_so_many_grasps_are_remembered() -> None:
+    sender = reporter(Output())
+    for grasp in range(1, JUDGED_MAX + 2):
+        judge(sender, grasp)
+        judge(sender, grasp)  # a grasp that is judged twice is one
+    assert sender.outcome(BOOT, 1, "slip") is not None
+    assert sender.outcome(BOOT, 2, "slip") is None
+    assert sender.outcome(BOOT, JUDGED_MAX + 1, "slip") is None
+
+
+@pytest.fixture
+def questions(tmp_path: Path) -> Iterator[Questions]:
+    with Questions(f"ipc://{tmp_path}/ask", 10**9) as taker:
+        taker.on_outcome = lambda boot, grasp, _: None if (boot, grasp) == (BOOT, 7) else "no such"
+        yield taker
+
+
+@pytest.fixture
+def teller(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.linger = 0
+        socket.connect(questions.endpoint)
+        yield socket
+
+
+def told(questions: Questions, teller: zmq.Socket[bytes], *frames: bytes) -> dict[str, Any]:
+    teller.send_multipart(frames)
+    deadline_s = time.monotonic() + 10.0
+    while not teller.poll(1):
+        assert questions.take(0) == 0  # it is no question: nobody is judged for it
+        assert time.monotonic() < deadline_s
+    answer: dict[str, Any] = json.loads(teller.recv_multipart()[-1])
+    return answer
+
+
+def test_an_outcome_is_answered_at_once(questions: Questions, teller: zmq.Socket[bytes]) -> None:
+    text = f"outcome {BOOT} 7 stable".encode()
+    assert told(questions, teller, text) == {"v": 1, "ok": True}
+    assert told(questions, teller, b"", text) == {"v": 1, "ok": True}
+    refused = told(questions, teller, f"outcome {BOOT} 8 slip".encode())
+    assert refused == {"v": 1, "ok": False, "why": "no such"}
+    assert questions.waiting == 0
+    assert questions.counters["outcomes"] == 2
+    assert questions.counters["outcomes_refused"] == 1
+    assert questions.counters["malformed"] == 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "outcome",
+        "outcome ",
+        f"outcome {BOOT} 7",
+        f"outcome {BOOT} 7 Slip",
+        f"outcome {BOOT} 7 slip ",
+        f"outcome {BOOT} -7 slip",
+        f"outcome {BOOT} 7.0 slip",
+        f"outcome {BOOT[:-1]} 7 slip",
+        f"outcome {BOOT}  7 slip",
+        f"outcome {BOOT.upper()} 7 slip",
+        "outcome \xff",
+    ],
+)
+def test_an_outcome_that_is_malformed_is_answered_and_counted(
+    questions: Questions, teller: zmq.Socket[bytes], text: str
+) -> None:
+    answer = told(questions, teller, text.encode("latin-1"))
+    assert answer["ok"] is False
+    assert answer["why"].startswith("malformed")
+    assert questions.counters["malformed"] == 1
+
+
+def test_the_longest_outcome_fits_into_a_message() -> None:
+    assert len(f"outcome {BOOT} {10**15 - 1} stable") <= MESSAGE_MAX_BYTES
+
+
+def test_without_anybody_who_takes_outcomes_the_controller_hears_so(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    questions.on_outcome = None
+    assert told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"] is False
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.binary(max_size=MESSAGE_MAX_BYTES - 8), min_size=1, max_size=20))
+def test_whatever_follows_the_word_nothing_breaks(texts: list[bytes]) -> None:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Questions(f"ipc://{folder}/ask", 10**9) as taker,
+        zmq.Context() as context,
+        context.socket(zmq.DEALER) as socket,
+    ):
+        taker.on_outcome = lambda _boot, _grasp, _outcome: None
+        socket.linger = 0
+        socket.connect(taker.endpoint)
+        for text in texts:
+            answer = told(taker, socket, b"outcome " + text)
+            assert answer["v"] == 1
+        assert taker.counters["malformed"] + taker.counters["outcomes"] == len(texts)

@@ -1,0 +1,187 @@
+"""Captured frames and bytes come back as they were; damage costs what is damaged and no more."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import can
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.base import RecordingError
+from drivers.can_capture import CanCapture, frames_of
+from drivers.can_frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
+from drivers.candump import frame_of, line_of
+from drivers.capture_replay import CaptureReplayDriver
+from drivers.raw_capture import RawParser, RawRecord, Way, encode_records
+from drivers.serial_capture import SerialCapture, records_of
+
+FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
+
+
+@st.composite
+def frames(draw: st.DrawFn) -> CanFrame:
+    """A frame as it can come from a bus."""
+    kind = draw(st.sampled_from([0, EXTENDED, FD, FD | EXTENDED, REMOTE, REMOTE | EXTENDED, ERROR]))
+    highest = 0x1FFFFFFF if kind & (EXTENDED | ERROR) else 0x7FF
+    size = draw(st.sampled_from(FD_LENGTHS) if kind & FD else st.integers(0, 8))
+    data = b"" if kind & REMOTE else draw(st.binary(min_size=size, max_size=size))
+    return CanFrame(draw(st.integers(0, highest)), data, kind)
+
+
+@given(frames(), st.integers(0, 4 * 10**18))
+def test_a_frame_comes_back_from_its_line_to_the_microsecond(frame: CanFrame, wall_ns: int) -> None:
+    line = line_of(frame, wall_ns, "can0")
+    assert frame_of(line) == (wall_ns // 1000 * 1000, frame)
+
+
+@given(frames())
+def test_python_can_reads_our_lines(frame: CanFrame) -> None:
+    if frame.flags & ERROR:
+        return  # python-can keeps no class of an error
+    (message,) = can.CanutilsLogReader(io.StringIO(line_of(frame, 10**18, "can0")))
+    assert message.arbitration_id == frame.arbitration_id
+    assert bytes(message.data or b"") == frame.data
+    assert message.is_extended_id == bool(frame.flags & EXTENDED)
+    assert message.is_fd == bool(frame.flags & FD)
+    assert message.is_remote_frame == bool(frame.flags & REMOTE)
+    assert message.timestamp == pytest.approx(1e9)
+
+
+@given(frames())
+def test_we_read_the_lines_of_python_can(frame: CanFrame) -> None:
+    if frame.flags & ERROR:
+        return
+    out = io.StringIO()
+    writer = can.CanutilsLogWriter(out)
+    writer.on_message_received(
+        can.Message(
+            timestamp=1436509052.249713,
+            arbitration_id=frame.arbitration_id,
+            is_extended_id=bool(frame.flags & EXTENDED),
+            is_fd=bool(frame.flags & FD),
+            is_remote_frame=bool(frame.flags & REMOTE),
+            data=frame.data,
+            dlc=len(frame.data),
+            channel="can0",
+        )
+    )
+    assert frame_of(out.getvalue()) == (1436509052249713000, frame)
+
+
+@pytest.mark.parametrize(
+    ("line", "frame"),
+    [  # candump -L of can-utils
+        ("(1436509052.249713) vcan0 044#2A366C2BBA\n", CanFrame(0x44, b"\x2a\x36\x6c\x2b\xba")),
+        ("(1436509053.850870) vcan0 00000123#R\n", CanFrame(0x123, b"", EXTENDED | REMOTE)),
+        (
+            "(1436509053.850870) can0 20000004#0001000000000000",
+            CanFrame(4, b"\0\1" + 6 * b"\0", ERROR),
+        ),
+        ("(1436509053.850870) can0 213##311\n", CanFrame(0x213, b"\x11", FD)),
+        ("(1436509053.850870) can0 213#R8\n", CanFrame(0x213, b"", REMOTE)),
+        ("(1436509053.850870) can0 213#11 R\n", CanFrame(0x213, b"\x11")),
+    ],
+)
+def test_lines_of_candump_are_read(line: str, frame: CanFrame) -> None:
+    found = frame_of(line)
+    assert found is not None
+    assert found[1] == frame
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "\n",
+        "(1436509052.249713) vcan0 044#2A366",
+        "(1436509052.249713) vcan0 844#2A",
+        "(1436509052.24971) vcan0 044#2A",
+        "(1436509052.249713) vcan0 044#" + "00" * 9,
+        "(1436509052.249713) vcan0 044##0" + "00" * 65,
+        "(1436509052.249713) vcan0 44#00",
+        "(1436509052.249713) vcan0 0x4#00",
+        "can0  100   [3]  0D 3A 1F",
+    ],
+)
+def test_a_line_that_is_no_frame_is_none(line: str) -> None:
+    assert frame_of(line) is None
+
+
+@given(st.text(max_size=300))
+def test_no_text_makes_the_line_parser_raise(text: str) -> None:
+    frame_of(text)
+
+
+records = st.builds(
+    RawRecord, st.sampled_from(Way), st.integers(0, 2**64 - 1), st.binary(max_size=900)
+)
+
+
+def encoded(found: list[RawRecord]) -> bytes:
+    return b"".join(encode_records(record.way, record.t_ns, record.data) for record in found)
+
+
+@given(st.lists(records, max_size=10), st.integers(1, 50))
+def test_records_come_back_however_the_file_is_cut_into_chunks(
+    made: list[RawRecord], size: int
+) -> None:
+    data = encoded(made)
+    parser = RawParser()
+    found = [
+        record
+        for start in range(0, len(data), size)
+        for record in parser.feed(data[start : start + size])
+    ]
+    assert found == made
+    assert parser.damaged == 0
+
+
+@given(st.binary(min_size=961, max_size=5000))
+def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
+    found = list(RawParser().feed(encode_records(Way.RECEIVED, 5, data)))
+    assert b"".join(record.data for record in found) == data
+    assert {(record.way, record.t_ns) for record in found} == {(Way.RECEIVED, 5)}
+
+
+@given(st.lists(records, min_size=3, max_size=6), st.data())
+def test_damage_costs_the_record_that_is_damaged_and_the_one_after_it_at_most(
+    made: list[RawRecord], data: st.DataObject
+) -> None:
+    whole = bytearray(encoded(made))
+    at = data.draw(st.integers(0, len(whole) - 1))
+    whole[at] ^= data.draw(st.integers(1, 255))
+    found = list(RawParser().feed(bytes(whole)))
+    assert len(found) >= len(made) - 2
+    assert all(record in made for record in found)
+
+
+@given(st.lists(records, min_size=1, max_size=5), st.data())
+def test_a_file_that_was_cut_off_has_all_but_its_last_record(
+    made: list[RawRecord], data: st.DataObject
+) -> None:
+    cut = encoded(made)[: -data.draw(st.integers(1, len(encoded(made[-1:]))))]
+    assert list(RawParser().feed(cut)) == made[:-1]
+
+
+@given(st.binary(max_size=3000))
+def test_no_bytes_make_the_record_parser_raise(data: bytes) -> None:
+    list(RawParser().feed(data))
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 100, b"no frames\n" * 1000, bytes(range(256))])
+def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "capture"
+    path.write_bytes(content)
+    fingers = ("ff", "mf", "th")
+    drivers = (
+        CaptureReplayDriver([path], frames_of, CanCapture(fingers)),
+        CaptureReplayDriver([path], records_of, SerialCapture(fingers)),
+    )
+    for driver in drivers:
+        with pytest.raises(RecordingError, match="nothing that came over a link"), driver:
+            pass
+    with pytest.raises(ValueError, match="positive speed"):
+        CaptureReplayDriver([path], frames_of, CanCapture(fingers), speed=0.0)

@@ -1,0 +1,165 @@
+"""Recordings are read as far as they are whole, and nothing that is in a file breaks the reader."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.record_files import Joints, MessageFile
+from drivers.base import JointReading, RecordingError, TactileReading
+from drivers.mcap_recording import McapRecording, RecordedMessage
+from drivers.mcap_replay import McapReplayDriver
+
+BOOT = "0123456789abcdef" * 2
+OFFSET_NS = 10**18
+START_NS = 5 * 10**12
+PERIOD_NS = 10_000_000
+READINGS = 20
+NOW_NS = 7 * 10**12
+
+
+def counts_of(number: int) -> list[list[int]]:
+    counts: list[list[int]] = np.random.default_rng(number).integers(0, 4096, (2, 24)).tolist()
+    return counts
+
+
+def write(path: Path, first: int = 0) -> None:
+    """Readings of two fingers, 2 ms old when they were recorded, flushed after every fifth."""
+    header = {"fingers": '["ff", "th"]', "joints": "true", "boot_id": BOOT}
+    file = MessageFile(path, header, OFFSET_NS)
+    for number in range(first, first + READINGS):
+        t_ns = START_NS + number * PERIOD_NS
+        angles = JointReading(t_ns - 1000, number, ("FFJ3",), np.array([number / 100]))
+        tactile = {
+            "seq": number,
+            "t_mono_ns": t_ns,
+            "fingers": ["ff", "th"],
+            "counts": counts_of(number),
+            "faults": np.zeros((2, 24), dtype=int).tolist(),
+        }
+        joints = Joints.of(angles)
+        fields = {name: getattr(joints, name) for name in joints.__struct_fields__}
+        file.write(b"joints.right", json.dumps(fields).encode(), t_ns + 2_000_000)
+        file.write(b"tactile.right", json.dumps(tactile).encode(), t_ns + 2_000_000)
+        if number % 5 == 4:
+            file.flush()
+    file.close()
+
+
+def whole() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mcap"
+        write(path)
+        return path.read_bytes()
+
+
+WHOLE = whole()
+
+
+def read(data: bytes) -> list[RecordedMessage]:
+    return list(McapRecording(Path("a.mcap"), io.BytesIO(data)))
+
+
+def test_readings_come_back_as_old_as_they_were(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap")
+    write(tmp_path / "b.mcap", first=READINGS)
+    found: list[TactileReading] = []
+    turned: list[JointReading] = []
+    paths = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    with McapReplayDriver(paths, ("th", "ff"), clock=lambda: NOW_NS) as driver:
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                if isinstance(reading, TactileReading):
+                    found.append(reading)
+                else:
+                    turned.append(reading)
+    assert [reading.seq for reading in found] == list(range(2 * READINGS))
+    assert {reading.t_ns for reading in found} == {NOW_NS - 2_000_000}
+    assert [reading.made_ns - START_NS for reading in found] == [
+        number * PERIOD_NS for number in range(2 * READINGS)
+    ]
+    assert found[7].counts.tolist() == counts_of(7)[::-1]  # the thumb first, as was asked for
+    assert [reading.position_rad.tolist() for reading in turned][:2] == [[0.0], [0.01]]
+    assert driver.period_ns == PERIOD_NS
+    assert driver.counters.malformed == driver.counters.cut_off == 0
+
+
+def test_at_a_speed_readings_come_when_they_are_due(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap")
+    now_ns = NOW_NS
+    with McapReplayDriver(
+        [tmp_path / "a.mcap"], ("ff",), speed=2.0, clock=lambda: now_ns
+    ) as driver:
+        assert len(driver.read_ready()) == 1  # joints
+        assert len(driver.read_ready()) == 1  # tactile
+        assert driver.due_ns() == NOW_NS + PERIOD_NS // 2
+        assert not driver.read_ready()
+        now_ns += PERIOD_NS // 2
+        assert len(driver.read_ready()) == 1
+
+
+def test_a_finger_that_was_not_recorded_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap")
+    with pytest.raises(RecordingError, match="no finger mf"):
+        McapReplayDriver([tmp_path / "a.mcap"], ("mf",)).open()
+
+
+@given(st.integers(0, len(WHOLE) - 1))
+@settings(max_examples=200, deadline=None)
+def test_a_file_that_is_cut_anywhere_gives_what_was_flushed_before(at: int) -> None:
+    try:
+        found = read(WHOLE[:at])
+    except RecordingError:
+        found = []
+    assert found == read(WHOLE)[: len(found)]
+    assert len(found) % 10 == 0  # five readings and their joints, by flush
+
+
+@given(st.lists(st.tuples(st.integers(0, len(WHOLE) - 1), st.integers(0, 255)), max_size=5))
+@settings(max_examples=300, deadline=None)
+def test_no_damage_makes_the_reader_raise_anything_else(changes: list[tuple[int, int]]) -> None:
+    data = bytearray(WHOLE)
+    for at, value in changes:
+        data[at] = value
+    with contextlib.suppress(RecordingError):
+        read(bytes(data))
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_after_the_magic_make_it_raise_anything_else(data: bytes) -> None:
+    with pytest.raises(RecordingError):
+        read(b"\x89MCAP0\r\n" + data)
+
+
+def test_messages_that_are_no_readings_are_counted(tmp_path: Path) -> None:
+    header = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT}
+    file = MessageFile(tmp_path / "a.mcap", header, OFFSET_NS)
+    good = {"seq": 1, "t_mono_ns": 5, "fingers": ["ff"], "counts": [[1] * 24], "faults": [[0] * 24]}
+    wrong = [
+        b"",
+        b"{}",
+        b"\xff",
+        json.dumps(good | {"counts": [[1] * 23]}).encode(),
+        json.dumps(good | {"counts": [[-1] * 24]}).encode(),
+        json.dumps(good | {"counts": [[70_000] * 24]}).encode(),
+        json.dumps(good | {"fingers": ["mf"]}).encode(),
+        json.dumps(good | {"faults": []}).encode(),
+    ]
+    for payload in wrong:
+        file.write(b"tactile.right", payload, 10)
+    file.write(b"joints.right", b'{"seq":1,"t_mono_ns":1,"names":["FFJ3"],"position_rad":[]}', 10)
+    file.write(b"strange.right", b"{}", 10)
+    file.write(b"tactile.right", json.dumps(good).encode(), 10)
+    file.close()
+    with McapReplayDriver([tmp_path / "a.mcap"], ("ff",)) as driver:
+        assert len(driver.read_ready()) == 1
+        assert driver.exhausted
+    assert driver.counters.malformed == len(wrong) + 1
