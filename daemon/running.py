@@ -205,9 +205,10 @@ class Runner:
         from daemon.realtime import Hot
         from daemon.rehearsal import rehearse
 
+        # With a model of its own: how a model's inputs are scaled follows who judges with it.
+        model = assembly.load_model(parts.scene)
         rehearse(
-            lambda clock: assembly.build_pipeline(parts.scene, parts.model, clock),
-            parts.model.contract.seen,
+            lambda clock: assembly.build_pipeline(parts.scene, model, clock), model.contract.seen
         )
         return stack.enter_context(Hot(parts.scene.realtime))
 

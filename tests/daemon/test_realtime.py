@@ -4,20 +4,29 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import itertools
 import logging
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from daemon import assembly, scene
 from daemon.judge.verdict import GateState
 from daemon.realtime import Hot
 from daemon.rehearsal import rehearse
+from daemon.running import Parts, Runner, prepare
 from daemon.scene import Realtime
+from daemon.stop import StopSignal
+from drivers.base import TactileReading
+from drivers.replay import DEMO_TABLE
+from drivers.twins.grasps import Counts, recorded_counts
 
 WORLD = """
 import ctypes, os, resource, sys
@@ -163,3 +172,31 @@ def test_the_rehearsal_goes_through_a_whole_grasp(model: str) -> None:
     assert seen[-1] in (GateState.RELEASED, GateState.IDLE)
     if pipeline.session is not None:
         assert pipeline.session.grasps == 1
+
+
+def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Path) -> None:
+    """Also what its session has learned, which scales the input of its model."""
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
+        "[session]\nlearn = false\n[realtime]\nlock_memory = false\npriority = 1\n"
+    )
+    rows = list(itertools.islice(recorded_counts(DEMO_TABLE), 80))
+    judged = []
+    for rehearsed in (False, True):
+        parts = prepare(path)
+        judged.append(p_slips(parts, rows[:40]))
+        if rehearsed:
+            with StopSignal() as stop, ExitStack() as stack:
+                assert Runner(path, stop)._hot(parts, stack) is not None
+        judged[-1] += p_slips(parts, rows[40:])
+    assert judged[0] == judged[1]
+
+
+def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
+    return [
+        parts.pipeline.judge(
+            TactileReading(time.monotonic_ns(), 0, row, np.zeros(row.shape, dtype=np.uint8))
+        ).p_slip
+        for row in rows
+    ]
