@@ -1,0 +1,104 @@
+"""`python -m tests.system`: the service in a real Debian on a real kernel, from nothing.
+
+Needs the Debian packages mmdebstrap, qemu-system-x86 and e2fsprogs; who is not root also fakeroot
+and uidmap.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from tests.system import steps_faults, steps_install, steps_verdicts
+from tests.system.image import ImageError, image
+from tests.system.lab import Bridge, Lab, Outcome
+from tests.system.machine import Machine, MachineError
+from tests.system.payload import PROJECT, make_payload
+from tests.system.table import Table
+
+Step = Callable[[Lab], Outcome]
+
+STEPS: Final[tuple[Step, ...]] = (
+    steps_install.prepare,
+    steps_install.install,
+    steps_install.install_again,
+    steps_install.unit,
+    steps_install.check,
+    steps_install.start,
+    steps_install.realtime,
+    steps_install.access,
+    steps_verdicts.can_verdicts,
+    steps_verdicts.serial_verdicts,
+    steps_verdicts.can_frames,
+    steps_faults.killed,
+    steps_faults.hung,
+    steps_faults.bus_down,
+    steps_faults.unplugged,
+    steps_faults.bridge_hung,
+    steps_faults.disk_full,
+    steps_faults.clock_stepped,
+    steps_faults.wrong_reload,
+    steps_faults.stopped,
+    steps_faults.wrong_start,
+    steps_install.boot,
+    steps_install.uninstall,
+)
+NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
+"""Without these there is no use in going on."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run all steps; 0 if all is as it must be, 1 if something is not, 2 if it cannot be tried."""
+    parser = argparse.ArgumentParser(prog="python -m tests.system", description=__doc__)
+    parser.add_argument("--cache", type=Path, default=PROJECT / ".cache" / "system", metavar="DIR")
+    parser.add_argument(
+        "--rebuild", action="store_true", help="build the image even if it is there"
+    )
+    options = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
+    table = Table()
+    try:
+        with tempfile.TemporaryDirectory(prefix="graspd-system-") as folder:
+            _run(options.cache.resolve(), Path(folder), options.rebuild, table)
+    except (ImageError, MachineError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    table.end()
+    return 1 if table.failed else 0
+
+
+def _run(cache: Path, folder: Path, rebuild: bool, table: Table) -> None:
+    with table.timed("image") as seen:
+        built, is_new = image(cache, rebuild=rebuild)
+        seen.append("built" if is_new else "from the cache")
+    with table.timed("payload") as seen:
+        make_payload(cache, folder / "payload")
+        seen.append("wheels, deploy, programs for the machine")
+    bridge = Bridge(folder / "bridge")
+    with bridge.serving(), Machine(built, folder / "payload", bridge.path, folder) as machine:
+        with table.timed("boot") as seen:
+            machine.wait_for_agent()
+            seen.append("until commands run")
+        lab = Lab(machine, bridge)
+        for step in STEPS:
+            if not table.run(step, lab):
+                _explain(machine)
+                if step in NEEDED:
+                    return
+
+
+def _explain(machine: Machine) -> None:
+    """What the journal has, for whoever looks into a failure."""
+    with contextlib.suppress(MachineError):
+        said = machine.run("journalctl -q --no-pager -n 60 -p notice; systemctl --failed").out
+        sys.stderr.write(said + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

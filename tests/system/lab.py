@@ -1,0 +1,206 @@
+"""What the steps share: the machine, the twins on both sides of it, questions to it."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import shlex
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.twins.grasp_script import Durations
+from drivers.twins.spi import SpiTwin
+from drivers.twins.whole_grasps import synthetic_grasps
+from tests.system.machine import COMMAND_TIMEOUT_S, Machine
+from tests.system.messages import Message
+
+PAYLOAD: Final = "/payload"
+PYTHON: Final = "/opt/graspd/venv/bin/python"
+HANDS: Final = ("can", "serial")
+MEMBER, STRANGER = "member", "stranger"
+"""Users inside: of the group graspd, and of none."""
+CAN_RATE_HZ: Final = 10.0
+SERIAL_RATE_HZ: Final = 20.0
+"""Sweeps/s: what two emulated processors judge without falling behind."""
+GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(6.5, 6.5))
+"""At a fifth of the usual rate it takes as much longer to learn where the fingers rest (a hundred
+sweeps) and to settle."""
+PATIENCE_S: Final = 120.0
+"""For what takes a second on a computer that is not emulated."""
+LOOK_S: Final = 0.5
+
+
+class StepError(Exception):
+    """Something inside is not as it must be; the message says what."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a step saw."""
+
+    what: str
+    """One line."""
+    recovery_s: float | None = None
+    """From the deed to the first message that is well again, by the machine's clock."""
+
+
+class Lab:
+    """The machine, and what may be asked of it."""
+
+    def __init__(self, machine: Machine, bridge: Bridge) -> None:
+        self.machine = machine
+        self.bridge = bridge
+
+    def sh(self, script: str, timeout_s: float = COMMAND_TIMEOUT_S) -> str:
+        """What a script prints, without the last line's end. Raises `StepError` if it fails."""
+        done = self.machine.run(script, timeout_s)
+        if done.code:
+            said = (done.err or done.out).strip()[-2000:]
+            raise StepError(f"{script.splitlines()[0]} failed ({done.code}): {said}")
+        return done.out.rstrip("\n")
+
+    def deed(self, script: str) -> float:
+        """Run a script; when it began, by the machine's monotonic clock, s."""
+        return float(self.sh(f"read now _ < /proc/uptime; echo $now\n{script}").split()[0])
+
+    def now_s(self) -> float:
+        """The machine's monotonic clock, s."""
+        return self.deed(":")
+
+    def show(self, hand: str, what: str) -> str:
+        """A property of a hand's unit, as systemd has it."""
+        return self.sh(f"systemctl show --value -p {what} graspd@{hand}")
+
+    def journal(self, hand: str, after_s: float, priority: str = "debug") -> list[str]:
+        """Messages of a hand's unit, of a priority at least, since a time of the machine's clock.
+
+        By the monotonic clock: the wall clock is stepped, and a cursor skips the first match.
+        """
+        said = self.sh(
+            "journalctl -q -b --no-pager -o json --output-fields=MESSAGE "
+            f"-p {priority} -u graspd@{hand}"
+        )
+        entries = [json.loads(line) for line in said.splitlines()]
+        return [
+            str(entry["MESSAGE"])
+            for entry in entries
+            if int(entry["__MONOTONIC_TIMESTAMP"]) / 1e6 > after_s
+        ]
+
+    def await_journal(self, hand: str, after_s: float, text: str) -> None:
+        """Wait until a hand's unit says something. Raises `StepError` if it does not."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not any(text in line for line in self.journal(hand, after_s)):
+            if time.monotonic() > deadline_s:
+                raise StepError(f"{hand}: no word of {text!r} within {PATIENCE_S:g} s")
+            time.sleep(LOOK_S)
+
+    def await_message(
+        self,
+        hand: str,
+        after_s: float,
+        what: str,
+        wanted: Callable[[Message], bool] | None = None,
+        timeout_s: float = PATIENCE_S,
+    ) -> Message:
+        """The first message of a hand after a time that is wanted. Raises `StepError` if none."""
+
+        def fits(message: Message) -> bool:
+            return message.hand == hand and (message.judged if wanted is None else wanted(message))
+
+        found = self.machine.messages.wait(fits, timeout_s, after_s)
+        if found is None:
+            raise StepError(f"{hand}: {what}: not within {timeout_s:g} s")
+        return found
+
+    def await_true(
+        self, script: str, what: str, timeout_s: float = PATIENCE_S, look_s: float = LOOK_S
+    ) -> None:
+        """Wait until a script succeeds. Raises `StepError` if it never does."""
+        deadline_s = time.monotonic() + timeout_s
+        while self.machine.run(script).code:
+            if time.monotonic() > deadline_s:
+                raise StepError(f"{what}: not within {timeout_s:g} s")
+            time.sleep(look_s)
+
+    def status(self, hand: str) -> dict[str, Any]:
+        """The newest status of a hand. Raises `StepError` if there is none."""
+        message = self.machine.messages.last(hand, "status")
+        if message is None:
+            raise StepError(f"{hand}: no status has come")
+        return message.body
+
+    def verdicts(self, hand: str, from_s: float, to_s: float) -> list[Message]:
+        """Verdicts of a hand in a time, none of them lost. Raises `StepError` if one was."""
+        found = self.machine.messages.between(hand, "verdict", from_s, to_s)
+        for former, following in itertools.pairwise(found):
+            if former.body["boot_id"] != following.body["boot_id"]:
+                raise StepError(f"{hand}: started anew between {former.t_s} and {following.t_s} s")
+            if former.body["seq"] + 1 != following.body["seq"]:
+                raise StepError(f"{hand}: messages were lost after {former.body['seq']}")
+        return found
+
+    def observe(self) -> None:
+        """Have a member of the group subscribe to both hands."""
+        endpoints = " ".join(f"ipc:///run/graspd/{hand}.ipc" for hand in HANDS)
+        self.sh(
+            f"systemd-run -q --unit=observer --uid={MEMBER} "
+            "-p StandardOutput=file:/dev/virtio-ports/graspd.messages "
+            f"{PYTHON} {PAYLOAD}/guest/observe.py {endpoints}"
+        )
+
+    def twin(self, *options: str) -> None:
+        """Start the CAN board's twin on vcan0, or another one in its place."""
+        self.sh(
+            "systemctl stop twin-can 2>/dev/null; systemctl reset-failed twin-can 2>/dev/null\n"
+            "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
+            f"--interface socketcan --channel vcan0 --format sweep_fd {shlex.join(options)}"
+        )
+
+    def interface(self) -> dict[str, int]:
+        """Frames that the kernel has carried on vcan0, by its own counters."""
+        told = json.loads(self.sh("ip -s -j link show vcan0"))[0]["stats64"]
+        return {"sent": told["tx"]["packets"], "dropped": told["tx"]["dropped"]}
+
+
+class Bridge:
+    """An SPI bridge's twin on a terminal of the host, which the machine has as a USB adapter."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._quiet = threading.Event()
+        grasps = synthetic_grasps(rate_hz=SERIAL_RATE_HZ, durations=GRASPS, loop=True)
+        counts = (moment.counts for moment in grasps)
+        self._twin = SpiTwin(path, counts, rate_hz=SERIAL_RATE_HZ)
+
+    @contextlib.contextmanager
+    def serving(self) -> Iterator[None]:
+        """Serve in a thread of its own."""
+        stop = threading.Event()
+        with self._twin:
+            thread = threading.Thread(target=self._serve, args=(stop,))
+            thread.start()
+            try:
+                yield
+            finally:
+                stop.set()
+                thread.join()
+
+    @contextlib.contextmanager
+    def hung(self) -> Iterator[None]:
+        """Meanwhile the bridge neither hears nor says anything."""
+        self._quiet.set()
+        try:
+            yield
+        finally:
+            self._quiet.clear()
+
+    def _serve(self, stop: threading.Event) -> None:
+        while not stop.is_set():
+            self._twin.serve(lambda: stop.is_set() or self._quiet.is_set())
+            stop.wait(0.01)

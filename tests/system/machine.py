@@ -1,0 +1,225 @@
+"""One machine in QEMU, by software emulation: starts it, runs commands inside, pulls its cables."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import subprocess
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from tests.system.image import Image
+from tests.system.json_lines import JsonLines, ProtocolError
+from tests.system.messages import Messages
+
+MEMORY_MIB: Final = 1536
+CPUS: Final = 2
+START_TIMEOUT_S: Final = 10.0
+BOOT_TIMEOUT_S: Final = 180.0
+ANSWER_TIMEOUT_S: Final = 30.0
+"""For a guest agent that is busy, under emulation."""
+COMMAND_TIMEOUT_S: Final = 60.0
+SYNCHRONISE_S: Final = 5.0
+"""After this long the agent is asked again: while it starts it loses what it was asked."""
+BOOT_ID: Final = "cat /proc/sys/kernel/random/boot_id"
+POLL_S: Final = (0.05, 0.1, 0.2, 0.5)
+"""Waits between looks at whether a command has ended; the last one again and again."""
+AGENT_PORT: Final = "org.qemu.guest_agent.0"
+MESSAGE_PORT: Final = "graspd.messages"
+"""Name of the virtio port to which the guest writes what its subscriber receives."""
+ENVIRONMENT: Final = (
+    "PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin",
+    "LC_ALL=C.UTF-8",
+    "HOME=/root",
+)
+
+
+class MachineError(Exception):
+    """The machine does not do what every machine does: boot, run a command, answer in time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """A command that has ended."""
+
+    code: int
+    """Exit code; 128 and the signal's number if a signal ended it."""
+    out: str
+    err: str
+
+
+class Machine:
+    """Runs from `with` to its end; what it writes to its disk is forgotten."""
+
+    def __init__(self, image: Image, payload: Path, serial: Path, folder: Path) -> None:
+        """`payload`: a second disk. `serial`: a terminal of the host, the USB adapter's other end.
+
+        `folder` takes sockets and the console's log.
+        """
+        self.messages = Messages()
+        self.console = folder / "console.log"
+        self._image, self._payload, self._serial = image, payload, serial
+        self._folder = folder
+        self._number = 0
+        self._in_step = False
+        """Whether the agent has answered all that it was asked; else a late answer may come."""
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._qemu = subprocess.Popen(
+                self._command(), stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+            )
+            stack.callback(self._end)
+            try:
+                self._qmp = JsonLines(self._folder / "qmp", START_TIMEOUT_S)
+                stack.callback(self._qmp.close)
+                self._qmp.request("qmp_capabilities", ANSWER_TIMEOUT_S)
+                self._agent = JsonLines(self._folder / "agent", START_TIMEOUT_S)
+            except ProtocolError as error:
+                raise MachineError(f"QEMU does not start: {self._complaint()}") from error
+            stack.callback(self._agent.close)
+            stack.enter_context(self.messages.listening(self._folder / "messages"))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def wait_for_agent(self) -> None:
+        """Wait until commands can be run. Raises `MachineError`."""
+        deadline_s = time.monotonic() + BOOT_TIMEOUT_S
+        while time.monotonic() < deadline_s:
+            with contextlib.suppress(ProtocolError):
+                return self._synchronise()
+            if self._qemu.poll() is not None:
+                raise MachineError(f"QEMU has ended: {self._complaint()}")
+        raise MachineError(f"the machine has not booted in {BOOT_TIMEOUT_S:g} s")
+
+    def reboot(self) -> None:
+        """Start the machine anew, in good order; the messages so far are forgotten."""
+        former = self.run(BOOT_ID).out
+        self._begin("systemctl --no-block reboot")
+        deadline_s = time.monotonic() + BOOT_TIMEOUT_S
+        while time.monotonic() < deadline_s:
+            # The old one answers until it is stopped, and then in the middle no more.
+            with contextlib.suppress(MachineError):
+                if self.run(BOOT_ID, ANSWER_TIMEOUT_S).out != former:
+                    self.messages.forget()
+                    return
+            time.sleep(POLL_S[-1])
+        raise MachineError(f"the machine has not booted again in {BOOT_TIMEOUT_S:g} s")
+
+    def _synchronise(self) -> None:
+        """Ask the agent for a number, and read until it comes: what comes before is stale."""
+        self._number += 1
+        deadline_s = time.monotonic() + SYNCHRONISE_S
+        answer = self._agent.request("guest-sync", SYNCHRONISE_S, id=self._number)
+        while answer != self._number:
+            answer = self._agent.receive(deadline_s).get("return")
+        self._in_step = True
+
+    def run(self, script: str, timeout_s: float = COMMAND_TIMEOUT_S) -> Done:
+        """Run a shell script inside, as root. Raises `MachineError` if it does not end."""
+        deadline_s = time.monotonic() + timeout_s
+        pid = self._begin(script)
+        for look in range(1_000_000):
+            time.sleep(POLL_S[min(look, len(POLL_S) - 1)])
+            status = self._ask("guest-exec-status", pid=pid)
+            if status["exited"]:
+                return _done(status)
+            if time.monotonic() > deadline_s:
+                break
+        raise MachineError(f"no end after {timeout_s:g} s: {script}")
+
+    def unplug(self) -> None:
+        """Pull the USB serial adapter."""
+        self._qmp.request("device_del", ANSWER_TIMEOUT_S, id="adapter")
+
+    def plug(self) -> None:
+        """Put the USB serial adapter back."""
+        self._qmp.request(
+            "device_add",
+            ANSWER_TIMEOUT_S,
+            driver="usb-serial",
+            id="adapter",
+            chardev="bridge",
+            bus="usb.0",
+            serial=ADAPTER_SERIAL,
+        )
+
+    def _begin(self, script: str) -> int:
+        """Begin a shell script; its process id inside."""
+        if not self._in_step:
+            self.wait_for_agent()
+        started = self._ask(
+            "guest-exec",
+            path="/bin/sh",
+            arg=["-c", script],
+            env=list(ENVIRONMENT),
+            **{"capture-output": True},
+        )
+        return int(started["pid"])
+
+    def _ask(self, execute: str, **arguments: object) -> Any:  # noqa: ANN401
+        try:
+            return self._agent.request(execute, ANSWER_TIMEOUT_S, **arguments)
+        except ProtocolError as error:
+            self._in_step = False
+            if self._qemu.poll() is not None:
+                raise MachineError(f"QEMU has ended: {self._complaint()}") from error
+            raise MachineError(str(error)) from error
+
+    def _end(self) -> None:
+        self._qemu.kill()
+        self._qemu.communicate()
+
+    def _complaint(self) -> str:
+        self._qemu.kill()
+        return self._qemu.communicate()[1].strip()
+
+    def _command(self) -> list[str]:
+        words = [
+            *("setpriv", "--pdeathsig", "KILL"),  # QEMU must not outlive this process
+            "qemu-system-x86_64",
+            *("-accel", "tcg,thread=multi", "-machine", "q35", "-cpu", "max"),
+            *("-smp", str(CPUS), "-m", str(MEMORY_MIB)),
+            *("-nodefaults", "-no-user-config", "-display", "none", "-nic", "none"),
+            *("-kernel", str(self._image.kernel), "-initrd", str(self._image.initrd)),
+            *("-append", "root=/dev/vda rw console=ttyS0 quiet loglevel=4"),
+            *("-drive", f"file={self._image.disk},if=virtio,format=raw,snapshot=on"),
+            *("-drive", f"file={self._payload},if=virtio,format=raw,read-only=on"),
+            *("-serial", f"file:{self.console}"),
+            *("-chardev", f"socket,id=qmp,path={self._folder}/qmp,server=on,wait=off"),
+            *("-mon", "chardev=qmp,mode=control"),
+            *("-device", "virtio-serial"),
+        ]
+        for name, port in (("agent", AGENT_PORT), ("messages", MESSAGE_PORT)):
+            words += ["-chardev", f"socket,id={name},path={self._folder}/{name},server=on,wait=off"]
+            words += ["-device", f"virtserialport,chardev={name},name={port}"]
+        words += ["-device", "qemu-xhci,id=usb"]
+        words += ["-chardev", f"serial,id=bridge,path={os.path.realpath(self._serial)}"]
+        words += ["-device", f"usb-serial,id=adapter,chardev=bridge,serial={ADAPTER_SERIAL}"]
+        return words
+
+
+ADAPTER_SERIAL: Final = "GRASPD1"
+
+
+def _done(status: dict[str, Any]) -> Done:
+    code = status.get("exitcode", 128 + status.get("signal", 0))
+    out, err = (
+        base64.b64decode(status.get(name, "")).decode(errors="replace")
+        for name in ("out-data", "err-data")
+    )
+    return Done(code, out, err)

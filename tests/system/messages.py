@@ -1,0 +1,110 @@
+"""What a subscriber inside receives, with the times of arrival by the machine's clock."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+RECEIVE_BYTES: Final = 65536
+LOOK_S: Final = 0.2
+"""How soon the listening thread notices that it shall end."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a daemon."""
+
+    t_s: float
+    """When it came, by the machine's monotonic clock."""
+    kind: str
+    """`verdict`, `gate` or `status`."""
+    hand: str
+    body: dict[str, Any]
+
+    @property
+    def judged(self) -> bool:
+        """Whether it is a verdict that is one, `stable` or `slip`."""
+        return self.kind == "verdict" and bool(self.body["valid"])
+
+
+Wanted = Callable[[Message], bool]
+
+
+class Messages:
+    """All messages so far, kept by a thread that listens."""
+
+    def __init__(self) -> None:
+        self._all: list[Message] = []
+        self._changed = threading.Condition()
+
+    @contextlib.contextmanager
+    def listening(self, path: Path) -> Iterator[None]:
+        """Listen on the Unix socket where the machine's port ends."""
+        stop = threading.Event()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as port:
+            port.connect(str(path))
+            port.settimeout(LOOK_S)
+            thread = threading.Thread(target=self._listen, args=(port, stop))
+            thread.start()
+            try:
+                yield
+            finally:
+                stop.set()
+                thread.join()
+
+    def forget(self) -> None:
+        """All messages so far: the machine's clock has started anew."""
+        with self._changed:
+            self._all = []
+
+    def wait(self, wanted: Wanted, timeout_s: float, after_s: float = 0.0) -> Message | None:
+        """The first that is wanted and came later than `after_s`; None if none came in time."""
+        deadline_s = time.monotonic() + timeout_s
+        at = 0
+        with self._changed:
+            while True:
+                for message in self._all[at:]:
+                    if message.t_s > after_s and wanted(message):
+                        return message
+                at = len(self._all)
+                if not self._changed.wait(max(deadline_s - time.monotonic(), 0.0)):
+                    return None
+
+    def between(self, hand: str, kind: str, from_s: float, to_s: float) -> list[Message]:
+        """Messages of a hand and kind that came in this time."""
+        with self._changed:
+            found = list(self._all)
+        return [m for m in found if (m.hand, m.kind) == (hand, kind) and from_s < m.t_s <= to_s]
+
+    def last(self, hand: str, kind: str) -> Message | None:
+        """The newest of a hand and kind."""
+        return next(reversed(self.between(hand, kind, 0.0, float("inf"))), None)
+
+    def _listen(self, port: socket.socket, stop: threading.Event) -> None:
+        rest = b""
+        while not stop.is_set():
+            try:
+                chunk = port.recv(RECEIVE_BYTES)
+            except TimeoutError:
+                continue
+            if not chunk:
+                return
+            *lines, rest = (rest + chunk).split(b"\n")
+            self._take(lines)
+
+    def _take(self, lines: list[bytes]) -> None:
+        taken = []
+        for line in lines:
+            told = json.loads(line)
+            kind, hand = told["topic"].split(".", 1)
+            taken.append(Message(told["t_s"], kind, hand, told["body"]))
+        with self._changed:
+            self._all += taken
+            self._changed.notify_all()

@@ -1,0 +1,62 @@
+"""The machine's second disk: wheels, `deploy/`, and the programs that run inside."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+from typing import Final
+
+from tests.system.image import ImageError, run
+
+PROJECT: Final = Path(__file__).parents[2]
+GUEST: Final = Path(__file__).parent / "guest"
+GUEST_PYTHON: Final = (3, 11)
+"""Python of the machine's release; wheels are made by this one for that one."""
+SLACK_MIB: Final = 24
+"""What the file system itself takes, and more."""
+
+
+def make_payload(cache: Path, disk: Path) -> None:
+    """Make the disk; wheels of other projects are kept in `cache`. Raises `ImageError`."""
+    if sys.version_info[:2] != GUEST_PYTHON:
+        wanted = ".".join(map(str, GUEST_PYTHON))
+        raise ImageError(f"the machine has Python {wanted}: run this with Python {wanted}")
+    with tempfile.TemporaryDirectory(dir=disk.parent, prefix="payload-") as scratch:
+        content = Path(scratch) / "content"
+        wheels = content / "wheels"
+        shutil.copytree(_dependencies(cache), wheels)
+        _wheel(wheels, "--no-deps", str(PROJECT))
+        shutil.copytree(PROJECT / "deploy", content / "deploy")
+        shutil.copy(
+            PROJECT / "drivers" / "demo" / "synthetic_grasps.csv", content / "recording.csv"
+        )
+        shutil.copytree(GUEST, content / "guest", ignore=shutil.ignore_patterns("__pycache__"))
+        bytes_ = sum(path.stat().st_size for path in content.rglob("*"))
+        size = f"{(bytes_ >> 20) * 5 // 4 + SLACK_MIB}M"
+        options = ["-t", "ext4", "-E", "root_owner=0:0", "-d", str(content)]
+        run(["mke2fs", "-q", *options, str(disk), size])
+
+
+def _dependencies(cache: Path) -> Path:
+    """A folder with the wheels of what the project needs."""
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
+    wanted = sorted(project["dependencies"])
+    digest = hashlib.sha256("\n".join(wanted).encode()).hexdigest()[:16]
+    folder = cache / f"wheels-{digest}"
+    if not folder.is_dir():
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=cache, prefix="wheels-new-") as scratch:
+            made = Path(scratch) / "made"
+            _wheel(made, *wanted)
+            for former in cache.glob("wheels-????????????????"):
+                shutil.rmtree(former)
+            made.rename(folder)
+    return folder
+
+
+def _wheel(folder: Path, *what: str) -> None:
+    run([sys.executable, "-m", "pip", "wheel", "--quiet", "--wheel-dir", str(folder), *what])

@@ -1,0 +1,135 @@
+"""Steps of the system test: install, look at what was installed, remove it again."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from tests.system.lab import HANDS, MEMBER, PAYLOAD, PYTHON, STRANGER, Lab, Outcome, StepError
+
+INSTALL: Final = f"sh {PAYLOAD}/deploy/install.sh"
+OFFLINE: Final = f"{INSTALL} --wheelhouse {PAYLOAD}/wheels"
+INSTALL_TIMEOUT_S: Final = 900.0
+CHECK_TIMEOUT_S: Final = 180.0
+EXPOSURE_MAX: Final = 2.5
+EACCES: Final = 13
+
+
+def prepare(lab: Lab) -> Outcome:
+    """The machine is up; give it disk, users and a CAN bus."""
+    state = lab.sh("systemctl is-system-running --wait")
+    lab.sh(f"mkdir {PAYLOAD} && mount -o ro /dev/vdb {PAYLOAD}")
+    # The disk will be filled: the journal must not live on it.
+    lab.sh("journalctl --relinquish-var")
+    lab.sh("modprobe vcan && ip link add vcan0 type vcan && ip link set vcan0 up")
+    versions = lab.sh("uname -r; systemctl --version | sed -n '1s/(.*//p'; python3 --version")
+    boot = lab.sh("systemd-analyze | sed -n '1s/.*= *//p'")
+    return Outcome(f"{state}; Linux {', '.join(versions.split(chr(10)))}; by itself {boot}")
+
+
+def install(lab: Lab) -> Outcome:
+    """Offline, from wheels alone."""
+    lab.sh(OFFLINE, INSTALL_TIMEOUT_S)
+    lab.sh(f"useradd -G graspd {MEMBER} && useradd {STRANGER}")
+    scenes = " ".join(f"{PAYLOAD}/guest/{hand}.toml" for hand in HANDS)
+    lab.sh(f"cp {scenes} /etc/graspd/")
+    lab.sh(
+        "install -D -m 644 -t /etc/systemd/system/graspd@.service.d "
+        f"{PAYLOAD}/guest/emulation.conf && systemctl daemon-reload"
+    )
+    return Outcome(lab.sh("graspd --version") + ", offline, from wheels")
+
+
+def install_again(lab: Lab) -> Outcome:
+    """A second run has nothing to do."""
+    said = lab.sh(OFFLINE, INSTALL_TIMEOUT_S)
+    if "nothing to change" not in said:
+        raise StepError(f"a second run changes something: {said}")
+    return Outcome("a second run says that there is nothing to change")
+
+
+def unit(lab: Lab) -> Outcome:
+    """The unit is right, and as closed as it says."""
+    done = lab.machine.run("systemd-analyze verify graspd@can.service")
+    if done.code or done.err.strip():
+        raise StepError(f"systemd-analyze verify: {done.err}")
+    said = lab.sh("systemd-analyze security --no-pager graspd@can.service | tail -n 1")
+    found = re.search(r"graspd@can\.service: ([0-9.]+)", said)
+    if found is None or float(found[1]) >= EXPOSURE_MAX:
+        raise StepError(f"systemd-analyze security: {said}")
+    return Outcome(f"verify finds nothing, security says {found[1]}")
+
+
+def check(lab: Lab) -> Outcome:
+    """The scenes are fine, and the doctor sees the bridge behind the USB adapter."""
+    scenes = [f"/etc/graspd/{hand}.toml" for hand in HANDS]
+    said = lab.sh(f"graspd check {' '.join(scenes)}", CHECK_TIMEOUT_S)
+    if not all(f"{scene}: fine" in said for scene in scenes):
+        raise StepError(f"graspd check: {said}")
+    done = lab.machine.run("graspd doctor /etc/graspd/serial.toml", CHECK_TIMEOUT_S)
+    if done.code or "link up" not in done.out:
+        raise StepError(f"graspd doctor ({done.code}): {done.out}{done.err}")
+    return Outcome("check finds both scenes fine, doctor finds nothing wrong on the serial port")
+
+
+def start(lab: Lab) -> Outcome:
+    """Both hands at once; systemd waits for READY."""
+    began_s = lab.deed("systemctl start " + " ".join(f"graspd@{hand}" for hand in HANDS))
+    ready_s = []
+    for hand in HANDS:
+        ready_s.append(int(lab.show(hand, "ActiveEnterTimestampMonotonic")) / 1e6 - began_s)
+        if not lab.show(hand, "StatusText"):
+            raise StepError(f"{hand}: no STATUS")
+    lab.observe()
+    what = " and ".join(f"{hand} after {s:.1f} s" for hand, s in zip(HANDS, ready_s, strict=True))
+    return Outcome(f"READY {what}", max(ready_s))
+
+
+def realtime(lab: Lab) -> Outcome:
+    """The scene's [realtime] is granted by the unit, and nothing is missing."""
+    pid = lab.show("can", "MainPID")
+    policy = lab.sh(f"ps -o cls=,rtprio= -p {pid}").split()
+    locked_kib = int(lab.sh(f"sed -n 's/^VmLck:[^0-9]*\\([0-9]*\\).*/\\1/p' /proc/{pid}/status"))
+    if policy != ["FF", "50"] or not locked_kib:
+        raise StepError(f"scheduling {policy}, {locked_kib} KiB locked")
+    warnings = lab.journal("can", 0.0, "warning")
+    if warnings:
+        raise StepError(f"warnings: {warnings}")
+    return Outcome(f"SCHED_FIFO 50, {locked_kib >> 10} MiB locked, without a privilege")
+
+
+def access(lab: Lab) -> Outcome:
+    """Members of the group may connect, others not."""
+    probe = f"{PYTHON} {PAYLOAD}/guest/may_connect.py /run/graspd/can.ipc"
+    for user, expected in ((MEMBER, 0), (STRANGER, EACCES)):
+        code = lab.machine.run(f"runuser -u {user} -- {probe}").code
+        if code != expected:
+            raise StepError(f"{user} connects with {code}, not {expected}")
+    return Outcome("a member of the group graspd may subscribe, a stranger gets EACCES")
+
+
+def boot(lab: Lab) -> Outcome:
+    """An enabled hand is there after a restart of the machine, with nobody's help."""
+    lab.sh(f"{OFFLINE} --enable serial", INSTALL_TIMEOUT_S)
+    lab.machine.reboot()
+    lab.await_true("systemctl is-active -q graspd@serial", "graspd@serial runs", look_s=1.0)
+    ready_s = int(lab.show("serial", "ActiveEnterTimestampMonotonic")) / 1e6
+    lab.sh(f"mount -o ro /dev/vdb {PAYLOAD}")
+    lab.observe()
+    lab.await_message("serial", 0.0, "a judged grasp after the boot")
+    return Outcome("READY by itself, this long after the kernel began", ready_s)
+
+
+def uninstall(lab: Lab) -> Outcome:
+    """Nothing is left, except what belongs to the user; with --purge not even that."""
+    lab.sh("rm -r /etc/systemd/system/graspd@.service.d; systemctl stop observer")
+    lab.sh(f"{INSTALL} --uninstall")
+    find = "find / -xdev -iname '*graspd*' ! -path '/proc/*' ! -path '/sys/*' | sort"
+    left = lab.sh(find).split()
+    if [path for path in left if not path.startswith(("/etc/graspd", "/var/lib/graspd"))]:
+        raise StepError(f"left behind: {' '.join(left)}")
+    lab.sh(f"gpasswd -q -d {MEMBER} graspd; {INSTALL} --uninstall --purge")
+    left = lab.sh(find).split()
+    if left or lab.machine.run("id graspd").code == 0:
+        raise StepError(f"left behind after --purge: {' '.join(left)}")
+    return Outcome("leaves scenes and sessions, and with --purge nothing")
