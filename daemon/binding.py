@@ -69,6 +69,11 @@ class Bound(ABC):
             raise PublishError(f"{self.endpoint} is closed")
         return self._made
 
+    @property
+    def is_open(self) -> bool:
+        """False if the endpoint could not be had again."""
+        return self._made is not None
+
     @abstractmethod
     def _open(self) -> zmq.Socket[bytes]:
         """A new socket, bound. Raises `PublishError`."""
@@ -87,6 +92,9 @@ class Bound(ABC):
         while True:
             try:
                 self._made = self._open()
+            except zmq.ZMQError as error:  # no more descriptors
+                self.close()
+                raise PublishError(f"{self.endpoint}: {error.strerror}") from error
             except PublishError:
                 # A socket of ours that has just been closed may hold its port for a moment.
                 if not again or time.monotonic() >= deadline_s:

@@ -132,6 +132,7 @@ class _Run:
         self._usable_ns: int | None = None
         self._usable = np.ones((len(fingers), ELECTRODES), dtype=np.bool_)
         self._latest: TactileReading | None = None
+        self._sound = False
 
     def feel(self, reading: TactileReading) -> None:
         """Take in a reading, as `daemon.judge.grip` does."""
@@ -139,6 +140,7 @@ class _Run:
         if latest is not None and reading.seq != latest.seq + 1:
             self._fresh.reset()  # what is not in the recording was judged too
         watched = self._health.watch(reading)
+        self._sound = not (watched.reasons or watched.broken.any())
         if watched.reasons:
             return
         last_ns, self._usable_ns = self._usable_ns, reading.t_ns
@@ -150,10 +152,12 @@ class _Run:
     def counts_of(self, verdict: Verdict) -> NDArray[np.uint16] | None:
         """What a verdict was made of, shape (fingers, 24); None if it judged nothing.
 
-        None too where the recording lacks the sweeps before it.
+        None too where the recording lacks the sweeps before it, or an electrode of it is broken.
         """
         latest = self._latest
         if not verdict.judged or latest is None or latest.t_ns != verdict.t_mono_ns:
+            return None
+        if not self._sound:  # some of the counts are none, whatever the verdict made of them
             return None
         if self._single:
             return latest.counts

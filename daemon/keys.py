@@ -62,7 +62,7 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
 def load_clients(folder: Path) -> dict[bytes, str]:
     """Names of those who may connect, by their public key, Z85. Raises `KeysError`."""
     try:
-        paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)
+        paths = sorted(p for p in folder.iterdir() if p.suffix == PUBLIC and p.is_file())
     except OSError as error:
         raise KeysError(f"{folder}: cannot list the keys: {error.strerror}") from error
     if len(paths) > CLIENTS_MAX:

@@ -32,4 +32,5 @@ class Latest(Bound):
 
     def send(self, payload: bytes) -> None:
         """Hand one payload to ZeroMQ; never blocks."""
-        self.socket.send(payload, flags=zmq.NOBLOCK)
+        if self.is_open:
+            self.socket.send(payload, flags=zmq.NOBLOCK)

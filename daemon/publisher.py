@@ -14,6 +14,10 @@ from daemon.binding import Binding, Bound
 
 SUBSCRIBED, UNSUBSCRIBED = 1, 0
 """First byte of a message on an XPUB socket: somebody wants a topic, nobody does any more."""
+REPEATED = (b"verdict.", b"status.")
+"""Topics whose last message is for those who come later, too."""
+VERDICT_REPEATED_NS = 100_000_000
+"""An older verdict is not repeated: who gets it would take it for new."""
 SUBSCRIBED_MAX = 100
 """Topics that are remembered as wanted; the daemon has five."""
 SUBSCRIPTION_MAX_BYTES = 128
@@ -44,8 +48,8 @@ class Stop(Protocol):
 class Publisher(Bound):
     """Publishes two-frame messages `[topic, payload]`; never blocks the caller.
 
-    Whoever subscribes gets the last message of each topic that it asks for at once; others may see
-    such a message twice, with the same `seq`.
+    Whoever subscribes gets the last status and, if it is fresh, the last verdict at once; others
+    may see such a message twice, with the same `seq`.
 
     A subscriber that falls behind by the high-water mark loses messages, which is counted, and sees
     the gap in `seq`; it cannot delay anyone else. Different subscriptions are all remembered by
@@ -68,8 +72,8 @@ class Publisher(Bound):
         tells), messages repeated for new peers, subscriptions."""
         self._high_water_mark = high_water_mark
         self._clock = clock
-        self._last: dict[bytes, bytes] = {}
-        """Last payload by topic; the daemon has three."""
+        self._last: dict[bytes, tuple[bytes, int]] = {}
+        """Last payload, and when it was sent, by topic; the daemon has two."""
         self._subscribed: set[bytes] = set()
         """What topics that somebody wants begin with."""
         self._owed: set[bytes] = set()
@@ -98,10 +102,13 @@ class Publisher(Bound):
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Hand one message to ZeroMQ, and keep it for those who come later."""
-        self._last[topic] = payload
+        if topic.startswith(REPEATED):
+            self._last[topic] = (payload, self._clock())
         self._send(topic, payload)
 
     def _send(self, topic: bytes, payload: bytes) -> None:
+        if not self.is_open:
+            return
         try:
             self.socket.send_multipart((topic, payload), flags=zmq.NOBLOCK, copy=True)
         except zmq.Again:
@@ -140,8 +147,15 @@ class Publisher(Bound):
             return
         self._repeat_due_ns = now_ns + REPEAT_NS
         for topic in self._owed:
-            self._send(topic, self._last[topic])
-            self.counters["repeated"] += 1
+            payload, sent_ns = self._last[topic]
+            if not topic.startswith(REPEATED[0]) or now_ns - sent_ns <= VERDICT_REPEATED_NS:
+                self._send(topic, payload)
+                self.counters["repeated"] += 1
+        self._owed.clear()
+
+    def forget(self) -> None:
+        """Repeat nothing of what was sent up to now."""
+        self._last.clear()
         self._owed.clear()
 
     def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:

@@ -83,6 +83,8 @@ class Questions(Bound):
     def take(self, now_ns: int) -> int:
         """Take in what has come; how many questions it was."""
         taken = 0
+        if not self.is_open:
+            return taken
         for _ in range(TAKEN_MAX):
             if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:
                 break
@@ -131,7 +133,9 @@ class Questions(Bound):
 
         Whoever is gone misses it.
         """
-        while self._waiting and (now_ns is None or self._waiting[0].due_ns <= now_ns):
+        while (
+            self.is_open and self._waiting and (now_ns is None or self._waiting[0].due_ns <= now_ns)
+        ):
             question = self._waiting.popleft()
             self.socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
             self.counters["answered"] += 1

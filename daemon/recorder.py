@@ -42,7 +42,7 @@ FLUSH_AFTER: Final = 0.8
 """Of the flush interval: so that, with a round and the writing, nothing waits longer than that."""
 SWITCH_S: Final = 0.0005
 """How long the thread may go on while the loop wants to run, s; Python's own is ten times that."""
-CLOSE_S: Final = 5.0
+CLOSE_S: Final = 0.5
 """How long the end waits for a disk that does not answer, s."""
 
 
@@ -159,11 +159,16 @@ class Recorder:
     def _work(self) -> None:
         with contextlib.suppress(OSError):  # never in the way of the loop, if that is realtime
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
+        try:
+            while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
+                self._go_round()
+            self._flush_due_ns = 0
             self._go_round()
-        self._flush_due_ns = 0
-        self._go_round()
-        self._finish()
+        except BaseException:
+            self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
+            raise
+        finally:
+            self._finish()
 
     def _go_round(self) -> None:
         """Write what waits; after a failure let it go until it is time to try again."""

@@ -104,7 +104,7 @@ class Runner:
             self._running = False
             try:
                 ended = self._work(parts)
-            except (scene.SceneError, RecordingError, PublishError, DriverError) as error:
+            except (scene.SceneError, ModelError, PublishError, DriverError) as error:
                 if former is None or self._running:
                     raise
                 self._refuse(error)
@@ -171,7 +171,10 @@ class Runner:
             _announce(wanted)
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
-            return service.run()
+            try:
+                return service.run()
+            finally:
+                sockets.publisher.forget()
 
     def _recorder(
         self, parts: Parts, boot_id: str, tap: Tap | None, stack: ExitStack
@@ -206,10 +209,14 @@ class Runner:
         from daemon.rehearsal import rehearse
 
         # With a model of its own: how a model's inputs are scaled follows who judges with it.
-        model = assembly.load_model(parts.scene)
-        rehearse(
-            lambda clock: assembly.build_pipeline(parts.scene, model, clock), model.contract.seen
-        )
+        try:
+            model = assembly.load_model(parts.scene)
+            rehearse(
+                lambda clock: assembly.build_pipeline(parts.scene, model, clock),
+                model.contract.seen,
+            )
+        except ModelError as error:  # the file has changed since; the one in memory is sound
+            log.warning("no rehearsal: %s", error)
         return stack.enter_context(Hot(parts.scene.realtime))
 
     def _reload(self) -> bool:

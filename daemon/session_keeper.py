@@ -16,6 +16,8 @@ from models.session import SessionState
 
 log = logging.getLogger("graspd")
 
+WAIT_S = 0.4
+"""For a disk, at the end: the daemon has a second."""
 SAVE_PERIOD_NS = 10_000_000_000
 """What a power cut may cost: the grasps of ten seconds."""
 
@@ -63,9 +65,9 @@ class SessionKeeper:
         self.wait()
 
     def wait(self) -> None:
-        """Until what is being saved is on the disk, or is not."""
+        """Until what is being saved is on the disk, or is not; not for a disk that hangs."""
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(WAIT_S)
             self._thread = None
 
     def _saving(self) -> bool:
@@ -78,7 +80,7 @@ class SessionKeeper:
         if known == self._saved:
             return
         what = (self._session.state(), dict(self._serials), known)
-        self._thread = threading.Thread(target=self._write, args=what, name="session")
+        self._thread = threading.Thread(target=self._write, args=what, name="session", daemon=True)
         self._thread.start()
 
     def _write(

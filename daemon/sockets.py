@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self
 
 import zmq
 
-from daemon.binding import Binding
+from daemon.binding import Binding, PublishError
 from daemon.publisher import Publisher
 from daemon.scene import Curve, Scene, SceneError
 
@@ -32,6 +32,8 @@ class Sockets:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
         self._curve = wanted.curve
         self._keys_seen: object = None
+        self._lost = False
+        """Whether a port could not be had again."""
         self.gatekeeper: Gatekeeper | None = None
         self.publisher: Publisher
         self.latest: Latest | None = None
@@ -76,7 +78,7 @@ class Sockets:
     def _watch(self) -> None:
         if self.gatekeeper is not None:
             for bound in self._bound():
-                if bound.endpoint.startswith("tcp://"):
+                if bound.endpoint.startswith("tcp://") and bound.is_open:
                     self.gatekeeper.watch(bound.socket)
 
     def _bound(self) -> list[Publisher | Latest | Questions]:
@@ -95,14 +97,14 @@ class Sockets:
 
     def filenos(self) -> list[int]:
         """Become readable when a peer may want something; call `take` before waiting for them."""
-        found = [self.publisher.fileno()]
-        if self.questions is not None:
-            found.append(self.questions.fileno())
+        asked = [each for each in (self.publisher, self.questions) if each is not None]
+        found = [each.fileno() for each in asked if each.is_open]
         return found if self.gatekeeper is None else found + self.gatekeeper.filenos()
 
     def take(self) -> None:
         """See to peers that come; questions are taken by themselves."""
-        self.publisher.take()
+        if self.publisher.is_open:
+            self.publisher.take()
         if self.gatekeeper is not None:
             self.gatekeeper.take()
 
@@ -114,15 +116,14 @@ class Sockets:
     def mind_keys(self) -> None:
         """If the list of those who may connect has changed, take it; who is off it is cut off.
 
-        A list that cannot be read changes nothing. Raises `PublishError` if a port is lost to
-        somebody else meanwhile.
+        A list that cannot be read changes nothing, and is tried again. A port that somebody else
+        has taken meanwhile is left to them, and tried again.
         """
         if self._curve is None or self.gatekeeper is None:
             return
         now = _state(self._curve.clients)
-        if now == self._keys_seen:
+        if now == self._keys_seen and not self._lost:
             return
-        self._keys_seen = now
         from daemon.keys import KeysError, load_clients
 
         try:
@@ -130,13 +131,25 @@ class Sockets:
         except KeysError as error:
             log.error("%s; the former list stands", error)
             return
-        log.info("%d keys may connect", len(admitted))
-        if self.gatekeeper.admit(admitted):
+        if now != self._keys_seen:
+            log.info("%d keys may connect", len(admitted))
+        self._keys_seen = now
+        if self.gatekeeper.admit(admitted) or self._lost:
+            self._cut_off()
+
+    def _cut_off(self) -> None:
+        """Close all connections by TCP: libzmq cannot cut off one peer alone."""
+        if self.gatekeeper is not None:
             self.gatekeeper.unwatch()
-            for bound in self._bound():
-                if bound.endpoint.startswith("tcp://"):
-                    bound.renew()  # libzmq cannot cut off one peer alone
-            self._watch()
+        self._lost = False
+        for bound in self._bound():
+            if bound.endpoint.startswith("tcp://"):
+                try:
+                    bound.renew()
+                except PublishError as error:
+                    log.error("%s; nobody can connect there", error)
+                    self._lost = True
+        self._watch()
 
     def close(self) -> None:
         """Close them all. May be called again."""
@@ -156,7 +169,8 @@ class Sockets:
 def plan(wanted: Scene) -> object:
     """What of a scene is about its sockets: equal for scenes that can share them."""
     asked = (wanted.ask_endpoint, wanted.gate.request_ms)
-    return wanted.hand.name, wanted.publish, wanted.curve, asked
+    own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
+    return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
 
 
 def _state(folder: Path) -> object:
@@ -166,4 +180,4 @@ def _state(folder: Path) -> object:
             found = [(entry.name, entry.stat()) for entry in entries]
     except OSError as error:
         return error.errno
-    return sorted((name, status.st_mtime_ns, status.st_size) for name, status in found)
+    return sorted((name, each.st_mtime_ns, each.st_ctime_ns, each.st_size) for name, each in found)

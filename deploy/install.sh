@@ -16,7 +16,7 @@ Run it again to bring an installation up to date; where there is nothing to do i
   --prefix DIR      where the virtual environment goes (/opt/graspd, or where it is already)
   --wheelhouse DIR  install from the wheels in DIR and from nowhere else; graspd's own must be among
                     them. On a computer with network and the same Python: pip wheel -w DIR .
-  --extras LIST     optional parts of graspd, such as record
+  --extras LIST     optional parts of graspd, such as record (those that are there already; none: -)
   --python PROGRAM  the Python to use, 3.11 or newer (python3)
   --can             also have systemd-networkd bring up can0; an update keeps it
   --rebuild         make the virtual environment anew even if graspd has not changed
@@ -25,7 +25,7 @@ Run it again to bring an installation up to date; where there is nothing to do i
                     no user is made and no service touched
   --uninstall       stop all hands and remove what was installed, but not the scenes in /etc/graspd
                     and not what the hands have learned in /var/lib/graspd
-  --purge           with --uninstall: remove those and the user graspd too
+  --purge           with --uninstall: remove those, recordings and the user graspd too
 
 Exit codes: 0 done; 1 failed, what was installed before still works; 2 wrong command line.
 END
@@ -55,6 +55,7 @@ main() {
     scratch=$(mktemp -d)
     [ -z "$root" ] || find_root
     find_prefix
+    find_extras
     check_host
     if [ -n "$uninstall" ]; then remove; else install_all; fi
 }
@@ -132,6 +133,14 @@ find_prefix() {
     if [ -e "$root$prefix/venv" ] && [ ! -L "$root$prefix/venv" ]; then
         fail "$prefix/venv is there and was not made here; choose another --prefix"
     fi
+}
+
+# Those that are wanted, or that are there: an update must not take the recorder away.
+find_extras() {
+    case $extras in
+        -) extras='' ;;
+        '') extras=$(cat "$root$prefix/venv/extras" 2>/dev/null || true) ;;
+    esac
 }
 
 check_host() {
@@ -219,6 +228,7 @@ environment() {
         fail "the new graspd does not start; nothing has changed"
     settle
     printf '%s\n' "$digest" >"$new/inputs.sha256"
+    printf '%s\n' "$extras" >"$new/extras"
     ln -sfn "${new##*/}" "$root$prefix/venv.new"
     mv -T "$root$prefix/venv.new" "$current"
     new=''

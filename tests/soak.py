@@ -128,6 +128,7 @@ class Soak:
         self._sample_s = time.monotonic()
         self._deeds: deque[tuple[float, Callable[[], None]]] = deque()
         self._kills = self._stops = 0
+        self._ended_early = False
 
     def run(self) -> Found:
         """Do it. Raises `RuntimeError` if the daemon does not start, with what it said."""
@@ -147,6 +148,7 @@ class Soak:
             self._samples.clear()
             self._plan_deeds()
             self._hear(self._has_ended, self._plan.seconds)
+            self._ended_early = self._has_ended()
             self._twin.process.terminate()
             self._hear(lambda: self._twin.process.poll() is not None, STOP_S)
             self._hear(lambda: False, SETTLED_S)
@@ -190,6 +192,8 @@ class Soak:
             stops=self._stops,
             exit_code=code,
             stop_s=stop_s,
+            planned=self._plan.rate_hz * self._plan.seconds,
+            ended_early=self._ended_early,
         )
 
     def _plan_deeds(self) -> None:

@@ -125,6 +125,10 @@ class Found:
     stops: int
     exit_code: int
     stop_s: float
+    planned: float = 0.0
+    """Readings that would have come without faults and outages."""
+    ended_early: bool = False
+    """Whether the daemon was gone before it was told to stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +158,17 @@ def slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
     return float(np.median((y[second] - y[first]) / (x[second] - x[first])))
 
 
+FEW = 0.2
+"""Share of the planned readings that must have come: with fewer nothing has been tried."""
+
+
 def judge(found: Found) -> list[Row]:
     """Everything that was found, beside its limit."""
     heard = found.heard
     return [
         Row("readings", heard.readings),
+        Row("missing of a fifth of the plan's", max(FEW * found.planned - heard.readings, 0), 0),
+        Row("ended before it was told to", found.ended_early, 0),
         Row("faults and outages", _harm(found)),
         *_resources(found.samples),
         Row("gaps in seq", heard.gaps, GAPS_MAX),

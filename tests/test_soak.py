@@ -218,3 +218,13 @@ def test_faults_are_given_by_the_names_of_their_fields() -> None:
     assert len(link_faults("dead=3").dead_electrodes) == 3
     with pytest.raises(TypeError):
         link_faults("gremlins=1")
+
+
+def test_a_run_that_has_tried_nothing_does_not_pass() -> None:
+    found = well()
+    enough = dataclasses.replace(found, planned=MADE)
+    assert broken(judge(enough)) == set()
+    few = dataclasses.replace(found, planned=6.0 * MADE)
+    assert broken(judge(few)) == {"missing of a fifth of the plan's"}
+    gone = dataclasses.replace(found, ended_early=True)
+    assert broken(judge(gone)) == {"ended before it was told to"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 import stat
 import time
 from collections.abc import Callable, Iterator
@@ -222,3 +223,57 @@ def test_the_command_makes_lists_and_complains(tmp_path: Path) -> None:
     (tmp_path / "daemon.key_secret").chmod(0o644)
     assert graspd("keys", "list", "--dir", tmp_path).returncode == 2
     assert graspd("keys", "make", "daemon", "--dir", tmp_path).returncode == 2
+
+
+def test_a_list_that_could_not_be_read_is_tried_again(door: Door, tmp_path: Path) -> None:
+    """A key is taken off while another one is broken: once that is mended, it is off."""
+    friend = door.client("friend", tmp_path / "friends")
+    (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
+    door.sockets.mind_keys()
+    leaving = door.connect(friend)
+    assert door.hears(leaving, PATIENCE_S)
+    good = (door.clients / "controller.key").read_text()
+    (door.clients / "controller.key").write_text("nothing")
+    (door.clients / "friend.key").unlink()
+    door.sockets.mind_keys()
+    assert door.hears(leaving, PATIENCE_S)
+    (door.clients / "controller.key").write_text(good)
+    door.sockets.mind_keys()
+    while leaving.poll(100):
+        leaving.recv_multipart()
+    assert not door.hears(leaving, QUIET_S)
+
+
+def test_what_is_no_file_is_no_key_and_holds_nobody_up(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.key")
+    make(tmp_path, "laptop")
+    assert list(load_clients(tmp_path).values()) == ["laptop"]
+
+
+def test_a_port_that_is_lost_to_another_costs_that_port_alone(
+    door: Door, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The key of a client is removed, and somebody takes the port meanwhile."""
+    door.client("friend", tmp_path / "friends")
+    (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
+    door.sockets.mind_keys()
+    (door.clients / "friend.key").unlink()
+    publisher = door.sockets.publisher
+    publisher.socket.close(linger=0)
+    with socket.socket() as thief:
+        thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                thief.bind(("127.0.0.1", PORT))
+                break
+            except OSError:
+                assert time.monotonic() < deadline_s
+        thief.listen()
+        door.sockets.mind_keys()
+        assert "nobody can connect there" in caplog.text
+        door.sockets.take()
+        door.sockets.send(b"verdict.right", b"{}")
+        assert door.sockets.filenos()
+    door.sockets.mind_keys()
+    assert door.hears(door.connect(door.known), PATIENCE_S)

@@ -17,8 +17,9 @@ import zmq
 
 from daemon import scene
 from daemon.binding import PublishError
-from daemon.publisher import REPEAT_NS
+from daemon.publisher import REPEAT_NS, VERDICT_REPEATED_NS, Publisher
 from daemon.sockets import Sockets, plan
+from tests.daemon.fakes import Clock
 from tests.daemon.test_publisher import Peers
 
 PATIENCE_MS = 10_000
@@ -49,21 +50,58 @@ def until(done: Callable[[], object], sockets: Sockets) -> None:
         time.sleep(0.002)
 
 
-def test_who_comes_late_gets_the_last_of_each_topic_that_it_wants_at_once(
+def until_heard(publisher: Publisher, late: zmq.Socket[bytes], seconds: float = 10.0) -> bool:
+    deadline_s = time.monotonic() + seconds
+    while time.monotonic() < deadline_s:
+        publisher.take()
+        if late.poll(2):
+            return True
+    return False
+
+
+def test_who_comes_late_gets_the_last_verdict_and_status_that_it_wants_at_once(
     tmp_path: Path, peers: Peers
 ) -> None:
-    with Sockets(wanted(tmp_path)) as sockets:
+    clock = Clock()
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint, clock=clock) as publisher:
         for number in range(3):
-            sockets.send(b"verdict.right", b"%d" % number)
-            sockets.send(b"status.right", b"s%d" % number)
-        late = peers.subscribe(f"ipc://{tmp_path}/v", "verdict.")
-        until(lambda: late.poll(0), sockets)
+            publisher.send(b"verdict.right", b"%d" % number)
+            publisher.send(b"status.right", b"s%d" % number)
+        clock.now_ns += VERDICT_REPEATED_NS
+        late = peers.subscribe(endpoint, "verdict.")
+        assert until_heard(publisher, late)
         assert late.recv_multipart() == [b"verdict.right", b"2"]
         assert not late.poll(100)
-        both = peers.subscribe(f"ipc://{tmp_path}/v")
-        until(lambda: both.poll(0), sockets)
-        came = {tuple(both.recv_multipart()) for _ in range(2)}
-        assert came == {(b"verdict.right", b"2"), (b"status.right", b"s2")}
+
+
+def test_an_old_verdict_is_not_repeated_as_if_it_were_new(tmp_path: Path, peers: Peers) -> None:
+    clock = Clock()
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint, clock=clock) as publisher:
+        publisher.send(b"verdict.right", b"stable")
+        publisher.send(b"status.right", b"s")
+        clock.now_ns += VERDICT_REPEATED_NS + 1
+        late = peers.subscribe(endpoint)
+        assert until_heard(publisher, late)
+        assert late.recv_multipart() == [b"status.right", b"s"]
+        assert not until_heard(publisher, late, 0.2)
+
+
+def test_nothing_is_repeated_of_a_run_that_has_ended(tmp_path: Path, peers: Peers) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint, clock=Clock()) as publisher:
+        publisher.send(b"verdict.right", b"stable")
+        publisher.forget()
+        assert not until_heard(publisher, peers.subscribe(endpoint), 0.3)
+
+
+@pytest.mark.parametrize("topic", [b"tactile.right", b"gate.right", b"outcome.right"])
+def test_what_happened_once_is_never_repeated(tmp_path: Path, peers: Peers, topic: bytes) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint, clock=Clock()) as publisher:
+        publisher.send(topic, b"old")
+        assert not until_heard(publisher, peers.subscribe(endpoint), 0.3)
 
 
 def test_nothing_is_repeated_before_anything_was_sent(tmp_path: Path, peers: Peers) -> None:
@@ -76,7 +114,7 @@ def test_nothing_is_repeated_before_anything_was_sent(tmp_path: Path, peers: Pee
 
 def test_many_who_come_at_once_do_not_make_a_storm(tmp_path: Path, peers: Peers) -> None:
     with Sockets(wanted(tmp_path)) as sockets:
-        sockets.send(b"verdict.right", b"1")
+        sockets.send(b"status.right", b"1")
         start_s = time.monotonic()
         late = [peers.subscribe(f"ipc://{tmp_path}/v") for _ in range(30)]
         until(lambda: all(each.poll(0) for each in late), sockets)
