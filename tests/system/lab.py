@@ -128,11 +128,11 @@ class Lab:
                 raise StepError(f"{what}: not within {timeout_s:g} s")
             time.sleep(look_s)
 
-    def status(self, hand: str) -> dict[str, Any]:
-        """The newest status of a hand. Raises `StepError` if there is none."""
-        message = self.machine.messages.last(hand, "status")
+    def last(self, hand: str, kind: str) -> dict[str, Any]:
+        """The newest message of a hand and kind. Raises `StepError` if there is none."""
+        message = self.machine.messages.last(hand, kind)
         if message is None:
-            raise StepError(f"{hand}: no status has come")
+            raise StepError(f"{hand}: no {kind} has come")
         return message.body
 
     def verdicts(self, hand: str, from_s: float, to_s: float) -> list[Message]:

@@ -16,6 +16,8 @@ PROJECT: Final = Path(__file__).parents[2]
 GUEST: Final = Path(__file__).parent / "guest"
 GUEST_PYTHON: Final = (3, 11)
 """Python of the machine's release; wheels are made by this one for that one."""
+EXTRA: Final = "record"
+"""The optional part that the scenes need."""
 SLACK_MIB: Final = 24
 """What the file system itself takes, and more."""
 
@@ -44,7 +46,7 @@ def make_payload(cache: Path, disk: Path) -> None:
 def _dependencies(cache: Path) -> Path:
     """A folder with the wheels of what the project needs."""
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
-    wanted = sorted(project["dependencies"])
+    wanted = sorted(project["dependencies"] + project["optional-dependencies"][EXTRA])
     digest = hashlib.sha256("\n".join(wanted).encode()).hexdigest()[:16]
     folder = cache / f"wheels-{digest}"
     if not folder.is_dir():

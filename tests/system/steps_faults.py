@@ -25,6 +25,9 @@ cat /proc/cpuinfo > {FILLER}.last 2>/dev/null && exit 1
 :"""
 """Shell: fill the disk to the last block, without writing; fails if a file still fits."""
 CANNOT_KEEP: Final = "cannot keep the session: No space left on device"
+CANNOT_RECORD: Final = "No space left on device; nothing is recorded"
+RECORDINGS: Final = "/var/lib/graspd/record/*.mcap"
+REPLAY_TIMEOUT_S: Final = 240.0
 SESSION: Final = "/var/lib/graspd/serial.session.json"
 
 
@@ -44,7 +47,9 @@ def hung(lab: Lab) -> Outcome:
 
 def _end_badly(lab: Lab, signal: str, result: str) -> float:
     """Send a signal; from then to the first verdict of the process that systemd starts, s."""
-    former, pid = lab.status("can")["boot_id"], lab.show("can", "MainPID")
+    # By a verdict: the last status may be that of a process before.
+    former = lab.last("can", "verdict")["boot_id"]
+    pid = lab.show("can", "MainPID")
     at_s = lab.deed(f"kill -{signal} {pid}")
     well = lab.await_message(
         "can", at_s, "a verdict", lambda m: m.judged and m.body["boot_id"] != former
@@ -118,30 +123,35 @@ def _same_process(lab: Lab, hand: str, pid: str) -> None:
 
 
 def disk_full(lab: Lab) -> Outcome:
-    """The disk is full: judging goes on, one warning says so, and what was kept stays whole.
-
-    The session file is all that is written there. A recorder belongs here once there is one.
-    """
+    """The disk is full: judging goes on, a warning each tells what cannot be kept, and no more."""
     pid = lab.show("serial", "MainPID")
     try:
         full_s = lab.deed(FILL)
-        lab.await_journal("serial", full_s, CANNOT_KEEP)
+        for text in (CANNOT_KEEP, CANNOT_RECORD):
+            lab.await_journal("serial", full_s, text)
         for _ in range(2):  # grasps: another one that cannot be kept
             lab.await_message("serial", lab.now_s(), "a judged grasp", judgement)
         warnings = lab.journal("serial", full_s, "warning")
-        if len(warnings) != 1:
+        if len(warnings) != 2:
             raise StepError(f"{len(warnings)} warnings: {warnings}")
         lab.sh("graspd session show /etc/graspd/serial.toml")  # what was kept before is whole
         lab.sh(f"touch -d @0 {SESSION}")
     finally:
         free_s = lab.deed(f"rm -f {FILLER}.*")
     lab.await_true(f"[ $(stat -c %Y {SESSION}) -gt 0 ]", "the session kept again", look_s=0.2)
-    kept_s = lab.now_s()
+    kept_s = lab.now_s() - free_s
+    first = f"$(ls {RECORDINGS} | head -n 1)"
+    lab.sh(f"graspd replay --json {first} | grep -c '\"valid\":true'", REPLAY_TIMEOUT_S)
+    again = lab.await_message("serial", free_s, "a recording again", _recording)
     for hand in HANDS:
-        lab.verdicts(hand, full_s, kept_s)
+        lab.verdicts(hand, full_s, again.t_s)
     _same_process(lab, "serial", pid)
-    what = "verdicts go on, one warning, the kept session whole; from room to kept again"
-    return Outcome(what, kept_s - free_s)
+    what = f"verdicts go on, a warning each, what was kept is whole; session kept {kept_s:.1f} s"
+    return Outcome(f"{what} after there is room, recording again", again.t_s - free_s)
+
+
+def _recording(message: Message) -> bool:
+    return message.kind == "status" and bool(message.body["drivers"]["record"]["writing"])
 
 
 def clock_stepped(lab: Lab) -> Outcome:

@@ -6,9 +6,10 @@ import re
 from typing import Final
 
 from tests.system.lab import HANDS, MEMBER, PAYLOAD, PYTHON, STRANGER, Lab, Outcome, StepError
+from tests.system.payload import EXTRA
 
 INSTALL: Final = f"sh {PAYLOAD}/deploy/install.sh"
-OFFLINE: Final = f"{INSTALL} --wheelhouse {PAYLOAD}/wheels"
+OFFLINE: Final = f"{INSTALL} --wheelhouse {PAYLOAD}/wheels --extras {EXTRA}"
 INSTALL_TIMEOUT_S: Final = 900.0
 CHECK_TIMEOUT_S: Final = 180.0
 EXPOSURE_MAX: Final = 2.5
@@ -116,7 +117,7 @@ def boot(lab: Lab) -> Outcome:
     ready_s = int(lab.show("serial", "ActiveEnterTimestampMonotonic")) / 1e6
     lab.sh(f"mount -o ro /dev/vdb {PAYLOAD}")
     lab.observe()
-    lab.await_message("serial", 0.0, "a judged grasp after the boot")
+    lab.await_message("serial", 0.0, "a verdict after the boot", lambda m: m.kind == "verdict")
     return Outcome("READY by itself, this long after the kernel began", ready_s)
 
 

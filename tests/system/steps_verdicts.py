@@ -47,7 +47,7 @@ def _run_of_judged(lab: Lab, began_s: float) -> list[float]:
             if len(run) == REPLAYED_ROWS:
                 return run
         time.sleep(LOOK_S)
-    raise StepError(f"no {REPLAYED_ROWS} verdicts in a row: {lab.status('can')['reasons']}")
+    raise StepError(f"no {REPLAYED_ROWS} verdicts in a row: {lab.last('can', 'status')['reasons']}")
 
 
 def _place(judged: list[float], expected: list[float]) -> int | None:
@@ -68,7 +68,7 @@ def serial_verdicts(lab: Lab) -> Outcome:
         after_s = judged.t_s
     judgements = lab.machine.messages.between("serial", "gate", began_s, after_s)
     grasps = Counter(m.body["grasp"] for m in judgements if m.body["state"] == "judged")
-    counters = lab.status("serial")["drivers"]["spi"]
+    counters = lab.last("serial", "status")["drivers"]["spi"]
     if counters["bad_crc"] > 1:  # the piece of a frame that was in the line when it was opened
         raise StepError(f"{counters['bad_crc']} damaged frames on the serial port")
     often = max(grasps.values())
