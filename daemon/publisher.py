@@ -14,7 +14,9 @@ from daemon.binding import Binding, Bound
 
 SUBSCRIBED, UNSUBSCRIBED = 1, 0
 """First byte of a message on an XPUB socket: somebody wants a topic, nobody does any more."""
-REPEATED = (b"verdict.", b"status.")
+VERDICT = b"verdict."
+"""What the topics of verdicts begin with."""
+REPEATED = (VERDICT, b"status.")
 """Topics whose last message is for those who come later, too."""
 VERDICT_REPEATED_NS = 100_000_000
 """An older verdict is not repeated: who gets it would take it for new."""
@@ -148,7 +150,7 @@ class Publisher(Bound):
         self._repeat_due_ns = now_ns + REPEAT_NS
         for topic in self._owed:
             payload, sent_ns = self._last[topic]
-            if not topic.startswith(REPEATED[0]) or now_ns - sent_ns <= VERDICT_REPEATED_NS:
+            if not topic.startswith(VERDICT) or now_ns - sent_ns <= VERDICT_REPEATED_NS:
                 self._send(topic, payload)
                 self.counters["repeated"] += 1
         self._owed.clear()

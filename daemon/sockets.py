@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Self
 import zmq
 
 from daemon.binding import Binding, PublishError
-from daemon.publisher import Publisher
+from daemon.publisher import VERDICT, Publisher
 from daemon.scene import Curve, Scene, SceneError
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from daemon.questions import Questions
 
 log = logging.getLogger("graspd")
-
-VERDICT = b"verdict."
 
 
 class Sockets:
