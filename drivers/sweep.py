@@ -183,6 +183,9 @@ class SampleSweeps:
         self._previous_start_ns: int | None = None
         self._previous_end_ns: int | None = None
         self._previous_had = _ALL
+        self._seen = -1
+        self._run = 0
+        self._broken = False
         self._have = 0
         self._last = -1
         self._t_ns = 0
@@ -215,6 +218,7 @@ class SampleSweeps:
         if place is None:
             self._counters.unexpected_channels += channel not in self._others
             return ()
+        self._count_run(place)
         if until_ns is None:
             until_ns = t_ns
         elif until_ns - t_ns >= self._lateness_ns():
@@ -236,6 +240,7 @@ class SampleSweeps:
     def cut(self) -> Sequence[TactileReading]:
         """Samples were lost, nobody knows how many: end the sweep at hand, wait for another."""
         self._counters.cut_sweeps += not self._finished and self._have != 0
+        self._run = 0
         finished = self._finish()
         self._synchronised = False
         self._begin()
@@ -246,7 +251,15 @@ class SampleSweeps:
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
         self._synchronised = False
         self._previous_had = _ALL
+        self._run = 0
         self._begin()
+
+    def _count_run(self, place: int) -> None:
+        """Count the samples in a row that came each right after its predecessor in the order."""
+        if place != self._seen:
+            follows = place == (self._seen + 1) % ELECTRODES
+            self._run = self._run + 1 if follows else 1
+            self._seen = place
 
     def _starts(self, place: int) -> bool:
         """Whether a sweep begins with this sample, the first ones after opening."""
@@ -361,10 +374,18 @@ class SampleSweeps:
         if self._last == ELECTRODES - 1:
             self._learn(self._t_ns)
         else:
-            self._previous_end_ns = None
+            self._broken = True
 
     def _learn(self, end_ns: int) -> None:
-        """A sweep ended at `end_ns`, and maybe the one before it ended right before."""
-        if self._previous_end_ns is not None and 0 < end_ns - self._previous_end_ns <= OUTAGE_NS:
-            self._readings.learn(end_ns - self._previous_end_ns)
+        """A sweep ended at `end_ns`, and maybe the one before it ended right before.
+
+        Samples without a gap in their order tell of one period even where the time between them
+        broke the sweep: else a period that is wrong once, and breaks every sweep, would stay.
+        """
+        known = not self._broken or self._run > ELECTRODES
+        if known and self._previous_end_ns is not None:
+            gap_ns = end_ns - self._previous_end_ns
+            if 0 < gap_ns <= OUTAGE_NS:
+                self._readings.learn(gap_ns)
+        self._broken = False
         self._previous_end_ns = end_ns

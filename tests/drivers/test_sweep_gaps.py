@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -186,3 +187,43 @@ def test_the_assembler_has_as_many_fingers_as_the_truth() -> None:
     (reading,) = feed(assembler()[0], samples(3))
     assert_true(reading, assert_of_one_sweep(reading))
     assert reading.counts.shape == (FINGERS, 24)
+
+
+def retimed(stream: Sequence[Sample], times_ns: Sequence[int]) -> list[Sample]:
+    return [(sample[0], sample[1], t) for sample, t in zip(stream, times_ns, strict=True)]
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("mean_ms", [2, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_host_that_stalls_leaves_no_wrong_period_behind(
+    sequence: str, mean_ms: float, seed: int
+) -> None:
+    """Half a second of samples that come late and in heaps, as from a computer without a break."""
+    chance = random.Random(seed)
+    sweeps, _ = assembler(sequence)
+    count = 5000 // len(SEQUENCES[sequence])
+    stream = concatenated([samples(n, sequence) for n in range(count)])
+    times = [t_ns for _, _, t_ns in stream]
+    for at, sent_ns in enumerate(times):
+        if 150 * MS <= sent_ns < 650 * MS:
+            times[at] = sent_ns + round(chance.expovariate(1 / mean_ms) * MS)
+    readings = feed(sweeps, retimed(stream, list(accumulate(times, max))))  # the order stays
+    for reading in readings:
+        assert_of_one_sweep(reading)
+    assert sweeps.period_ns == len(SEQUENCES[sequence]) * SLOT_NS
+    assert not any(reading.faults.any() for reading in readings[-20:])
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("rate_hz", [1, 5, 20, 60, 400])
+def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
+    """Nothing is known of the rate when the driver opens."""
+    sweeps, _ = assembler(sequence)
+    slot_ns = round(1e9 / rate_hz / len(SEQUENCES[sequence]))
+    stream = concatenated([samples(n, sequence) for n in range(40)])
+    readings = feed(sweeps, retimed(stream, [slot_ns * at for at in range(len(stream))]))
+    for reading in readings:
+        assert_of_one_sweep(reading)
+    assert [r.faults.any() for r in readings[-30:]] == [False] * 30
+    assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])
