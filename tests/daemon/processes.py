@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 GRASPD = (sys.executable, "-m", "daemon")
@@ -36,10 +37,10 @@ def graspd(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def start(*arguments: object) -> subprocess.Popen[str]:
-    """Start a command and leave it running."""
+def start(*arguments: object, before: Sequence[str] = ()) -> subprocess.Popen[str]:
+    """Start a command, by the words `before` it, and leave it running."""
     return subprocess.Popen(
-        [*GRASPD, *map(str, arguments)],
+        [*before, *GRASPD, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

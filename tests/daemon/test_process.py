@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -96,6 +97,19 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
     assert process.returncode in (130, -signal.SIGINT)  # both are 130 to a shell
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
+
+
+def test_no_descriptor_gets_a_number_that_the_loop_cannot_wait_for(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    )
+    with start("run", scene, before=("prlimit", "--nofile=4096")) as process:
+        wait_for(tmp_path / "graspd")
+        limits = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
+        process.terminate()
+    assert limits == (1024, 4096)  # FD_SETSIZE of select(2)
 
 
 @pytest.mark.parametrize("package", ["torch", "rich"])
