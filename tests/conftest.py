@@ -9,9 +9,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 # Before anybody imports onnxruntime: its telemetry opens descriptors whenever it likes.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+# Tests run side by side; threads of OpenMP that wait for each other would take the cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+settings.register_profile(
+    "side by side", deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("side by side")
 
 ROOT = Path(__file__).parents[1]
 

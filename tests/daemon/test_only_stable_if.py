@@ -325,7 +325,7 @@ def test_a_verdict_is_given_only_if_all_that_it_needs_holds_in(
 
 
 @given(gate=gates, begin=begins, feels=st.lists(feels, min_size=3, max_size=12))
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 def test_a_verdict_is_given_only_if_all_that_it_needs_holds(
     gate: GripLimits, begin: Sequence[Feel], feels: Sequence[Feel]
 ) -> None:

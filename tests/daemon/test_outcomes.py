@@ -167,7 +167,7 @@ def test_without_anybody_who_takes_outcomes_the_controller_hears_so(
     assert told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"] is False
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.binary(max_size=MESSAGE_MAX_BYTES - 8), min_size=1, max_size=20))
 def test_whatever_follows_the_word_nothing_breaks(texts: list[bytes]) -> None:
     with (

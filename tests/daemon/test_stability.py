@@ -304,7 +304,7 @@ def inputs_by_hand(name: str, counts: NDArray[np.uint16]) -> tuple[Wide, list[fl
 
 
 @pytest.mark.parametrize("name", HANDS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(counts=READINGS)
 def test_inputs_keep_their_bound_over_the_12_bit_space(
     name: str, counts: NDArray[np.uint16]
@@ -321,7 +321,7 @@ def test_inputs_keep_their_bound_over_the_12_bit_space(
 
 
 @pytest.mark.parametrize("name", HANDS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(counts=READINGS)
 def test_probabilities_keep_their_bound_over_the_12_bit_space(
     name: str, counts: NDArray[np.uint16]
@@ -344,7 +344,7 @@ NOT_FINITE = st.sampled_from((np.nan, np.inf, -np.inf))
 
 
 @pytest.mark.parametrize("name", zoo.names())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(counts=READINGS, wrong=st.dictionaries(st.integers(0, 71), NOT_FINITE, min_size=1))
 def test_what_is_not_finite_never_gives_a_verdict(
     name: str, counts: NDArray[np.uint16], wrong: dict[int, float]

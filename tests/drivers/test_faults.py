@@ -179,7 +179,7 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
     assert trace(1) != trace(2)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     off_from=st.none() | st.integers(0, ROWS + 10),
     stuck_from=st.none() | st.integers(1, ROWS + 10),

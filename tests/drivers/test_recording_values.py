@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.base import ElectrodeFault, RecordingError
@@ -58,7 +58,6 @@ def test_an_integer_may_be_written_in_several_ways(cell: str, expected: int) -> 
     assert not row.faults.any()
 
 
-@settings(deadline=None)
 @given(st.text(max_size=12) | st.from_regex(r"[0-9.eE+_ -]{1,8}", fullmatch=True))
 @example("1_0")
 def test_a_count_is_never_read_from_what_python_would_not_call_that_number(cell: str) -> None:
@@ -69,7 +68,6 @@ def test_a_count_is_never_read_from_what_python_would_not_call_that_number(cell:
         assert 0 <= value <= 4095
 
 
-@settings(deadline=None)
 @given(st.integers(-10_000, 10_000))
 def test_an_integer_is_a_count_exactly_if_it_has_12_bits(value: int) -> None:
     expected = value if 0 <= value < 4096 else None
@@ -78,13 +76,11 @@ def test_an_integer_is_a_count_exactly_if_it_has_12_bits(value: int) -> None:
         assert count_of(f"{value}.0") == count_of(f"{value:e}".replace("e+0", "e+")) == expected
 
 
-@settings(deadline=None)
 @given(st.floats(allow_nan=True, allow_infinity=True))
 def test_a_number_is_read_as_python_writes_it(value: float) -> None:
     assert number_of(repr(value)) == (value if math.isfinite(value) else None)
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=400) | st.binary(max_size=200).map(lambda tail: table(2) + tail))
 def test_bytes_of_any_kind_give_rows_or_a_recording_error(content: bytes) -> None:
     outcome = rows_or_message(content)
@@ -95,7 +91,6 @@ def test_bytes_of_any_kind_give_rows_or_a_recording_error(content: bytes) -> Non
         assert all(row.counts.max() <= 4095 for row in outcome)
 
 
-@settings(deadline=None)
 @given(st.lists(st.integers(0, 4095), min_size=72, max_size=72), st.booleans())
 def test_every_count_survives_writing_and_reading(counts: list[int], as_floats: bool) -> None:
     written = [f"{value}.0" if as_floats else str(value) for value in counts]

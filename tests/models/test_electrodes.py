@@ -133,7 +133,7 @@ def test_what_is_known_to_be_broken_is_not_looked_at() -> None:
         np.testing.assert_array_equal(electrodes.implausible(values, broken, 12), broken)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(0, 15),

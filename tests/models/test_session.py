@@ -121,7 +121,7 @@ def test_a_prior_without_spread_or_weight_is_refused(spread: float, weight: floa
         SessionStatistics(np.zeros(2), np.full(2, spread), weight)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     st.lists(st.lists(st.floats(-1e6, 1e6, width=32), min_size=WIDTH, max_size=WIDTH), max_size=40)
 )

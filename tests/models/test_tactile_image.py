@@ -132,7 +132,7 @@ counts_of_three_fingers = hnp.arrays(np.uint16, (3, 24), elements=st.integers(0,
 
 
 @given(counts=counts_of_three_fingers)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_any_counts_give_a_finite_image_or_zeros(counts: np.ndarray) -> None:
     image = np.full((12, 11, 3), np.nan, dtype=np.float32)
     spread = TactileImager(3).build(counts, image)
@@ -146,7 +146,7 @@ def test_any_counts_give_a_finite_image_or_zeros(counts: np.ndarray) -> None:
 
 
 @given(counts=counts_of_three_fingers)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_a_finger_does_not_touch_the_channel_of_another(counts: np.ndarray) -> None:
     whole, single = np.zeros((12, 11, 3), np.float32), np.zeros((12, 11, 1), np.float32)
     TactileImager(3).build(counts, whole)
