@@ -24,6 +24,7 @@ from daemon.record_files import Joints, MessageFile, Shelf
 from daemon.scene import Record
 from daemon.sockets import Sockets
 from drivers.base import JointReading
+from drivers.mcap_recording import ASKED, EXCHANGED
 
 if TYPE_CHECKING:
     from daemon.questions import Questions
@@ -65,6 +66,20 @@ class RawFile(Protocol):
 MakeRaw = Callable[[Path], RawFile]
 """Makes a raw file by its name without ending."""
 
+Texts = Callable[[], Mapping[str, str]]
+"""Puts into words, in the thread, what was known when it was taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """Stands in the queue between what belongs into one file and into the next."""
+
+    texts: Texts
+
+
+_Entry = tuple[int, bytes, object]
+"""When, monotonic ns; topic, none for what came over a link; content."""
+
 
 @dataclass(slots=True, eq=False)
 class _Open:
@@ -77,6 +92,7 @@ class _Open:
     size: int = 0
     """At the last flush, bytes."""
     unflushed: int = 0
+    """Entries taken for these files that the disk may not have."""
 
 
 class Recorder:
@@ -89,21 +105,29 @@ class Recorder:
         header: Mapping[str, str],
         *,
         make_raw: MakeRaw | None = None,
+        take_state: Callable[[], Texts] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start the thread, which makes the first file. `header` stands in front of every file."""
+        """Start the thread, which makes the first file. `header` stands in front of every file.
+
+        So does what `take_state` gives. It is called in the loop, here and then where a file is to
+        end: after a status, when no reading is on its way to a verdict.
+        """
         self._shelf = shelf
         self._rotate_bytes = round(options.rotate_mb * 1e6)
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
         self._header = dict(header)
         self._make_raw = make_raw
+        self._take_state = take_state
         self._clock = clock
         self._wall_clock = wall_clock
-        self._queue: deque[tuple[int, bytes, object]] = deque()
+        self._queue: deque[_Entry] = deque()
         self._joints_topic = f"joints.{shelf.hand}".encode()
-        self._asked_topic = f"asked.{shelf.hand}".encode()
+        self._asked_topic = f"{ASKED}.{shelf.hand}".encode()
+        self._exchanged_topic = f"{EXCHANGED}.{shelf.hand}".encode()
+        self._status_topic = f"status.{shelf.hand}".encode()
         self._encoder = msgspec.json.Encoder()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
@@ -111,6 +135,11 @@ class Recorder:
         self._number = 0
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
+        self._awaits_turn = take_state is not None
+        """Whether a `_Turn` is on its way, or will be when `_wants_turn` is seen."""
+        self._wants_turn = False
+        if take_state is not None:
+            self._queue.append((clock(), b"", _Turn(take_state())))
         self._stopping = threading.Event()
         self._switch_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
@@ -120,6 +149,9 @@ class Recorder:
     def send(self, topic: bytes, payload: bytes) -> None:
         """Record one message."""
         self._put(topic, payload)
+        if self._wants_turn and self._take_state is not None and topic == self._status_topic:
+            self._wants_turn = False
+            self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
     def joints(self, reading: JointReading) -> None:
         """Record joint angles."""
@@ -128,6 +160,10 @@ class Recorder:
     def asked(self) -> None:
         """Record that the controller asks for a judgement."""
         self._put(self._asked_topic, b"{}")
+
+    def exchanged(self) -> None:
+        """Record that a sensor is another one than before."""
+        self._put(self._exchanged_topic, b"{}")
 
     def raw(self, entry: object, at_ns: int) -> None:
         """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""
@@ -174,29 +210,43 @@ class Recorder:
         """Write what waits; after a failure let it go until it is time to try again."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()
-        if self._open is None:
-            if self._retry_due_ns is not None and now_ns < self._retry_due_ns:
-                self._counted["lost"] += len(entries)
-                return
-            self._begin(now_ns)
-        if self._open is None:
-            self._counted["lost"] += len(entries)
-            return
-        try:
-            self._write(self._open, entries)
-            if now_ns >= self._flush_due_ns:
-                self._flush(self._open, now_ns)
-        except OSError as error:
-            self._fail(error, len(entries))
+        if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
+            self._turn(now_ns)
+        waiting: list[_Entry] = []
+        for entry in entries:
+            if isinstance(entry[2], _Turn):
+                self._write(waiting)
+                waiting = []
+                self._take_turn(entry[2], now_ns)
+            else:
+                waiting.append(entry)
+        self._write(waiting)
+        if self._open is not None and now_ns >= self._flush_due_ns:
+            self._flush(self._open, now_ns)
 
-    def _begin(self, now_ns: int) -> None:
+    def _turn(self, now_ns: int) -> None:
+        """Go on in new files, now or where the loop says what is known there."""
+        if self._take_state is None:
+            self._finish()
+            self._begin(now_ns, {})
+        elif not self._awaits_turn:
+            self._awaits_turn = self._wants_turn = True
+
+    def _take_turn(self, turn: _Turn, now_ns: int) -> None:
+        """Go on in new files, but not for the little that comes after the end."""
+        self._awaits_turn = False
+        if self._open is None or not self._stopping.is_set():
+            self._finish()
+            self._begin(now_ns, turn.texts())
+
+    def _begin(self, now_ns: int, state: Mapping[str, str]) -> None:
         """Begin new files, if the disk lets us."""
         offset_ns = self._wall_clock() - now_ns
         try:
             self._counted["removed"] += self._shelf.make_room(self._rotate_bytes)
             name = self._shelf.name(self._number)
             path = name.with_name(f"{name.name}.mcap")
-            header = {**self._header, "file": str(self._number)}
+            header = {**self._header, **state, "file": str(self._number)}
             messages = MessageFile(path, header, offset_ns)
             raw = None
             try:
@@ -205,7 +255,7 @@ class Recorder:
                 messages.remove()
                 raise
         except OSError as error:
-            self._fail(error, 0)
+            self._fail(error)
             return
         log.info("record: %s", path)
         self._retry_due_ns = None
@@ -213,29 +263,40 @@ class Recorder:
         self._counted["files"] += 1
         self._open = _Open(messages, raw, offset_ns, now_ns)
 
-    def _write(self, files: _Open, entries: list[tuple[int, bytes, object]]) -> None:
-        for at_ns, topic, content in entries:
-            if isinstance(content, JointReading):
-                content = self._encoder.encode(Joints.of(content))
-            if topic and isinstance(content, bytes):
-                files.messages.write(topic, content, at_ns)
-            elif files.raw is not None:
-                files.raw.write(content, at_ns, files.offset_ns)
-            files.unflushed += 1
+    def _write(self, entries: list[_Entry]) -> None:
+        """Write entries, or count them as lost."""
+        files = self._open
+        if files is None:
+            self._counted["lost"] += len(entries)
+            return
+        files.unflushed += len(entries)  # all of them, wherever among them the disk fails
+        try:
+            for at_ns, topic, content in entries:
+                if isinstance(content, JointReading):
+                    content = self._encoder.encode(Joints.of(content))
+                if topic and isinstance(content, bytes):
+                    files.messages.write(topic, content, at_ns)
+                elif files.raw is not None:
+                    files.raw.write(content, at_ns, files.offset_ns)
+        except OSError as error:
+            self._fail(error)
 
     def _flush(self, files: _Open, now_ns: int) -> None:
-        files.size = files.messages.flush()
-        if files.raw is not None:
-            files.size += files.raw.flush()
+        try:
+            files.size = files.messages.flush()
+            if files.raw is not None:
+                files.size += files.raw.flush()
+        except OSError as error:
+            self._fail(error)
+            return
         self._counted["recorded"] += files.unflushed
         files.unflushed = 0
         self._flush_due_ns = now_ns + round(self._flush_ns * FLUSH_AFTER)
         if files.size >= self._rotate_bytes or now_ns - files.since_ns >= self._rotate_ns:
-            self._finish()
-            self._begin(now_ns)
+            self._turn(now_ns)
 
     def _finish(self) -> None:
-        files, self._open = self._open, None
+        files = self._open
         if files is None:
             return
         try:
@@ -243,13 +304,16 @@ class Recorder:
             if files.raw is not None:
                 files.raw.close()
         except OSError as error:
-            self._fail(error, 0)
+            self._fail(error)
+            return
+        self._open = None
+        self._counted["recorded"] += files.unflushed
 
-    def _fail(self, error: OSError, entries: int) -> None:
+    def _fail(self, error: OSError) -> None:
         """The disk does not take it: one warning, and another try in a minute."""
         files, self._open = self._open, None
         if files is not None:
-            self._counted["lost"] += max(files.unflushed, entries)
+            self._counted["lost"] += files.unflushed
             files.messages.abandon()
             if files.raw is not None:
                 files.raw.abandon()

@@ -6,12 +6,13 @@ The bytes go through the very decoders that live ones go through, at the times a
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Protocol
 
-from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
+from drivers.base import DriverCounters, Reading, RecordingError
 from drivers.recording import open_recording
+from drivers.timeline import TimedDriver
 
 CANDUMP, SERIAL = ".log", ".serial"
 """Endings of the two kinds of files."""
@@ -39,13 +40,11 @@ Records = Callable[[Path], Iterator[tuple[int, object]]]
 """Times, ns, and records of a file. Raises `RecordingError`."""
 
 
-class CaptureReplayDriver:
+class CaptureReplayDriver(TimedDriver[object]):
     """Plays captures in a row, as one run. `recorded_ns` of a reading is its time on their clock.
 
     Without `speed` as fast as possible. `open` raises `RecordingError`.
     """
-
-    name = "replay"
 
     def __init__(
         self,
@@ -57,19 +56,10 @@ class CaptureReplayDriver:
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Nothing is opened yet. Raises `ValueError` without files or with a speed that is none."""
-        if not paths or (speed is not None and not speed > 0.0):
-            raise ValueError("captures and a positive speed are needed")
-        self._paths = tuple(paths)
+        super().__init__(paths, speed, clock)
         self._records = records
         self._decoding = decoding
-        self._speed = speed
-        self._clock = clock
-        self.handed_over_ns = self._opened_ns = clock()
-        """When the last reading was handed over, monotonic ns."""
-        self._timeline: Iterator[tuple[int, object]] | None = None
-        self._next: tuple[int, object] | None = None
-        self._began: tuple[int, int] | None = None
-        self.exhausted = False
+        self._reset()
 
     @property
     def counters(self) -> DriverCounters:
@@ -82,77 +72,25 @@ class CaptureReplayDriver:
         recorded_ns = self._decoding.period_ns
         return None if recorded_ns is None else round(recorded_ns / (self._speed or 1.0))
 
-    @property
-    def serials(self) -> dict[str, str]:
-        """A recording is of no sensor that is there."""
-        return {}
-
-    def describe(self) -> dict[str, str]:
-        """Which captures are played."""
-        return {"recordings": ", ".join(map(str, self._paths))}
-
     def open(self) -> None:
         """Start over with the first file."""
-        self.close()
-        for path in self._paths:
-            open_recording(path).close()
-        self._decoding.begin()
-        self._began = None
-        self._timeline = (record for path in self._paths for record in self._records(path))
-        self._take_next()
+        super().open()
         if self._next is None:
             raise RecordingError(self._paths[0], "has nothing that came over a link")
 
-    def close(self) -> None:
-        """Close the file that plays."""
-        timeline: Any = self._timeline
-        self._timeline = None
-        if timeline is not None:
-            timeline.close()
+    def _check(self) -> None:
+        for path in self._paths:
+            open_recording(path).close()
+        self._decoding.begin()
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
-
-    def fileno(self) -> int | None:
-        """None: a file is always readable, the clock says when."""
-        return None
-
-    def due_ns(self) -> int | None:
-        """When the next record is due; a time in the past for at once."""
-        if self._timeline is None or self.exhausted:
-            return None
-        if self._speed is None or self._next is None or self._began is None:
-            return self._opened_ns
-        began_ns, recorded_ns = self._began
-        return began_ns + round((self._next[0] - recorded_ns) / self._speed)
+    def _play(self) -> Generator[tuple[int, object], None, None]:
+        for path in self._paths:
+            yield from self._records(path)
 
     def read_ready(self) -> Sequence[Reading]:
         """The readings that the records up to the first complete one give, as far as due."""
-        readings: Sequence[Reading] = ()
-        while not readings and self._next is not None:
-            due_ns, now_ns = self.due_ns(), self._clock()
-            if due_ns is None or now_ns < due_ns:
-                break
-            t_ns, record = self._next
-            if self._began is None:
-                self._began = now_ns, t_ns
-            readings = self._decoding.feed(t_ns, record)
-            self._take_next()
-            if readings:
-                return [self._handed_over(reading, t_ns) for reading in readings]
+        while (due := self._take_due()) is not None:
+            t_ns, record, _ = due
+            if readings := self._decoding.feed(t_ns, record):
+                return [self._hand_over(reading, t_ns) for reading in readings]
         return ()
-
-    def _handed_over(self, made: Reading, came_ns: int) -> Reading:
-        self.handed_over_ns = self._clock()
-        if not isinstance(made, TactileReading):
-            return made
-        t_ns = self.handed_over_ns - (came_ns - made.t_ns)
-        return TactileReading(t_ns, made.seq, made.counts, made.faults, None, made.t_ns)
-
-    def _take_next(self) -> None:
-        self._next = None if self._timeline is None else next(self._timeline, None)
-        self.exhausted = self._next is None

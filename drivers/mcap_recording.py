@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final
 
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
@@ -23,6 +23,12 @@ from drivers.recording import open_recording
 
 METADATA = "graspd"
 """Name of the metadata record that every file of graspd begins with."""
+ASKED: Final = "asked"
+"""Kind of the message that the controller has asked for a judgement."""
+EXCHANGED: Final = "exchanged"
+"""Kind of the message that a sensor is another one than before."""
+EVENTS: Final = frozenset({ASKED, EXCHANGED})
+"""Kinds of messages without content of their own, that matter to what is judged."""
 RECORD_MAX_BYTES = 64 << 20
 """graspd's chunks have a megabyte; what says to be far longer is damaged."""
 

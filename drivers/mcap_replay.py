@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
 
 import msgspec
 import numpy as np
 
-from drivers.base import ELECTRODES, DriverCounters, JointReading, RecordingError, TactileReading
-from drivers.mcap_recording import McapRecording, RecordedMessage, header_of
+from drivers.base import (
+    ELECTRODES,
+    DriverCounters,
+    JointReading,
+    Reading,
+    RecordingError,
+    TactileReading,
+)
+from drivers.mcap_recording import EVENTS, McapRecording, RecordedMessage, header_of
 from drivers.recording import open_recording
+from drivers.timeline import TimedDriver
 
 _log = logging.getLogger(__name__)
 
@@ -56,24 +63,21 @@ class McapCounters(DriverCounters):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Due:
-    """A reading and when it was recorded, monotonic ns of the daemon that did."""
+    """A reading, and what was told between the one before it and this one."""
 
-    reading: TactileReading | JointReading
-    at_ns: int
-    asked: bool = False
-    """Whether the controller asked for a judgement before it."""
+    reading: Reading
+    told: tuple[str, ...] = ()
+    """Kinds of `EVENTS`, in their order."""
 
 
-class McapReplayDriver:
+class McapReplayDriver(TimedDriver[_Due]):
     """Plays MCAP files of graspd, one reading per call of `read_ready` at most.
 
-    `recorded_ns` of a reading is its `t_ns` when it was recorded; `t_ns` makes it as old, when it
-    is handed over, as it was then. Several files play in a row as the one run that they are.
-    Without `speed` as fast as possible. The constructor raises `ValueError`, `open`
-    `RecordingError`. Damage ends a file early, which is counted.
+    `recorded_ns` of a reading is its `t_ns` when it was recorded, counted from `axis_ns`; `t_ns`
+    makes it as old, when it is handed over, as it was then. Several files play in a row as the one
+    run that they are. Without `speed` as fast as possible. The constructor raises `ValueError`,
+    `open` `RecordingError`. Damage ends a file early, which is counted.
     """
-
-    name = "replay"
 
     def __init__(
         self,
@@ -81,102 +85,46 @@ class McapReplayDriver:
         fingers: Sequence[str],
         *,
         speed: float | None = None,
+        axis_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        if not paths:
-            raise ValueError("no recording to replay")
-        if speed is not None and not speed > 0.0:
-            raise ValueError(f"speed is {speed}, must be positive")
-        self._paths = tuple(paths)
+        super().__init__(paths, speed, clock)
+        self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
-        self._speed = speed
-        self._clock = clock
-        self.on_asked: Callable[[], None] | None = None
-        """Done where the controller had asked for a judgement."""
-        self._timeline: Iterator[_Due] | None = None
+        self.on_told: Mapping[str, Callable[[], None]] = {}
+        """What is done, by kind of `EVENTS`, where one stands."""
         self._reset()
 
     def _reset(self) -> None:
+        super()._reset()
         self.counters = McapCounters()
         self.period_ns: int | None = None
         """Shortest time, ns, between two readings so far, as played."""
-        self.exhausted = False
-        self.handed_over_ns = self._clock()
-        """When the last reading was: what a judge must take for now, to find it as old as it was
-        found then, however busy the machine is."""
-        self._opened_ns = self._clock()
-        self._began: tuple[int, int] | None = None
-        self._next: _Due | None = None
         self._last_ns: int | None = None
 
-    @property
-    def serials(self) -> dict[str, str]:
-        """A recording does not tell."""
-        return {}
-
-    def describe(self) -> dict[str, str]:
-        """Which recordings are played."""
-        return {"recordings": ", ".join(map(str, self._paths))}
-
-    def open(self) -> None:
-        """Check the beginning of every file, then start over with the first one."""
-        self.close()
-        self._reset()
+    def _check(self) -> None:
         for path in self._paths:
             recorded = header_of(path).fingers
             missing = [finger for finger in self._fingers if finger not in recorded]
             if missing:
                 raise RecordingError(path, f"has no finger {missing[0]}, only {recorded}")
-        self._timeline = self._play()
-        self._prepare_next()
 
-    def close(self) -> None:
-        """Close the file that plays."""
-        timeline, self._timeline = self._timeline, None
-        close = getattr(timeline, "close", None)
-        if close is not None:
-            close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
-
-    def fileno(self) -> int | None:
-        """None: a file is always readable, the clock says when."""
-        return None
-
-    def due_ns(self) -> int | None:
-        """When the next reading is due; a time in the past for at once."""
-        if self._timeline is None or self.exhausted:
-            return None
-        if self._speed is None or self._next is None or self._began is None:
-            return self._opened_ns
-        began_ns, recorded_ns = self._began
-        return began_ns + round((self._next.at_ns - recorded_ns) / self._speed)
-
-    def read_ready(self) -> Sequence[TactileReading | JointReading]:
+    def read_ready(self) -> Sequence[Reading]:
         """The next reading if it is due, else none."""
-        due, due_ns, now_ns = self._next, self.due_ns(), self._clock()
-        if due is None or due_ns is None or now_ns < due_ns:
+        taken = self._take_due()
+        if taken is None:
             return ()
-        if self._began is None:
-            self._began = now_ns, due.at_ns
-        elif self._speed is not None and self.period_ns is not None:
-            self.counters.late += now_ns - due_ns > self.period_ns
-        self._prepare_next()
-        if due.asked and self.on_asked is not None:
-            self.on_asked()
-        return [self._handed_over(due)]
+        at_ns, due, late_ns = taken
+        if self._speed is not None and self.period_ns is not None:
+            self.counters.late += late_ns > self.period_ns
+        for kind in due.told:
+            if kind in self.on_told:
+                self.on_told[kind]()
+        if isinstance(due.reading, TactileReading):
+            self._count(due.reading)
+        return [self._hand_over(due.reading, at_ns, self._axis_ns)]
 
-    def _handed_over(self, due: _Due) -> TactileReading | JointReading:
-        made, now_ns = due.reading, self._clock()
-        self.handed_over_ns = now_ns
-        t_ns = now_ns - (due.at_ns - made.t_ns)
-        if isinstance(made, JointReading):
-            return JointReading(t_ns, made.seq, made.names, made.position_rad, made.t_ns)
+    def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
         self.counters.faulty_readings += bool(made.faults.any())
         step_ns = made.t_ns - self._last_ns if self._last_ns is not None else 0
@@ -184,29 +132,24 @@ class McapReplayDriver:
             step_ns = round(step_ns / (self._speed or 1.0))
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
-        return TactileReading(t_ns, made.seq, made.counts, made.faults, None, made.t_ns)
 
-    def _prepare_next(self) -> None:
-        if self._timeline is not None:
-            self._next = next(self._timeline, None)
-            self.exhausted = self._next is None
-
-    def _play(self) -> Iterator[_Due]:
-        asked = False
+    def _play(self) -> Generator[tuple[int, _Due], None, None]:
+        told: tuple[str, ...] = ()
         for path in self._paths:
             with open_recording(path) as stream:
                 recording = McapRecording(path, stream)
                 for message in recording:
-                    asked = asked or message.kind == "asked"
+                    if message.kind in EVENTS and message.kind not in told:
+                        told = (*told, message.kind)
                     reading = self._reading(message)
                     if reading is not None:
-                        yield _Due(reading, message.at_ns, asked)
-                        asked = False
+                        yield message.at_ns, _Due(reading, told)
+                        told = ()
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
-    def _reading(self, message: RecordedMessage) -> TactileReading | JointReading | None:
+    def _reading(self, message: RecordedMessage) -> Reading | None:
         """The reading in a message; None for one of another kind, or that has none."""
         try:
             if message.kind == "tactile":

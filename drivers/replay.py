@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from drivers.base import (
 )
 from drivers.faults import FaultInjector, ReplayCounters, ReplayFaults
 from drivers.recording import Recording, Row, open_recording, read_lines
+from drivers.timeline import TimelineDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Synthetic grasps, drawn by `drivers.twins.synthetic`: nobody ever grasped these."""
@@ -60,7 +61,7 @@ class _Scheduled:
     period_ns: int | None
 
 
-class ReplayDriver:
+class ReplayDriver(TimelineDriver[_Scheduled]):
     """Plays CSV recordings, one row per call of `read_ready` at most.
 
     `fingers` picks the fingers and their order. A row gives a `TactileReading`, in a stream with
@@ -75,8 +76,6 @@ class ReplayDriver:
     `strict` raise as well. See `drivers.recording.Recording`.
     """
 
-    name = "replay"
-
     def __init__(
         self,
         paths: Sequence[Path],
@@ -90,15 +89,13 @@ class ReplayDriver:
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        if not paths:
-            raise ValueError("no recording to replay")
+        super().__init__(paths, clock)
         if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
             raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
         if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
             raise ValueError(f"rate_hz is {rate_hz}, must be in {RATE_MIN_HZ}..{RATE_MAX_HZ}")
         if not SPEED_MIN <= speed <= SPEED_MAX:
             raise ValueError(f"speed is {speed}, must be in {SPEED_MIN}..{SPEED_MAX}")
-        self._paths = tuple(paths)
         self._fingers = tuple(fingers)
         self._pace = pace
         self._speed = speed
@@ -108,43 +105,26 @@ class ReplayDriver:
         self._strict = strict
         self._faults = faults
         self._delay_ns = round(faults.delayed_s * _NS_PER_S)
-        self._clock = clock
         self.ignored_columns: tuple[str, ...] = ()
         """Columns of the files that are not known, each once. Set by `open`."""
-        self._timeline: Generator[_Scheduled, None, None] | None = None
         self._reset()
 
     def _reset(self) -> None:
+        super()._reset()
         self.counters = ReplayCounters()
         self.period_ns: int | None = None
         """Nominal time, ns, between readings as played, before any fault.
 
         Tables: from `rate_hz` and `speed`. Streams: the mean so far; None before it is known.
         """
-        self.exhausted = False
-        """True when the last row has been handed over, or after an error, until `open`."""
         self._injector = FaultInjector(self._faults, self._fingers, self.counters)
-        self._next: _Scheduled | None = None
         self._failure: RecordingError | None = None
-        self._opened_ns = self._clock()
         self._started_ns: int | None = None
         self._row_index = 0
         self._seq = 0
         self._released = 0
 
-    @property
-    def serials(self) -> dict[str, str]:
-        """A recording does not tell."""
-        return {}
-
-    def describe(self) -> dict[str, str]:
-        """Which recordings are played."""
-        return {"recordings": ", ".join(map(str, self._paths))}
-
-    def open(self) -> None:
-        """Check the header of every file, then start over with the first one."""
-        self.close()
-        self._reset()
+    def _check(self) -> None:
         ignored: dict[str, None] = {}
         for path in self._paths:
             with open_recording(path) as stream:
@@ -153,25 +133,6 @@ class ReplayDriver:
         if ignored:
             few = ", ".join(map(repr, self.ignored_columns[:IGNORED_COLUMNS_LOGGED]))
             _log.info("replay: unknown columns ignored: %d, such as %s", len(ignored), few)
-        self._timeline = self._play()
-        self._prepare_next()
-
-    def close(self) -> None:
-        """Close the file that plays."""
-        if self._timeline is not None:
-            self._timeline.close()
-            self._timeline = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
-
-    def fileno(self) -> int | None:
-        """None: a file is always readable, the clock says when."""
-        return None
 
     def due_ns(self) -> int | None:
         """When the next row is due, a time in the past for at once, or None for not by itself."""
@@ -221,15 +182,10 @@ class ReplayDriver:
 
     def _prepare_next(self) -> None:
         """Read one row ahead; an error waits until the readings before it are handed over."""
-        if self._timeline is None:
-            return
         try:
-            self._next = next(self._timeline, None)
+            super()._prepare_next()
         except RecordingError as error:
             self._next, self._failure = None, error
-            return
-        if self._next is None:
-            self.exhausted = True
 
     def _play(self) -> Generator[_Scheduled, None, None]:
         """All rows of all files on one time axis."""

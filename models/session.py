@@ -31,6 +31,8 @@ class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mean: tuple[float, ...]
     squares: tuple[Annotated[float, msgspec.Meta(ge=0.0)], ...]
     """Sum of the squared deviations from the mean."""
+    last: tuple[float, ...] | None = None
+    """The grasp that was taken in last: still held, it is not taken in again."""
 
 
 class SessionStatistics:
@@ -87,21 +89,27 @@ class SessionStatistics:
     def state(self) -> SessionState:
         """What `restore` needs."""
         return SessionState(
-            self._weight, self.grasps, tuple(self._mean.tolist()), tuple(self._squares.tolist())
+            self._weight,
+            self.grasps,
+            tuple(self._mean.tolist()),
+            tuple(self._squares.tolist()),
+            None if self._last is None else tuple(self._last.tolist()),
         )
 
     def restore(self, state: SessionState) -> None:
         """Go on from an earlier state. Raises `ValueError` if it is of another kind of vector."""
         mean, squares = np.array(state.mean), np.array(state.squares)
-        if not mean.shape == squares.shape == self._prior_mean.shape:
+        last = mean if state.last is None else np.array(state.last)
+        if not mean.shape == squares.shape == last.shape == self._prior_mean.shape:
             raise ValueError(f"is of {len(mean)} values, not of {len(self._prior_mean)}")
-        if not (np.isfinite(mean).all() and np.isfinite(squares).all()):
+        if not np.isfinite((mean, squares, last)).all():
             raise ValueError("holds numbers that are not finite")
         if state.weight != min(state.grasps, HORIZON_GRASPS):
             raise ValueError(f"says that {state.grasps} grasps weigh {state.weight:g}")
         self.reset()
         self.grasps, self._weight = state.grasps, state.weight
         self._mean, self._squares = mean, squares
+        self._last = None if state.last is None else last
         self._settle()
 
     def _is_held(self, values: NDArray[np.float64]) -> bool:

@@ -52,7 +52,7 @@ class Judgement:
 
 
 @dataclass(frozen=True, slots=True)
-class _Opinion:
+class Opinion:
     """What the network said of a grasp, and what stands against its being asked."""
 
     p_slip: float | None
@@ -60,7 +60,7 @@ class _Opinion:
     repaired: tuple[str, ...] = ()
 
 
-NO_OPINION = _Opinion(None, ())
+NO_OPINION = Opinion(None, ())
 
 
 class Pipeline:
@@ -103,12 +103,21 @@ class Pipeline:
         self._learnt_grasp = 0
         self._to_learn: NDArray[np.generic] | None = None
         self._opinion = NO_OPINION
+        self._latest: TactileReading | None = None
+        self.on_exchange: Callable[[], None] | None = None
+        """Done when the sensors were exchanged."""
 
     @property
     def session(self) -> SessionCalibration | None:
         """With all that was judged; None for a model that needs none."""
         self.learn()
         return self._session
+
+    @property
+    def axis_ns(self) -> int:
+        """`t_ns` less `made_ns` of the latest reading: where the time of a replay is counted from,
+        0 of live readings."""
+        return 0 if self._latest is None else self._latest.t_ns - self._latest.made_ns
 
     @property
     def on_request(self) -> bool:
@@ -128,6 +137,8 @@ class Pipeline:
             self._session.reset()
         if self.grip is not None:
             self.grip.forget()
+        if self.on_exchange is not None:
+            self.on_exchange()
 
     def turn(self, reading: JointReading) -> None:
         """Take in joint angles."""
@@ -138,6 +149,7 @@ class Pipeline:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
         self.learn()
         self._readings += 1
+        self._latest = reading
         watched = self._health.watch(reading)
         counts = self._counts_to_judge(reading, watched)
         judged = counts is not None or self.grip is None
@@ -187,7 +199,7 @@ class Pipeline:
 
     def _consider(
         self, counts: NDArray[np.uint16], watched: Watched
-    ) -> tuple[_Opinion, NDArray[np.generic] | None]:
+    ) -> tuple[Opinion, NDArray[np.generic] | None]:
         """What the network says of counts (fingers, 24), and what the session may learn."""
         findings = self._plausibility.examine(counts, watched.broken)
         p_slip, reasons = None, findings.reasons
@@ -195,7 +207,7 @@ class Pipeline:
             p_slip, reasons = self._network.judge(findings.counts)
         repaired = [] if findings.repaired is None else np.argwhere(findings.repaired).tolist()
         names = tuple(self._name(finger, place) for finger, place in repaired)
-        return _Opinion(p_slip, reasons, names), findings.grasp
+        return Opinion(p_slip, reasons, names), findings.grasp
 
     def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
         """Remember to learn a grasp, as it was before the lift and not as it changed since."""
@@ -214,7 +226,7 @@ class Pipeline:
             self._session.observe(counts)
 
     def _judgement(
-        self, t_ns: int, against: tuple[Reason, ...], opinion: _Opinion, *, judged: bool
+        self, t_ns: int, against: tuple[Reason, ...], opinion: Opinion, *, judged: bool
     ) -> Judgement:
         grip = self.grip
         health = (*against, *opinion.reasons)

@@ -26,6 +26,7 @@ NEVER = {
     *("daemon.scene_errors", "daemon.cost", "daemon.doctor"),
     *("daemon.realtime", "daemon.notify", "daemon.latest", "daemon.watch"),
     *(
+        "daemon.judge.memory",
         "daemon.recorder",
         "daemon.record_files",
         "daemon.recording",

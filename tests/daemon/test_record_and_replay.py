@@ -91,13 +91,33 @@ def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:
     assert len(now) == len(of_kind(lab.files[0], "tactile"))
 
 
-def test_a_session_goes_on_in_the_replay_where_it_was(tmp_path: Path) -> None:
-    rotated = work(tmp_path, 3, record="rotate_minutes = 0.05\nflush_ms = 200")
-    assert len(rotated.files) > 1
+@pytest.fixture(scope="module")
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """A session model at work, and files that end after three seconds, whatever is held then."""
+    options = "rotate_minutes = 0.05\nflush_ms = 200"
+    return work(tmp_path_factory.mktemp("rotated"), GRASPS, record=options)
+
+
+def test_a_session_goes_on_in_the_replay_where_it_was(rotated: Lab) -> None:
+    assert len(rotated.files) > 2
     before = [verdict for path in rotated.files for verdict in of_readings(path)]
     now = again(*rotated.files)
     assert {verdict["model"] for verdict in now} == {"small-session"}
     assert [compared(v) for v in now] == [compared(v) for v in before]
+
+
+def test_each_file_of_a_run_is_judged_as_then_without_those_before_it(rotated: Lab) -> None:
+    for path in rotated.files:
+        now = again(path)
+        assert [compared(v) for v in now] == [compared(v) for v in of_readings(path)]
+
+
+def test_files_that_do_not_follow_each_other_are_named(rotated: Lab) -> None:
+    first, _, third = rotated.files[:3]
+    result = graspd("replay", "--json", first, third)
+    assert result.returncode == 0
+    assert f"{third}: does not go on where the file before it ends" in result.stderr
+    assert "does not go on" not in graspd("replay", "--json", *rotated.files[:3]).stderr
 
 
 def test_questions_are_in_the_recording_and_are_asked_again(tmp_path: Path) -> None:

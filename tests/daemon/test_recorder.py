@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -18,7 +19,7 @@ import pytest
 
 from daemon import recorder as recorder_module
 from daemon import scene
-from daemon.record_files import Shelf, schemas
+from daemon.record_files import MessageFile, Shelf, schemas
 from daemon.recorder import QUEUE_MAX, Recorder
 from daemon.scene import Record, SceneError
 from drivers.base import JointReading
@@ -256,6 +257,35 @@ def test_a_disk_that_refuses_is_told_once_and_tried_again_every_minute(
     recorder.send(TOPIC, payload(2))
     recorder.close()
     assert numbers(tmp_path) == [2]
+
+
+def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten entries wait for a flush; of the twenty that follow the disk refuses the fifth.
+
+    The test goes the rounds itself: with this interval the thread's first one comes after 6 s.
+    """
+    recorder = make(flush_ms=60_000.0)
+    real, written = MessageFile.write, list[int]()
+
+    def write(file: MessageFile, topic: bytes, payload: bytes, at_ns: int) -> None:
+        if len(written) == 14:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(at_ns)
+        real(file, topic, payload, at_ns)
+
+    monkeypatch.setattr(MessageFile, "write", write)
+    for number in range(10):
+        recorder.send(TOPIC, payload(number))
+    recorder._go_round()
+    for number in range(20):
+        recorder.send(TOPIC, payload(number))
+    recorder._go_round()
+    recorder.send(TOPIC, payload(0))
+    recorder.close()
+    counted = recorder.counters()
+    assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
 
 
 FULL = """

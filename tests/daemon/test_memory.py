@@ -1,0 +1,216 @@
+"""A judge that takes over what another one knew says, from there on, the very same."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon import assembly, scene
+from daemon.judge.memory import JudgeMemory, decode, encode
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.verdict import Outcome, Reason
+from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from drivers.replay import DEMO_RECORDING, Pace, ReplayDriver
+from models.contract import Finger
+from models.runtime import TactileModel
+from models.session import SessionState
+
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
+SECTIONS: dict[str, Any] = {
+    "hand": {"fingers": FINGERS},
+    "tactile": {"driver": "palm", "source": "udp://127.0.0.1:9870"},
+    "joints": {"driver": "stream", "source": "udp://127.0.0.1:9871"},
+}
+STEP = 23
+"""Readings between one judge and the next: some 200 places, of all that happens in a grasp."""
+
+
+@pytest.fixture(scope="module")
+def readings() -> list[Reading]:
+    with ReplayDriver([DEMO_RECORDING], FINGERS, pace=Pace.FAST, clock=lambda: 10**12) as driver:
+        found: list[Reading] = []
+        while not driver.exhausted:
+            found += driver.read_ready()
+    return found
+
+
+@pytest.fixture(scope="module")
+def troubled(readings: list[Reading]) -> list[Reading]:
+    """The same with electrodes that jump, stand still or are missing, and with outages."""
+    rng = np.random.default_rng(4)
+    found: list[Reading] = []
+    for place, reading in enumerate(readings):
+        if place % 1900 > 1700 or (isinstance(reading, JointReading) and 700 < place < 1000):
+            continue
+        if isinstance(reading, TactileReading):
+            counts, faults = reading.counts.copy(), reading.faults.copy()
+            if place % 1000 > 600:
+                counts[0, 3] += 400 * (rng.random() < 0.3)
+                faults[2, 7] = ElectrodeFault.MISSING * (rng.random() < 0.5)
+            if place % 800 > 400:
+                counts[1, 11] = 2000
+            found.append(dataclasses.replace(reading, counts=counts, faults=faults))
+        else:
+            found.append(reading)
+    return found
+
+
+def judge(
+    now: list[int], gate: dict[str, Any], model: str | TactileModel = "small-session"
+) -> Pipeline:
+    """Finds readings as old as `now` says."""
+    named = model if isinstance(model, str) else model.contract.name
+    sections = {**SECTIONS, "gate": gate, "model": {"name": named}}
+    if gate.get("mode") == "every":
+        del sections["joints"]
+    wanted = scene.parse(sections, Path("test"))
+    loaded = assembly.load_model(wanted) if isinstance(model, str) else model
+    return assembly.build_pipeline(wanted, loaded, lambda: now[0])
+
+
+def judged(
+    pipeline: Pipeline, now: list[int], readings: Sequence[Reading]
+) -> list[tuple[Judgement, dict[str, Reason]]]:
+    """What is said of readings, and of the health then; sometimes somebody asks."""
+    found = []
+    for reading in readings:
+        now[0] = reading.t_ns
+        if isinstance(reading, JointReading):
+            if reading.seq % 97 == 0:
+                pipeline.ask()
+            pipeline.turn(reading)
+        else:
+            found.append((pipeline.judge(reading), pipeline.health()))
+    return found
+
+
+def handed_on(former: Pipeline, other: Pipeline) -> Pipeline:
+    """The other one, with what this one knows, as a recording tells it."""
+    assert former.session is not None
+    assert other.session is not None
+    memory = encode(JudgeMemory.of(former))
+    state = msgspec.json.encode(former.session.state())
+    decode(memory).give_judge(other, same_model=True)
+    other.session.restore(msgspec.json.decode(state, type=SessionState))
+    return other
+
+
+@pytest.mark.parametrize("mode", ["settled", "request", "every"])
+def test_whoever_takes_over_anywhere_judges_the_rest_the_same(
+    mode: str, troubled: list[Reading]
+) -> None:
+    now, gate = [0], {"mode": mode}
+    whole, other = judge(now, gate), judge(now, gate)
+    model = assembly.load_model(scene.parse(SECTIONS, Path("test")))
+    times = 0
+    for cut in range(0, len(troubled), STEP):
+        part = troubled[cut : cut + STEP]
+        expected = judged(whole, now, part)
+        other = handed_on(other, judge(now, gate, model))
+        assert judged(other, now, part) == expected
+        times += sum(each.judged for each, _ in expected)
+    assert times > 5
+
+
+def test_what_is_taken_does_not_change_when_the_judge_goes_on(readings: list[Reading]) -> None:
+    now = [0]
+    pipeline = judge(now, {"mode": "settled"})
+    judged(pipeline, now, readings[:2000])
+    memory = JudgeMemory.of(pipeline)
+    before = encode(memory)
+    judged(pipeline, now, readings[2000:])
+    assert encode(memory) == before
+
+
+def test_another_model_judges_the_grasp_at_hand_anew_and_knows_where_the_hand_rests(
+    readings: list[Reading],
+) -> None:
+    now = [0]
+    pipeline = judge(now, {"mode": "settled"})
+    said: list[Judgement] = []
+    place = 0
+    while not (said and said[-1].outcome is not Outcome.UNKNOWN):
+        said += [each for each, _ in judged(pipeline, now, readings[place : place + 1])]
+        place += 1
+    other = judge(now, {"mode": "settled"}, "cnn1")
+    decode(encode(JudgeMemory.of(pipeline))).give_judge(other, same_model=False)
+    found = [each for each, _ in judged(other, now, readings[place : place + 100])]
+    assert found[0].outcome is Outcome.UNKNOWN
+    assert Reason.NOT_TARED not in {reason for each in found for reason in each.reasons}
+    assert found[0].grasp == said[-1].grasp
+    assert any(each.judged for each in found if each.grasp == said[-1].grasp)
+
+
+def test_the_memory_of_another_hand_is_refused(readings: list[Reading]) -> None:
+    now = [0]
+    pipeline = judge(now, {"mode": "settled"})
+    judged(pipeline, now, readings[:1000])
+    sections = {**SECTIONS, "hand": {"fingers": ["ff", "th"]}}
+    wanted = scene.parse(sections, Path("test"))
+    two = assembly.build_pipeline(wanted, assembly.load_model(wanted))
+    with pytest.raises(ValueError, match="shape"):
+        JudgeMemory.of(pipeline).give_judge(two, same_model=False)
+
+
+@pytest.fixture(scope="module")
+def known(readings: list[Reading]) -> bytes:
+    now = [0]
+    pipeline = judge(now, {"mode": "settled"})
+    judged(pipeline, now, readings[:1500])
+    return encode(JudgeMemory.of(pipeline))
+
+
+@pytest.fixture(scope="module")
+def spare() -> tuple[Pipeline, list[int]]:
+    """A judge that is given one memory after the other, and its clock."""
+    now = [0]
+    return judge(now, {"mode": "settled"}), now
+
+
+ODD = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**63), 2**64 - 1),
+    st.floats(),
+    st.sampled_from(["", "idle", "<u2", "O", "<f8", [], {}, b"", b"\0" * 48, [0] * 40, ["<u2"]]),
+)
+
+
+@settings(max_examples=400)
+@given(st.data(), ODD)
+def test_whatever_is_in_a_memory_is_refused_or_can_be_gone_on_from(
+    known: bytes,
+    spare: tuple[Pipeline, list[int]],
+    readings: list[Reading],
+    data: st.DataObject,
+    odd: object,
+) -> None:
+    tree = place = msgspec.msgpack.decode(zlib.decompress(known))
+    while True:
+        keys = sorted(place) if isinstance(place, dict) else list(range(len(place)))
+        key = data.draw(st.sampled_from(keys))
+        if not (isinstance(place[key], dict | list) and place[key]) or data.draw(st.booleans()):
+            break
+        place = place[key]
+    place[key] = odd
+    pipeline, now = spare
+    try:
+        decode(zlib.compress(msgspec.msgpack.encode(tree))).give_judge(pipeline, same_model=True)
+    except ValueError:
+        return
+    judged(pipeline, now, readings[1500:1504])
+
+
+@pytest.mark.parametrize("data", [b"", b"\x80", zlib.compress(b"{}"), zlib.compress(bytes(9**7))])
+def test_what_is_no_memory_is_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match=r".+"):
+        decode(data)
