@@ -9,8 +9,9 @@ import os
 import socket
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import zmq
@@ -25,8 +26,9 @@ REQUEST_FRAMES = 9
 """Of a CURVE request: who asks (2), version, id, domain, address, identity, mechanism, key."""
 TAKEN_MAX = 64
 """Requests and events looked at in one round, so that a flood does not hold up readings."""
-REMEMBERED_MAX = 1000
-"""Connections of which the address is kept until they have shown their keys."""
+ANSWERED_MAX = 256
+"""Addresses that were answered and whose handshake has not ended yet; beyond, the log may name
+another address of those that are at the door."""
 EVENTS = (
     zmq.EVENT_ACCEPTED
     | zmq.EVENT_DISCONNECTED
@@ -41,7 +43,30 @@ TABLE_MAX_CHARS = 1 << 16
 """Of it so much is read at most, some hundred connections: it takes 0.5 ms."""
 TIME_WAIT = "06"
 """State of a connection that this side has closed."""
-FAILED = (zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL)
+ANSWERED = (zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_HANDSHAKE_FAILED_AUTH)
+"""End a handshake in which we were asked: who it is has been told."""
+NOT_ZEROMQ = "turned away %s: it does not speak ZeroMQ 4"
+FAILED = {
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "turned away %s: it has no keys, or not the daemon's",
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): (
+        "turned away %s: it has no keys, or broke off before it showed them"
+    ),
+}
+"""End one in which we were not asked, and come right before the connection goes. Who speaks another
+protocol, or a ZeroMQ from before there were keys, just goes (libzmq 4.3.5)."""
+
+
+@dataclass(slots=True, eq=False)
+class _Watched:
+    """A listening socket, and who is at its door."""
+
+    listening: zmq.Socket[bytes]
+    monitor: zmq.Socket[bytes]
+    waiting: dict[int, str | None] = field(default_factory=dict)
+    """Connections whose handshake has not ended, oldest first: address by descriptor, None where
+    it had gone before anybody looked. No more than the process may have descriptors."""
+    why: str = NOT_ZEROMQ
+    """Of the connection that goes next."""
 
 
 class Gatekeeper:
@@ -60,15 +85,14 @@ class Gatekeeper:
         self._requests = context.socket(zmq.ROUTER)
         self._requests.linger = 0
         self._requests.bind(ZAP_ENDPOINT)
-        self._monitors: list[tuple[zmq.Socket[bytes], zmq.Socket[bytes]]] = []
-        self._addresses: dict[int, str] = {}
-        """Of connections by their descriptor."""
-        self._failed = 0
-        """Handshakes that have failed and whose connection has not gone yet."""
+        self._watched: list[_Watched] = []
+        self._answered: deque[str] = deque(maxlen=ANSWERED_MAX)
+        """Addresses of those who have shown a key and whose handshake has not ended."""
         self._asked_kernel_s = -math.inf
 
     def watch(self, listening: zmq.Socket[bytes]) -> None:
-        """Hear of peers of this socket that fail without asking: those without keys."""
+        """Hear of peers of this socket that fail without asking: those without keys, those that
+        speak no ZeroMQ, those that say nothing for 30 s (libzmq's limit for a handshake)."""
         endpoint = f"inproc://graspd-monitor-{id(listening)}"
         listening.monitor(endpoint, EVENTS)
         monitor = self._context.socket(zmq.PAIR)
@@ -76,7 +100,7 @@ class Gatekeeper:
         # Else libzmq's own thread waits in the middle of its work when nobody has looked for long.
         monitor.rcvhwm = 0
         monitor.connect(endpoint)
-        self._monitors.append((listening, monitor))
+        self._watched.append(_Watched(listening, monitor))
 
     def admit(self, admitted: Mapping[bytes, str]) -> bool:
         """Take another list; whether somebody is no longer on it."""
@@ -86,7 +110,7 @@ class Gatekeeper:
 
     def filenos(self) -> list[int]:
         """Become readable when there may be something; call `take` before waiting for them."""
-        monitors = (monitor for _, monitor in self._monitors)
+        monitors = (watched.monitor for watched in self._watched)
         return [int(each.fileno()) for each in (self._requests, *monitors)]
 
     def take(self) -> None:
@@ -95,42 +119,52 @@ class Gatekeeper:
             if not int(self._requests.get(zmq.EVENTS)) & zmq.POLLIN:
                 break
             self._answer(self._requests.recv_multipart(zmq.NOBLOCK))
-        for _, monitor in self._monitors:
+        for watched in self._watched:
             for _ in range(TAKEN_MAX):
-                if not int(monitor.get(zmq.EVENTS)) & zmq.POLLIN:
+                if not int(watched.monitor.get(zmq.EVENTS)) & zmq.POLLIN:
                     break
-                event = parse_monitor_message(monitor.recv_multipart(zmq.NOBLOCK))
-                self._note(event["event"], event["value"])
+                event = parse_monitor_message(watched.monitor.recv_multipart(zmq.NOBLOCK))
+                self._note(watched, event["event"], event["value"])
 
     def _answer(self, frames: list[bytes]) -> None:
         if len(frames) != REQUEST_FRAMES or frames[2] != ZAP_VERSION or frames[7] != b"CURVE":
             return  # libzmq alone can reach this socket, and asks so only for sockets with keys
         envelope, number, address, key = frames[:2], frames[3], frames[5], frames[8]
-        name = self._admitted.get(z85.encode(key))
+        name, who = self._admitted.get(z85.encode(key)), address.decode("ascii")
+        self._answered.append(who)
         if name is None:
             self.counters["turned_away"] += 1
-            log.warning("turned away %s: its key is not on the list", address.decode("ascii"))
+            log.warning("turned away %s: its key is not on the list", who)
         else:
             self.counters["admitted"] += 1
-            log.info("%s is %s", address.decode("ascii"), name)
+            log.info("%s is %s", who, name)
         status = (b"400", b"not on the list") if name is None else (b"200", b"OK")
         user = b"" if name is None else name.encode()
         self._requests.send_multipart([*envelope, ZAP_VERSION, number, *status, user, b""])
 
-    def _note(self, event: int, value: int) -> None:
+    def _note(self, watched: _Watched, event: int, value: int) -> None:
+        """`value` is a descriptor where somebody comes or goes."""
         if event == zmq.EVENT_ACCEPTED:
-            address = _peer(value)
-            if address is not None and len(self._addresses) < REMEMBERED_MAX:
-                self._addresses[value] = address
+            watched.waiting[value] = _peer(value)
+        elif event in ANSWERED:
+            self._let_pass(watched)
         elif event in FAILED:
-            self._failed += 1
+            watched.why = FAILED[event]
         elif event == zmq.EVENT_DISCONNECTED:
-            address = self._addresses.pop(value, None)
-            if self._failed:
-                self._failed -= 1
+            why, watched.why = watched.why, NOT_ZEROMQ
+            if value in watched.waiting:
+                address = watched.waiting.pop(value)
                 self.counters["turned_away"] += 1
-                who = address or self._who_was_it()
-                log.warning("turned away %s: it has no keys, or not the daemon's", who)
+                log.warning(why, address or self._who_was_it())
+
+    def _let_pass(self, watched: _Watched) -> None:
+        """One handshake has ended. The event does not say which: the newest of an address that was
+        answered, for a handshake takes no time, and who says nothing has long been there."""
+        known = [each for each, who in watched.waiting.items() if who in self._answered]
+        for descriptor in (known or list(watched.waiting))[-1:]:
+            address = watched.waiting.pop(descriptor)
+            if address is not None and address in self._answered:
+                self._answered.remove(address)
 
     def _who_was_it(self) -> str:
         """A connection may be gone before anybody looks; the kernel remembers it for a minute."""
@@ -138,18 +172,17 @@ class Gatekeeper:
         if now_s - self._asked_kernel_s < KERNEL_PERIOD_S:
             return "somebody"
         self._asked_kernel_s = now_s
-        ports = {_port(listening) for listening, _ in self._monitors}
+        ports = {_port(watched.listening) for watched in self._watched}
         return " or ".join(sorted(gone_peers(ports))) or "somebody"
 
     def unwatch(self) -> None:
         """Watch no socket any more: they are about to be closed."""
-        for listening, monitor in self._monitors:
-            if not listening.closed:
-                listening.disable_monitor()
-            monitor.close(linger=0)
-        self._monitors.clear()
-        self._addresses.clear()
-        self._failed = 0
+        for watched in self._watched:
+            if not watched.listening.closed:
+                watched.listening.disable_monitor()
+            watched.monitor.close(linger=0)
+        self._watched.clear()
+        self._answered.clear()
 
     def close(self) -> None:
         """Answer nobody any more."""

@@ -60,7 +60,10 @@ def prepare(path: Path) -> Parts:
     Raises `SceneError`, `ModelError` or `RecordingError`.
     """
     wanted = scene.load(path)
-    model = assembly.load_model(wanted)
+    return _built(wanted, assembly.load_model(wanted))
+
+
+def _built(wanted: scene.Scene, model: TactileModel) -> Parts:
     pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session_learns)
     return Parts(wanted, model, pipeline, assembly.build_drivers(wanted))
 
@@ -110,9 +113,13 @@ class Runner:
                 self._refuse(error)
                 parts, former = former, None
                 continue
-            if ended is not Ended.RELOAD or self._next is None:
+            if ended is Ended.SLEPT:
+                log.warning("the computer has slept: everything starts anew")
+                parts, former = _built(parts.scene, parts.model), None
+            elif ended is Ended.RELOAD and self._next is not None:
+                parts, former = self._next, parts
+            else:
                 return
-            parts, former = self._next, parts
 
     def _open_sockets(self, wanted: scene.Scene) -> Sockets:
         """Those that are open, if the scene wants the same ones."""

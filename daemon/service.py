@@ -12,6 +12,7 @@ from daemon.deadlines import Deadlines
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.verdict import State, Status, Verdict
 from daemon.reporter import Reporter
+from daemon.sleep import Sleep
 from daemon.stop import StopSignal
 from drivers.base import Driver, JointReading, TactileReading
 
@@ -36,6 +37,8 @@ class Ended(Enum):
     """The recording is over."""
     RELOAD = "reload"
     """Another scene is ready to take over."""
+    SLEPT = "slept"
+    """The computer has: what is known of the hand is from before it, however fresh it looks."""
 
 
 class Watchdog(Protocol):
@@ -85,6 +88,7 @@ class Service:
         on_status: Callable[[Status], None] | None = None,
         reload: Callable[[], bool] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
+        sleep: Sleep | None = None,
     ) -> None:
         """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
 
@@ -93,7 +97,7 @@ class Service:
         `sockets` are answered with the next verdict, or if a grasp is judged on request only, when
         it has been.
         `on_status` gets every status once it is sent. `reload` is done when a reload is asked for,
-        and says whether the loop shall end for it.
+        and says whether the loop shall end for it. `sleep` says whether the computer has slept.
         """
         self._drivers = drivers
         self._tactile = drivers[0]
@@ -112,6 +116,7 @@ class Service:
         self._on_status = on_status
         self._reload = reload
         self._clock = clock
+        self._sleep = Sleep() if sleep is None else sleep
         self._deadlines = Deadlines()
         self._joints: JointReading | None = None
         self._watched: set[int] = set()
@@ -135,6 +140,8 @@ class Service:
                         return Ended.EXHAUSTED
                     if self._stop.take_reload() and self._reload is not None and self._reload():
                         return Ended.RELOAD
+                    if self._sleep.has_slept():  # before anything is repeated for who comes late
+                        return self._wake()
                     self._go_round(selector)
             if self._tactile.fileno() is not None:
                 self._take_readings()  # what had come before the signal
@@ -155,6 +162,12 @@ class Service:
             self._send_status()
         if self._watchdog is not None:
             self._watchdog.feed()
+
+    def _wake(self) -> Ended:
+        """Say that nothing is known, also to who waits for an answer."""
+        self._silence_due_ns = self._clock()
+        self._mind_silence()
+        return Ended.SLEPT
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
         """Sleep until a driver, a timer or a signal wants attention."""
@@ -190,6 +203,8 @@ class Service:
                 continue
             self._reporter.tactile(reading, self._joints)
             judgement = self._pipeline.judge(reading)
+            if self._sleep.has_slept():
+                return taken  # it was read before
             verdict, payload = self._reporter.verdict(judgement, received_ns, self._silence_ns())
             self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
             self._state = State.RUNNING

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Self
 
@@ -11,12 +11,18 @@ import zmq.auth
 from zmq.utils.monitor import recv_monitor_message
 
 from daemon.keys import Z85_KEY, KeysError, load_pair
+from daemon.sleep import boottime_ns
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX = 2000
 """Messages that wait here; at 100 Hz those of seven seconds. More are lost, and seen as lost."""
 TAKEN_MAX = 5000
 """Messages taken at a time, more than can wait: after a pause the newest is there at once."""
+PAUSE_NS = 1_000_000_000
+"""Who has not looked for longer connects anew: what waits is old, and what is new may be lost."""
+RETRY_NS = 5_000_000_000
+"""After being turned away: libzmq does not try again by itself, and the key may be known by then.
+"""
 MESSAGE_MAX_BYTES = 1 << 20
 """A status has some kilobytes; who sends more is no daemon."""
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
@@ -28,9 +34,7 @@ EVENTS: Final = {
     int(zmq.EVENT_HANDSHAKE_SUCCEEDED): "connected",
     int(zmq.EVENT_DISCONNECTED): NOT_CONNECTED,
     int(zmq.EVENT_CONNECT_RETRIED): NOT_CONNECTED,
-    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): (
-        "turned away: the daemon does not know this key; start again when it does"
-    ),
+    int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "turned away: the daemon does not know this key",
 }
 """What the connection is like after an event."""
 REFUSALS: Final = {
@@ -51,31 +55,44 @@ FOLLOW = 2
 class Feed:
     """Subscribed to all topics of an endpoint until `close`; connects again by itself."""
 
-    def __init__(self, endpoint: str, keys: tuple[bytes, bytes, bytes] | None = None) -> None:
-        """`keys`: own public and secret key and the daemon's public one, Z85, where it needs them.
+    def __init__(
+        self,
+        endpoint: str,
+        keys: tuple[bytes, bytes, bytes] | None = None,
+        clock: Callable[[], int] = boottime_ns,
+    ) -> None:
+        """`keys`: own public and secret key and the daemon's public one, Z85, where it needs them;
+        `clock` gives ns, also while the computer sleeps.
 
         Raises `zmq.ZMQError` for an endpoint that is none.
         """
         self.link = "connecting"
         """What the connection is like, in words."""
+        self._endpoint = endpoint
+        self._keys = keys
+        self._clock = clock
+        self._taken_ns = self._opened_ns = clock()
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._events = EVENTS | {event: says[keys is not None] for event, says in REFUSALS.items()}
+        self._follow = 0
+        self._open()
+
+    def _open(self) -> None:
         self._socket = self._context.socket(zmq.SUB)
         self._socket.linger = 0
         self._socket.rcvhwm = WAITING_MAX
         self._socket.maxmsgsize = MESSAGE_MAX_BYTES
         self._socket.reconnect_ivl = RECONNECT_MS
         self._socket.reconnect_ivl_max = RECONNECT_MAX_MS
-        if keys is not None:
-            self._socket.curve_publickey, self._socket.curve_secretkey = keys[:2]
-            self._socket.curve_serverkey = keys[2]
-        if endpoint.startswith("tcp://"):
+        if self._keys is not None:
+            self._socket.curve_publickey, self._socket.curve_secretkey = self._keys[:2]
+            self._socket.curve_serverkey = self._keys[2]
+        if self._endpoint.startswith("tcp://"):
             self._socket.heartbeat_ivl = HEARTBEAT_MS
             self._socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
         self._monitor = self._socket.get_monitor_socket(sum(EVENTS) + sum(REFUSALS))
-        self._events = EVENTS | {event: says[keys is not None] for event, says in REFUSALS.items()}
-        self._follow = 0
         try:
-            self._socket.connect(endpoint)
+            self._socket.connect(self._endpoint)
         except zmq.ZMQError:
             self.close()
             raise
@@ -84,6 +101,7 @@ class Feed:
 
     def take(self) -> Iterator[tuple[bytes, bytes]]:
         """Topic and payload of each message that has come; never waits."""
+        self._connect_anew_if_need_be()
         self._look_at_link()
         for _ in range(TAKEN_MAX):
             try:
@@ -93,6 +111,20 @@ class Feed:
             if len(frames) == 2:
                 yield frames[0], frames[1]
 
+    def _connect_anew_if_need_be(self) -> None:
+        now_ns = self._clock()
+        paused = now_ns - self._taken_ns > PAUSE_NS
+        self._taken_ns = now_ns
+        if paused or (self.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
+            self._opened_ns = now_ns
+            self._let_go()
+            self._open()
+
+    @property
+    def is_turned_away(self) -> bool:
+        """Whether the daemon does not let us in."""
+        return self.link.startswith("turned away")
+
     def _look_at_link(self) -> None:
         while self._monitor.poll(0):
             event = int(recv_monitor_message(self._monitor)["event"])
@@ -100,16 +132,19 @@ class Feed:
             if link == NOT_CONNECTED and self._follow:
                 self._follow -= 1
                 continue
-            self._follow = FOLLOW if link.startswith("turned away") else 0
             self.link = link
+            self._follow = FOLLOW if self.is_turned_away else 0
 
     def close(self) -> None:
         """Let go of the endpoint. May be called again."""
+        self._let_go()
+        self._context.term()
+
+    def _let_go(self) -> None:
         if not self._socket.closed:
             self._socket.disable_monitor()
             self._monitor.close(0)
             self._socket.close(0)
-        self._context.term()
 
     def __enter__(self) -> Self:
         return self

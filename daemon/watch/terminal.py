@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 from rich.console import Group, RenderableType
 from rich.style import Style
@@ -60,6 +61,8 @@ def _header(seen: Snapshot) -> Text:
     return _line(
         ("graspd ", BOLD),
         (_name(seen.hand or "-"), BOLD),
+        # Of the picture: an operator sees it stand still where nothing is drawn any more.
+        (time.strftime("  %H:%M:%S", time.localtime(seen.t)), BOLD),
         (f"  {_name(seen.model or 'no model yet')}", DIM),
         (f"  {seen.state or '-'}", BOLD),
     )
@@ -157,27 +160,27 @@ def _strip(seen: Snapshot, canvas: Canvas, width: int) -> Text:
 
 
 def _numbers(seen: Snapshot) -> list[Text]:
-    time = seen.timing
+    timing = seen.timing
     first = _line(
         ("readings ", DIM),
-        (f"{_number(time.readings_hz)}/s", ""),
+        (f"{_number(timing.readings_hz)}/s", ""),
         ("  verdicts ", DIM),
-        (f"{time.verdicts_hz:.0f}/s", ""),
+        (f"{timing.verdicts_hz:.0f}/s", ""),
         ("  age ", DIM),
-        (f"{_number(time.age_ms, 1)} ms", ""),
+        (f"{_number(timing.age_ms, 1)} ms", ""),
         ("  latency p50 p99 ", DIM),
-        (f"{_number(time.p50_us)} {_number(time.p99_us)} us", ""),
+        (f"{_number(timing.p50_us)} {_number(timing.p99_us)} us", ""),
     )
-    lost = Style(bold=True) if time.lost or time.not_understood else Style()
+    lost = Style(bold=True) if timing.lost or timing.not_understood else Style()
     second = _line(
         ("late ", DIM),
-        (f"{_number(time.late)}", ""),
+        (f"{_number(timing.late)}", ""),
         ("  worst age ", DIM),
-        (f"{_number(time.worst_age_ms)} ms", ""),
+        (f"{_number(timing.worst_age_ms)} ms", ""),
         ("  lost here ", DIM),
-        (f"{time.lost}", lost),
+        (f"{timing.lost}", lost),
         ("  not understood ", DIM),
-        (f"{time.not_understood}", lost),
+        (f"{timing.not_understood}", lost),
     )
     return [first, second]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
+from daemon.sleep import boottime_ns
 from daemon.watch.feed import Feed
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.view import SNAPSHOTS_HZ, View
@@ -18,8 +19,8 @@ def snapshots(feed: Feed, view: View, is_over: Callable[[], bool]) -> Iterator[S
     due_s = 0.0
     while not is_over():
         for topic, payload in feed.take():
-            view.take(topic, payload, time.monotonic_ns())
+            view.take(topic, payload, boottime_ns())  # after a sleep, what came before it is old
         view.link = feed.link
         if time.monotonic() >= due_s:
             due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
-            yield view.snapshot(time.monotonic_ns())
+            yield view.snapshot(boottime_ns())

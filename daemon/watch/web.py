@@ -52,6 +52,12 @@ class Newest:
         self._number = 0
         self.closed = False
 
+    @property
+    def number(self) -> int:
+        """Of the newest; 0 before the first."""
+        with self._changed:
+            return self._number
+
     def put(self, payload: bytes) -> None:
         """Replace it."""
         with self._changed:
@@ -166,9 +172,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{PAGES_MAX} pages are open")
             return
         try:
+            number = self.server.newest.number  # the next one is sent first: this may be old
             self._begin("text/event-stream")
             self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
-            number = 0
             while not self.server.newest.closed:
                 number, payload = self.server.newest.after(number)
                 if payload:

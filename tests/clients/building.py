@@ -39,6 +39,19 @@ def compiled(name: str, folder: Path) -> Path:
     return folder / name
 
 
+def compiled_sleep(folder: Path) -> Path:
+    """What makes a program take the computer for one that has slept."""
+    skip_unless_it_can_be_compiled()
+    library = folder / "sleep.so"
+    source = Path(__file__).parent / "sleep.c"
+    subprocess.run(
+        ["gcc", "-shared", "-fPIC", "-Wall", "-Werror", source, "-o", library],
+        check=True,
+        timeout=55,
+    )
+    return library
+
+
 def compiled_probe(folder: Path) -> Path:
     """The probe that tells what the header's rules say."""
     skip_unless_it_can_be_compiled()

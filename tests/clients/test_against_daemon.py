@@ -12,7 +12,7 @@ import zmq
 from daemon.keys import make
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Graspd, Keys
-from tests.clients.bench import PATIENCE_S, Daemon, free_endpoint, until
+from tests.clients.bench import PATIENCE_S, Daemon, free_endpoint, unlisted, until
 
 SILENCE_S = 0.1
 """`silence_ms` of a daemon at 100 Hz with the default age limit."""
@@ -25,7 +25,6 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_p
         Graspd(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asking,
         Graspd(daemon.endpoint, ask_endpoint=f"{daemon.ask_endpoint}.nobody") as unanswered,
     ):
-        assert listening.may_i_lift(0.0).verdict.reasons == ("no-message",)
         until(lambda: bool(asking.may_i_lift(0.5)))
         assert listening.verdict(0.1)
         answer = unanswered.may_i_lift(0.2)
@@ -113,6 +112,19 @@ def test_only_who_has_keys_is_told(tmp_path: Path) -> None:
         assert stranger.verdict(0.2).reasons == ("no-message",)
     with pytest.raises(ValueError, match="no secret key"):
         Keys.load(public, own_public)
+
+
+def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(tmp_path: Path) -> None:
+    keys = unlisted(tmp_path)
+    endpoint = free_endpoint()
+    with (
+        Daemon(tmp_path, keys.section, endpoint=endpoint),
+        Graspd(endpoint, keys=Keys.load(keys.server, keys.own)) as graspd,
+    ):
+        assert graspd.verdict(1.5).reasons == ("no-message",)
+        keys.admit()
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        assert graspd.counts.malformed == 0
 
 
 def test_the_latest_endpoint_is_no_place_for_this_client(tmp_path: Path) -> None:

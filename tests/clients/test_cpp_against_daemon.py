@@ -10,9 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+import zmq
 
 from daemon.keys import make
-from tests.clients.bench import Daemon, free_endpoint
+from tests.clients.bench import Daemon, free_endpoint, unlisted
+from tests.clients.building import compiled_sleep
+from tests.clients.messages import frames, verdict
 
 MAY, MAY_NOT, WRONG = 0, 1, 2
 """Exit codes of `lift_gate`."""
@@ -100,6 +103,45 @@ def test_only_who_has_keys_is_told(lift_gate: Path, tmp_path: Path) -> None:
             line_with(watch, "stable", "slip")
         code, text = asked(lift_gate, endpoint, 0.3)
     assert (code, text.startswith("unknown [ no-message ]")) == (MAY_NOT, True)
+
+
+def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(
+    lift_gate: Path, tmp_path: Path
+) -> None:
+    keys = unlisted(tmp_path)
+    endpoint = free_endpoint()
+    with (
+        Daemon(tmp_path, keys.section, endpoint=endpoint),
+        watching(lift_gate, endpoint, keys.server, keys.own) as watch,
+    ):
+        line_with(watch, "no-message")
+        time.sleep(1.5)
+        keys.admit()
+        line_with(watch, "stable", "slip")
+
+
+def test_what_came_before_the_computer_slept_is_unknown_however_young_it_looks(
+    lift_gate: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept, endpoint = tmp_path / "slept", f"ipc://{tmp_path}/out"
+    monkeypatch.setenv("SLEPT", str(slept))
+    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.XPUB) as out,
+        watching(lift_gate, endpoint) as watch,
+    ):
+        out.linger = 0
+        out.bind(endpoint)
+        for seq in range(2):
+            while out.recv()[:1] != b"\x01":  # it has subscribed, the second time anew
+                pass
+            message = verdict(seq, time.monotonic_ns(), "unknown", silence_ms=1e9)
+            out.send_multipart(frames(message))
+            line_with(watch, "moving")
+            if not slept.exists():
+                slept.touch()
+                line_with(watch, "slept")
 
 
 @pytest.mark.parametrize(

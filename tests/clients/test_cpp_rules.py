@@ -73,9 +73,7 @@ def as_hex(frame: bytes) -> str:
     return frame.hex() or "-"
 
 
-@settings(
-    max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(events(), st.booleans(), st.sampled_from([0, 5, 77_000]))
 def test_both_clients_say_the_same(
     probe: Probe, sequence: Sequence[Event], same_computer: bool, ahead_ms: int

@@ -32,6 +32,8 @@ class World:
     answers: list[tuple[int, bytes]] = field(default_factory=list)
     """How long after its question each comes, ns; then none any more."""
     now_ns: int = START_NS
+    slept_ns: int = 0
+    """What the computer has slept: the monotonic clock does not count it."""
     came: list[list[bytes]] = field(default_factory=list)
     answered: list[bytes] = field(default_factory=list)
     questions: int = 0
@@ -41,6 +43,9 @@ class World:
     def monotonic_ns(self) -> int:
         self.now_ns += LOOK_NS
         return self.now_ns
+
+    def boot_ns(self, _clock: int) -> int:
+        return self.monotonic_ns() + self.slept_ns
 
     def receive(self) -> list[bytes] | None:
         if not self.coming or self.coming[0][0] > self.now_ns:
@@ -81,7 +86,8 @@ def client(world: World, ask: bool = False) -> Iterator[Graspd]:
     """A client in that world."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graspd_client, "_Link", lambda *_: world)
-        patch.setattr(graspd_client, "time", SimpleNamespace(monotonic_ns=world.monotonic_ns))
+        clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}
+        patch.setattr(graspd_client, "time", SimpleNamespace(**clocks, CLOCK_BOOTTIME=7))
         with Graspd("ipc:///nowhere", ask_endpoint=ASK if ask else None) as made:
             yield made
 
@@ -222,6 +228,53 @@ def test_who_has_not_read_for_long_connects_anew() -> None:
     assert world.renewed == 1
 
 
+def test_what_came_before_the_computer_slept_is_unknown_however_young_it_looks() -> None:
+    world = World(stream("stable", "stable", "stable"))
+    with client(world) as graspd:
+        assert graspd.verdict()
+        world.slept_ns += 3600 * 1000 * MS
+        assert graspd.verdict().reasons == ("slept",)
+        assert (world.renewed, graspd.may_i_lift(0.005).verdict.reasons) == (1, ("slept",))
+        world.now_ns += 10 * MS
+        assert graspd.verdict()  # the next message is of after it
+    assert world.renewed == 1
+
+
+def test_a_clock_that_is_read_late_is_no_sleep() -> None:
+    world = World(stream("stable"))
+    with client(world) as graspd:
+        graspd.verdict()
+        world.slept_ns += 10 * MS
+        assert graspd.verdict()
+    assert world.renewed == 0
+
+
+def test_who_hears_nothing_at_all_connects_anew_ever_more_seldom() -> None:
+    world = World([])
+    times_s = []
+    with client(world) as graspd:
+        for _ in range(400):
+            before = world.renewed
+            graspd.verdict(0.1)
+            if world.renewed > before:
+                times_s.append((world.now_ns - START_NS) / 1e9)
+    gaps = [after - before for before, after in zip([0.0, *times_s], times_s, strict=False)]
+    assert gaps == pytest.approx([1.0, 2.0, 4.0, 8.0, 10.0, 10.0], abs=0.15)
+
+
+def test_a_daemon_that_is_heard_seldom_is_not_connected_to_anew() -> None:
+    """One reading in two seconds: it may be silent for ten times as long."""
+    coming = [
+        (at_ns, frames(verdict(seq, at_ns - MS, silence_ms=20_000.0)))
+        for seq, at_ns in enumerate(range(START_NS, START_NS + 30_000 * MS, 2000 * MS))
+    ]
+    world = World(coming)
+    with client(world) as graspd:
+        for _ in range(250):
+            graspd.verdict(0.1)
+    assert world.renewed == 0
+
+
 def test_a_flood_does_not_hold_it_up() -> None:
     world = World([(START_NS, [b"verdict.right"])] * 1500)
     with client(world) as graspd:
@@ -229,7 +282,7 @@ def test_a_flood_does_not_hold_it_up() -> None:
         assert graspd.verdict().reasons == ("malformed",)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(
     events(),
     st.lists(st.tuples(st.integers(0, 60), events()), max_size=4),

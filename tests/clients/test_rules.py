@@ -25,7 +25,7 @@ def local() -> Newest:
     return Newest(TOPIC, MAX_AGE_NS, True)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(events())
 def test_it_says_stable_exactly_when_all_that_came_says_so(sequence: Sequence[Event]) -> None:
     newest, now_ns, came = local(), START_NS, []
@@ -37,7 +37,7 @@ def test_it_says_stable_exactly_when_all_that_came_says_so(sequence: Sequence[Ev
         assert bool(newest.at(now_ns)) == is_stable(came, now_ns)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=200) | st.text(max_size=100).map(str.encode))
 def test_noise_is_counted_and_never_stable(payload: bytes) -> None:
     newest = local()
@@ -132,7 +132,7 @@ OFFSET_NS = 77_000 * MS
 """By which the other computer's clock is ahead."""
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(st.integers(0, 400), max_size=60), st.sampled_from([0.0, 5e-4, -5e-4]))
 def test_from_another_computer_nothing_that_the_network_held_up_is_stable(
     delays_ms: list[int], drift: float
@@ -167,6 +167,18 @@ def test_another_computer_that_was_rebooted_is_heard_again() -> None:
         theirs_ns = (OFFSET_NS if boot_id == "a" else 0) + number * 10 * MS
         newest.take(frames(verdict(number, theirs_ns, boot_id=boot_id)), now_ns - MS, now_ns)
         assert bool(newest.at(now_ns)) == (number in (1, 3))
+
+
+def test_what_is_forgotten_comes_back_only_with_a_newer_message() -> None:
+    newest = Newest(TOPIC, MAX_AGE_NS, False)
+    for seq in range(3):
+        newest.take(frames(verdict(seq, OFFSET_NS)), START_NS, START_NS)
+    newest.forget("slept")
+    assert (newest.at(START_NS).reasons, newest.silence_ns) == (("slept",), 0)
+    newest.take(frames(verdict(2, OFFSET_NS)), START_NS, START_NS)
+    assert newest.at(START_NS).reasons == ("slept",)
+    newest.take(frames(verdict(3, OFFSET_NS)), START_NS, START_NS)
+    assert newest.at(START_NS).reasons == ("joining",)  # how the clocks differ is not known now
 
 
 def test_what_waited_while_nobody_read_has_no_time_of_arrival() -> None:

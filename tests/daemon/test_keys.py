@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import socket
@@ -141,6 +142,60 @@ def test_who_takes_another_daemon_for_this_one_is_turned_away(
     assert not door.hears(door.connect(door.known, server=other), QUIET_S)
     door.until(lambda: door.counted("turned_away") > 0)
     assert "or not the daemon's" in caplog.text
+
+
+STRANGERS = {
+    "http": (b"GET / HTTP/1.1\r\nHost: graspd\r\n\r\n", "it does not speak ZeroMQ 4"),
+    "zeros": (bytes(300), "it does not speak ZeroMQ 4"),
+    "tls": (bytes.fromhex("16 03 01 02 00 01 00 01 fc 03 03"), "it does not speak ZeroMQ 4"),
+    # RFC 15: signature, revision 1, socket type SUB, no identity.
+    "ZeroMQ 3": (bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 01 02 00 00"), "not speak ZeroMQ 4"),
+    "nothing": (b"", "it has no keys, or broke off"),
+    "half a greeting": (bytes.fromhex("ff 00 00 00"), "it has no keys, or broke off"),
+    "a greeting that goes on in noise": (b"\xff" * 300, "it has no keys"),
+}
+"""What peers may say that are none, and what is said of them."""
+
+
+@pytest.mark.parametrize(("says", "told"), STRANGERS.values(), ids=STRANGERS)
+def test_who_speaks_no_zeromq_is_turned_away_by_address_and_counted_once(
+    door: Door, caplog: pytest.LogCaptureFixture, says: bytes, told: str
+) -> None:
+    with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as stranger:
+        stranger.sendall(says)
+        with contextlib.suppress(OSError):  # it may be cut off already
+            stranger.shutdown(socket.SHUT_WR)
+        door.until(lambda: door.counted("turned_away") > 0)
+    assert "turned away 127.0.0.1: " in caplog.text
+    assert told in caplog.text
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+    assert door.counted("turned_away") == 1
+
+
+def test_friends_that_go_are_not_counted_and_who_waits_at_the_door_meanwhile_is(
+    door: Door,
+) -> None:
+    with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as silent:
+        for _ in range(3):
+            friend = door.connect(door.known)
+            assert door.hears(friend, PATIENCE_S)
+            friend.close(linger=0)
+        for _ in range(20):
+            door.sockets.take()
+            time.sleep(0.005)
+        assert door.counted("turned_away") == 0
+        silent.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        door.until(lambda: door.counted("turned_away") > 0)
+    assert (door.counted("turned_away"), door.counted("admitted")) == (1, 3)
+
+
+def test_a_key_that_is_not_on_the_list_is_counted_once(door: Door, tmp_path: Path) -> None:
+    """Refused when asked: that its connection goes as well is nothing new."""
+    stranger = door.connect(door.client("stranger", tmp_path / "elsewhere"))
+    assert not door.hears(stranger, QUIET_S)
+    stranger.close(linger=0)
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+    assert door.counted("turned_away") == 1
 
 
 def test_a_key_that_is_taken_off_the_list_is_cut_off_while_connected(

@@ -14,7 +14,16 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.verdict import State, Status, Verdict, decode_status, decode_verdict
+from daemon.judge.verdict import (
+    Outcome,
+    Reason,
+    State,
+    Status,
+    Verdict,
+    decode_status,
+    decode_verdict,
+)
+from tests.clients.building import compiled_sleep
 from tests.daemon.processes import GRASPD
 
 DEMO = Path(__file__).parents[2] / "drivers" / "demo" / "synthetic_stream.csv"
@@ -189,6 +198,29 @@ def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> N
     after = running.verdict()
     assert after.boot_id == before.boot_id
     assert running.stop()[0] == 0
+
+
+def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept = tmp_path / "slept"
+    monkeypatch.setenv("SLEPT", str(slept))
+    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    with Running(tmp_path).started() as running:
+        running.told("READY=1")
+        before = running.verdict()
+        slept.touch()
+        assert running.told("READY=1")
+        deadline_s = time.monotonic() + PATIENCE_S
+        while (after := running.verdict()).boot_id == before.boot_id:
+            former = after
+            assert time.monotonic() < deadline_s
+        assert former.verdict is Outcome.UNKNOWN
+        assert former.reasons[0] is Reason.STALE
+        assert (after.seq, after.grasp) < (before.seq + 1000, before.grasp + 1)
+        code, said = running.stop()
+    assert code == 0
+    assert said.count("the computer has slept") == 1
 
 
 def test_a_scene_that_is_wrong_at_the_start_ends_with_2(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from daemon.judge.verdict import (
 )
 from daemon.reporter import Reporter
 from daemon.service import Ended, Service, Watchdog
+from daemon.sleep import Sleep
 from daemon.stop import StopSignal
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
@@ -62,6 +63,7 @@ class Bench:
         model: FakeModel | None = None,
         watchdog: Watchdog | None = None,
         reload: Callable[[], bool] | None = None,
+        sleep: Sleep | None = None,
     ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
@@ -78,6 +80,7 @@ class Bench:
             watchdog=watchdog,
             reload=reload,
             clock=clock,
+            sleep=sleep,
         )
 
     def _listen(self, verdict: Verdict, payload: bytes, _reading: TactileReading | None) -> None:

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import random
+import time
 from pathlib import Path
 
 import msgspec
@@ -302,6 +303,16 @@ def test_the_view_fits_the_terminal(width: int, height: int, canvas: Canvas) -> 
 def test_a_terminal_of_ascii_gets_ascii() -> None:
     for line in text_of(a_grasp(), 80, 24, Canvas(colour=False, ascii_only=True)):
         assert line.replace("°", "").isascii()
+
+
+def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "CET-1")
+    time.tzset()
+    seen = after((b"verdict.right", verdict(0, Outcome.STABLE))).snapshot(0)
+    header = text_of(seen, 80, 24, Canvas())[0]
+    monkeypatch.undo()
+    time.tzset()
+    assert header.startswith("graspd right  15:13:20")  # date -u -d @1790000000: 14:13:20
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (10, 3), (40, 12), (79, 23)])

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -16,7 +18,7 @@ from daemon.watch.view import View
 from daemon.watch.watching import TICK_S, snapshots
 from daemon.watch.web import Newest, Server
 from tests.daemon.browser import CHROMIUM, Browser
-from tests.daemon.watch_fakes import Talker
+from tests.daemon.watch_fakes import Talker, verdict
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 
@@ -143,6 +145,104 @@ def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
     see(browser, "slip")
     page.stop()
     see(browser, "silent")
-    assert "no message from graspd watch for " in text(browser, "why")
+    why = text(browser, "why")
+    assert why.startswith("no connection: graspd watch does not answer; no message from graspd ")
     page.start()
     see(browser, "slip")
+
+
+def note_tones(browser: Browser) -> None:
+    """From now on, or from when it is frozen, the page keeps in `tones` what was to be seen."""
+    browser.value(
+        "tones = []; document.addEventListener('freeze', () => { tones = []; });"
+        f" new MutationObserver(() => {{ const tone = {BANNER}.dataset.tone;"
+        " if (tones.at(-1) !== tone) tones.push(tone); })"
+        f".observe({BANNER}, {{attributes: true}})"
+    )
+
+
+def hide(browser: Browser, hidden: str) -> None:
+    """Have the page believe that it is hidden, `true`, or is not."""
+    value = f"{{value: {hidden}, configurable: true}}"
+    browser.value(f"Object.defineProperty(document, 'hidden', {value})")
+
+
+def test_a_page_that_was_frozen_shows_unknown_and_nothing_of_what_waited(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.outcome = Outcome.STABLE
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "stable")
+    hide(browser, "false")  # as far as the page knows
+    note_tones(browser)
+    browser.ask("Page.setWebLifecycleState", state="frozen")
+    time.sleep(1.0)  # of which stable verdicts wait
+    talker.outcome = Outcome.SLIP
+    time.sleep(1.0)
+    browser.ask("Page.setWebLifecycleState", state="active")
+    see(browser, "slip")
+    assert browser.value("tones") == ["silent", "slip"]
+    assert browser.complaints == []
+
+
+def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    """Only the wall clock has gone on meanwhile."""
+    talker.outcome = Outcome.STABLE
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "stable")
+    note_tones(browser)
+    browser.value("(real => { tones = []; Date.now = () => real() + 3600000; })(Date.now)")
+    browser.wait_for("tones.length >= 2")
+    assert browser.value("tones") == ["silent", "stable"]
+
+
+def test_a_page_in_the_background_shows_no_verdict(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.outcome = Outcome.STABLE
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "stable")
+    for hidden, tone in (("true", "silent"), ("false", "stable")):
+        hide(browser, hidden)
+        browser.value("document.dispatchEvent(new Event('visibilitychange'))")
+        see(browser, tone)
+        assert browser.value("document.title") == f"{text(browser, 'verdict').lower()} - graspd"
+
+
+def test_the_page_has_a_clock_that_goes_on(page: Page, talker: Talker, browser: Browser) -> None:
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "waiting")
+    first = text(browser, "clock")
+    assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
+    browser.wait_for(f"document.getElementById('clock').innerText > '{first}'")
+
+
+def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
+    """The way gets five seconds longer, as through a tunnel that hung."""
+    server, late_s, over = Server(0, Newest()), 0.0, threading.Event()
+    view = View("ipc:///tmp/any", wall=lambda: time.time() - late_s)
+
+    def put() -> None:
+        seq = 0
+        while not over.wait(0.05):
+            view.take(b"verdict.right", verdict(seq, Outcome.STABLE), 0)
+            server.newest.put(msgspec.json.encode(view.snapshot(0)))
+            seq += 1
+
+    threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]
+    for thread in threads:
+        thread.start()
+    try:
+        browser.go(f"http://127.0.0.1:{server.server_port}/")
+        see(browser, "stable")
+        note_tones(browser)
+        late_s = 5.0
+        browser.wait_for("tones.includes('silent')")
+    finally:
+        over.set()
+        server.shutdown()
+        for thread in threads:
+            thread.join()
+        server.server_close()

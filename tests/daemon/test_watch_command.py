@@ -21,12 +21,14 @@ from typing import Self
 import pytest
 
 from daemon import scene
-from daemon.judge.verdict import Outcome
+from daemon.judge.verdict import Outcome, decode_verdict
 from daemon.keys import KeysError, make
+from daemon.publisher import Publisher
 from daemon.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys
+from tests.daemon.fakes import Clock
 from tests.daemon.processes import GRASPD, graspd, start
-from tests.daemon.watch_fakes import Talker, verdict
+from tests.daemon.watch_fakes import MS, Talker, verdict
 
 PATIENCE_S = 30.0
 PORT = 45941
@@ -40,6 +42,8 @@ class Terminal:
 
     def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
         self.kind = "xterm-256color"
+        self.shell: tuple[str, ...] = ()
+        """What runs the command; alone in its session, Ctrl-C is for it."""
         self._arguments = arguments
         self._size = struct.pack("HHHH", lines, columns, 0, 0)
         self.output = b""
@@ -49,7 +53,7 @@ class Terminal:
         fcntl.ioctl(theirs, termios.TIOCSWINSZ, self._size)
         self.former = termios.tcgetattr(self._ours)
         self.process = subprocess.Popen(
-            ["setsid", "--ctty", *GRASPD, "watch", *self._arguments],  # Ctrl-C is for it
+            ["setsid", "--ctty", *self.shell, *GRASPD, "watch", *self._arguments],
             stdin=theirs,
             stdout=theirs,
             stderr=theirs,
@@ -68,7 +72,7 @@ class Terminal:
         self.output = b""
         os.set_blocking(self._ours, False)
         deadline_s = time.monotonic() + PATIENCE_S
-        while not re.search(pattern, self.output):
+        while not re.search(pattern, self.output, re.DOTALL):
             assert time.monotonic() < deadline_s, self.output[-3000:]
             time.sleep(0.02)
             self.read()
@@ -145,6 +149,66 @@ def test_it_shows_verdicts_then_silence_and_verdicts_again(endpoint: str) -> Non
         terminal.read_until(rb"graspd")
         press_q(terminal)
         assert terminal.end() == 0
+
+
+SHELL = ("bash", "-c", 'set -m; "$@"; echo "[stopped]"; read -r; fg', "bash")
+"""Runs a command as an interactive shell does, and goes on with it after a line is typed."""
+
+
+def test_stopped_by_ctrl_z_it_shows_no_verdict_and_comes_back_with_new_ones(endpoint: str) -> None:
+    terminal = Terminal("--connect", endpoint)
+    terminal.shell = SHELL
+    with Talker(endpoint) as talker, terminal:
+        talker.outcome = Outcome.STABLE
+        terminal.read_until(rb"judged to hold")
+        terminal.type(b"\x1a")
+        terminal.read_until(
+            re.escape(LEAVE) + rb".*stopped at \d\d:\d\d:\d\d: unknown.*\[stopped\]"
+        )
+        assert ENTER not in terminal.output
+        talker.outcome = Outcome.SLIP
+        time.sleep(1.2)  # longer than it may be without looking
+        terminal.type(b"\n")
+        terminal.read_until(re.escape(ENTER) + rb".*do not lift")
+        assert b"judged to hold" not in terminal.output
+        press_q(terminal)
+        assert terminal.end() == 0
+        assert LEAVE in terminal.output
+
+
+def test_ctrl_z_where_no_shell_could_continue_it_is_no_end(endpoint: str) -> None:
+    """The kernel stops nobody then (POSIX, orphaned process groups)."""
+    with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
+        talker.outcome = Outcome.STABLE
+        terminal.read_until(rb"judged to hold")
+        terminal.type(b"\x1a")
+        terminal.read_until(re.escape(ENTER) + rb".*judged to hold")
+        press_q(terminal)
+        assert terminal.end() == 0
+
+
+def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
+    clock = Clock()
+    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+
+        def came(outcome: Outcome, seq: int) -> list[bytes]:
+            deadline_s = time.monotonic() + PATIENCE_S
+            while not (found := [payload for _, payload in feed.take()]):
+                assert time.monotonic() < deadline_s
+                publisher.take()
+                publisher.send(b"verdict.right", verdict(seq, outcome))
+                time.sleep(0.01)
+            return found
+
+        came(Outcome.STABLE, 0)
+        for seq in range(1, 50):
+            publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+        time.sleep(0.1)
+        publisher.forget()
+        clock.now_ns += 1001 * MS
+        assert list(feed.take()) == []
+        for payload in came(Outcome.SLIP, 50):
+            assert decode_verdict(payload).seq == 50
 
 
 def test_it_waits_for_a_daemon_that_is_not_there_yet(endpoint: str) -> None:
@@ -294,6 +358,20 @@ def test_whoever_is_turned_away_is_told_why(
         later_s = time.monotonic() + 0.5  # whatever is tried again says the same
         hears(door, feed, lambda heard: heard or time.monotonic() > later_s)
         assert said in feed.link
+
+
+def test_who_was_turned_away_is_let_in_when_its_key_is_known(tmp_path: Path, door: Sockets) -> None:
+    clock = Clock()
+    keys = load_keys(tmp_path / "stranger.key_secret", tmp_path / "daemon.key")
+    with Feed(TCP, keys, clock) as feed:
+        hears(door, feed, lambda _: feed.is_turned_away)
+        (tmp_path / "stranger.key").rename(tmp_path / "clients" / "stranger.key")
+        door.mind_keys()
+        for _ in range(6):  # looks, and is not paused
+            clock.now_ns += 900 * MS
+            list(feed.take())
+        hears(door, feed, lambda heard: heard)
+        assert feed.link == "connected"
 
 
 def test_keys_that_are_wrong_are_said(tmp_path: Path) -> None:

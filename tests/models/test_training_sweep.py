@@ -144,7 +144,7 @@ def test_a_cluster_that_is_not_there_is_said_so(
 
 def test_a_cluster_that_loses_a_worker_loses_no_result(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="no extra: cluster")
-    wanted = some_jobs(16, trees=120)
+    wanted = some_jobs(12, trees=40)
     alone = sweep(wanted, GRASPS, tmp_path / "alone")
     killed: list[int] = []
     with cluster(tmp_path, workers=2) as (address, _, workers):
@@ -165,7 +165,7 @@ def test_a_cluster_that_loses_a_worker_loses_no_result(tmp_path: Path) -> None:
 
 def test_a_cluster_that_dies_leaves_what_was_finished(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="no extra: cluster")
-    wanted = some_jobs(30, trees=60)
+    wanted = some_jobs(12, trees=30)
     told: list[int] = []
     with cluster(tmp_path, workers=1) as (address, scheduler, _):
 
@@ -177,7 +177,7 @@ def test_a_cluster_that_dies_leaves_what_was_finished(tmp_path: Path) -> None:
         with pytest.raises(ClusterError, match="the cluster does not answer"):
             sweep(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_scheduler)
     stored = len(list((tmp_path / "ours").iterdir()))
-    assert 3 <= stored == len(told) < 30
+    assert 3 <= stored == len(told) < 12
     finished = sweep(wanted, GRASPS, tmp_path / "ours")
     assert_same(finished, [jobs.run(job, GRASPS) for job in wanted])
 

@@ -42,6 +42,12 @@ constexpr std::int64_t MESSAGE_MAX_BYTES = 1 << 16;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
 // Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
 constexpr Nanoseconds READ_WITHIN_NS = 5'000'000'000;
+// Whoever hears nothing for so long connects anew, at first and at most: who was turned away once
+// is not tried again by libzmq, and may be let in by now.
+constexpr Nanoseconds QUIET_NS = 1'000'000'000, QUIET_MAX_NS = 10'000'000'000;
+// The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
+// scheduler a moment between two looks at the clocks.
+constexpr Nanoseconds SLEPT_NS = 50'000'000;
 // Longest wait in one piece: so well is it known when a message came from another computer.
 constexpr std::int64_t SLICE_MS = 10;
 // What a message may come from the future by before the clocks are taken for different ones.
@@ -124,10 +130,16 @@ namespace detail {
 
 using nlohmann::json;
 
-inline Nanoseconds now_ns() {
+inline Nanoseconds now_ns(clockid_t clock = CLOCK_MONOTONIC) {
     timespec now{};
-    clock_gettime(CLOCK_MONOTONIC, &now);
+    clock_gettime(clock, &now);
     return static_cast<Nanoseconds>(now.tv_sec) * 1'000'000'000 + now.tv_nsec;
+}
+
+// How long the computer has slept, and something constant: only the first clock counts that.
+inline Nanoseconds slept_ns() {
+    const Nanoseconds awake_and_asleep_ns = now_ns(CLOCK_BOOTTIME);
+    return awake_and_asleep_ns - now_ns();
 }
 
 inline bool is_same_computer(std::string_view endpoint) {
@@ -225,6 +237,16 @@ public:
         : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer) {}
 
     Counts counts;
+
+    // For how long no message may come; 0 without one.
+    Nanoseconds silence_ns() const { return message_ ? message_->silence_ns : 0; }
+
+    // What came is not known any more, nor how the clocks differ; repeats stay repeats.
+    void forget(std::string why) {
+        message_.reset();
+        best_.reset();
+        why_ = std::move(why);
+    }
 
     // Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
     // Whether it is a new one. A repeated one is not; one that is not understood is.
@@ -509,24 +531,45 @@ private:
     // Read all that waits, without waiting; whether there was anything new.
     bool drain() {
         bool anything_new = false;
-        if (detail::now_ns() - read_ns_ > READ_WITHIN_NS) {
-            link_.renew();
-            empty_ns_ = detail::now_ns();
-        }
+        const Nanoseconds heard_ns = forget_what_is_old();
         behind_ = true;
         for (int taken = 0; behind_ && taken < QUEUE_MAX; ++taken) {
             const Nanoseconds before_ns = detail::now_ns();
             if (link_.receive(frames_)) {
                 std::vector<std::string_view> views;
                 for (const zmq::message_t& frame : frames_) views.push_back(frame.to_string_view());
-                anything_new |= newest_.take(views, empty_ns_, detail::now_ns());
+                heard_ns_ = detail::now_ns();
+                anything_new |= newest_.take(views, empty_ns_, heard_ns_);
             } else {
                 empty_ns_ = before_ns;
                 behind_ = false;
             }
         }
         read_ns_ = detail::now_ns();
+        if (heard_ns_ != heard_ns) {
+            quiet_ns_ = QUIET_NS;
+        } else if (read_ns_ - heard_ns > std::max(quiet_ns_, newest_.silence_ns())) {
+            quiet_ns_ = std::min(2 * quiet_ns_, QUIET_MAX_NS);
+            connect_anew();
+        }
         return anything_new;
+    }
+
+    // What came or waits since before a sleep of the computer, or a long time without a look; when
+    // something was heard, or was connected to, last. While the computer sleeps the monotonic clock
+    // stands still: all would look fresh.
+    Nanoseconds forget_what_is_old() {
+        const Nanoseconds slept_ns = detail::slept_ns();
+        const bool slept = slept_ns - slept_ns_ > SLEPT_NS;
+        slept_ns_ = std::max(slept_ns_, slept_ns);
+        if (slept) newest_.forget("slept");
+        if (slept || detail::now_ns() - read_ns_ > READ_WITHIN_NS) connect_anew();
+        return heard_ns_;
+    }
+
+    void connect_anew() {
+        link_.renew();
+        empty_ns_ = heard_ns_ = detail::now_ns();
     }
 
     // Wait for a message, but not for long; false when it is time to end.
@@ -541,7 +584,8 @@ private:
     detail::Link link_;
     bool asks_;
     bool behind_ = false;
-    Nanoseconds read_ns_ = detail::now_ns(), empty_ns_ = read_ns_;
+    Nanoseconds read_ns_ = detail::now_ns(), empty_ns_ = read_ns_, heard_ns_ = read_ns_;
+    Nanoseconds quiet_ns_ = QUIET_NS, slept_ns_ = detail::slept_ns();
     std::vector<zmq::message_t> frames_;
 };
 

@@ -1,7 +1,7 @@
 """May the hand lift? The newest verdict of a graspd daemon, and `unknown` where there is none.
 
-One file to copy: it needs Python 3.9 or newer and pyzmq, and nothing of graspd itself. The messages
-are those of deploy/wire/README.md, version 1.
+One file to copy: it needs Linux, Python 3.9 or newer and pyzmq, and nothing of graspd itself. The
+messages are those of deploy/wire/README.md, version 1.
 
     with Graspd("ipc:///run/graspd/right.ipc") as graspd:
         if graspd.may_i_lift(0.5):
@@ -20,56 +20,62 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple
 
 import zmq
 from zmq.auth import load_certificate
 
-VERSION = 1
-"""Of the messages; what has another is not understood."""
+VERSION = 1  # of the messages; what has another is not understood
 STABLE, SLIP, UNKNOWN = "stable", "slip", "unknown"
 CODES = {UNKNOWN: 0, STABLE: 1, SLIP: 2}
-INTEGER_MAX = 2**60
-"""Of a message: as a time, 36 years in ns."""
+INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
+MILLISECONDS_MAX = 1e12  # of a message: thirty years
+# A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
-"""A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected."""
-QUEUE_MAX = 1000
-"""Messages that wait to be read: ten seconds at 100 Hz."""
+QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
+# Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
 READ_WITHIN_NS = 5_000_000_000
-"""Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost."""
+# Whoever hears nothing for so long connects anew, at first and at most: who was turned away once
+# is not tried again by libzmq, and may be let in by now.
+QUIET_NS, QUIET_MAX_NS = 1_000_000_000, 10_000_000_000
+# The computer has slept if its clocks have moved apart by more. A sleep takes seconds, the
+# scheduler a moment between two looks at the clocks.
+SLEPT_NS = 50_000_000
+# Longest wait in one piece: so well is it known when a message came from another computer.
 SLICE_MS = 10
-"""Longest wait in one piece: so well is it known when a message came from another computer."""
+# What a message may come from the future by before the clocks are taken for different ones.
 CLOCK_SLACK_NS = 1_000_000
-"""What a message may come from the future by before the clocks are taken for different ones."""
+# By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4.
 DRIFT = 1e-3
-"""By which two computers' clocks may run apart: NTP slews by 5e-4, a bad crystal is off by 1e-4."""
-FORMER_MAX = 16
-"""Starts of the daemon that are remembered as over."""
+FORMER_MAX = 16  # starts of the daemon that are remembered as over
+# On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-"""On TCP: between two signs of life, and when a daemon that gives none is connected to anew, ms."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known of the grasp. True in an `if` exactly when it is stable."""
+    """What is known of the grasp. True in an `if` exactly when it is stable.
+
+    `verdict` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
+    one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
+    unknown, `grasp` the number of the contact episode, `age_ms` the time since the reading's last
+    byte, ms, at least. What is not known before the first message is None.
+    """
 
     verdict: str
-    """`stable`, `slip` or `unknown`."""
     reasons: tuple[str, ...] = ()
-    """Why it is unknown: the daemon's reasons, or one of `no-message`, `joining`, `silent`,
-    `stale`, `clock`, `malformed`, `version`, `behind`, `closed` (deploy/clients/README.md)."""
     p_slip: float | None = None
-    """Probability of slip; None when unknown."""
     grasp: int | None = None
-    """Number of the contact episode; None before the first message."""
     seq: int | None = None
     boot_id: str | None = None
     age_ms: float | None = None
-    """Since the reading's last byte, ms, at least."""
 
     def __bool__(self) -> bool:
         return self.verdict == STABLE
+
+    def unknown(self, *reasons: str) -> Verdict:
+        """The same, but unknown."""
+        return replace(self, verdict=UNKNOWN, reasons=reasons, p_slip=None)
 
 
 @dataclass(frozen=True)
@@ -80,31 +86,20 @@ class LiftAnswer:
     """What it was decided by; besides its usual reasons `no-answer` and `late`."""
     waited_s: float
 
-    @property
-    def may_lift(self) -> bool:
-        """Whether the hand may."""
-        return bool(self.verdict)
-
     def __bool__(self) -> bool:
-        return self.may_lift
+        return bool(self.verdict)
 
 
 @dataclass
 class Counts:
     """What came since the start."""
 
-    messages: int = 0
-    """New ones of this hand."""
-    lost: int = 0
-    """Gaps in `seq`, in messages."""
-    repeats: int = 0
-    """Messages that were known already."""
-    malformed: int = 0
-    """Messages that are not understood, answers too."""
-    restarts: int = 0
-    """Times that the daemon was started anew."""
-    former: int = 0
-    """Messages of a start that is over."""
+    messages: int = 0  # new ones of this hand
+    lost: int = 0  # gaps in `seq`, in messages
+    repeats: int = 0  # messages that were known already
+    malformed: int = 0  # messages that are not understood, answers too
+    restarts: int = 0  # times that the daemon was started anew
+    former: int = 0  # messages of a start that is over
 
 
 class Keys(NamedTuple):
@@ -155,7 +150,8 @@ class Graspd:
         self._asks = ask_endpoint is not None
         self._closed = self._behind = False
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
-        self._read_ns = self._empty_ns = time.monotonic_ns()
+        self._read_ns = self._empty_ns = self._heard_ns = time.monotonic_ns()
+        self._quiet_ns, self._slept_ns = QUIET_NS, _slept_ns()
 
     @property
     def counts(self) -> Counts:
@@ -184,16 +180,15 @@ class Graspd:
             raise ValueError(f"the deadline must be 0 s or more and finite, not {deadline_s}")
         began_ns = time.monotonic_ns()
         due_ns = began_ns + round(deadline_s * 1e9)
-        question = _Question(self._newest, self._link) if self._asks and not self._closed else None
+        question = _Question(self._newest, self._link, self._asks and not self._closed)
         try:
-            decided = self._decided(question)
+            decided = question.decided(self.verdict())
             while decided.verdict == UNKNOWN and not self._closed and self._wait(due_ns):
-                decided = self._decided(question)
+                decided = question.decided(self.verdict())
                 if time.monotonic_ns() > due_ns and decided:
-                    decided = replace(decided, verdict=UNKNOWN, reasons=("late",), p_slip=None)
+                    decided = decided.unknown("late")
         finally:
-            if question is not None:
-                self._link.hang_up()
+            self._link.hang_up()
         return LiftAnswer(decided, (time.monotonic_ns() - began_ns) / 1e9)
 
     def close(self) -> None:
@@ -205,26 +200,13 @@ class Graspd:
     def __enter__(self) -> Graspd:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_details: object) -> None:
         self.close()
-
-    def _decided(self, question: _Question | None) -> Verdict:
-        newest = self.verdict()
-        return newest if question is None else question.decided(newest)
 
     def _drain(self) -> bool:
         """Read all that waits, without waiting; whether there was anything new."""
-        new = False
-        now_ns = time.monotonic_ns()
-        if now_ns - self._read_ns > READ_WITHIN_NS:
-            self._link.renew()
-            self._empty_ns = now_ns
-        self._behind = True
+        self._forget_what_is_old()
+        new, heard_ns, self._behind = False, self._heard_ns, True
         for _ in range(QUEUE_MAX):
             before_ns = time.monotonic_ns()
             frames = self._link.receive()
@@ -232,9 +214,32 @@ class Graspd:
                 self._empty_ns = before_ns
                 self._behind = False
                 break
-            new |= self._newest.take(frames, self._empty_ns, time.monotonic_ns())
+            self._heard_ns = time.monotonic_ns()
+            new |= self._newest.take(frames, self._empty_ns, self._heard_ns)
         self._read_ns = time.monotonic_ns()
+        if self._heard_ns != heard_ns:
+            self._quiet_ns = QUIET_NS
+        elif self._read_ns - heard_ns > max(self._quiet_ns, self._newest.silence_ns):
+            self._quiet_ns = min(2 * self._quiet_ns, QUIET_MAX_NS)
+            self._connect_anew()
         return new
+
+    def _forget_what_is_old(self) -> None:
+        """What came or waits since before a sleep of the computer, or a long time without a look.
+
+        While the computer sleeps the monotonic clock stands still: all would look fresh.
+        """
+        slept_ns = _slept_ns()
+        slept = slept_ns - self._slept_ns > SLEPT_NS
+        self._slept_ns = max(self._slept_ns, slept_ns)
+        if slept:
+            self._newest.forget("slept")
+        if slept or time.monotonic_ns() - self._read_ns > READ_WITHIN_NS:
+            self._connect_anew()
+
+    def _connect_anew(self) -> None:
+        self._link.renew()
+        self._empty_ns = self._heard_ns = time.monotonic_ns()
 
     def _wait(self, due_ns: int) -> bool:
         """Wait for a message, but not for long; False when it is time to end."""
@@ -248,16 +253,9 @@ class Graspd:
 class _Message(NamedTuple):
     """What matters of a verdict message."""
 
-    boot_id: str
-    seq: int
-    grasp: int
-    verdict: str
-    p_slip: float | None
-    reasons: tuple[str, ...]
-    read_ns: int
-    """By the daemon's monotonic clock: when the reading's last byte came ..."""
-    published_ns: int
-    """... and when the message went out."""
+    verdict: Verdict  # without its age
+    read_ns: int  # by the daemon's monotonic clock: when the reading's last byte came ...
+    published_ns: int  # ... and when the message went out
     silence_ns: int
 
 
@@ -267,9 +265,7 @@ class Newest:
     def __init__(self, topic: bytes, max_age_ns: int, same_computer: bool) -> None:
         """`topic` is the hand's; other messages are passed over."""
         self.counts = Counts()
-        self._topic = topic
-        self._max_age_ns = max_age_ns
-        self._same_computer = same_computer
+        self._topic, self._max_age_ns, self._same_computer = topic, max_age_ns, same_computer
         self._message: _Message | None = None
         self._published_ns: int | None = None
         """Of the message, by one's own clock: not later than then; None while that is not known."""
@@ -281,6 +277,15 @@ class Newest:
         self._best: tuple[int, int] | None = None
         """The fastest way of a message so far, as the difference of the clocks, and when, ns."""
 
+    @property
+    def silence_ns(self) -> int:
+        """For how long no message may come; 0 without one."""
+        return 0 if self._message is None else self._message.silence_ns
+
+    def forget(self, why: str) -> None:
+        """What came is not known any more, nor how the clocks differ; repeats stay repeats."""
+        self._message, self._why, self._best = None, why, None
+
     def take(self, frames: Sequence[bytes], empty_ns: int, now_ns: int) -> bool:
         """Take in a message, which came after `empty_ns` and not after `now_ns` (own clock).
 
@@ -288,12 +293,11 @@ class Newest:
         """
         if not frames or frames[0] != self._topic:
             return False
-        found = _read(frames[1]) if len(frames) == 2 else "malformed"
+        found = self.read(frames[1] if len(frames) == 2 else b"")
         if isinstance(found, str):
-            self.counts.malformed += 1
             self._message, self._why = None, found
             return True
-        if not self._is_new(found):
+        if not self._is_new(found.verdict):
             return False
         self.counts.messages += 1
         self._message = found
@@ -309,43 +313,39 @@ class Newest:
             return Verdict(UNKNOWN, (self._why,))
         age_ns = 0 if self._published_ns is None else now_ns - self._published_ns
         reading_age_ns = age_ns + message.published_ns - message.read_ns
-        reasons = message.reasons
+        said = replace(message.verdict, age_ms=reading_age_ns / 1e6)
         if self._published_ns is None:
-            reasons = ("joining",)
-        elif age_ns < -CLOCK_SLACK_NS:
-            reasons = ("clock",)
-        elif age_ns > message.silence_ns:
-            reasons = ("silent",)
-        elif message.verdict != UNKNOWN and reading_age_ns > self._max_age_ns:
-            reasons = ("stale",)
-        about = (message.grasp, message.seq, message.boot_id, reading_age_ns / 1e6)
-        if reasons:
-            return Verdict(UNKNOWN, reasons, None, *about)
-        return Verdict(message.verdict, (), message.p_slip, *about)
+            return said.unknown("joining")
+        if age_ns < -CLOCK_SLACK_NS:
+            return said.unknown("clock")
+        if age_ns > message.silence_ns:
+            return said.unknown("silent")
+        if said.verdict != UNKNOWN and reading_age_ns > self._max_age_ns:
+            return said.unknown("stale")
+        return said
 
-    def answered(self, payload: bytes) -> _Message | None:
-        """An answer; None if it is not understood."""
+    def read(self, payload: bytes) -> _Message | str:
+        """A message or an answer; `malformed` or `version` for what is not understood, counted."""
         found = _read(payload)
-        if not isinstance(found, str):
-            return found
-        self.counts.malformed += 1
-        return None
+        self.counts.malformed += isinstance(found, str)
+        return found
 
-    def _is_new(self, message: _Message) -> bool:
-        if message.boot_id != self._boot_id:
-            if message.boot_id in self._former:
+    def _is_new(self, said: Verdict) -> bool:
+        boot_id, seq = said.boot_id or "", said.seq or 0
+        if boot_id != self._boot_id:
+            if boot_id in self._former:
                 self.counts.former += 1
                 return False
             if self._boot_id is not None:
                 self._former.append(self._boot_id)
                 self.counts.restarts += 1
-            self._boot_id, self._seq, self._best = message.boot_id, message.seq, None
+            self._boot_id, self._seq, self._best = boot_id, seq, None
             return True
-        if message.seq <= self._seq:
+        if seq <= self._seq:
             self.counts.repeats += 1
             return False
-        self.counts.lost += message.seq - self._seq - 1
-        self._seq = message.seq
+        self.counts.lost += seq - self._seq - 1
+        self._seq = seq
         return True
 
     def _by_arrival(self, published_ns: int, empty_ns: int, now_ns: int) -> int | None:
@@ -367,38 +367,37 @@ class Newest:
 class _Question:
     """One question at a time, until the newest message confirms a stable answer."""
 
-    def __init__(self, newest: Newest, link: _Link) -> None:
-        self._newest = newest
-        self._link = link
+    def __init__(self, newest: Newest, link: _Link, asks: bool) -> None:
+        self._newest, self._link, self._asks = newest, link, asks
         self._asked = False
-        self._stable: _Message | None = None
+        self._stable: Verdict | None = None
         """The answer that is to be confirmed."""
 
     def decided(self, newest: Verdict) -> Verdict:
         """The newest message, if it confirms the answer; unknown otherwise. Asks if need be."""
+        if not self._asks:
+            return newest
         payload = self._link.answer() if self._asked else None
         if payload is not None:
             self._asked = False
-            answer = self._newest.answered(payload)
-            if answer is not None and answer.verdict == SLIP:
-                return Verdict(SLIP, (), answer.p_slip, answer.grasp, answer.seq, answer.boot_id)
-            self._stable = answer if answer is not None and answer.verdict == STABLE else None
-        if self._stable is not None and not _is_behind(newest, self._stable):
+            answer = self._newest.read(payload)
+            said = Verdict(UNKNOWN) if isinstance(answer, str) else answer.verdict
+            if said.verdict == SLIP:
+                return said
+            self._stable = said if said else None
+        if self._stable is not None and _reaches(newest, self._stable):
             if newest and newest.grasp == self._stable.grasp:
                 return newest
             self._stable = None
         if not self._asked and self._stable is None:
             self._link.ask()
             self._asked = True
-        reasons = newest.reasons or ("no-answer",)
-        return replace(newest, verdict=UNKNOWN, reasons=reasons, p_slip=None)
+        return newest.unknown(*(newest.reasons or ("no-answer",)))
 
 
-def _is_behind(newest: Verdict, answer: _Message) -> bool:
-    """Whether the message that is the answer is still to come."""
-    if newest.boot_id != answer.boot_id or newest.seq is None:
-        return True
-    return newest.seq < answer.seq
+def _reaches(newest: Verdict, answer: Verdict) -> bool:
+    """Whether the message that is the answer is no longer to come."""
+    return newest.boot_id == answer.boot_id and (newest.seq or 0) >= (answer.seq or 0)
 
 
 class _Link:
@@ -409,7 +408,7 @@ class _Link:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._asking: zmq.Socket[bytes] | None = None
         try:
-            self._socket = self._subscribed()
+            self._socket = self._connected(zmq.SUB, endpoint)
         except BaseException:
             self._context.destroy(0)
             raise
@@ -423,19 +422,15 @@ class _Link:
 
     def wait(self, timeout_ms: int) -> None:
         """Until a message or an answer waits, so long at most."""
-        poller = zmq.Poller()
-        for socket in (self._socket, self._asking):
-            if socket is not None:
-                poller.register(socket, zmq.POLLIN)
-        poller.poll(timeout_ms)
+        wanted = [each for each in (self._socket, self._asking) if each is not None]
+        zmq.zmq_poll([(each, zmq.POLLIN) for each in wanted], timeout_ms)
 
     def renew(self) -> None:
         """Connect anew, and forget what waits."""
         self._socket.close(0)
-        self._socket = self._subscribed()
+        self._socket = self._connected(zmq.SUB, self._endpoint)
 
     def ask(self) -> None:
-        """Ask; before the answer is there, not again."""
         if self._ask is not None:
             if self._asking is None:
                 self._asking = self._connected(zmq.DEALER, self._ask)
@@ -456,11 +451,7 @@ class _Link:
             self._asking = None
 
     def close(self) -> None:
-        """Close all."""
         self._context.destroy(0)
-
-    def _subscribed(self) -> zmq.Socket[bytes]:
-        return self._connected(zmq.SUB, self._endpoint)
 
     def _connected(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
         made = self._context.socket(kind)
@@ -477,77 +468,58 @@ class _Link:
         return made
 
 
+def is_same_computer(endpoint: str) -> bool:
+    """Whether an endpoint can only be of this computer."""
+    return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
+
+
+def _slept_ns() -> int:
+    """How long the computer has slept, and something constant: only the first clock counts that."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+
+
 def _read(payload: bytes) -> _Message | str:
     """A verdict message; `malformed` or `version` for what is not understood or contradicts."""
     try:
-        told = json.loads(payload.decode(), parse_constant=_refused, parse_float=_finite)
+        told = json.loads(payload.decode())
+        json.dumps(told, allow_nan=False)  # refuses what is no JSON and no number
         if not isinstance(told, dict):
             return "malformed"
-        version = _integer(told, "v")
-        return _message(told) if version == VERSION else "version"
+        return _message(told) if _number(told, "v") == VERSION else "version"
     except (ValueError, KeyError, RecursionError):
         return "malformed"
 
 
-def is_same_computer(endpoint: str) -> bool:
-    """Whether an endpoint can only be of this computer."""
-    local = ("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:")
-    return endpoint.startswith(local)
-
-
 def _message(told: dict[str, Any]) -> _Message:
-    verdict, p_slip, reasons = told["verdict"], told["p_slip"], told["reasons"]
-    if not isinstance(verdict, str) or _integer(told, "verdict_code") != CODES.get(verdict):
-        raise ValueError
-    known = verdict != UNKNOWN
-    if told["valid"] is not known or (p_slip is not None) is not known:
-        raise ValueError
-    if known and not 0.0 <= _number(told, "p_slip") <= 1.0:
-        raise ValueError
-    if not isinstance(reasons, list) or not all(isinstance(reason, str) for reason in reasons):
-        raise ValueError
-    if bool(reasons) is known or not isinstance(told["boot_id"], str):
-        raise ValueError
-    read_ns = _integer(told, "t_mono_ns")
-    return _Message(
-        boot_id=told["boot_id"],
-        seq=_integer(told, "seq"),
-        grasp=_integer(told, "grasp"),
-        verdict=verdict,
-        p_slip=p_slip,
-        reasons=tuple(reasons),
-        read_ns=read_ns,
-        published_ns=read_ns + _milliseconds(told, "age_ms"),
-        silence_ns=_milliseconds(told, "silence_ms"),
+    verdict, reasons = told["verdict"], told["reasons"]
+    known = verdict in (STABLE, SLIP)
+    p_slip = _number(told, "p_slip", 1, (int, float)) if known else told["p_slip"]
+    fits = (
+        isinstance(verdict, str)
+        and _number(told, "verdict_code") == CODES.get(verdict)
+        and told["valid"] is known
+        and (known or p_slip is None)
+        and isinstance(reasons, list)
+        and all(isinstance(reason, str) for reason in reasons)
+        and bool(reasons) is not known
+        and isinstance(told["boot_id"], str)
     )
+    if not fits:
+        raise ValueError
+    boot_id, seq, grasp = told["boot_id"], _number(told, "seq"), _number(told, "grasp")
+    read_ns = _number(told, "t_mono_ns")
+    age_ms, silence_ms = (
+        _number(told, name, MILLISECONDS_MAX, (int, float)) for name in ("age_ms", "silence_ms")
+    )
+    said = Verdict(verdict, tuple(reasons), p_slip, grasp, seq, boot_id)
+    return _Message(said, read_ns, read_ns + round(age_ms * 1e6), round(silence_ms * 1e6))
 
 
-def _integer(told: dict[str, Any], name: str) -> int:
+def _number(
+    told: dict[str, Any], name: str, most: float = INTEGER_MAX, kinds: tuple[type, ...] = (int,)
+) -> Any:  # noqa: ANN401
+    """Of one of these kinds, of which bool is none, from 0 to `most`."""
     value = told[name]
-    if type(value) is not int or not 0 <= value <= INTEGER_MAX:
+    if type(value) not in kinds or not 0 <= value <= most:
         raise ValueError
     return value
-
-
-def _number(told: dict[str, Any], name: str) -> float:
-    value = told[name]
-    if type(value) not in (int, float):
-        raise ValueError
-    return float(value) if abs(value) <= INTEGER_MAX else _refused(name)
-
-
-def _milliseconds(told: dict[str, Any], name: str) -> int:
-    """In ns."""
-    value = _number(told, name)
-    if not 0.0 <= value <= 1e12:  # thirty years
-        raise ValueError
-    return round(value * 1e6)
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    return value if math.isfinite(value) else _refused(text)
-
-
-def _refused(text: str) -> float:
-    raise ValueError(text)

@@ -1,0 +1,41 @@
+"""Whether the computer has slept: the monotonic clock stands still then, and what is old looks
+fresh afterwards."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+SLEPT_NS = 50_000_000
+"""By which the clocks must move apart, ns: a sleep takes seconds, the scheduler a moment between
+two looks at the clocks."""
+
+LOOKS = 3
+"""At the start, so that one of them is not interrupted."""
+
+
+def boottime_ns() -> int:
+    """ns since the computer was started, those that it slept included (clock_gettime(2))."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+
+class Sleep:
+    """Notices it."""
+
+    def __init__(
+        self,
+        clock: Callable[[], int] = time.monotonic_ns,
+        boot_clock: Callable[[], int] = boottime_ns,
+    ) -> None:
+        """Both give ns; only `boot_clock` goes on in a sleep."""
+        self._clock = clock
+        self._boot_clock = boot_clock
+        self._apart_ns = max(self._look() for _ in range(LOOKS))
+
+    def has_slept(self) -> bool:
+        """Whether it has since this was made. Takes a microsecond."""
+        return self._look() - self._apart_ns > SLEPT_NS
+
+    def _look(self) -> int:
+        # In this order a look that the scheduler interrupts takes no sleep for granted.
+        return self._boot_clock() - self._clock()
