@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +118,25 @@ class DriverCounters:
     def as_dict(self) -> dict[str, int]:
         """All counters by name, for the status message."""
         return dataclasses.asdict(self)
+
+
+class Opened(ABC):
+    """Something that a `with` block opens and closes."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Take the device."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release it."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()
 
 
 class Driver(Protocol):

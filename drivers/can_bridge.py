@@ -11,11 +11,11 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import can
 
-from drivers.base import DriverError, LinkError, Reading
+from drivers.base import DriverError, LinkError, Opened, Reading
 from drivers.can_bus import STAMPED_INTERFACES, CanBus, Stamped
 from drivers.can_decoders import CanCounters, make_decoder
 from drivers.can_formats import SWEEP_BASE_ID, CanFormat
@@ -47,7 +47,7 @@ FD_CLOCK_HZ: Final = 80_000_000
 """Clock from which slcan adapters with CAN FD derive their bit times (CANable 2)."""
 
 
-class CanBridgeDriver:
+class CanBridgeDriver(Opened):
     """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for the two formats.
 
     The constructor raises `ValueError` for an argument out of range. `open` raises `DriverError`
@@ -177,13 +177,6 @@ class CanBridgeDriver:
         """Let go of the bus."""
         self._bus.close()
         self._link.close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def fileno(self) -> int | None:
         """Descriptor to wait on, None while there is none or no reading is near."""

@@ -6,9 +6,8 @@ import ipaddress
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Self
 
-from drivers.base import JointReading, Reading
+from drivers.base import JointReading, Opened, Reading
 from drivers.datagram_link import DatagramLink
 from drivers.datagrams import Endpoint
 from drivers.joint_message import DATAGRAM_BYTES_MAX, JointCounters, JointParser, MessageOrder
@@ -31,7 +30,7 @@ class JointStreamCounters(JointCounters):
     """Times that messages came and then none for `silence_s`."""
 
 
-class JointStreamDriver:
+class JointStreamDriver(Opened):
     """Gives a `JointReading` per message.
 
     `source` is `udp://ADDRESS:PORT` to listen on; `only_from` the sender's IP address, if no other
@@ -107,13 +106,6 @@ class JointStreamDriver:
             self._described = self._link.describe()
             self._link.close()
             self._link = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def fileno(self) -> int | None:
         """The socket."""

@@ -17,11 +17,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from drivers.base import JointReading, Reading
+from drivers.base import JointReading, Opened, Reading
 from drivers.datagram_link import DRAIN_MAX, DatagramLink
 from drivers.datagrams import SCHEME, Endpoint
 from drivers.link import LinkState
@@ -61,7 +61,7 @@ class PalmCounters(RoundCounters):
     """Times that packets came and then none for ten periods."""
 
 
-class PalmDriver:
+class PalmDriver(Opened):
     """Gives a `TactileReading` per round of 14 packets and a `JointReading` per `joint_period_s`.
 
     `source` is `udp://ADDRESS:PORT` to listen on, or the path of a file of packets, which is
@@ -180,13 +180,6 @@ class PalmDriver:
         if self._file is not None:
             self._file.close()
             self._file = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def fileno(self) -> int | None:
         """The socket, but None for a file and while no round can end.

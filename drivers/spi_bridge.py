@@ -8,9 +8,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Sequence
-from typing import Self
 
-from drivers.base import FINGERS, LinkError, Reading, TactileReading
+from drivers.base import FINGERS, LinkError, Opened, Reading, TactileReading
 from drivers.bridge_protocol import (
     DIGEST,
     SENSORS_MAX,
@@ -58,7 +57,7 @@ POLL_NS = 2_000_000
 """How often a port without a descriptor is read."""
 
 
-class SpiBridgeDriver:
+class SpiBridgeDriver(Opened):
     """Readings of the sensors behind one bridge; finds the bridge again whenever it was lost.
 
     `fingers` are the rows of a reading. `sensors` are the fingers in the order of the chip selects,
@@ -191,13 +190,6 @@ class SpiBridgeDriver:
                 self._line.write(encode(Stop()))
         self._line.close()
         self._link.close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def fileno(self) -> int | None:
         """Descriptor of the port, or None: no port, or one that must be polled."""

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import Generic, Self, TypeVar
+from typing import Generic, TypeVar
 
-from drivers.base import Reading
+from drivers.base import Opened, Reading
 
 Item = TypeVar("Item")
 
 
-class TimelineDriver(ABC, Generic[Item]):
+class TimelineDriver(Opened, Generic[Item]):
     """Plays the items of its files, one after the other. Whoever derives says what items are."""
 
     name = "replay"
@@ -70,13 +70,6 @@ class TimelineDriver(ABC, Generic[Item]):
         if self._timeline is not None:
             self._timeline.close()
             self._timeline = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def fileno(self) -> int | None:
         """None: a file is always readable, the clock says when."""

@@ -8,11 +8,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import can
 
-from drivers.base import ELECTRODES, FINGERS, DriverError, LinkError
+from drivers.base import ELECTRODES, FINGERS, DriverError, LinkError, Opened
 from drivers.biotac import E1, E24, PAC, PDC, TAC, TDC, encode_word
 from drivers.can_bus import open_bus
 from drivers.can_formats import (
@@ -43,7 +43,7 @@ Outgoing = tuple[int, bytes]
 """Arbitration id and data."""
 
 
-class CanTwin:
+class CanTwin(Opened):
     """Sends the sweeps of `counts` in one of the two formats.
 
     `send_sweep` sends one at once and waits for nothing, for tests; `serve` sends at `rate_hz`.
@@ -125,13 +125,6 @@ class CanTwin:
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.shutdown()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def send_sweep(self) -> bool:
         """Send the frames of one sweep at once. False when the counts have ended."""

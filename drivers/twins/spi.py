@@ -11,11 +11,11 @@ import tty
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.base import Opened
 from drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
 from drivers.bridge_protocol import (
     DIGEST,
@@ -58,7 +58,7 @@ OTHER_COUNT = 2000
 _WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16)
 
 
-class SpiTwin:
+class SpiTwin(Opened):
     """The bridge's side of the protocol, one thread, driven by `run_once` or `serve`.
 
     `path` becomes a symbolic link to the pseudo-terminal, a new one after each `plug`. `source`
@@ -154,13 +154,6 @@ class SpiTwin:
         """Unplug and remove the path."""
         self.unplug()
         self._replug_ns = None
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()
 
     def plug(self) -> None:
         """Make a pseudo-terminal, point the path at it, and say HELLO as after a reset."""
