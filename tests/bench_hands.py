@@ -127,12 +127,15 @@ def percentiles(values: Sequence[Micros]) -> dict[str, float]:
     return {n: round(float(np.quantile(all_of_them, share)), 1) for n, share in shares.items()}
 
 
-def scene_text(tactile: str, endpoint: str, model: str, hand: str, realtime: bool) -> str:
-    """A scene in which each reading is judged and nothing is kept."""
+def scene_text(
+    tactile: str, endpoint: str, model: str, hand: str, *, realtime: bool, settled: bool
+) -> str:
+    """A scene that keeps nothing and judges what has settled, as by default, or each reading."""
     text = (
         f'{tactile}[hand]\nname = "{hand}"\n[model]\nname = "{model}"\n'
-        f'[gate]\nmode = "every"\n[session]\nkeep = false\n[publish]\nendpoint = "{endpoint}"\n'
+        f'[session]\nkeep = false\n[publish]\nendpoint = "{endpoint}"\n'
     )
+    text += "" if settled else '[gate]\nmode = "every"\n'
     return text + (f"[realtime]\npriority = {PRIORITY}\n" if realtime else "")
 
 
@@ -146,8 +149,17 @@ def promote(pid: int, priority: int) -> None:
 class Hand:
     """One publisher, daemon or echo, and its twin."""
 
-    def __init__(self, folder: Path, kind: Kind, name: str = "right", *, ends: int = 0) -> None:
-        """`ends`: priority in realtime of the twin; 0 for none."""
+    def __init__(
+        self,
+        folder: Path,
+        kind: Kind,
+        name: str = "right",
+        *,
+        ends: int = 0,
+        settled: bool = False,
+    ) -> None:
+        """`ends`: priority in realtime of the twin; 0 for none. `settled`: whole grasps, each of
+        which is judged once it has settled, and not each reading of one that lasts."""
         self.folder = folder / name
         self.folder.mkdir()
         self.log = self.folder / "log"
@@ -156,6 +168,7 @@ class Hand:
         self.endpoint = f"ipc://{self.folder}/graspd"
         self.kind = kind
         self.record = Record()
+        self.settled = settled
         self._ends = ends
         self._stack = ExitStack()
 
@@ -169,7 +182,10 @@ class Hand:
         """Publish verdicts of this model."""
         scene = self.folder / "scene.toml"
         tactile = tactile_section(self.kind, self.where)
-        scene.write_text(scene_text(tactile, self.endpoint, model, self.name, realtime))
+        text = scene_text(
+            tactile, self.endpoint, model, self.name, realtime=realtime, settled=self.settled
+        )
+        scene.write_text(text)
         self.publish(start_daemon(scene, self.log))
 
     def publish(self, publisher: Child) -> None:
@@ -189,7 +205,7 @@ class Hand:
             kind=self.kind,
             where=self.where,
             tally=str(self.folder / "tally"),
-            held=True,
+            held=not self.settled,
             stamps=str(self.folder / "stamps.npy"),
         )
         self._twin = self._stack.enter_context(start_twin(plan))
@@ -238,7 +254,7 @@ def measure(
         after = [usage(hand.publisher.pid) for hand in hands]
     for hand in hands:
         judged, readings = hand.record.judged, len(hand.record.told_ns)
-        if judged < JUDGED_MIN_SHARE * readings or not judged:
+        if not judged or (judged < JUDGED_MIN_SHARE * readings and not hand.settled):
             why = dict(hand.record.reasons)
             raise RuntimeError(f"{judged} of {readings} readings were judged; others: {why}")
     return [100 * (b.cpu_s - a.cpu_s) / (b.t_s - a.t_s) for a, b in zip(before, after, strict=True)]

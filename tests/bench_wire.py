@@ -115,13 +115,14 @@ class Options:
     seconds: float
     kind: Kind
     ends: int
+    settled: bool
 
 
 def daemon_turn(options: Options, model: str, times: Times, realtime: bool) -> None:
     """One turn of the daemon."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Hand(Path(folder), options.kind, ends=options.ends) as hand,
+        Hand(Path(folder), options.kind, ends=options.ends, settled=options.settled) as hand,
     ):
         hand.start_daemon(model, realtime=realtime)
         (cpu,) = measure([hand], options.seconds, ends=options.ends)
@@ -239,7 +240,7 @@ def turns(models: Sequence[str], options: Options) -> dict[str, Turn]:
 
 def run_all(given: argparse.Namespace) -> dict[Case, Times]:
     """Every case in every round."""
-    options = Options(given.seconds, given.link, given.ends)
+    options = Options(given.seconds, given.link, given.ends, given.settled)
     found: dict[Case, Times] = {}
     for number in range(given.rounds):
         for load_name in given.loads:
@@ -314,6 +315,12 @@ def main() -> None:
     parser.add_argument("--no-realtime", dest="realtime", action="store_false")
     parser.add_argument(
         "--ends", type=int, default=0, help="realtime priority of twin and subscriber; 0: none"
+    )
+    parser.add_argument(
+        "--settled",
+        action="store_true",
+        help="whole grasps, each of which is judged once it has settled, as by default, instead of "
+        "each reading of one that lasts",
     )
     parser.add_argument("--json", type=Path)
     parser.add_argument("--echo", nargs=3, help=argparse.SUPPRESS)
