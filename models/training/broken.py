@@ -64,10 +64,9 @@ class Study:
 
 def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
     """Train on folds of the grasps, break electrodes of what was left out, and judge it."""
-    fold_of = folds_of(grasps.slipped, min(FOLDS, _smaller_class(grasps)), seed)
     folds = [
-        _Fold(system, grasps, fold_of == fold, fold_seed(seed, fold))
-        for fold in range(min(JUDGED_FOLDS, int(fold_of.max()) + 1))
+        _Fold(system, grasps, out, fold_seed(seed, fold))
+        for fold, out in enumerate(left_out(grasps, seed))
     ]
     nothing = [fold.judge(fold.counts) for fold in folds]
     alarms = [fold.find(fold.counts) for fold in folds]
@@ -83,6 +82,16 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
         sound_repaired=float(np.mean(repaired)),
         broken=tuple(_break(folds, number, reads, random) for reads in KINDS for number in NUMBERS),
     )
+
+
+def left_out(grasps: Grasps, seed: int) -> list[NDArray[np.bool_]]:
+    """Of each training of the study, shape (N,): True for the grasps that it is judged by.
+
+    Raises `TooFewGraspsError` for less than two grasps of a class.
+    """
+    folds = min(FOLDS, max(2, _smaller_class(grasps)))
+    fold_of = folds_of(grasps.slipped, folds, seed)
+    return [fold_of == fold for fold in range(min(JUDGED_FOLDS, folds))]
 
 
 class _Fold:

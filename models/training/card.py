@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from models.bts3 import CITATIONS, FINGERS, LICENCE, REPOSITORY
-from models.contract import ModelContract
+from models.contract import Dataset, ModelContract
 from models.training.broken import Study
+from models.training.datasets import Grasps, own_tables, unpublished
 from models.training.export import Parity
 from models.training.metrics import CurvePoint, Fraction, Spread
 from models.training.summary import ObjectFigures, Summary, Variant
@@ -20,12 +21,15 @@ from models.training.system import System, plain
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 
+PUBLISHED_DATA = "The data is of one hand and 41 objects, lifted in one way."
 WEAK_POINTS = (
-    "The data is of one hand and 41 objects, lifted in one way.",
     "A wrong electrode that keeps within what its neighbours allow is not noticed.",
     "Readings are compared with the training's covariance: what varies like a grasp without being "
     "one, such as hum on all electrodes, may be judged.",
 )
+
+OWN_LICENCE = "whatever the owner of the tables says"
+"""Of data without a published table."""
 
 
 class ModelFile(msgspec.Struct, frozen=True):
@@ -41,10 +45,18 @@ class Data(msgspec.Struct, frozen=True):
     """Where the data comes from. Digests and rows stand in the contract."""
 
     licence: str = LICENCE
-    repository: str = REPOSITORY
+    repository: str | None = REPOSITORY
     cite: tuple[str, ...] = CITATIONS
     not_published: tuple[str, ...] = ()
     """Files that differ from the published ones: licence and sources above are not theirs."""
+
+    @classmethod
+    def of(cls, files: Sequence[Dataset]) -> Data:
+        """Of the tables that were trained on or judged."""
+        not_published = tuple(unpublished(files))
+        if len(own_tables(files)) < len(files):
+            return cls(not_published=not_published)
+        return cls(OWN_LICENCE, None, (), not_published)
 
 
 class Measured(msgspec.Struct, frozen=True):
@@ -123,8 +135,8 @@ class Card(msgspec.Struct, frozen=True):
     weak_points: tuple[str, ...]
 
 
-def weak_points(summaries: Sequence[Summary]) -> tuple[str, ...]:
-    """What a user must know, with the figures that were measured."""
+def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]:
+    """What a user must know, with the figures that were measured; `grasps` are trained on."""
     texts = []
     for summary in summaries:
         f1 = 100 * summary.main.spreads["f1"].mean
@@ -147,7 +159,21 @@ def weak_points(summaries: Sequence[Summary]) -> tuple[str, ...]:
                 f"{f1:.1f} %: it still ranks (AUC {auc:.2f}), its zero has moved. What looks "
                 "unlike the training data is refused."
             )
-    return (*texts, *WEAK_POINTS)
+    own = own_tables(grasps.files)
+    return (*texts, *(_own_data(grasps, own, summaries) if own else [PUBLISHED_DATA]), *WEAK_POINTS)
+
+
+def _own_data(grasps: Grasps, own: Sequence[str], summaries: Sequence[Summary]) -> Iterator[str]:
+    objects, tables = len(set(grasps.objects)), sum(file.rows > 0 for file in grasps.files)
+    yield (
+        f"The data is of {objects} {'object' if objects == 1 else 'objects'} in {tables} "
+        f"{'table' if tables == 1 else 'tables'}, of which {', '.join(own)} "
+        f"{'is' if len(own) == 1 else 'are'} not published."
+    )
+    if any(summary.protocol == "session" for summary in summaries):
+        yield "The figures of another day are of the published tables alone."
+    else:
+        yield "What it is worth on another day than those of its data was not measured."
 
 
 def configuration(system: System) -> dict[str, Any]:

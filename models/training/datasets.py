@@ -165,6 +165,12 @@ def unpublished(files: Sequence[Dataset]) -> list[str]:
     return [file.name for file in files if (file.name, file.sha256) not in published]
 
 
+def own_tables(files: Sequence[Dataset]) -> tuple[str, ...]:
+    """Names of the files that do not have the name of a published table, in their order."""
+    published = {table.name for table in TABLES}
+    return tuple(file.name for file in files if file.name not in published)
+
+
 class _Table:
     """Where the columns of one table stand, and how its rows are read."""
 

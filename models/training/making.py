@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import shlex
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from models.bts3 import NEW_SESSION
+from models.bts3 import NEW_SESSION, TABLES, WHOLE
 from models.contract import (
     CLASSES,
     ConfidenceStep,
@@ -23,10 +25,11 @@ from models.contract import (
 from models.training import card as cards
 from models.training import jobs
 from models.training.broken import broken_study
-from models.training.datasets import Grasps, unpublished
+from models.training.datasets import Grasps
 from models.training.export import Parity, SessionStandards, export
 from models.training.graphs import OPSET
 from models.training.jobs import Job, JobResult
+from models.training.metrics import FEWEST_JUDGED
 from models.training.protocols import Protocol
 from models.training.seen import held_out_never_seen, made_up_never_seen, seen_counts
 from models.training.standards import PRIOR_GRASPS, RUNNING
@@ -53,12 +56,17 @@ class Order:
     only: Protocol | None = None
     """Measured by this protocol alone, and without broken electrodes: for a model that is compared
     and not used."""
+    own: tuple[str, ...] = ()
+    """Names of the files of one's own that are trained on, with their endings."""
 
     def protocols(self, grasps: Grasps) -> tuple[Protocol, ...]:
         """By what it is measured: `cv` first; the second, with new objects, calibrates it."""
         if self.only is not None:
             return (self.only,)
-        if NEW_SESSION not in {file.name for file in grasps.files}:
+        there = {file.name for file in grasps.files}
+        if not there.intersection(WHOLE):
+            return ("cv", "objects")
+        if NEW_SESSION not in there:
             return ("cv", "objects-whole")
         objects: Protocol = "objects" if NEW_SESSION in self.system.tables else "objects-whole"
         return ("cv", objects, "session")
@@ -73,12 +81,13 @@ class Order:
 
     @property
     def command(self) -> str:
-        """The command line that repeats it."""
-        only = "" if self.only is None else f" --only {self.only}"
-        return (
-            f"graspd train {self.system.name} --data DIR --seed {self.seed} --folds {self.folds}"
-            + only
-        )
+        """The command line that repeats it, without the folders of this machine."""
+        published = [table.name for table in TABLES if table.name in self.system.tables]
+        data = ["--data DIR"] if published else []
+        data += [f"--own {shlex.quote(name)}" for name in self.own]
+        only = [] if self.only is None else [f"--only {self.only}"]
+        words = (*data, f"--seed {self.seed}", f"--folds {self.folds}", *only)
+        return " ".join(("graspd train", self.system.name, *words))
 
 
 def make(
@@ -95,8 +104,8 @@ def make(
     summaries = _summaries(order, grasps, found)
     again = jobs.run(wanted[0], grasps)
     on_done()
-    own = grasps.of_tables(order.system.tables).of_fingers(order.system.fingers)
-    trained = train(order.system, own, order.seed)
+    chosen = grasps.of_tables(order.system.tables).of_fingers(order.system.fingers)
+    trained = train(order.system, chosen, order.seed)
     on_done()
     contract = _contract(order, trained, summaries)
     calibrator = _calibrator(summaries)
@@ -110,7 +119,7 @@ def make(
         contract=contract,
         file=_file(path, parity),
         parameters=trained.fitted.parameters,
-        data=cards.Data(not_published=tuple(unpublished(grasps.files))),
+        data=cards.Data.of(grasps.files),
         system=cards.configuration(order.system),
         protocols={summary.protocol: cards.Measured.of(summary) for summary in summaries},
         temperature=temperature,
@@ -124,7 +133,7 @@ def make(
         same_seed_same_margins=_same(found[0], again),
         command=order.command,
         made_with=cards.made_with(),
-        weak_points=cards.weak_points(summaries),
+        weak_points=cards.weak_points(summaries, trained.grasps),
     )
     cards.write(card, path.with_suffix(".json"))
     return card
@@ -157,11 +166,18 @@ def _contract(order: Order, trained: Trained, summaries: list[Summary]) -> Model
         seed=order.seed,
         datasets=tuple(file for file in trained.grasps.files if file.rows),
         measured=tuple(map(_measured, summaries)),
-        confidence=tuple(
-            ConfidenceStep(point.confidence, point.accuracy, point.coverage)
-            for point in reversed(_calibrator(summaries).main.curve)
-        ),
+        confidence=_confidence(_calibrator(summaries)),
         seen=seen_counts(_mapped(trained), trained.looks.margin),
+    )
+
+
+def _confidence(summary: Summary) -> tuple[ConfidenceStep, ...]:
+    """Of few grasps the surest are too few to say how often they are right."""
+    judged = summary.folds * summary.test_grasps
+    return tuple(
+        ConfidenceStep(point.confidence, point.accuracy, point.coverage)
+        for point in reversed(summary.main.curve)
+        if round(point.coverage * judged) >= FEWEST_JUDGED
     )
 
 
@@ -217,7 +233,8 @@ def _mapped(trained: Trained) -> NDArray[np.float64]:
 def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> cards.NeverSeen:
     objects = np.array(trained.grasps.objects)
     counts, margin = _mapped(trained), trained.looks.margin
-    several = len(set(trained.grasps.objects)) > 1
+    # Two of other objects at least have a covariance.
+    several = len(objects) - max(Counter(trained.grasps.objects).values()) > 1
     return cards.NeverSeen(
         held_out_object=held_out_never_seen(counts, objects, margin) if several else None,
         made_up=made_up_never_seen(counts, contract.seen, seed),

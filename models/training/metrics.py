@@ -116,8 +116,10 @@ def score(
 
 
 def over_seeds(figures: Sequence[Sequence[float]]) -> Spread:
-    """Mean and spread of figures (seeds, folds). NaN is left out."""
+    """Mean and spread of figures (seeds, folds). NaN is left out; all NaN give NaN."""
     table = np.array(figures)
+    if np.isnan(table).all():  # the mean of nothing is a warning
+        return Spread(math.nan, math.nan, None, *table.shape)
     means = np.nanmean(table, axis=1)
     seeds, folds = table.shape
     std = np.nanstd(table, axis=1).mean() if folds > 1 else means.std()

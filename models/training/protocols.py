@@ -1,4 +1,8 @@
-"""What is trained on and what is judged: the splits that every figure stands on."""
+"""What is trained on and what is judged: the splits that every figure stands on.
+
+`cv`, `objects` and `objects-whole` take tables of one's own, which are none of the published, in
+addition; of data that have no published table, these alone.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.bts3 import NEW_SESSION, WHOLE
-from models.training.datasets import Grasps
+from models.training.datasets import Grasps, own_tables
 from models.training.folds import TooFewGraspsError, folds_of, object_folds
 
 Protocol = Literal[
@@ -54,9 +58,9 @@ def splits(protocol: Protocol, grasps: Grasps, seed: int, folds: int = FOLDS) ->
     return _MAKERS[protocol](grasps, seed, folds)
 
 
-def _stratified(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
+def _stratified(*tables: str, own_too: bool = False) -> Callable[[Grasps, int, int], list[Split]]:
     def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-        rows = _rows(grasps, *tables)
+        rows = _rows(grasps, *tables, own_too=own_too)
         return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
 
     return make
@@ -64,7 +68,7 @@ def _stratified(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
 
 def _grouped(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
     def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-        rows = _rows(grasps, *tables)
+        rows = _rows(grasps, *tables, own_too=True)
         return _leave_out(rows, _object_folds(grasps, rows, folds, seed), folds)
 
     return make
@@ -95,7 +99,7 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
 
 
 _MAKERS: dict[Protocol, Callable[[Grasps, int, int], list[Split]]] = {
-    "cv": _stratified(*WHOLE),
+    "cv": _stratified(*WHOLE, own_too=True),
     "unknown": _unknown,
     "objects": _grouped(*WHOLE, NEW_SESSION),
     "objects-whole": _grouped(*WHOLE),
@@ -105,9 +109,12 @@ _MAKERS: dict[Protocol, Callable[[Grasps, int, int], list[Split]]] = {
 }
 
 
-def _rows(grasps: Grasps, *tables: str) -> NDArray[np.int64]:
-    """Indices of the grasps of these tables, all of which must be there."""
+def _rows(grasps: Grasps, *tables: str, own_too: bool = False) -> NDArray[np.int64]:
+    """Indices of the grasps of these tables, all of which must be there, and of one's own."""
     names = [file.name for file in grasps.files]
+    if own_too:
+        others = own_tables(grasps.files)
+        tables = others if len(others) == len(names) else (*tables, *others)
     for table in tables:
         if table not in names:
             raise TooFewGraspsError(f"the data lack {table}")

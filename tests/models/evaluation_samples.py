@@ -44,11 +44,16 @@ def write_sessions(folder: Path, grasps: int) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for seed, name in enumerate(TABLES):
         made = table(name, grasps, seed, drift=800 if name == "palm_45" else 0)
-        with (folder / f"{name}.csv").open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(HEADER)
-            for row in zip(made.objects, made.slipped, made.counts, strict=True):
-                writer.writerow([row[0], int(row[1]), *_flat(row[2])])
+        write(folder / f"{name}.csv", made)
+
+
+def write(path: Path, made: Grasps) -> None:
+    """Grasps as a table in the published form."""
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(HEADER)
+        for row in zip(made.objects, made.slipped, made.counts, strict=True):
+            writer.writerow([row[0], int(row[1]), *_flat(row[2])])
 
 
 def _flat(counts: NDArray[np.uint16]) -> list[int]:

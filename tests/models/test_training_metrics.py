@@ -76,6 +76,12 @@ def test_a_fold_without_a_figure_is_left_out() -> None:
     assert over_seeds([[0.8, math.nan, 0.6]]).mean == pytest.approx(0.7)
 
 
+def test_a_figure_that_no_fold_has_is_none_and_no_warning() -> None:
+    nothing = over_seeds([[math.nan, math.nan]])
+    assert math.isnan(nothing.mean)
+    assert (nothing.seeds, nothing.folds) == (1, 2)
+
+
 def test_differences_of_overlapping_trainings_are_less_sure_than_they_look() -> None:
     ours, theirs = [0.95, 0.93, 0.94, 0.96], [0.92, 0.92, 0.92, 0.92]
     # Differences 3, 1, 2, 4 points: mean 2.5, variance 5/3. Ten folds: test/train = 1/9.

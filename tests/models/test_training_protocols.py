@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
-from models.training.datasets import Grasps, read_all
+from models.training.datasets import Grasps, concatenate, read_all
 from models.training.folds import TooFewGraspsError, fold_seed, object_folds
 from models.training.protocols import (
     ABOUT,
@@ -128,6 +128,33 @@ def test_more_folds_than_objects_are_refused() -> None:
 def test_a_protocol_whose_table_is_missing_is_refused(protocol: Protocol) -> None:
     with pytest.raises(TooFewGraspsError, match="the data lack palm_side"):
         splits(protocol, table("palm_down", 40, 0), seed=0)
+
+
+def test_a_table_of_ones_own_is_dealt_out_like_a_published_one() -> None:
+    whole = [table("palm_down", 100, 0), table("palm_side", 100, 1)]
+    published = splits("objects", concatenate([*whole, table("palm_45", 100, 2)]), seed=0)
+    own = splits("objects-whole", concatenate([*whole, table("lab", 100, 2)]), seed=0)
+    for one, other in zip(published, own, strict=True):
+        assert np.array_equal(one.train, other.train)
+        assert np.array_equal(one.test, other.test)
+
+
+@pytest.mark.parametrize("protocol", ["cv", "objects", "objects-whole"])
+def test_tables_of_ones_own_alone_are_all_that_there_is(protocol: Protocol) -> None:
+    grasps = concatenate([table("monday", 100, 0), table("friday", 60, 1)])
+    judged = np.concatenate([split.test for split in splits(protocol, grasps, seed=0)])
+    assert sorted(judged.tolist()) == list(range(160))
+
+
+@pytest.mark.parametrize("protocol", ["unknown", "session", "cv-palm-down", "cv-palm-side"])
+def test_figures_of_published_tables_take_no_other(protocol: Protocol) -> None:
+    alone = splits(protocol, sessions(100), seed=0)
+    beside = splits(protocol, concatenate([sessions(100), table("lab", 100, 3)]), seed=0)
+    for one, other in zip(alone, beside, strict=True):
+        assert np.array_equal(one.train, other.train)
+        assert np.array_equal(one.test, other.test)
+    with pytest.raises(TooFewGraspsError, match="the data lack palm_"):
+        splits(protocol, table("lab", 100, 3), seed=0)
 
 
 def test_data_without_the_papers_unknown_objects_are_refused() -> None:
