@@ -197,13 +197,14 @@ def _peer(descriptor: int) -> str | None:
     except OSError:
         return None
     try:
-        with socket.socket(fileno=ours) as connection:
-            host, *_ = connection.getpeername()
-    except (OSError, ValueError):
-        with contextlib.suppress(OSError):  # by now another file than a socket has this number
-            os.close(ours)
+        connection = socket.socket(fileno=ours)
+    except OSError:  # by now another file than a socket has this number
+        os.close(ours)
         return None
-    return str(host)
+    with connection, contextlib.suppress(OSError, ValueError):
+        host, *_ = connection.getpeername()
+        return str(host)
+    return None
 
 
 def _port(listening: zmq.Socket[bytes]) -> int:
