@@ -198,17 +198,21 @@ def min_confidence(model: TactileModel, min_accuracy: float | None) -> float:
     """From which confidence on the model's verdicts are right as often as wanted; 0 for None.
 
     By the accuracy-coverage curve of its contract, measured on objects that were left out. Raises
-    `ModelError` if they never are.
+    `ModelError` if it has none, or if not even its surest verdicts are.
     """
     if min_accuracy is None:
         return 0.0
-    from_the_surest = reversed(model.contract.confidence)
-    reached = list(itertools.takewhile(lambda s: s.accuracy >= min_accuracy, from_the_surest))
-    if not reached:
-        best = max((step.accuracy for step in model.contract.confidence), default=0.0)
+    curve = model.contract.confidence
+    if not curve:
         raise ModelError(
-            f"{model.path}: model.min_accuracy {min_accuracy:g} is more than the model reaches, "
-            f"{best:.3f} at best"
+            f"{model.path}: model.min_accuracy needs a model whose accuracy by confidence was "
+            "measured: this one's was not"
+        )
+    reached = list(itertools.takewhile(lambda s: s.accuracy >= min_accuracy, reversed(curve)))
+    if not reached:
+        raise ModelError(
+            f"{model.path}: model.min_accuracy {min_accuracy:g} is more than the model reaches "
+            f"where it is surest: {curve[-1].accuracy:g} of those verdicts were right"
         )
     return reached[-1].confidence
 

@@ -40,6 +40,8 @@ class Grasp:
     """Shape (fingers, 24)."""
     verdict: Verdict
     slipped: bool
+    object_name: str | None = None
+    """What was lifted, if the controller has told it."""
 
 
 @dataclass(slots=True)
@@ -112,7 +114,8 @@ def _take(
         if verdict.repaired:
             found.repaired += grasp not in found.grasps
         else:
-            found.grasps[grasp] = Grasp(counts, verdict, outcome.outcome == "slip")
+            slipped = outcome.outcome == "slip"
+            found.grasps[grasp] = Grasp(counts, verdict, slipped, outcome.object)
 
 
 class _Run:
@@ -165,7 +168,7 @@ class _Run:
 
 
 def write(out: TextIO, found: Export, object_name: str) -> int:
-    """Write the table; how many rows."""
+    """Write the table; how many rows. `object_name` is that of grasps without one."""
     writer = csv.writer(out, lineterminator="\n")
     names = [name for finger in found.fingers for name in electrode_columns(finger)]
     writer.writerow([OBJECT, SLIPPED, *names])
@@ -177,4 +180,5 @@ def write(out: TextIO, found: Export, object_name: str) -> int:
 def rows(found: Export, object_name: str) -> Iterator[list[object]]:
     """The cells of each grasp: object, 1 for slip or 0 for stable, counts finger by finger."""
     for grasp in found.grasps.values():
-        yield [object_name, int(grasp.slipped), *grasp.counts.ravel().tolist()]
+        name = object_name if grasp.object_name is None else grasp.object_name
+        yield [name, int(grasp.slipped), *grasp.counts.ravel().tolist()]

@@ -12,23 +12,31 @@ from typing import Literal
 import zmq
 
 from daemon.binding import Binding, Bound
+from daemon.judge.verdict import OBJECT_PATTERN
 
 QUESTION = b"judge"
 TELLING = b"outcome"
-"""First word of `outcome <boot_id> <grasp> <stable|slip>`."""
+"""First word of `outcome <boot_id> <grasp> <stable|slip> [<object>]`."""
 FRAMES_MAX = 3
 """Of a question: who asks, an empty frame from a REQ socket, the question."""
-MESSAGE_MAX_BYTES = 64
-"""A peer that sends more asks nothing and is disconnected."""
+MESSAGE_MAX_BYTES = 128
+"""The longest outcome; a peer that sends more asks nothing and is disconnected."""
 WAITING_MAX = 16
 """Questions that wait for an answer; the oldest is given up for a newer one."""
 QUEUE_MAX = 16
 """Messages queued per peer in either direction."""
-_TOLD = re.compile(rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)")
-MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip>"
+_TOLD = re.compile(
+    rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
+)
+MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
 NOBODY = "nobody takes outcomes here"
 TAKEN_MAX = 64
 """Messages, and at most so many frames, taken in one round: a flood must not hold up readings."""
+
+
+TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
+"""Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
+does not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +59,7 @@ class Questions(Bound):
         self.counters: Counter[str] = Counter()
         """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken and
         `outcomes_refused`."""
-        self.on_outcome: Callable[[str, int, Literal["stable", "slip"]], str | None] | None = None
-        """Takes a boot id, a grasp and how its lift ended; None, or why it does not."""
+        self.on_outcome: TakeOutcome | None = None
         self._patience_ns = patience_ns
         self._waiting: deque[_Question] = deque()
         self._frames: list[bytes] = []
@@ -121,7 +128,8 @@ class Questions(Bound):
             why = NOBODY
         else:
             outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
-            why = self.on_outcome(told[1].decode(), int(told[2]), outcome)
+            named = None if told[4] is None else told[4].decode()
+            why = self.on_outcome(told[1].decode(), int(told[2]), outcome, named)
         refused = "malformed" if why == MALFORMED else "outcomes_refused"
         self.counters["outcomes" if why is None else refused] += 1
         said = {"v": 1, "ok": True} if why is None else {"v": 1, "ok": False, "why": why}

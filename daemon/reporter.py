@@ -147,8 +147,14 @@ class Reporter:
         if len(self._judged) > JUDGED_MAX:
             del self._judged[next(iter(self._judged))]
 
-    def outcome(self, boot_id: str, grasp: int, outcome: Literal["stable", "slip"]) -> str | None:
-        """Send how the lift of a grasp ended; or say why not."""
+    def outcome(
+        self,
+        boot_id: str,
+        grasp: int,
+        outcome: Literal["stable", "slip"],
+        object_name: str | None = None,
+    ) -> str | None:
+        """Send how the lift of a grasp ended, and what was lifted; or say why not."""
         if boot_id != self._boot_id:
             return "unknown boot_id: not of this start"
         if grasp not in self._judged:
@@ -160,6 +166,7 @@ class Reporter:
             t_mono_ns=self._clock(),
             grasp=grasp,
             outcome=outcome,
+            object=object_name,
         )
         self._outcome_seq += 1
         if self._output is not None:

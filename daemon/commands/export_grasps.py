@@ -29,7 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
     )
     parser.add_argument(
-        "--object", type=_name, default="unknown", metavar="NAME", help="what was grasped"
+        "--object",
+        type=_name,
+        default="unknown",
+        metavar="NAME",
+        help="what was grasped where the controller told no object",
     )
 
 
@@ -53,11 +57,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _summary(found: Export) -> str:
-    slipped = sum(grasp.slipped for grasp in found.grasps.values())
-    parts = [f"{len(found.grasps)} grasps, {slipped} slipped"]
+    grasps = found.grasps.values()
+    slipped = sum(grasp.slipped for grasp in grasps)
+    parts = [f"{len(grasps)} grasps, {slipped} slipped"]
     parts += [
         f"{number} {what}"
         for number, what in (
+            (len({grasp.object_name for grasp in grasps} - {None}), "objects by name"),
+            (sum(grasp.object_name is None for grasp in grasps), "grasps without an object"),
             (found.without_outcome, "left out without an outcome"),
             (found.repaired, "left out with repaired electrodes"),
             (found.unjoined, "outcomes of grasps that are not in the recordings"),

@@ -18,6 +18,10 @@ WIRE_VERSION: Final = 1
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0.0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+OBJECT_PATTERN: Final = r"[!#-&(-+\--~]{1,64}"
+"""Name of an object: printable ASCII but blank, quotes and comma, so that it is one word of a
+message and one bare cell of a CSV file."""
+ObjectName = Annotated[str, msgspec.Meta(pattern=f"^{OBJECT_PATTERN}$")]
 _HAND = msgspec.Meta(max_length=5)
 """A hand has five fingers."""
 
@@ -227,6 +231,8 @@ class OutcomeMessage(msgspec.Struct, frozen=True, kw_only=True):
     grasp: Count
     """Of the verdict that the lift was made by."""
     outcome: Literal["stable", "slip"]
+    object: ObjectName | None = None
+    """What was lifted; null: it was not told."""
 
 
 class State(StrEnum):

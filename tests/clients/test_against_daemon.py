@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import zmq
 
+from daemon.judge.verdict import decode_outcome
 from daemon.keys import make
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Graspd, Keys
@@ -33,6 +36,32 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_p
         for client in (listening, asking):
             assert client.counts.messages > 0
             assert client.counts.malformed == 0
+
+
+def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: Path) -> None:
+    with (
+        Daemon(tmp_path) as daemon,
+        Graspd(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as graspd,
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as listener,
+    ):
+        listener.linger = 0
+        listener.connect(daemon.endpoint)
+        listener.subscribe("outcome.right")
+        until(lambda: graspd.verdict(0.1).p_slip is not None)
+        lifted_on = graspd.verdict()
+        assert graspd.outcome(lifted_on, slipped=True, object_name="mug", wait_s=10.0)
+        again = [str(lifted_on.boot_id), str(lifted_on.grasp), "stable"]
+        places = [daemon.endpoint, daemon.ask_endpoint]
+        subprocess.run([lift_gate, "--tell", *places, *again], check=True, timeout=40)
+        heard = []
+        for _ in range(2):
+            assert listener.poll(5000)
+            heard.append(decode_outcome(listener.recv_multipart()[1]))
+        never = replace(lifted_on, grasp=10**9)
+        assert graspd.outcome(never, slipped=True, wait_s=10.0).why.startswith("unknown grasp")
+    assert [(told.outcome, told.object) for told in heard] == [("slip", "mug"), ("stable", None)]
+    assert {(told.boot_id, told.grasp) for told in heard} == {(lifted_on.boot_id, lifted_on.grasp)}
 
 
 def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Both clients ask a daemon that answers what it should not: only what fits allows a lift."""
+"""Both clients ask and tell a daemon that answers what it should not: only what fits counts."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import zmq
 
-from deploy.clients.python.graspd_client import Graspd
+from deploy.clients.python.graspd_client import Graspd, OutcomeAnswer, Verdict
 from tests.clients.messages import TOPIC, verdict
 
 PERIOD_MS = 5
@@ -120,3 +120,124 @@ def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome
         assert (
             subprocess.run([lift_gate, *places], capture_output=True, check=False).returncode == 1
         )
+
+
+BOOT = "0f0e0d0c0b0a09080706050403020100"
+LIFTED_ON = Verdict("stable", grasp=42, boot_id=BOOT)
+
+
+@contextmanager
+def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
+    """What is told to a daemon that answers so, or not at all."""
+    found: list[bytes] = []
+    stop = threading.Event()
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as asked:
+        asked.linger = 0
+        asked.bind(f"ipc://{folder}/ask")
+
+        def listen() -> None:
+            while not stop.is_set():
+                if asked.poll(PERIOD_MS):
+                    who, *words = asked.recv_multipart()
+                    found.extend(words)
+                    if frames:
+                        asked.send_multipart([who, *frames])
+
+        thread = threading.Thread(target=listen)
+        thread.start()
+        try:
+            yield found
+        finally:
+            stop.set()
+            thread.join()
+
+
+def told_in_python(folder: Path, name: str | None) -> OutcomeAnswer:
+    with Graspd(f"ipc://{folder}/out", ask_endpoint=f"ipc://{folder}/ask") as graspd:
+        return graspd.outcome(LIFTED_ON, True, name, wait_s=0.5)
+
+
+def told_in_cpp(lift_gate: Path, folder: Path, *words: str) -> tuple[int, str]:
+    """Exit code and what it says."""
+    places = [f"ipc://{folder}/out", f"ipc://{folder}/ask"]
+    result = subprocess.run(
+        [lift_gate, "--tell", *places, *words],
+        capture_output=True,
+        text=True,
+        timeout=40,
+        check=False,
+    )
+    return result.returncode, (result.stdout + result.stderr).splitlines()[0]
+
+
+TAKEN: dict[str, tuple[list[bytes], str]] = {
+    "taken": ([b'{"v":1,"ok":true}'], ""),
+    "with a later field": ([b'{"v":1,"ok":true,"later":[1]}'], ""),
+    "refused": ([b'{"v":1,"ok":false,"why":"unknown grasp: no"}'], "unknown grasp: no"),
+    "of a later version": ([b'{"v":2,"ok":true}'], "version"),
+    "without a version": ([b'{"ok":true}'], "malformed"),
+    "refused without why": ([b'{"v":1,"ok":false}'], "malformed"),
+    "refused with no word": ([b'{"v":1,"ok":false,"why":""}'], "malformed"),
+    "refused with a number": ([b'{"v":1,"ok":false,"why":1}'], "malformed"),
+    "a number": ([b'{"v":1,"ok":1}'], "malformed"),
+    "a verdict": ([json.dumps(verdict()).encode()], "malformed"),
+    "not JSON": ([b"yes"], "malformed"),
+    "no object": ([b"[]"], "malformed"),
+    "no number": ([b'{"v":1,"ok":true,"later":NaN}'], "malformed"),
+    "empty": ([b""], "malformed"),
+    "of two frames": ([b'{"v":1,"ok":true}'] * 2, "malformed"),
+    "nothing": ([], "no-answer"),
+}
+
+
+@pytest.mark.parametrize(("frames", "why"), TAKEN.values(), ids=TAKEN)
+def test_an_outcome_is_taken_only_if_the_answer_says_so(
+    lift_gate: Path, tmp_path: Path, frames: list[bytes], why: str
+) -> None:
+    with heard(tmp_path, frames) as found:
+        answer = told_in_python(tmp_path, "mug")
+        assert (bool(answer), answer.why) == (not why, why)
+        code, text = told_in_cpp(lift_gate, tmp_path, BOOT, "42", "slip", "mug")
+        assert (code, text) == (1 if why else 0, why or "taken")
+    assert found == [f"outcome {BOOT} 42 slip mug".encode()] * 2
+
+
+@pytest.mark.parametrize("name", [None, "035_power-drill", "a/b;c=1", "x" * 64])
+def test_an_outcome_has_the_object_as_it_was_given(
+    lift_gate: Path, tmp_path: Path, name: str | None
+) -> None:
+    with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
+        assert told_in_python(tmp_path, name)
+        given = [] if name is None else [name]
+        assert told_in_cpp(lift_gate, tmp_path, BOOT, "42", "slip", *given)[0] == 0
+    assert found == [" ".join(["outcome", BOOT, "42", "slip", *given]).encode()] * 2
+
+
+@pytest.mark.parametrize("name", ["a mug", "mug,cup", '"mug"', "mug's", "müg", "mug\n", "x" * 65])
+def test_a_name_that_is_no_word_of_an_outcome_is_not_sent(
+    lift_gate: Path, tmp_path: Path, name: str
+) -> None:
+    with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
+        with pytest.raises(ValueError, match="no name of an object"):
+            told_in_python(tmp_path, name)
+        code, text = told_in_cpp(lift_gate, tmp_path, BOOT, "42", "slip", name)
+        assert (code, "no name of an object" in text) == (2, True)
+    assert found == []
+
+
+def test_an_outcome_needs_a_grasp_somebody_to_tell_and_an_open_client(tmp_path: Path) -> None:
+    asking = Graspd(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask")
+    with asking as graspd, pytest.raises(ValueError, match="of no grasp"):
+        graspd.outcome(graspd.verdict(), True)
+    assert asking.outcome(LIFTED_ON, True).why == "closed"
+    with Graspd(f"ipc://{tmp_path}/out") as graspd, pytest.raises(ValueError, match="ask_endpoint"):
+        graspd.outcome(LIFTED_ON, True)
+
+
+@pytest.mark.parametrize(
+    "words", [("", "42", "slip"), (BOOT, "0", "slip"), (BOOT, "42", "Slip"), (BOOT, "x", "slip")]
+)
+def test_in_cpp_an_outcome_of_nothing_is_a_wrong_command_line(
+    lift_gate: Path, tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    assert told_in_cpp(lift_gate, tmp_path, *words)[0] == 2

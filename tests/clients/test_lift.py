@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Graspd
+from deploy.clients.python.graspd_client import Graspd, Verdict
 from tests.clients.messages import MS, Event, events, frames, verdict
 from tests.clients.oracle import is_stable, newest, told
 
@@ -57,7 +57,7 @@ class World:
         due_ns = [due for due, _ in self.coming[:1]] + ([self._answer[0]] if self._answer else [])
         self.now_ns = max(self.now_ns, min([self.now_ns + timeout_ms * MS, *due_ns]))
 
-    def ask(self) -> None:
+    def ask(self, _question: bytes = b"judge") -> None:
         assert self._answer is None, "one question at a time"
         self.questions += 1
         if self.answers:
@@ -217,6 +217,16 @@ def test_an_answer_does_not_outlive_the_moment_in_which_nothing_is_known() -> No
     with client(world, ask=True) as graspd:
         assert not graspd.may_i_lift(0.09)
     assert world.questions == 2
+
+
+def test_while_an_outcome_is_answered_what_comes_is_read() -> None:
+    world = World(stream("unknown", *["stable"] * 9), [(45 * MS, b'{"v":1,"ok":true}')])
+    with client(world, ask=True) as graspd:
+        before_ns = world.now_ns
+        assert graspd.outcome(Verdict("stable", grasp=1, boot_id="a"), slipped=False)
+        assert 45 * MS <= world.now_ns - before_ns < 47 * MS
+        assert graspd.counts.messages == 5
+        assert graspd.verdict().seq == 4
 
 
 def test_who_has_not_read_for_long_connects_anew() -> None:

@@ -85,7 +85,7 @@ class Writer:
         )
         self._file.write(b"verdict.right", encode(message), self._now_ns)
 
-    def outcome(self, grasp: int, outcome: Ending) -> None:
+    def outcome(self, grasp: int, outcome: Ending, name: str | None = None) -> None:
         message = OutcomeMessage(
             boot_id=self._boot_id,
             seq=0,
@@ -93,8 +93,15 @@ class Writer:
             t_mono_ns=self._now_ns,
             grasp=grasp,
             outcome=outcome,
+            object=name,
         )
         self._file.write(b"outcome.right", encode(message), self._now_ns)
+
+    def outcome_without_the_field(self, grasp: int, outcome: Ending) -> None:
+        """As it was recorded before objects were told."""
+        content = {"v": 1, "boot_id": self._boot_id, "seq": 0, "t": 0.0, "t_mono_ns": self._now_ns}
+        payload = json.dumps(content | {"grasp": grasp, "outcome": outcome}).encode()
+        self._file.write(b"outcome.right", payload, self._now_ns)
 
     def close(self) -> None:
         self._file.close()
@@ -155,6 +162,34 @@ def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
     found = collect([tmp_path / "a.mcap"])
     assert [grasp.slipped for grasp in found.grasps.values()] == [True]  # the later counts
     assert (found.without_outcome, found.repaired, found.unjoined) == (2, 1, 1)
+
+
+def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
+    tmp_path: Path,
+) -> None:
+    writer = Writer(tmp_path / "a.mcap", mode="every")
+    for grasp, counts in enumerate(sweeps(6), 1):
+        writer.tactile(counts)
+        writer.verdict(grasp)
+    writer.outcome(1, "slip", "mug")
+    writer.outcome(2, "stable", "ball")
+    writer.outcome(3, "stable")
+    writer.outcome_without_the_field(4, "slip")
+    writer.outcome(5, "slip", "mug")
+    writer.outcome(5, "stable", "box")  # the later counts, with its object ...
+    writer.outcome(6, "slip", "mug")
+    writer.outcome(6, "stable")  # ... or without
+    writer.close()
+    out = tmp_path / "t.csv"
+    for options, other in (((), "unknown"), (("--object", "cup"), "cup")):
+        result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out, *options)
+        assert result.returncode == 0, result.stderr
+        assert result.stdout == (
+            "6 grasps, 2 slipped; 3 objects by name; 3 grasps without an object\n"
+        )
+        table = read_table(out)
+        assert table.objects == ("mug", "ball", other, other, "box", other)
+        assert table.slipped.tolist() == [True, False, False, True, False, False]
 
 
 def test_grasps_of_two_starts_are_told_apart(tmp_path: Path) -> None:

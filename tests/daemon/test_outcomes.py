@@ -63,8 +63,19 @@ def test_an_outcome_of_a_judged_grasp_is_published_as_the_schema_says() -> None:
         OutcomeMessage(boot_id=BOOT, seq=seq, t=5.0, t_mono_ns=NOW_NS, grasp=3, outcome=outcome)
         for seq, outcome in enumerate(BOTH)
     ]
+    assert {decode_outcome(payload).object for payload in messages} == {None}
     for payload in messages:
         jsonschema.validate(json.loads(payload), schema() | {"$ref": "#/$defs/OutcomeMessage"})
+
+
+def test_an_outcome_names_the_object_if_the_controller_does() -> None:
+    output = Output()
+    sender = reporter(output)
+    judge(sender, 3)
+    assert sender.outcome(BOOT, 3, "slip", "mug") is None
+    payload = json.loads(output.sent[-1][1])
+    assert (payload["outcome"], payload["object"]) == ("slip", "mug")
+    jsonschema.validate(payload, schema() | {"$ref": "#/$defs/OutcomeMessage"})
 
 
 def test_an_outcome_of_another_start_or_of_a_grasp_that_was_not_judged_is_refused() -> None:
@@ -97,7 +108,7 @@ def test_only_so_many_grasps_are_remembered() -> None:
 @pytest.fixture
 def questions(tmp_path: Path) -> Iterator[Questions]:
     with Questions(f"ipc://{tmp_path}/ask", 10**9) as taker:
-        taker.on_outcome = lambda boot, grasp, _: None if (boot, grasp) == (BOOT, 7) else "no such"
+        taker.on_outcome = lambda boot, grasp, *_: None if (boot, grasp) == (BOOT, 7) else "no such"
         yield taker
 
 
@@ -131,6 +142,17 @@ def test_an_outcome_is_answered_at_once(questions: Questions, teller: zmq.Socket
     assert questions.counters["malformed"] == 0
 
 
+@pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "a/b;c=1", "x" * 64, "-", "~"])
+def test_the_object_arrives_as_it_was_told(
+    questions: Questions, teller: zmq.Socket[bytes], name: str | None
+) -> None:
+    heard: list[tuple[object, ...]] = []
+    questions.on_outcome = lambda *told: heard.append(told)
+    text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
+    assert told(questions, teller, text.encode()) == {"v": 1, "ok": True}
+    assert heard == [(BOOT, 7, "slip", name)]
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -145,6 +167,17 @@ def test_an_outcome_is_answered_at_once(questions: Questions, teller: zmq.Socket
         f"outcome {BOOT}  7 slip",
         f"outcome {BOOT.upper()} 7 slip",
         "outcome \xff",
+        f"outcome {BOOT} 7 slip  mug",
+        f"outcome {BOOT} 7 slip mug ",
+        f"outcome {BOOT} 7 slip a mug",
+        f"outcome {BOOT} 7 slip mug,cup",
+        f'outcome {BOOT} 7 slip "mug"',
+        f"outcome {BOOT} 7 slip mug's",
+        f"outcome {BOOT} 7 slip mug\n",
+        f"outcome {BOOT} 7 slip m\xfcg",
+        f"outcome {BOOT} 7 slip mug\x7f",
+        f"outcome {BOOT} 7 slip mug\0",
+        f"outcome {BOOT} 7 slip " + "x" * 65,
     ],
 )
 def test_an_outcome_that_is_malformed_is_answered_and_counted(
@@ -157,7 +190,7 @@ def test_an_outcome_that_is_malformed_is_answered_and_counted(
 
 
 def test_the_longest_outcome_fits_into_a_message() -> None:
-    assert len(f"outcome {BOOT} {10**15 - 1} stable") <= MESSAGE_MAX_BYTES
+    assert len(f"outcome {BOOT} {10**15 - 1} stable " + "x" * 64) <= MESSAGE_MAX_BYTES
 
 
 def test_without_anybody_who_takes_outcomes_the_controller_hears_so(
@@ -176,7 +209,7 @@ def test_whatever_follows_the_word_nothing_breaks(texts: list[bytes]) -> None:
         zmq.Context() as context,
         context.socket(zmq.DEALER) as socket,
     ):
-        taker.on_outcome = lambda _boot, _grasp, _outcome: None
+        taker.on_outcome = lambda *_told: None
         socket.linger = 0
         socket.connect(taker.endpoint)
         for text in texts:

@@ -81,7 +81,8 @@ def test_a_question_gets_one_answer(
         [b"judge", b"judge"],
         [b"", b"", b"judge"],
         [b"judge", b""],
-        [b"\xff" * 60],
+        [b"\xff" * 128],
+        [b"judge mug"],
     ],
 )
 def test_what_is_no_question_is_counted_and_not_answered(

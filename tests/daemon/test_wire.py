@@ -157,6 +157,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t_mono_ns=123459789012345,
         grasp=42,
         outcome="slip",
+        object="mug",
     ),
     "status": Status(
         boot_id=BOOT,
@@ -199,6 +200,24 @@ def test_a_verdict_of_before_there_was_a_gate_is_still_read() -> None:
     for added in ("judged", "gate", "contact", "repaired", "session_calibrated"):
         del former[added]
     assert decode_verdict(json.dumps(former).encode()) == MESSAGES["verdict_stable"]
+
+
+def test_an_outcome_of_before_objects_were_told_is_still_read() -> None:
+    former = json.loads((GOLDEN / "outcome.json").read_text())
+    del former["object"]
+    read = decode_outcome(json.dumps(former).encode())
+    assert (read.grasp, read.outcome, read.object) == (42, "slip", None)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "a mug", "mug,cup", 'the "mug"', "mug's", "x" * 65, "m\u00fcg"]
+)
+def test_an_object_that_is_no_word_of_a_message_is_no_outcome(name: str) -> None:
+    content = json.loads((GOLDEN / "outcome.json").read_text()) | {"object": name}
+    with pytest.raises(msgspec.DecodeError):
+        decode_outcome(json.dumps(content).encode())
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(content, schema() | {"$ref": "#/$defs/OutcomeMessage"})
 
 
 @pytest.mark.parametrize("name", MESSAGES)

@@ -8,7 +8,8 @@
 //     if (client.may_i_lift(0.5)) lift();
 //
 // Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that
-// made it. Only `verdict(wait_s)` and `may_i_lift(deadline_s)` wait, and no longer than told.
+// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `outcome(..., wait_s)` wait, and no
+// longer than told.
 #pragma once
 
 #include <algorithm>
@@ -57,6 +58,7 @@ constexpr double DRIFT = 1e-3;
 constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembered as over
 // On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
+constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
 
 enum class Outcome { unknown = 0, stable = 1, slip = 2 };  // as `verdict_code`
 
@@ -85,6 +87,13 @@ struct LiftAnswer {
     double waited_s = 0.0;
 
     explicit operator bool() const { return static_cast<bool>(verdict); }
+};
+
+// Whether graspd has taken how a lift ended. True in an `if` exactly when it has.
+struct OutcomeAnswer {
+    std::string why;  // why not: the daemon's words, or `no-answer`, `malformed` or `version`
+
+    explicit operator bool() const { return why.empty(); }
 };
 
 // What came since the start.
@@ -119,7 +128,8 @@ struct Options {
     std::string endpoint;
     std::string hand = "right";
     double max_age_ms = 100.0;  // how old a reading may be that a lift relies on
-    std::string ask_endpoint = {};  // `[ask]`; with it `may_i_lift` asks for a judgement as well
+    // `[ask]`; with it `may_i_lift` asks for a judgement as well, and `outcome` has whom to tell.
+    std::string ask_endpoint = {};
     // Whether the daemon's monotonic clock is one's own. Unless given, it is with ipc:// and on
     // loopback addresses: say false through a tunnel.
     std::optional<bool> same_computer = {};
@@ -227,6 +237,38 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
         return {message(told), ""};
     } catch (const Malformed&) {
         return {std::nullopt, "malformed"};
+    }
+}
+
+// An outcome as it is sent. Throws `std::invalid_argument`.
+inline std::string telling(const Verdict& lifted_on, bool slipped, const std::string& object) {
+    if (lifted_on.boot_id.empty() || lifted_on.grasp.value_or(0) == 0)
+        throw std::invalid_argument("nothing was lifted on a verdict that is of no grasp");
+    const auto told = "outcome " + lifted_on.boot_id + ' ' + std::to_string(*lifted_on.grasp) +
+                      (slipped ? " slip" : " stable");
+    if (object.empty()) return told;
+    const auto fits = [](char c) {
+        return c > ' ' && c <= '~' && c != '"' && c != '\'' && c != ',';
+    };
+    if (object.size() > OBJECT_MAX || !std::all_of(object.begin(), object.end(), fits))
+        throw std::invalid_argument("no name of an object: " + object);
+    return told + ' ' + object;
+}
+
+// The answer to an outcome; none if it is not understood.
+inline std::optional<OutcomeAnswer> taken(std::string_view payload) {
+    if (payload.empty() || payload.front() == '\xEF') return std::nullopt;  // BOM
+    const json told = json::parse(payload, nullptr, false);
+    if (!told.is_object()) return std::nullopt;
+    try {
+        if (integer(told, "v") != VERSION) return OutcomeAnswer{"version"};
+        const json& ok = field(told, "ok");
+        if (!ok.is_boolean()) return std::nullopt;
+        const std::string why = ok.get<bool>() ? "" : text(field(told, "why"));
+        if (why.empty() != ok.get<bool>()) return std::nullopt;
+        return OutcomeAnswer{why};
+    } catch (const Malformed&) {
+        return std::nullopt;
     }
 }
 
@@ -371,10 +413,10 @@ public:
         socket_ = connected(zmq::socket_type::sub, options_.endpoint);
     }
 
-    // Ask; before the answer is there, not again.
-    void ask() {
+    // Ask or tell; before the answer is there, not again.
+    void ask(const std::string& question = "judge") {
         if (!asking_) asking_ = connected(zmq::socket_type::dealer, options_.ask_endpoint);
-        asking_.send(zmq::str_buffer("judge"), zmq::send_flags::dontwait);
+        asking_.send(zmq::buffer(question), zmq::send_flags::dontwait);
     }
 
     // The answer, if it is there; empty if it is none.
@@ -384,7 +426,6 @@ public:
         return frames.size() == 1 ? frames[0].to_string() : std::string();
     }
 
-    // An answer that is late must not be taken for one to the next question.
     void hang_up() {
         asking_.close();
         asking_ = zmq::socket_t();
@@ -432,13 +473,19 @@ inline bool is_behind(const Verdict& newest, const Message& answer) {
     return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < answer.seq;
 }
 
+// An answer that is late must not be taken for one to the next question.
+struct HangUp {
+    Link& link;
+    explicit HangUp(Link& asked) : link(asked) {}
+    HangUp(const HangUp&) = delete;
+    HangUp& operator=(const HangUp&) = delete;
+    ~HangUp() { link.hang_up(); }
+};
+
 // One question at a time, until the newest message confirms a stable answer.
 class Question {
 public:
-    Question(Newest& newest, Link& link) : newest_(newest), link_(link) {}
-    Question(const Question&) = delete;
-    Question& operator=(const Question&) = delete;
-    ~Question() { link_.hang_up(); }
+    Question(Newest& newest, Link& link) : newest_(newest), link_(link), after_{link} {}
 
     // The newest message, if it confirms the answer; unknown otherwise. Asks if need be.
     Verdict decided(Verdict newest) {
@@ -467,6 +514,7 @@ public:
 private:
     Newest& newest_;
     Link& link_;
+    HangUp after_;
     bool asked_ = false;
     std::optional<Message> stable_;  // the answer that is to be confirmed
 };
@@ -514,6 +562,29 @@ public:
         }
         const auto waited_ns = static_cast<double>(detail::now_ns() - began_ns);
         return {std::move(decided), waited_ns / 1e9};
+    }
+
+    // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
+    //
+    // Waits at most `wait_s` seconds for the answer; without one tell it again, the later counts.
+    // Throws `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp,
+    // and for a name that is no 1 to 64 printable ASCII characters without blank, quotes and comma.
+    OutcomeAnswer outcome(const Verdict& lifted_on, bool slipped, const std::string& object = {},
+                          double wait_s = 0.5) {
+        const std::string telling = detail::telling(lifted_on, slipped, object);
+        if (!asks_) throw std::invalid_argument("an outcome needs an ask_endpoint");
+        const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
+        const detail::HangUp after{link_};
+        link_.ask(telling);
+        auto payload = link_.answer();
+        while (!payload && wait(due_ns)) {
+            drain();
+            payload = link_.answer();
+        }
+        if (!payload) return {"no-answer"};
+        const auto taken = detail::taken(*payload);
+        if (!taken) newest_.counts.malformed++;
+        return taken.value_or(OutcomeAnswer{"malformed"});
     }
 
 private:

@@ -1,6 +1,9 @@
-// Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not.
+// Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not. Or tells it how the
+// lift ended: 0 it was taken, 1 it was not.
 //
 //     lift_gate ENDPOINT DEADLINE_S [ASK_ENDPOINT]    one question
+//     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP stable|slip [OBJECT]
+//                                                     `boot` and `grasp` are those of the answer
 //     lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]
 //                                                     each change of the verdict, until it is killed
 #include "graspd_client.hpp"
@@ -34,6 +37,21 @@ int ask(const graspd::Options& options, double deadline_s) {
     return answer ? 0 : 1;
 }
 
+int tell(const std::vector<std::string>& words) {
+    if (words[5] != "stable" && words[5] != "slip") throw std::invalid_argument("stable or slip");
+    graspd::Options options;
+    options.endpoint = words[1];
+    options.ask_endpoint = words[2];
+    graspd::Verdict lifted_on;
+    lifted_on.boot_id = words[3];
+    lifted_on.grasp = std::stoll(words[4]);
+    graspd::Client client(options);
+    const graspd::OutcomeAnswer answer =
+        client.outcome(lifted_on, words[5] == "slip", words.size() == 7 ? words[6] : "");
+    std::cout << (answer ? "taken" : answer.why) << '\n';
+    return answer ? 0 : 1;
+}
+
 }  // namespace
 
 int main(int count, char** given) {
@@ -48,6 +66,8 @@ int main(int count, char** given) {
                                             graspd::load_key(words[3], "secret-key")};
             return watch(options);
         }
+        if (!words.empty() && words[0] == "--tell" && (words.size() == 6 || words.size() == 7))
+            return tell(words);
         if (words.size() == 2 || words.size() == 3) {
             options.endpoint = words[0];
             if (words.size() == 3) options.ask_endpoint = words[2];
@@ -58,6 +78,7 @@ int main(int count, char** given) {
         return 2;
     }
     std::cerr << "lift_gate ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
+                 "lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP stable|slip [OBJECT]\n"
                  "lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]\n";
     return 2;
 }

@@ -8,13 +8,15 @@ messages are those of deploy/wire/README.md, version 1.
             lift()
 
 Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that made
-it. Only `verdict(wait_s)` and `may_i_lift(deadline_s)` wait, and no longer than they are told.
+it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `outcome(..., wait_s)` wait, and no longer
+than they are told.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -50,6 +52,8 @@ DRIFT = 1e-3
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
 # On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
+# Name of an object: printable ASCII but blank, quotes and comma.
+OBJECT = re.compile(r"[!#-&(-+\--~]{1,64}")
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,17 @@ class LiftAnswer:
 
     def __bool__(self) -> bool:
         return bool(self.verdict)
+
+
+@dataclass(frozen=True)
+class OutcomeAnswer:
+    """Whether graspd has taken how a lift ended. True in an `if` exactly when it has."""
+
+    why: str = ""
+    """Why not: the daemon's words, or `no-answer`, `malformed`, `version` or `closed`."""
+
+    def __bool__(self) -> bool:
+        return not self.why
 
 
 @dataclass
@@ -136,7 +151,8 @@ class Graspd:
     ) -> None:
         """`max_age_ms` is how old a reading may be that a lift relies on, ms.
 
-        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well. `same_computer`
+        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `outcome` has
+        somebody to tell. `same_computer`
         says whether the daemon's monotonic clock is one's own; unless given, it is with `ipc://`
         and on loopback addresses: say False through a tunnel. Raises `zmq.ZMQError` for an endpoint
         that is none, and `ValueError` for an age that is none.
@@ -190,6 +206,39 @@ class Graspd:
         finally:
             self._link.hang_up()
         return LiftAnswer(decided, (time.monotonic_ns() - began_ns) / 1e9)
+
+    def outcome(
+        self,
+        lifted_on: Verdict,
+        slipped: bool,
+        object_name: str | None = None,
+        wait_s: float = 0.5,
+    ) -> OutcomeAnswer:
+        """Tell how the lift ended that was made on a verdict, and what was lifted.
+
+        Waits at most `wait_s` seconds for the answer; without one tell it again, the later counts.
+        Raises `ValueError` without an ask endpoint, for a verdict that is of no grasp, and for a
+        name that is no 1 to 64 printable ASCII characters without blank, quotes and comma.
+        """
+        telling = _telling(lifted_on, slipped, object_name)
+        if not self._asks:
+            raise ValueError("an outcome needs an ask_endpoint")
+        if self._closed:
+            return OutcomeAnswer("closed")
+        due_ns = time.monotonic_ns() + round(wait_s * 1e9)
+        try:
+            self._link.ask(telling)
+            payload = self._link.answer()
+            while payload is None and self._wait(due_ns):
+                self._drain()
+                payload = self._link.answer()
+        finally:
+            self._link.hang_up()
+        if payload is None:
+            return OutcomeAnswer("no-answer")
+        taken = _taken(payload)
+        self.counts.malformed += taken is None
+        return OutcomeAnswer("malformed") if taken is None else taken
 
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on."""
@@ -430,11 +479,11 @@ class _Link:
         self._socket.close(0)
         self._socket = self._connected(zmq.SUB, self._endpoint)
 
-    def ask(self) -> None:
+    def ask(self, question: bytes = b"judge") -> None:
         if self._ask is not None:
             if self._asking is None:
                 self._asking = self._connected(zmq.DEALER, self._ask)
-            self._asking.send(b"judge", zmq.NOBLOCK)
+            self._asking.send(question, zmq.NOBLOCK)
 
     def answer(self) -> bytes | None:
         """The answer, if it is there; empty if it is none."""
@@ -481,13 +530,19 @@ def _slept_ns() -> int:
 def _read(payload: bytes) -> _Message | str:
     """A verdict message; `malformed` or `version` for what is not understood or contradicts."""
     try:
-        told = json.loads(payload.decode())
-        json.dumps(told, allow_nan=False)  # refuses what is no JSON and no number
-        if not isinstance(told, dict):
-            return "malformed"
+        told = _parsed(payload)
         return _message(told) if _number(told, "v") == VERSION else "version"
     except (ValueError, KeyError, RecursionError):
         return "malformed"
+
+
+def _parsed(payload: bytes) -> dict[str, Any]:
+    """A JSON object. Raises `ValueError` or `RecursionError`."""
+    told = json.loads(payload.decode())
+    json.dumps(told, allow_nan=False)  # refuses what is no JSON and no number
+    if not isinstance(told, dict):
+        raise ValueError
+    return told
 
 
 def _message(told: dict[str, Any]) -> _Message:
@@ -513,6 +568,31 @@ def _message(told: dict[str, Any]) -> _Message:
     )
     said = Verdict(verdict, tuple(reasons), p_slip, grasp, seq, boot_id)
     return _Message(said, read_ns, read_ns + round(age_ms * 1e6), round(silence_ms * 1e6))
+
+
+def _telling(lifted_on: Verdict, slipped: bool, object_name: str | None) -> bytes:
+    """What to send. Raises `ValueError`."""
+    if not lifted_on.boot_id or not lifted_on.grasp:
+        raise ValueError("nothing was lifted on a verdict that is of no grasp")
+    words = ["outcome", lifted_on.boot_id, str(lifted_on.grasp), SLIP if slipped else STABLE]
+    if object_name is not None:
+        if OBJECT.fullmatch(object_name) is None:
+            raise ValueError(f"{object_name!r} is no name of an object")
+        words.append(object_name)
+    return " ".join(words).encode()
+
+
+def _taken(payload: bytes) -> OutcomeAnswer | None:
+    """The answer to an outcome; None for what is not understood."""
+    try:
+        told = _parsed(payload)
+        if _number(told, "v") != VERSION:
+            return OutcomeAnswer("version")
+        said, why = told["ok"], "" if told["ok"] is True else told["why"]
+    except (ValueError, KeyError, RecursionError):
+        return None
+    fits = isinstance(said, bool) and isinstance(why, str) and bool(why) is not said
+    return OutcomeAnswer(why) if fits else None
 
 
 def _number(
