@@ -16,6 +16,9 @@ REBIND_S, REBIND_STEP_S = 0.5, 0.002
 """How long a closed socket may hold its port, s."""
 CURVE_MESSAGE_MAX_BYTES = 1024
 """The longest message of the handshake, INITIATE, has 257 bytes and metadata (RFC 26)."""
+HANDSHAKE_MS = 5000
+"""Who connects and says nothing is disconnected after so long: libzmq's 30 s let a few strangers
+hold more connections than the process may have."""
 ZAP_DOMAIN = b"graspd"
 """Named in requests to whoever admits peers (RFC 27); libzmq asks nobody for an empty one."""
 
@@ -111,6 +114,7 @@ class Bound(ABC):
             self._file = socket_file(self.endpoint, self._binding)
             self._admit_only_known(made)
             made.ipv6 = "[" in self.endpoint
+            made.handshake_ivl = HANDSHAKE_MS
             if self._file is not None:
                 # Left to itself libzmq would first remove whatever is at the path.
                 made.setsockopt(zmq.USE_FD, self._file.listener.fileno())

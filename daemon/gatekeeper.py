@@ -92,7 +92,7 @@ class Gatekeeper:
 
     def watch(self, listening: zmq.Socket[bytes]) -> None:
         """Hear of peers of this socket that fail without asking: those without keys, those that
-        speak no ZeroMQ, those that say nothing for 30 s (libzmq's limit for a handshake)."""
+        speak no ZeroMQ, those that say nothing (until their handshake has taken too long)."""
         endpoint = f"inproc://graspd-monitor-{id(listening)}"
         listening.monitor(endpoint, EVENTS)
         monitor = self._context.socket(zmq.PAIR)

@@ -312,6 +312,7 @@ class Recorder:
     def _fail(self, error: OSError) -> None:
         """The disk does not take it: one warning, and another try in a minute."""
         files, self._open = self._open, None
+        self._number += 1  # the next file does not go on where the last one ends
         if files is not None:
             self._counted["lost"] += files.unflushed
             files.messages.abandon()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from daemon.recorder import Recorded, Recorder
 
 log = logging.getLogger("graspd")
+
+AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
+"""After a sleep, between two tries to open what is not there yet, and to look for signals, s."""
 
 
 class Manager(Watchdog, Protocol):
@@ -103,23 +107,40 @@ class Runner:
 
     def _run(self, parts: Parts) -> None:
         former: Parts | None = None
+        woken = False
         while True:
             self._running = False
             try:
+                if woken:
+                    parts = _built(parts.scene, parts.model)
                 ended = self._work(parts)
             except (scene.SceneError, ModelError, PublishError, DriverError) as error:
-                if former is None or self._running:
+                if self._running or (former is None and not woken):
                     raise
-                self._refuse(error)
-                parts, former = former, None
+                if former is not None:
+                    self._refuse(error)
+                    parts, former = former, None
+                elif not self._waits_for_the_rest(error):
+                    return
                 continue
-            if ended is Ended.SLEPT:
+            woken = ended is Ended.SLEPT
+            if woken:
                 log.warning("the computer has slept: everything starts anew")
-                parts, former = _built(parts.scene, parts.model), None
+                former = None
             elif ended is Ended.RELOAD and self._next is not None:
                 parts, former = self._next, parts
             else:
                 return
+
+    def _waits_for_the_rest(self, error: Exception) -> bool:
+        """Networks and disks may wake later than we do; whether to try again then."""
+        log.warning("%s; another try in %g s", error, AWAKE_RETRY_S)
+        until_s = time.monotonic() + AWAKE_RETRY_S
+        while self._stop.received is None and time.monotonic() < until_s:
+            if self._manager is not None:
+                self._manager.feed()
+            time.sleep(AWAKE_LOOK_S)
+        return self._stop.received is None
 
     def _open_sockets(self, wanted: scene.Scene) -> Sockets:
         """Those that are open, if the scene wants the same ones."""

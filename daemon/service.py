@@ -165,8 +165,9 @@ class Service:
 
     def _wake(self) -> Ended:
         """Say that nothing is known, also to who waits for an answer."""
-        self._silence_due_ns = self._clock()
-        self._mind_silence()
+        payload = self._tell_silence(self._clock())
+        if self._questions is not None:
+            self._questions.answer(payload)
         return Ended.SLEPT
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
@@ -236,8 +237,10 @@ class Service:
 
     def _mind_silence(self) -> None:
         now_ns = self._clock()
-        if now_ns < self._silence_due_ns or self._tactile.exhausted:
-            return
+        if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
+            self._tell_silence(now_ns)
+
+    def _tell_silence(self, now_ns: int) -> bytes:
         self._state = State.SILENT
         self._silence_due_ns = now_ns + self._silence_ns()
         verdict, payload = self._reporter.verdict(
@@ -246,6 +249,7 @@ class Service:
         self._answer(verdict, payload)
         if self._listener is not None:
             self._listener(verdict, payload, None)
+        return payload
 
     def _silence_ns(self) -> int:
         """How long nothing may come before it is said, ns."""

@@ -60,6 +60,9 @@ SLOT_MIN_NS: Final = 100_000
 period is not known, it is taken for that of the fastest board."""
 ARRIVAL_JITTER_NS: Final = 5_000_000
 """A sweep that comes less than this late, ns, tells of no missed one."""
+EVEN_SHARE: Final = 1 / 3
+"""Of the time from one end to the next, what two samples may at most be apart where no sweep is
+missing; one that is takes half of it."""
 OUTAGE_NS: Final = 2_000_000_000
 """After this long, ns, nobody knows how many sweeps were made: it counts as one missed."""
 
@@ -185,6 +188,8 @@ class SampleSweeps:
         self._previous_had = _ALL
         self._seen = -1
         self._run = 0
+        self._at_ns = 0
+        self._widest_ns = 0
         self._broken = False
         self._have = 0
         self._last = -1
@@ -218,7 +223,7 @@ class SampleSweeps:
         if place is None:
             self._counters.unexpected_channels += channel not in self._others
             return ()
-        self._count_run(place)
+        self._count_run(place, t_ns)
         if until_ns is None:
             until_ns = t_ns
         elif until_ns - t_ns >= self._lateness_ns():
@@ -254,12 +259,15 @@ class SampleSweeps:
         self._run = 0
         self._begin()
 
-    def _count_run(self, place: int) -> None:
-        """Count the samples in a row that came each right after its predecessor in the order."""
+    def _count_run(self, place: int, t_ns: int) -> None:
+        """Count the samples in a row that came each right after its predecessor in the order, and
+        keep the widest time between two since the last end."""
         if place != self._seen:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
             self._seen = place
+        self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
+        self._at_ns = t_ns
 
     def _starts(self, place: int) -> bool:
         """Whether a sweep begins with this sample, the first ones after opening."""
@@ -380,12 +388,15 @@ class SampleSweeps:
         """A sweep ended at `end_ns`, and maybe the one before it ended right before.
 
         Samples without a gap in their order tell of one period even where the time between them
-        broke the sweep: else a period that is wrong once, and breaks every sweep, would stay.
+        broke the sweep: else a period that is wrong once, and breaks every sweep, would stay. Not
+        where a whole sweep may be missing in the widest gap between them.
         """
         known = not self._broken or self._run > ELECTRODES
         if known and self._previous_end_ns is not None:
             gap_ns = end_ns - self._previous_end_ns
-            if 0 < gap_ns <= OUTAGE_NS:
+            even = not self._broken or self._widest_ns < EVEN_SHARE * gap_ns
+            if even and 0 < gap_ns <= OUTAGE_NS:
                 self._readings.learn(gap_ns)
         self._broken = False
+        self._widest_ns = 0
         self._previous_end_ns = end_ns

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,6 +20,7 @@ from daemon.reporter import Reporter
 from daemon.scene import Scene, SceneError
 from daemon.service import Listener, Service
 from daemon.session_file import SessionFileError, load, statistics_of
+from daemon.sleep import Sleep
 from daemon.sockets import Sockets
 from daemon.stop import StopSignal
 from daemon.text import complain
@@ -146,6 +148,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             max_age_ns=wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
             listener=listener,
             sockets=sockets,
+            sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
         )
         try:
             service.run()

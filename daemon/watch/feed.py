@@ -72,6 +72,8 @@ class Feed:
         self._keys = keys
         self._clock = clock
         self._taken_ns = self._opened_ns = clock()
+        self.empty_ns = self._opened_ns
+        """When nothing waited: what `take` gives has come since, and may be as old."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._events = EVENTS | {event: says[keys is not None] for event, says in REFUSALS.items()}
         self._follow = 0
@@ -104,9 +106,11 @@ class Feed:
         self._connect_anew_if_need_be()
         self._look_at_link()
         for _ in range(TAKEN_MAX):
+            before_ns = self._clock()
             try:
                 frames = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
+                self.empty_ns = before_ns
                 return
             if len(frames) == 2:
                 yield frames[0], frames[1]
@@ -116,7 +120,7 @@ class Feed:
         paused = now_ns - self._taken_ns > PAUSE_NS
         self._taken_ns = now_ns
         if paused or (self.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
-            self._opened_ns = now_ns
+            self._opened_ns = self.empty_ns = now_ns
             self._let_go()
             self._open()
 

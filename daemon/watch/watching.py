@@ -19,7 +19,7 @@ def snapshots(feed: Feed, view: View, is_over: Callable[[], bool]) -> Iterator[S
     due_s = 0.0
     while not is_over():
         for topic, payload in feed.take():
-            view.take(topic, payload, boottime_ns())  # after a sleep, what came before it is old
+            view.take(topic, payload, feed.empty_ns)  # what has waited is old
         view.link = feed.link
         if time.monotonic() >= due_s:
             due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)

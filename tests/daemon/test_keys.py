@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon import scene
+from daemon import gatekeeper, scene
 from daemon.keys import KeysError, load_clients, load_pair, make
 from daemon.scene import SceneError
 from daemon.sockets import Sockets
@@ -133,6 +133,27 @@ def test_who_has_no_key_is_turned_away_by_address(
     assert not door.hears(stranger, QUIET_S)
     door.until(lambda: door.counted("turned_away") > 0)
     assert "turned away 127.0.0.1: it has no keys" in caplog.text
+
+
+def test_a_peer_that_is_gone_before_it_is_looked_at_costs_nobody_a_descriptor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """libzmq's thread takes each number as soon as it is free."""
+    taken: list[int] = []
+    close = os.close
+
+    def take_and_close(descriptor: int) -> None:
+        taken.append(os.open(os.devnull, os.O_RDONLY))
+        close(descriptor)
+
+    with socket.socket() as unconnected, open(os.devnull) as no_socket:
+        monkeypatch.setattr(os, "close", take_and_close)
+        assert gatekeeper._peer(unconnected.fileno()) is None
+        assert gatekeeper._peer(no_socket.fileno()) is None
+        monkeypatch.undo()
+        for descriptor in taken:
+            os.fstat(descriptor)  # still open
+            close(descriptor)
 
 
 def test_who_takes_another_daemon_for_this_one_is_turned_away(

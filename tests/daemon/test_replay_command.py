@@ -16,6 +16,7 @@ import pytest
 
 from daemon.judge.verdict import decode_verdict, schema
 from drivers.replay import DEMO_RECORDING, DEMO_TABLE
+from tests.clients.building import compiled_sleep
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
 
@@ -146,6 +147,21 @@ def test_a_signal_ends_a_replay_with_its_summary_and_nothing_left(
     if first:
         decode_verdict(first.encode())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_replay_in_which_the_computer_sleeps_goes_on_to_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept = tmp_path / "slept"
+    monkeypatch.setenv("SLEPT", str(slept))
+    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    with start("replay", "--speed", 2, "--json", DEMO_TABLE) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        slept.touch()
+        rest, _ = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0
+    assert len([first, *rest.splitlines()]) == len(demo_rows())
 
 
 def replace_cell(text: str) -> str:

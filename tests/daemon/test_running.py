@@ -223,6 +223,31 @@ def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket
     assert said.count("the computer has slept") == 1
 
 
+def test_what_is_not_back_yet_after_a_sleep_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept, recording, away = tmp_path / "slept", tmp_path / "demo.csv", tmp_path / "away"
+    monkeypatch.setenv("SLEPT", str(slept))
+    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    recording.write_bytes(DEMO.read_bytes())
+    waiting = Running(tmp_path)
+    waiting.write(recording=recording)
+    with waiting.started() as running:
+        running.told("READY=1")
+        before = running.verdict()
+        recording.rename(away)
+        slept.touch()
+        time.sleep(2.5)  # two tries
+        assert running.process.poll() is None
+        away.rename(recording)
+        running.told("READY=1")
+        while running.verdict().boot_id == before.boot_id:
+            pass
+        code, said = running.stop()
+    assert code == 0
+    assert said.count("another try in 1 s") >= 1
+
+
 def test_a_scene_that_is_wrong_at_the_start_ends_with_2(tmp_path: Path) -> None:
     wrong = Running(tmp_path)
     wrong.write(model="no-such")

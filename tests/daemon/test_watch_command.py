@@ -26,6 +26,7 @@ from daemon.keys import KeysError, make
 from daemon.publisher import Publisher
 from daemon.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys
+from daemon.watch.view import View
 from tests.daemon.fakes import Clock
 from tests.daemon.processes import GRASPD, graspd, start
 from tests.daemon.watch_fakes import MS, Talker, verdict
@@ -209,6 +210,29 @@ def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
         assert list(feed.take()) == []
         for payload in came(Outcome.SLIP, 50):
             assert decode_verdict(payload).seq == 50
+
+
+def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoint: str) -> None:
+    clock = Clock()
+    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+        deadline_s, seq = time.monotonic() + PATIENCE_S, 0
+        while not list(feed.take()):
+            assert time.monotonic() < deadline_s
+            publisher.take()
+            publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+            seq += 1
+            time.sleep(0.01)
+        while list(feed.take()):
+            pass
+        looked_ns = clock.now_ns
+        publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+        time.sleep(0.2)
+        clock.now_ns += 900 * MS
+        view = View(endpoint)
+        for topic, payload in feed.take():
+            view.take(topic, payload, feed.empty_ns)
+        assert view.snapshot(clock.now_ns).verdict == "unknown"
+        assert view.snapshot(looked_ns).verdict == "stable"
 
 
 def test_it_waits_for_a_daemon_that_is_not_there_yet(endpoint: str) -> None:

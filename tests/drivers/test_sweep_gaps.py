@@ -227,3 +227,23 @@ def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> Non
         assert_of_one_sweep(reading)
     assert [r.faults.any() for r in readings[-30:]] == [False] * 30
     assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("lost", [-1, 0, 1])
+def test_losses_of_a_sweep_in_a_rhythm_are_not_taken_for_a_longer_period(
+    sequence: str, lost: int
+) -> None:
+    """The order looks as if nothing were missing."""
+    sweeps, _ = assembler(sequence)
+    length = len(SEQUENCES[sequence])
+    stream = concatenated([samples(n, sequence) for n in range(200)])
+    rhythm = 5 * length // 2 + 1
+    kept = [
+        sample
+        for at, sample in enumerate(stream)
+        if at < 20 * length or at % rhythm >= length + lost
+    ]
+    for reading in feed(sweeps, kept):
+        assert_of_one_sweep(reading)
+    assert sweeps.period_ns == length * SLOT_NS
