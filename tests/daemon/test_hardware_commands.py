@@ -29,7 +29,7 @@ TWINS: dict[str, list[str]] = {
     "can": [],
     "palm": ["--to", "udp://127.0.0.1:{port}"],
 }
-PORT = 45931
+PORT = 25911
 
 
 MODEL = "cnn1"

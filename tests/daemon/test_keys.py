@@ -20,7 +20,7 @@ from daemon.scene import SceneError
 from daemon.sockets import Sockets
 from tests.daemon.processes import graspd
 
-PORT = 45931
+PORT = 25931
 ENDPOINT = f"tcp://127.0.0.1:{PORT}"
 PATIENCE_S = 10.0
 QUIET_S = 0.5

@@ -64,7 +64,7 @@ def peers() -> Iterator[Peers]:
     peers.close()
 
 
-ENDPOINTS = {"ipc": "ipc://{folder}/v", "tcp": "tcp://127.0.0.1:45917", "ip6": "tcp://[::1]:45917"}
+ENDPOINTS = {"ipc": "ipc://{folder}/v", "tcp": "tcp://127.0.0.1:25917", "ip6": "tcp://[::1]:25917"}
 
 
 def has_ipv6() -> bool:
@@ -154,8 +154,8 @@ def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
 
 
 def test_a_second_publisher_on_the_same_port_is_refused() -> None:
-    with Publisher("tcp://127.0.0.1:45918"), pytest.raises(PublishError, match="in use"):
-        Publisher("tcp://127.0.0.1:45918")
+    with Publisher("tcp://127.0.0.1:25918"), pytest.raises(PublishError, match="in use"):
+        Publisher("tcp://127.0.0.1:25918")
 
 
 def test_a_peer_that_sends_more_than_a_subscription_is_cut_off(

@@ -32,7 +32,7 @@ from tests.daemon.processes import GRASPD, graspd, start
 from tests.daemon.watch_fakes import MS, Talker, verdict
 
 PATIENCE_S = 30.0
-PORT = 45941
+PORT = 25941
 TCP = f"tcp://127.0.0.1:{PORT + 1}"
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 """Of the alternate screen (xterm)."""
