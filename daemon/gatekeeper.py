@@ -33,7 +33,6 @@ EVENTS = (
     zmq.EVENT_ACCEPTED
     | zmq.EVENT_DISCONNECTED
     | zmq.EVENT_HANDSHAKE_SUCCEEDED
-    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
     | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
 )
@@ -45,15 +44,10 @@ TIME_WAIT = "06"
 """State of a connection that this side has closed."""
 ANSWERED = (zmq.EVENT_HANDSHAKE_SUCCEEDED, zmq.EVENT_HANDSHAKE_FAILED_AUTH)
 """End a handshake in which we were asked: who it is has been told."""
-NOT_ZEROMQ = "turned away %s: it does not speak ZeroMQ 4"
-FAILED = {
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "turned away %s: it has no keys, or not the daemon's",
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): (
-        "turned away %s: it has no keys, or broke off before it showed them"
-    ),
-}
-"""End one in which we were not asked, and come right before the connection goes. Who speaks another
-protocol, or a ZeroMQ from before there were keys, just goes (libzmq 4.3.5)."""
+NO_KEY_SHOWN = "turned away %s: it showed no key, has none, or does not speak ZeroMQ 4"
+WRONG_KEYS = "turned away %s: it has no keys, or not the daemon's"
+"""Of a handshake that failed without our being asked, which libzmq says right before the connection
+goes. Who speaks another protocol, or notices first that the keys do not fit, just goes (4.3.5)."""
 
 
 @dataclass(slots=True, eq=False)
@@ -65,7 +59,7 @@ class _Watched:
     waiting: dict[int, str | None] = field(default_factory=dict)
     """Connections whose handshake has not ended, oldest first: address by descriptor, None where
     it had gone before anybody looked. No more than the process may have descriptors."""
-    why: str = NOT_ZEROMQ
+    why: str = NO_KEY_SHOWN
     """Of the connection that goes next."""
 
 
@@ -148,10 +142,10 @@ class Gatekeeper:
             watched.waiting[value] = _peer(value)
         elif event in ANSWERED:
             self._let_pass(watched)
-        elif event in FAILED:
-            watched.why = FAILED[event]
+        elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
+            watched.why = WRONG_KEYS
         elif event == zmq.EVENT_DISCONNECTED:
-            why, watched.why = watched.why, NOT_ZEROMQ
+            why, watched.why = watched.why, NO_KEY_SHOWN
             if value in watched.waiting:
                 address = watched.waiting.pop(value)
                 self.counters["turned_away"] += 1

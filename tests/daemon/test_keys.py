@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import socket
 import stat
 import time
@@ -132,7 +133,7 @@ def test_who_has_no_key_is_turned_away_by_address(
     stranger = door.connect(None)
     assert not door.hears(stranger, QUIET_S)
     door.until(lambda: door.counted("turned_away") > 0)
-    assert "turned away 127.0.0.1: it has no keys" in caplog.text
+    assert re.search(r"turned away 127\.0\.0\.1: it (has|showed) no key", caplog.text)
 
 
 def test_a_peer_that_is_gone_before_it_is_looked_at_costs_nobody_a_descriptor(
@@ -166,29 +167,28 @@ def test_who_takes_another_daemon_for_this_one_is_turned_away(
 
 
 STRANGERS = {
-    "http": (b"GET / HTTP/1.1\r\nHost: graspd\r\n\r\n", "it does not speak ZeroMQ 4"),
-    "zeros": (bytes(300), "it does not speak ZeroMQ 4"),
-    "tls": (bytes.fromhex("16 03 01 02 00 01 00 01 fc 03 03"), "it does not speak ZeroMQ 4"),
+    "http": b"GET / HTTP/1.1\r\nHost: graspd\r\n\r\n",
+    "zeros": bytes(300),
+    "tls": bytes.fromhex("16 03 01 02 00 01 00 01 fc 03 03"),
     # RFC 15: signature, revision 1, socket type SUB, no identity.
-    "ZeroMQ 3": (bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 01 02 00 00"), "not speak ZeroMQ 4"),
-    "nothing": (b"", "it has no keys, or broke off"),
-    "half a greeting": (bytes.fromhex("ff 00 00 00"), "it has no keys, or broke off"),
-    "a greeting that goes on in noise": (b"\xff" * 300, "it has no keys"),
+    "ZeroMQ 3": bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 01 02 00 00"),
+    "nothing": b"",
+    "half a greeting": bytes.fromhex("ff 00 00 00"),
+    "a greeting that goes on in noise": b"\xff" * 300,
 }
-"""What peers may say that are none, and what is said of them."""
+"""What peers may say that are none."""
 
 
-@pytest.mark.parametrize(("says", "told"), STRANGERS.values(), ids=STRANGERS)
+@pytest.mark.parametrize("says", STRANGERS.values(), ids=STRANGERS)
 def test_who_speaks_no_zeromq_is_turned_away_by_address_and_counted_once(
-    door: Door, caplog: pytest.LogCaptureFixture, says: bytes, told: str
+    door: Door, caplog: pytest.LogCaptureFixture, says: bytes
 ) -> None:
     with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as stranger:
         stranger.sendall(says)
         with contextlib.suppress(OSError):  # it may be cut off already
             stranger.shutdown(socket.SHUT_WR)
         door.until(lambda: door.counted("turned_away") > 0)
-    assert "turned away 127.0.0.1: " in caplog.text
-    assert told in caplog.text
+    assert re.search(r"turned away 127\.0\.0\.1: it (has|showed) no key", caplog.text)
     assert door.hears(door.connect(door.known), PATIENCE_S)
     assert door.counted("turned_away") == 1
 
