@@ -215,6 +215,11 @@ class Soak:
             at_s = back_s + pace * self._random.uniform(*BETWEEN_S)
 
     def _kill_twin(self) -> None:
+        # As with a real adapter its path goes with it: else it leads to the next terminal that gets
+        # this number, and that may be anybody's.
+        self._twin.process.send_signal(signal.SIGSTOP)
+        if self._plan.kind == "spi":
+            Path(self._twin_plan.where).unlink(missing_ok=True)
         self._twin.kill()
         self._kills += 1
 
