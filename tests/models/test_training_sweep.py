@@ -13,13 +13,14 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import joblib
 import numpy as np
 import pytest
-from joblib.externals.loky import get_reusable_executor
 
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
+
+import joblib
+from joblib.externals.loky import get_reusable_executor
 
 from models.contract import VectorInput
 from models.training import jobs
