@@ -39,8 +39,8 @@ def compiled(name: str, folder: Path) -> Path:
     return folder / name
 
 
-def compiled_sleep(folder: Path) -> Path:
-    """What makes a program take the computer for one that has slept."""
+def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file of which programs started from now on take the beginning for a computer's sleep."""
     skip_unless_it_can_be_compiled()
     library = folder / "sleep.so"
     source = Path(__file__).parent / "sleep.c"
@@ -49,7 +49,10 @@ def compiled_sleep(folder: Path) -> Path:
         check=True,
         timeout=55,
     )
-    return library
+    slept = folder / "slept"
+    monkeypatch.setenv("SLEPT", str(slept))
+    monkeypatch.setenv("LD_PRELOAD", str(library))
+    return slept
 
 
 def compiled_probe(folder: Path) -> Path:

@@ -14,7 +14,7 @@ import zmq
 
 from daemon.keys import make
 from tests.clients.bench import Daemon, free_endpoint, unlisted
-from tests.clients.building import compiled_sleep
+from tests.clients.building import sleep_at_will
 from tests.clients.messages import frames, verdict
 
 MAY, MAY_NOT, WRONG = 0, 1, 2
@@ -123,9 +123,7 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(
 def test_what_came_before_the_computer_slept_is_unknown_however_young_it_looks(
     lift_gate: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slept, endpoint = tmp_path / "slept", f"ipc://{tmp_path}/out"
-    monkeypatch.setenv("SLEPT", str(slept))
-    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    slept, endpoint = sleep_at_will(tmp_path, monkeypatch), f"ipc://{tmp_path}/out"
     with (
         zmq.Context() as context,
         context.socket(zmq.XPUB) as out,

@@ -16,7 +16,7 @@ import pytest
 
 from daemon.judge.verdict import decode_verdict, schema
 from drivers.replay import DEMO_RECORDING, DEMO_TABLE
-from tests.clients.building import compiled_sleep
+from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
 
@@ -152,9 +152,7 @@ def test_a_signal_ends_a_replay_with_its_summary_and_nothing_left(
 def test_a_replay_in_which_the_computer_sleeps_goes_on_to_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slept = tmp_path / "slept"
-    monkeypatch.setenv("SLEPT", str(slept))
-    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    slept = sleep_at_will(tmp_path, monkeypatch)
     with start("replay", "--speed", 2, "--json", DEMO_TABLE) as process:
         assert process.stdout is not None
         first = process.stdout.readline()

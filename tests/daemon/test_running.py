@@ -23,7 +23,7 @@ from daemon.judge.verdict import (
     decode_status,
     decode_verdict,
 )
-from tests.clients.building import compiled_sleep
+from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD
 
 DEMO = Path(__file__).parents[2] / "drivers" / "demo" / "synthetic_stream.csv"
@@ -203,9 +203,7 @@ def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> N
 def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slept = tmp_path / "slept"
-    monkeypatch.setenv("SLEPT", str(slept))
-    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    slept = sleep_at_will(tmp_path, monkeypatch)
     with Running(tmp_path).started() as running:
         running.told("READY=1")
         before = running.verdict()
@@ -226,9 +224,8 @@ def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket
 def test_what_is_not_back_yet_after_a_sleep_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    slept, recording, away = tmp_path / "slept", tmp_path / "demo.csv", tmp_path / "away"
-    monkeypatch.setenv("SLEPT", str(slept))
-    monkeypatch.setenv("LD_PRELOAD", str(compiled_sleep(tmp_path)))
+    recording, away = tmp_path / "demo.csv", tmp_path / "away"
+    slept = sleep_at_will(tmp_path, monkeypatch)
     recording.write_bytes(DEMO.read_bytes())
     waiting = Running(tmp_path)
     waiting.write(recording=recording)
