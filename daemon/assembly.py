@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from daemon.judge.grip import GripLimits
     from daemon.judge.joints import JointLimits
     from daemon.session_keeper import SessionKeeper
-    from drivers.recording_columns import Columns
+    from drivers.recordings.csv_columns import Columns
 
 log = logging.getLogger("graspd")
 
@@ -160,7 +160,7 @@ def grip_limits(scene: Scene) -> GripLimits | None:
 
 
 def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
-    from drivers.recording import columns_of
+    from drivers.recordings.csv_rows import columns_of
 
     return [columns_of(path, scene.hand.fingers) for path in options.recordings]
 
@@ -176,7 +176,7 @@ def is_mcap(options: ReplayTactile) -> bool:
 def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
     if not is_mcap(options):
         return any(columns.joints for columns in _columns(scene, options))
-    from drivers.mcap_recording import header_of
+    from daemon.record.mcap import header_of
 
     return any(header_of(path).joints for path in options.recordings)
 
@@ -225,7 +225,7 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
     with _section("tactile"):
         drivers = [_tactile(scene, clock)]
     if isinstance(scene.joints, StreamJoints):
-        from drivers.joints import JointStreamDriver
+        from drivers.joints.driver import JointStreamDriver
 
         with _section("joints"):
             drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
@@ -283,17 +283,17 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
         case ReplayTactile() as options:
             return _replay(scene, options, clock)
         case SpiTactile() as options:
-            from drivers.spi_bridge import SpiBridgeDriver
+            from drivers.spi.driver import SpiBridgeDriver
 
             wanted = options.model_dump(exclude={"driver"})
             return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
         case CanTactile() as options:
-            from drivers.can_bridge import CanBridgeDriver
+            from drivers.can.driver import CanBridgeDriver
 
             wanted = options.model_dump(exclude={"driver"})
             return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
         case PalmTactile() as options:
-            from drivers.palm import PalmDriver
+            from drivers.palm.driver import PalmDriver
 
             joints = scene.joints
             calibration = joints.calibration if isinstance(joints, PalmJoints) else None
@@ -310,8 +310,8 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if is_mcap(options):
         return _replay_mcap(scene, options, clock)
-    from drivers.faults import ReplayFaults
-    from drivers.replay import Pace, ReplayDriver
+    from drivers.recordings.csv_player import Pace, ReplayDriver
+    from drivers.recordings.faults import ReplayFaults
 
     return ReplayDriver(
         options.recordings,
@@ -330,7 +330,7 @@ def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if options.loop or options.strict or options.faults != ReplayFaultsSection():
         raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
     try:
-        from drivers.mcap_replay import McapReplayDriver
+        from daemon.record.player import McapReplayDriver
     except ModuleNotFoundError as error:
         raise ValueError(
             f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "

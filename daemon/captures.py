@@ -11,7 +11,7 @@ from daemon import assembly, scene
 from daemon.judge.pipeline import Pipeline
 from daemon.scene import Scene, SceneError
 from daemon.scene_drivers import CanTactile, SpiTactile
-from drivers.capture_replay import CANDUMP, SERIAL, CaptureReplayDriver
+from drivers.recordings.capture_player import CANDUMP, SERIAL, CaptureReplayDriver
 from models.runtime import TactileModel
 
 _DRIVER = {CANDUMP: "can", SERIAL: "spi"}
@@ -86,13 +86,13 @@ def changed(
 def _driver(wanted: Scene, paths: Sequence[Path], speed: float | None) -> CaptureReplayDriver:
     tactile, fingers = wanted.tactile, wanted.hand.fingers
     if isinstance(tactile, SpiTactile):
-        from drivers.serial_capture import SerialCapture, records_of
+        from drivers.recordings.serial_capture import SerialCapture, records_of
 
         bridge = SerialCapture(fingers, tactile.sensors)
         return CaptureReplayDriver(paths, records_of, bridge, speed=speed)
     if not isinstance(tactile, CanTactile):
         raise ValueError("captures are of the drivers can and spi")
-    from drivers.can_capture import CanCapture, frames_of
+    from drivers.recordings.can_capture import CanCapture, frames_of
 
     options = tactile.model_dump(
         exclude={"driver", "interface", "channel", "bitrate", "data_bitrate"}

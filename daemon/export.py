@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from daemon.judge.fresh import FreshMedian
 from daemon.judge.health import Health
 from daemon.judge.verdict import Verdict, decode_outcome, decode_verdict
+from daemon.record.mcap import McapRecording
+from daemon.record.player import tactile_reading
 from drivers.base import ELECTRODES, RecordingError, TactileReading
-from drivers.mcap_recording import McapRecording
-from drivers.mcap_replay import tactile_reading
-from drivers.recording import open_recording
-from drivers.recording_columns import OBJECT, SLIPPED, electrode_columns
+from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
+from drivers.recordings.csv_rows import open_recording
 
 MEDIAN_SWEEPS: Final = 3
 

@@ -37,11 +37,11 @@ CORE = (
 )
 """Part and modules: what every scene imports."""
 ELSEWHERE = (
-    ("driver replay", ("drivers.replay",)),
-    ("driver spi", ("drivers.spi_bridge",)),
-    ("driver can", ("drivers.can_bridge",)),
-    ("driver palm", ("drivers.palm",)),
-    ("joints", ("daemon.judge.joints", "drivers.joints", "drivers.hall_calibration")),
+    ("driver replay", ("drivers.recordings.csv_player",)),
+    ("driver spi", ("drivers.spi.driver",)),
+    ("driver can", ("drivers.can.driver",)),
+    ("driver palm", ("drivers.palm.driver",)),
+    ("joints", ("daemon.judge.joints", "drivers.joints.driver", "drivers.palm.calibration")),
     ("gate", ("daemon.judge.grip",)),
     ("session", ("daemon.judge.session",)),
     ("session file", ("daemon.session_keeper",)),
@@ -173,7 +173,7 @@ def _drivers(wanted: Scene, meter: Meter, stack: ExitStack) -> list[Driver]:
     if wanted.joints is not None:
         drivers += assembly.build_drivers(wanted)[1:]
         if isinstance(wanted.joints, PalmJoints):
-            from drivers.hall_calibration import load_calibration
+            from drivers.palm.calibration import load_calibration
 
             load_calibration(wanted.joints.calibration)
     gated = assembly.gate_mode(wanted) != "every"

@@ -16,10 +16,10 @@ from daemon import assembly
 from daemon.captures import changed
 from daemon.judge.memory import decode
 from daemon.judge.pipeline import Pipeline
+from daemon.record.mcap import ASKED, EXCHANGED, RecordingHeader, header_of
+from daemon.record.player import McapReplayDriver
 from daemon.scene import Scene, SceneError, parse
 from drivers.base import RecordingError
-from drivers.mcap_recording import ASKED, EXCHANGED, RecordingHeader, header_of
-from drivers.mcap_replay import McapReplayDriver
 from models.runtime import TactileModel
 from models.session import SessionState
 

@@ -16,8 +16,8 @@ import msgspec
 from mcap.writer import Writer
 
 from daemon.judge.verdict import WIRE_VERSION, schema
+from daemon.record.mcap import METADATA
 from drivers.base import JointReading
-from drivers.mcap_recording import METADATA
 
 MODE: Final = 0o640
 """Of files: what a hand grasped is nobody else's business."""

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Final
 from daemon.record_files import create
 from daemon.scene_drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
-from drivers.can_frames import LOST
-from drivers.candump import line_of
-from drivers.raw_capture import Way, encode_records
+from drivers.can.frames import LOST
+from drivers.recordings.candump import line_of
+from drivers.recordings.serial_file import Way, encode_records
 
 if TYPE_CHECKING:
     from daemon.recorder import RawFile
-    from drivers.can_bus import Stamped
+    from drivers.can.bus import Stamped
 
 EARLY_MAX: Final = 1000
 """Entries held while the recorder is not there yet: those of the link's opening."""
@@ -64,7 +64,7 @@ class Tap:
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:
     """A tap on the link of a driver; None for one that has no link of these kinds."""
     if isinstance(section, CanTactile):
-        from drivers.can_bridge import CanBridgeDriver
+        from drivers.can.driver import CanBridgeDriver
 
         channel = section.channel
         tap = Tap(lambda name: CandumpFile(name, channel))
@@ -72,7 +72,7 @@ def tap_of(driver: Driver, section: Tactile) -> Tap | None:
             driver.tap(tap.frames)
         return tap
     if isinstance(section, SpiTactile):
-        from drivers.spi_bridge import SpiBridgeDriver
+        from drivers.spi.driver import SpiBridgeDriver
 
         tap = Tap(SerialFile)
         if isinstance(driver, SpiBridgeDriver):
@@ -126,7 +126,7 @@ class CandumpFile(_File):
 
 
 class SerialFile(_File):
-    """Serial bytes in the frames of `drivers.raw_capture`, with monotonic times."""
+    """Serial bytes in the frames of `drivers.recordings.serial_file`, with monotonic times."""
 
     def __init__(self, name: Path) -> None:
         super().__init__(name, ".serial")

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
+from daemon.record.mcap import ASKED, EXCHANGED
 from daemon.record_files import Joints, MessageFile, Shelf
 from daemon.scene import Record
 from daemon.sockets import Sockets
 from drivers.base import JointReading
-from drivers.mcap_recording import ASKED, EXCHANGED
 
 if TYPE_CHECKING:
     from daemon.questions import Questions

@@ -27,12 +27,12 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 
 from drivers.base import TactileReading
-from drivers.can_bridge import CanBridgeDriver
-from drivers.can_bus import FRAMES_PER_DRAIN, CanBus
-from drivers.can_frames import CanFrame, pack_frame
-from drivers.sweep import SEQUENCES
+from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
+from drivers.can.driver import CanBridgeDriver
+from drivers.can.frames import CanFrame, pack_frame
+from drivers.can.samples import SEQUENCES
 from drivers.twins.can import CanTwin
-from drivers.twins.grasps import Counts, GeneratedContact
+from drivers.twins.grasps.grasps import Counts, GeneratedContact
 from tests.drivers.can_standin import LOOPBACK, SocketBus
 
 Result = dict[str, object]
@@ -116,7 +116,7 @@ def over_standin(frames_per_s: float, seconds: float) -> Result:
     go = multiprocessing.Event()
     with SocketBus() as bus:
         sender = multiprocessing.Process(target=feed, args=(bus, frames_per_s, sweeps, go))
-        with mock.patch("drivers.can_bus.can.Bus", return_value=bus):
+        with mock.patch("drivers.can.bus.can.Bus", return_value=bus):
             driver = CanBridgeDriver("socketcan", LOOPBACK, arbitration_id=SAMPLE_ID)
             with driver:
                 sender.start()

@@ -21,10 +21,16 @@ from daemon.judge.joints import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import Outcome
 from drivers.base import JointReading, TactileReading
-from drivers.twins.grasp_script import EndPoint, Phase, Timetable
-from drivers.twins.grasps import recorded_counts
-from drivers.twins.tactile_noise import fresh_residuals
-from drivers.twins.whole_grasps import Moment, Sampling, WholeGrasps, read_end_points, rest_above
+from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
+from drivers.twins.grasps.grasps import recorded_counts
+from drivers.twins.grasps.tactile_noise import fresh_residuals
+from drivers.twins.grasps.whole_grasps import (
+    Moment,
+    Sampling,
+    WholeGrasps,
+    read_end_points,
+    rest_above,
+)
 from models import zoo
 from models.runtime import TactileModel
 

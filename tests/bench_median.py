@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.twins.tactile_noise import MeasuredNoise
-from drivers.twins.whole_grasps import read_end_points
+from drivers.twins.grasps.tactile_noise import MeasuredNoise
+from drivers.twins.grasps.whole_grasps import read_end_points
 from models import zoo
 from models.runtime import TactileModel
 

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from drivers.base import TactileReading
-from drivers.palm import PalmDriver
-from drivers.twins.grasps import GeneratedContact
+from drivers.palm.driver import PalmDriver
+from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.palm import PalmTwin
 
 EXAMPLE = Path(__file__).parents[1] / "deploy" / "calibration" / "example_hand.toml"

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.spi_bridge import SpiBridgeDriver
-from drivers.twins.grasps import GeneratedContact
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.spi import SpiTwin
 from tests.drivers.bridge_bench import FINGERS, replug_times_s
 

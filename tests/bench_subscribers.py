@@ -27,7 +27,7 @@ import zmq
 from numpy.typing import NDArray
 
 from daemon.judge.verdict import Status, Verdict, decode_status, decode_verdict
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.live import HEARING, PATIENCE_S, Child, Subscriber, start_daemon, start_listeners, table
 
 WARM_UP_S = 1.0

@@ -35,8 +35,8 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from drivers.bridge_protocol import Start, encode
-from drivers.framing import DELIMITER
+from drivers.spi.framing import DELIMITER
+from drivers.spi.messages import Start, encode
 from models import zoo
 from models.runtime import TactileModel
 from tests.bench_hands import (

@@ -21,7 +21,7 @@ from typing import Final
 import zmq
 
 from daemon.judge.verdict import decode_verdict
-from drivers.replay import DEMO_RECORDING
+from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.recorded import messages
 

@@ -27,13 +27,13 @@ import zmq
 from numpy.typing import NDArray
 
 from drivers.base import FINGERS
-from drivers.bridge_protocol import Message, Sweep
+from drivers.spi.messages import Message, Sweep
 from drivers.twins.can import CanTwin, Outgoing
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasp_script import Durations, Phase
-from drivers.twins.grasps import Counts
+from drivers.twins.grasps.grasp_script import Durations, Phase
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.spi import SpiTwin
-from drivers.twins.whole_grasps import synthetic_grasps
 
 PATIENCE_S = 30.0
 """Longest wait for what must come, s."""

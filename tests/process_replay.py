@@ -24,13 +24,13 @@ from daemon.judge.pipeline import Pipeline
 from daemon.recording import IGNORED_FIELDS
 from daemon.reporter import Reporter
 from drivers.base import JointReading, Reading
-from drivers.can_decoders import CanCounters, make_decoder
-from drivers.can_formats import CanFormat
-from drivers.can_frames import CanFrame
-from drivers.replay import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.can.decoders import CanCounters, make_decoder
+from drivers.can.formats import CanFormat
+from drivers.can.frames import CanFrame
+from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps import recorded_counts
+from drivers.twins.grasps.grasps import recorded_counts
 from models.contract import Finger
 
 FOLDER: Final = Path(__file__).parent / "references"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.framing import DELIMITER, FrameParser, encode_frame
+from drivers.spi.framing import DELIMITER, FrameParser, encode_frame
 from tests.fuzz import FRAMES, TARGETS, FuzzError, Target, fuzz, load, main
 
 

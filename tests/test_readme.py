@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.judge.verdict import decode_verdict
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -131,7 +131,7 @@ def _try_drivers(wanted: scene.Scene) -> None:
         with contextlib.closing(driver):
             assembly.open_driver(driver)
     if isinstance(joints, scene_drivers.PalmJoints):
-        from drivers.hall_calibration import load_calibration
+        from drivers.palm.calibration import load_calibration
 
         load_calibration(joints.calibration)
 

@@ -25,7 +25,7 @@ from daemon.sockets import Sockets
 from daemon.stop import StopSignal
 from daemon.text import complain
 from drivers.base import Driver, DriverError, TactileReading
-from drivers.replay import DEMO_RECORDING
+from drivers.recordings.csv_player import DEMO_RECORDING
 from models.contract import ModelError
 from models.runtime import TactileModel
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from types import FrameType
 
 from drivers.base import DriverError
-from drivers.sweep import SEQUENCES
+from drivers.can.samples import SEQUENCES
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import Counts, recorded_counts
-from drivers.twins.whole_grasps import PALM_RATE_HZ, synthetic_grasps
+from drivers.twins.grasps.grasps import Counts, recorded_counts
+from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps
 from models.bts3 import FINGERS
 
 log = logging.getLogger("graspd")

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
-from drivers.recording import Recording, open_recording, read_lines
-from drivers.replay import DEMO_RECORDING, DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from drivers.recordings.csv_rows import Recording, open_recording, read_lines
 from models.bts3 import TABLES
 from models.contract import SeenCounts
 

@@ -17,8 +17,8 @@ from daemon.judge.joints import JointLimits, JointMotion
 from daemon.judge.verdict import Reason
 from daemon.reports.stability_steps import StepRow
 from drivers.base import COUNT_MAX, ELECTRODES, JointReading, TactileReading
-from drivers.hall import CoupledTable, Table
-from drivers.hall_calibration import CalibrationError, parse_calibration
+from drivers.palm.calibration import CalibrationError, parse_calibration
+from drivers.palm.hall import CoupledTable, Table
 from models.contract import Finger
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

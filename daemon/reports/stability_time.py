@@ -9,11 +9,11 @@ import numpy as np
 from daemon.reports.stability_steps import StepRow
 from drivers.base import ELECTRODES
 from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.bridge_protocol import Hello, Sweep
-from drivers.bridge_session import BridgeCounters, BridgeSession
-from drivers.clock import UNKNOWN_DELAY_NS, DeviceClock
-from drivers.frame_sweep import FrameSweeps
-from drivers.sweep import SweepCounters
+from drivers.can.samples import SweepCounters
+from drivers.can.sweep_frames import FrameSweeps
+from drivers.spi.clock import UNKNOWN_DELAY_NS, DeviceClock
+from drivers.spi.conversation import BridgeCounters, BridgeSession
+from drivers.spi.messages import Hello, Sweep
 
 TICK_HZ = 1_000_000
 S, MS = 1_000_000_000, 1_000_000

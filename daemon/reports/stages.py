@@ -18,8 +18,8 @@ from daemon.judge.plausibility import Plausibility
 from daemon.publisher import Publisher
 from daemon.reporter import Reporter
 from drivers.base import TactileReading
-from drivers.recording import Recording
-from drivers.recording_columns import electrode_columns
+from drivers.recordings.csv_columns import electrode_columns
+from drivers.recordings.csv_rows import Recording
 from models.electrodes import Electrodes
 from models.runtime import TactileModel
 

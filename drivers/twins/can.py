@@ -14,18 +14,18 @@ import can
 
 from drivers.base import ELECTRODES, FINGERS, DriverError, LinkError, Opened
 from drivers.biotac import E1, E24, PAC, PDC, TAC, TDC, encode_word
-from drivers.can_bus import open_bus
-from drivers.can_formats import (
+from drivers.can.bus import open_bus
+from drivers.can.formats import (
     SWEEP_BASE_ID,
     SWEEP_VERSION,
     CanFormat,
     SweepFrame,
     encode_sample,
 )
-from drivers.can_frames import STANDARD_ID_MAX
-from drivers.sweep import SEQUENCES
+from drivers.can.frames import STANDARD_ID_MAX
+from drivers.can.samples import SEQUENCES
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps import Counts
+from drivers.twins.grasps.grasps import Counts
 
 SAMPLE_ID: Final = 0x100
 """Arbitration id of the twin's samples: no public file says what the real board uses."""

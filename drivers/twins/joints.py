@@ -9,10 +9,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from drivers.datagrams import Endpoint
-from drivers.joint_message import JointMessage
+from drivers.joints.message import JointMessage
 from drivers.twins.datagrams import send_paced
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
+from drivers.udp.receiver import Endpoint
 
 RATE_HZ = 100.0
 SWING_S = 4.0

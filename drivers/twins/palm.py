@@ -9,8 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from drivers.base import FINGERS
-from drivers.datagrams import Endpoint
-from drivers.palm_packet import (
+from drivers.palm.packet import (
     CHANNELS,
     COMMAND_SENSOR_DATA,
     CYCLE_NS,
@@ -25,7 +24,8 @@ from drivers.palm_packet import (
 )
 from drivers.twins.datagrams import send_paced
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps import Counts
+from drivers.twins.grasps.grasps import Counts
+from drivers.udp.receiver import Endpoint
 
 SENSORS_AT_REST = (
     *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706),

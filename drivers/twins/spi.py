@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from drivers.base import Opened
 from drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.bridge_protocol import (
+from drivers.spi.framing import DELIMITER
+from drivers.spi.messages import (
     DIGEST,
     TEXT_BYTES,
     VERSION,
@@ -32,9 +33,8 @@ from drivers.bridge_protocol import (
     encode,
     frame_parser,
 )
-from drivers.framing import DELIMITER
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
-from drivers.twins.grasps import Counts
+from drivers.twins.grasps.grasps import Counts
 
 TICK_HZ = 1_000_000
 SLOT_NS = 80_000

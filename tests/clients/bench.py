@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from daemon.keys import make
-from drivers.replay import DEMO_RECORDING, DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 
 PATIENCE_S = 45.0

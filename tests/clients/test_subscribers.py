@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from daemon.judge.verdict import Verdict
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench_subscribers import Crowd, Setup, Turn, take_turn
 
 CROWD = Crowd(listeners=27, stopped=3, flood=True, garbage=True)

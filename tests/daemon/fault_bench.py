@@ -19,8 +19,8 @@ from daemon.judge.joints import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
-from drivers.twins.grasp_script import Durations
-from drivers.twins.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
+from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
 from models import zoo
 from models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, MS, Clock

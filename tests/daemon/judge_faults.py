@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.faults import FaultInjector, ReplayCounters, ReplayFaults
-from drivers.palm_packet import ROUND, PalmParser
-from drivers.palm_sweep import PalmSweeps, RoundCounters
+from drivers.palm.packet import ROUND, PalmParser
+from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
 from tests.daemon.fakes import FINGERS, MS

@@ -11,9 +11,9 @@ from typing import Any
 import zmq
 
 from daemon.judge.verdict import Verdict, decode_verdict
-from drivers.mcap_recording import McapRecording
-from drivers.recording import open_recording
-from drivers.replay import DEMO_RECORDING
+from daemon.record.mcap import McapRecording
+from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 
 

@@ -14,8 +14,8 @@ import pytest
 from daemon import assembly
 from daemon.judge.verdict import Outcome
 from daemon.scene import Scene, parse
-from drivers.replay import DEMO_TABLE, ReplayDriver
-from drivers.spi_bridge import SpiBridgeDriver
+from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
+from drivers.spi.driver import SpiBridgeDriver
 from models.contract import ConfidenceStep, ModelError
 from models.runtime import TactileModel
 from tests.daemon.fakes import Clock, reading

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
 from daemon.judge.fresh import FreshMedian
-from drivers.twins.grasps import recorded_counts
+from drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
 
 FF, MF, TH = 0, 1, 2

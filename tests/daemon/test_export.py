@@ -23,7 +23,7 @@ from daemon.judge.verdict import (
 )
 from daemon.record_files import MessageFile
 from drivers.base import RecordingError
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 from models.training.datasets import read_table
 from tests.daemon.processes import graspd
 

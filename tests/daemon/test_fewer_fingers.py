@@ -11,7 +11,7 @@ import onnxruntime as ort
 import pytest
 
 from daemon.judge.verdict import Verdict, decode_verdict
-from drivers.replay import DEMO_RECORDING, DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from models import zoo
 from models.contract import FEATURES_PER_FINGER, OUTPUT_NAME
 from tests.daemon.processes import graspd

@@ -13,7 +13,7 @@ import pytest
 
 from daemon.cost import CostError, Footprint, measure
 from daemon.footprint import CORE
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
@@ -33,20 +33,29 @@ NEVER = {
         "daemon.playback",
         "daemon.captures",
     ),
-    *("drivers.mcap_recording", "drivers.mcap_replay", "drivers.candump", "drivers.capture_replay"),
+    *(
+        "daemon.record.mcap",
+        "daemon.record.player",
+        "drivers.recordings.candump",
+        "drivers.recordings.capture_player",
+    ),
     *("zstandard", "lz4", "daemon.gatekeeper", "daemon.keys", "zmq.auth", "zmq.utils.monitor"),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or the latest verdict alone."""
 BUSES = {
-    "replay": {"drivers.replay", "drivers.recording", "drivers.faults"},
-    "spi": {"serial", "cobs", "drivers.spi_bridge", "drivers.serial_line"},
-    "can": {"can", "asyncio", "sqlite3", "drivers.can_bridge", "drivers.can_bus"},
-    "palm": {"drivers.palm", "drivers.palm_packet"},
+    "replay": {
+        "drivers.recordings.csv_player",
+        "drivers.recordings.csv_rows",
+        "drivers.recordings.faults",
+    },
+    "spi": {"serial", "cobs", "drivers.spi.driver", "drivers.spi.line"},
+    "can": {"can", "asyncio", "sqlite3", "drivers.can.driver", "drivers.can.bus"},
+    "palm": {"drivers.palm.driver", "drivers.palm.packet"},
 }
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
-JOINTS = {"daemon.judge.joints", "drivers.joints", "drivers.joint_message"}
-HALL = {"drivers.hall", "drivers.hall_calibration"}
+JOINTS = {"daemon.judge.joints", "drivers.joints.driver", "drivers.joints.message"}
+HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
 GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "fresh", "grip", "stillness")}
 STATISTICS = {"daemon.judge.session", "models.session"}
 KEPT = {"daemon.session_file", "daemon.session_keeper"}
@@ -54,7 +63,13 @@ ASK = {"daemon.questions"}
 
 FORBIDDEN = {
     # The demo's recording has joints; nothing is kept of a replay.
-    "demo": {*(BUSES["spi"] | BUSES["can"] | BUSES["palm"]), "drivers.joints", *HALL, *KEPT, *ASK},
+    "demo": {
+        *(BUSES["spi"] | BUSES["can"] | BUSES["palm"]),
+        "drivers.joints.driver",
+        *HALL,
+        *KEPT,
+        *ASK,
+    },
     "spi": BUSES["replay"] | BUSES["can"] | BUSES["palm"] | JOINTS | HALL | ASK,
     "can": BUSES["replay"] | BUSES["spi"] | BUSES["palm"] | JOINTS | HALL | ASK,
     "palm": BUSES["replay"] | BUSES["spi"] | BUSES["can"] | JOINTS | HALL | ASK,
@@ -223,7 +238,7 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     found = measured(written(tmp_path, text))
     parts = {part.name: part for part in found.parts}
     assert HALL | ASK | {"daemon.judge.joints"} <= set(found.modules)
-    assert below({"drivers.joints", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
+    assert below({"drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
     assert parts["joints"].modules > 0
     assert parts["sockets"].threads == ZMQ_THREADS  # those of one context, for both
     assert found.timed.judged is not None
@@ -257,7 +272,7 @@ def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training(
     unwanted |= BUSES["spi"] | BUSES["can"] | BUSES["palm"] | HALL | ASK
     unwanted.add("daemon.session_keeper")
     assert below(unwanted, modules) == []
-    assert "drivers.replay" in modules
+    assert "drivers.recordings.csv_player" in modules
 
 
 def test_what_is_measured_leaves_sockets_and_sessions_alone(tmp_path: Path) -> None:

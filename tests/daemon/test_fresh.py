@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.fresh import FreshMedian
-from drivers.twins.grasps import recorded_counts
+from drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
 
 SHAPE = (3, 24)

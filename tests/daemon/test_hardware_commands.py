@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.judge.verdict import Verdict, decode_verdict
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
 WANTED = 150

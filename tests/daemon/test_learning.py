@@ -12,7 +12,7 @@ from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.session import SessionCalibration
 from drivers.base import TactileReading
-from drivers.twins import synthetic
+from drivers.twins.grasps import synthetic
 from models import zoo
 from models.runtime import TactileModel
 

@@ -19,7 +19,7 @@ from daemon.judge.memory import JudgeMemory, decode, encode
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.verdict import Outcome, Reason
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from drivers.replay import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger
 from models.runtime import TactileModel
 from models.session import SessionState

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from daemon.text import printable
-from drivers.replay import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, graspd, start, wait_for
 
 ROOT = Path(__file__).parents[2]
@@ -57,7 +57,7 @@ def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) ->
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
     )
-    result = python(AT_IMPORT.format(module="drivers.faults"), "run", scene)
+    result = python(AT_IMPORT.format(module="drivers.recordings.faults"), "run", scene)
     assert result.returncode == 0, result.stderr
     assert "Traceback" not in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]

@@ -12,7 +12,7 @@ import zmq
 from daemon.binding import PublishError
 from daemon.judge.verdict import Outcome, Reason, Verdict, decode_verdict
 from daemon.questions import WAITING_MAX, Questions
-from drivers.replay import DEMO_RECORDING
+from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 
 PATIENCE_NS = 1_000_000_000

@@ -10,12 +10,12 @@ from typing import Any
 
 import can
 
+from daemon.record.mcap import header_of
 from daemon.recording import IGNORED_FIELDS
 from drivers.base import TactileReading
-from drivers.can_capture import CanCapture, frames_of
-from drivers.capture_replay import CaptureReplayDriver
-from drivers.mcap_recording import header_of
-from drivers.replay import DEMO_RECORDING
+from drivers.recordings.can_capture import CanCapture, frames_of
+from drivers.recordings.capture_player import CaptureReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.recorded import messages
 

@@ -25,8 +25,8 @@ from daemon.running import Parts, Runner, prepare
 from daemon.scene import Realtime
 from daemon.stop import StopSignal
 from drivers.base import TactileReading
-from drivers.replay import DEMO_TABLE
-from drivers.twins.grasps import Counts, recorded_counts
+from drivers.recordings.csv_player import DEMO_TABLE
+from drivers.twins.grasps.grasps import Counts, recorded_counts
 
 WORLD = """
 import ctypes, os, resource, sys

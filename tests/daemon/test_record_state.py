@@ -14,14 +14,14 @@ import pytest
 from daemon import assembly, scene
 from daemon.judge.pipeline import Judgement
 from daemon.playback import Playback
+from daemon.record import mcap as mcap_recording
 from daemon.record_files import MessageFile, Shelf
 from daemon.recorder import Recorder
 from daemon.recording import build_recorder
 from daemon.reporter import Reporter
 from daemon.scene import Record
-from drivers import mcap_recording
 from drivers.base import TactileReading
-from drivers.replay import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from tests.daemon.recorded import messages
 
 BOOT = "0123456789abcdef" * 2

@@ -19,13 +19,13 @@ import pytest
 
 from daemon import recorder as recorder_module
 from daemon import scene
+from daemon.record.mcap import McapRecording
 from daemon.record_files import MessageFile, Shelf, schemas
 from daemon.recorder import QUEUE_MAX, Recorder
 from daemon.scene import Record, SceneError
 from drivers.base import JointReading
-from drivers.mcap_recording import McapRecording
-from drivers.recording import open_recording
-from drivers.replay import DEMO_RECORDING
+from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.recordings.csv_rows import open_recording
 from tests import kill_recorder
 from tests.daemon.recorded import messages
 

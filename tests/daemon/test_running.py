@@ -26,7 +26,7 @@ from daemon.judge.verdict import (
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD
 
-DEMO = Path(__file__).parents[2] / "drivers" / "demo" / "synthetic_stream.csv"
+DEMO = Path(__file__).parents[2] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
 PATIENCE_S = 20.0
 
 SCENE = """

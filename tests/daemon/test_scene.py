@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from daemon.endpoint import check_endpoint
 from daemon.scene import SCENE_MAX_BYTES, Scene, SceneError, load
 from daemon.scene_drivers import ReplayFaultsSection, ReplayTactile
-from drivers.faults import ReplayFaults
+from drivers.recordings.faults import ReplayFaults
 
 GOOD = """
 [tactile]

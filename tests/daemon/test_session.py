@@ -24,8 +24,8 @@ from daemon.judge.verdict import GateState, Outcome, Reason
 from daemon.session_file import SessionFile, SessionFileError, exchanged, load
 from daemon.session_keeper import SAVE_PERIOD_NS, SessionKeeper
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.twins.grasp_script import Durations
-from drivers.twins.whole_grasps import synthetic_grasps
+from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from models import zoo
 from models.contract import Finger, SessionInput, Sharpness
 from models.inputs import SessionBuilder, raw_features

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from drivers.base import TactileReading
 from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.bridge_protocol import Hello, Message, Ping, Sweep, decode, encode, frame_parser
 from drivers.link import LinkState
-from drivers.spi_bridge import SpiBridgeDriver
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.messages import Hello, Message, Ping, Sweep, decode, encode, frame_parser
 from drivers.twins.spi import SpiTwin
 
 MS = 1_000_000

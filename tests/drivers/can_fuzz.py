@@ -7,9 +7,9 @@ import random
 import sys
 
 from drivers.base import TactileReading
-from drivers.can_decoders import CanCounters, CanDecoder, make_decoder
-from drivers.can_formats import CanFormat, SweepFrame, encode_sample
-from drivers.can_frames import CanFrame, FrameFlag, pack_frame, unpack_frame
+from drivers.can.decoders import CanCounters, CanDecoder, make_decoder
+from drivers.can.formats import CanFormat, SweepFrame, encode_sample
+from drivers.can.frames import CanFrame, FrameFlag, pack_frame, unpack_frame
 from tests.drivers.can_words import Clock, samples, truth, word
 
 SAMPLE_ID = 0x100

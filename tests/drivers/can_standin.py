@@ -11,13 +11,13 @@ import can
 import pytest
 
 from drivers.base import Reading, TactileReading
-from drivers.can_bridge import CanBridgeDriver
-from drivers.can_formats import encode_sample
-from drivers.can_frames import CanFrame, pack_frame
+from drivers.can.driver import CanBridgeDriver
+from drivers.can.formats import encode_sample
+from drivers.can.frames import CanFrame, pack_frame
 from drivers.kernel_stamps import SO_TIMESTAMPNS
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import Counts, GeneratedContact
+from drivers.twins.grasps.grasps import Counts, GeneratedContact
 from tests.drivers.can_words import Clock, samples
 
 MS = 1_000_000
@@ -110,7 +110,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, opener: Opener) -> None:
     def open_bus(**_: object) -> object:
         return opener()
 
-    monkeypatch.setattr("drivers.can_bus.can.Bus", open_bus)
+    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
 
 
 def channel() -> str:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from drivers.base import TactileReading
 from drivers.biotac import E1
-from drivers.can_decoders import CanCounters
-from drivers.sweep import SEQUENCES, SampleSweeps
+from drivers.can.decoders import CanCounters
+from drivers.can.samples import SEQUENCES, SampleSweeps
 
 FINGERS = 3
 SLOT_NS = 227_000

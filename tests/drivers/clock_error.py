@@ -1,4 +1,4 @@
-"""A device whose clock and ways are known exactly, to measure what `drivers.clock` makes of them.
+"""A device whose clock is known exactly: measures what `drivers.spi.clock` makes of it.
 
 `python -m tests.drivers.clock_error` prints the errors that the docstring states.
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.clock import DeviceClock
+from drivers.spi.clock import DeviceClock
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -6,7 +6,8 @@ import random
 
 import numpy as np
 
-from drivers.bridge_protocol import (
+from drivers.spi.framing import DELIMITER, ENCODED_MAX_BYTES, encode_frame
+from drivers.spi.messages import (
     DIGEST,
     UNSEEDED,
     Hello,
@@ -19,7 +20,6 @@ from drivers.bridge_protocol import (
     decode,
     frame_parser,
 )
-from drivers.framing import DELIMITER, ENCODED_MAX_BYTES, encode_frame
 from tests.fuzz import Target
 
 Value = tuple[int, bytes]

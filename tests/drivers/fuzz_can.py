@@ -9,7 +9,7 @@ import random
 from collections.abc import Callable, Sequence
 
 from drivers.biotac import CHANNELS
-from drivers.can_formats import (
+from drivers.can.formats import (
     Reject,
     SweepFrame,
     SynTouchSample,
@@ -17,7 +17,7 @@ from drivers.can_formats import (
     parse_sample,
     parse_sweep,
 )
-from drivers.can_frames import CanFrame, FrameFlag, pack_frame, unpack_frame
+from drivers.can.frames import CanFrame, FrameFlag, pack_frame, unpack_frame
 from tests.fuzz import Target
 
 SAMPLE_ID, SWEEP_ID = 0x100, 0x5B0

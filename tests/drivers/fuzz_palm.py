@@ -12,17 +12,17 @@ import math
 import random
 
 from drivers.base import COUNT_MAX, FINGERS
-from drivers.joint_message import (
+from drivers.joints.message import (
     ANGLE_MAX_RAD,
     JointCounters,
     JointMessage,
     JointParser,
     MessageOrder,
 )
-from drivers.palm_packet import Palm, PalmPacket, PalmParser
-from drivers.palm_sweep import PalmSweeps, RoundCounters
-from drivers.recording_columns import JOINTS
-from drivers.twins.grasps import GeneratedContact
+from drivers.palm.packet import Palm, PalmPacket, PalmParser
+from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.recordings.csv_columns import JOINTS
+from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.palm import PalmTwin
 from tests.fuzz import Target
 

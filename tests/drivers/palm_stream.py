@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from drivers.joints import JointStreamDriver
-from drivers.palm import PalmDriver
-from drivers.palm_packet import Palm, PalmPacket, PalmParser
-from drivers.palm_sweep import PalmSweeps, RoundCounters
-from drivers.twins.grasps import Counts
+from drivers.joints.driver import JointStreamDriver
+from drivers.palm.driver import PalmDriver
+from drivers.palm.packet import Palm, PalmPacket, PalmParser
+from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.twins.grasps.grasps import Counts
 from drivers.twins.palm import PalmTwin
 
 FINGERS = ("ff", "mf", "th")

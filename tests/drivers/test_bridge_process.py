@@ -18,8 +18,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.spi_bridge import SpiBridgeDriver
-from drivers.twins.grasps import recorded_counts
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.twins.grasps.grasps import recorded_counts
 from tests.drivers.bridge_c import (
     DIGEST,
     ELECTRODE_COMMANDS,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.biotac import SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, sample_command
-from drivers.bridge_protocol import (
+from drivers.spi.messages import (
     DIGEST,
     SCHEMA,
     Hello,

@@ -11,12 +11,12 @@ import can
 import pytest
 
 from drivers.base import Driver, DriverError, LinkError, TactileReading
-from drivers.can_bridge import CanBridgeDriver
-from drivers.can_formats import CanFormat
+from drivers.can.driver import CanBridgeDriver
+from drivers.can.formats import CanFormat
+from drivers.can.samples import SEQUENCES
 from drivers.link import LinkState
-from drivers.sweep import SEQUENCES
 from drivers.twins.can import SAMPLE_ID, CanTwin
-from drivers.twins.grasps import Counts, recorded_counts
+from drivers.twins.grasps.grasps import Counts, recorded_counts
 from tests.conftest import data_dir
 from tests.drivers.can_standin import (
     TwinLink,

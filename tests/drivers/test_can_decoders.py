@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from drivers.base import TactileReading
-from drivers.can_formats import CanFormat, SweepFrame, SweepStatus, encode_sample
-from drivers.can_frames import CanFrame, FrameFlag
+from drivers.can.formats import CanFormat, SweepFrame, SweepStatus, encode_sample
+from drivers.can.frames import CanFrame, FrameFlag
 from tests.drivers.can_fuzz import SAMPLE_ID, decoder
 from tests.drivers.can_words import samples, truth, word
 from tests.drivers.test_can_formats import E1_SAMPLE, SWEEP_EXAMPLE

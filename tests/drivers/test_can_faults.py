@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can_formats import CanFormat, SweepFrame
-from drivers.can_frames import CanFrame, FrameFlag
+from drivers.can.formats import CanFormat, SweepFrame
+from drivers.can.frames import CanFrame, FrameFlag
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import Counts
+from drivers.twins.grasps.grasps import Counts
 from tests.drivers.can_fuzz import decoder
 from tests.drivers.can_standin import (
     FailingBus,
@@ -90,7 +90,7 @@ def test_a_driver_that_loses_its_bus_again_and_again_invents_nothing(
         opened.append(FailingBus(real(**options)))
         return opened[-1]
 
-    monkeypatch.setattr("drivers.can_bus.can.Bus", open_bus)
+    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
     sent, losses = contact(120), 0
     with link.driver:
         for sweep, counts in enumerate(sent):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from drivers.base import FINGERS, TactileReading
 from drivers.biotac import decode_words
-from drivers.can_formats import (
+from drivers.can.formats import (
     SWEEP_BASE_ID,
     CanFormat,
     Reject,
@@ -24,7 +24,7 @@ from drivers.can_formats import (
     parse_sample,
     parse_sweep,
 )
-from drivers.can_frames import (
+from drivers.can.frames import (
     CanFrame,
     FrameFlag,
     describe_error,

@@ -11,8 +11,8 @@ import can
 import pytest
 
 from drivers.base import Reading
-from drivers.can_bridge import POLL_NS, SILENCE_MIN_NS, SILENCE_PERIODS, CanBridgeDriver
-from drivers.can_bus import FRAMES_PER_DRAIN, CanBus
+from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
+from drivers.can.driver import POLL_NS, SILENCE_MIN_NS, SILENCE_PERIODS, CanBridgeDriver
 from drivers.link import BACKOFF_MAX_S, LinkState
 from drivers.twins.can import SAMPLE_ID
 from tests.drivers.can_standin import (
@@ -170,7 +170,7 @@ def test_frames_per_second_are_told_until_there_are_none() -> None:
 
 def test_bus_options_reach_python_can_over_our_own(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, object] = {}
-    monkeypatch.setattr("drivers.can_bus.can.Bus", lambda **options: seen.update(options))
+    monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **options: seen.update(options))
     options = {"rx_queue_size": 7}
     CanBridgeDriver("virtual", "x", bitrate=500_000, bus_options=options).open()
     assert seen["rx_queue_size"] == 7

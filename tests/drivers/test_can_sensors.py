@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can_bridge import CanBridgeDriver
-from drivers.can_formats import encode_sample
+from drivers.can.driver import CanBridgeDriver
+from drivers.can.formats import encode_sample
 from tests.drivers.can_standin import ScriptedBus, bridge, channel, message, stand_in, tactile
 from tests.drivers.can_words import SLOT_NS, Clock, samples, truth
 

@@ -12,7 +12,7 @@ import can
 import pytest
 
 from drivers.base import Reading
-from drivers.can_bridge import (
+from drivers.can.driver import (
     CanBridgeDriver,
 )
 from drivers.link import LinkState
@@ -78,7 +78,7 @@ def test_an_slcan_adapter_is_read_and_its_unplugging_leaves_nothing_open(
 
 def test_data_bit_rates_reach_an_slcan_adapter(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, object] = {}
-    monkeypatch.setattr("drivers.can_bus.can.Bus", lambda **options: seen.update(options))
+    monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **options: seen.update(options))
     bus = CanBridgeDriver(
         "slcan", "/dev/null", format="sweep_fd", bitrate=1_000_000, data_bitrate=5_000_000
     )

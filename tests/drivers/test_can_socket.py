@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can_bridge import (
+from drivers.can.driver import (
     REST_MAX_NS,
     CanBridgeDriver,
 )
-from drivers.can_formats import CanFormat
-from drivers.can_frames import CanFrame, FrameFlag, pack_frame
+from drivers.can.formats import CanFormat
+from drivers.can.frames import CanFrame, FrameFlag, pack_frame
 from drivers.kernel_stamps import SO_RXQ_OVFL
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID, CanTwin

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from drivers.base import DriverError, LinkError, TactileReading
-from drivers.can_bridge import CanBridgeDriver
+from drivers.can.driver import CanBridgeDriver
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import GeneratedContact
+from drivers.twins.grasps.grasps import GeneratedContact
 from tests.drivers.can_standin import (
     bridge,
     channel,
@@ -112,7 +112,7 @@ def test_packages_are_named_as_they_are_installed(
     def refuse(**_: object) -> object:
         raise can.CanInterfaceNotImplementedError(says)
 
-    monkeypatch.setattr("drivers.can_bus.can.Bus", refuse)
+    monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
     with pytest.raises(LinkError, match=f"pip install {package}$"):
         CanTwin("slcan", "/dev/null", iter(())).open()
 
@@ -121,7 +121,7 @@ def test_a_library_that_does_not_work_here_says_why(monkeypatch: pytest.MonkeyPa
     def refuse(**_: object) -> object:
         raise can.CanInterfaceNotImplementedError("Windows only")
 
-    monkeypatch.setattr("drivers.can_bus.can.Bus", refuse)
+    monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
     with pytest.raises(LinkError, match="does not work here: Windows only"):
         CanTwin("vector", "0", iter(())).open()
 

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base import RecordingError
-from drivers.can_capture import CanCapture, frames_of
-from drivers.can_frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
-from drivers.candump import frame_of, line_of
-from drivers.capture_replay import CaptureReplayDriver
-from drivers.raw_capture import RawParser, RawRecord, Way, encode_records
-from drivers.serial_capture import SerialCapture, records_of
+from drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
+from drivers.recordings.can_capture import CanCapture, frames_of
+from drivers.recordings.candump import frame_of, line_of
+from drivers.recordings.capture_player import CaptureReplayDriver
+from drivers.recordings.serial_capture import SerialCapture, records_of
+from drivers.recordings.serial_file import RawParser, RawRecord, Way, encode_records
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.clock import AGE_MAX_NS, UNKNOWN_DELAY_NS, DeviceClock
+from drivers.spi.clock import AGE_MAX_NS, UNKNOWN_DELAY_NS, DeviceClock
 from tests.drivers.clock_error import (
     MS,
     START_NS,

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.faults import ReplayFaults
-from drivers.replay import DEMO_TABLE, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_TABLE, Pace, ReplayDriver
+from drivers.recordings.faults import ReplayFaults
 from tests.drivers.tables import stream, table, write
 
 MS = 1_000_000

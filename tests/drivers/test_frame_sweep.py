@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can_decoders import CanCounters
-from drivers.frame_sweep import LATE_FRAMES_MAX, SEQUENCE_JUMP_MAX, FrameSweeps
-from drivers.sweep import OUTAGE_NS, PERIODS_NEEDED
+from drivers.can.decoders import CanCounters
+from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED
+from drivers.can.sweep_frames import LATE_FRAMES_MAX, SEQUENCE_JUMP_MAX, FrameSweeps
 from tests.drivers.can_words import FINGERS, assert_true, truth, word
 
 MISSING = ElectrodeFault.MISSING

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from drivers.framing import ENCODED_MAX_BYTES, FrameParser, encode_frame
+from drivers.spi.framing import ENCODED_MAX_BYTES, FrameParser, encode_frame
 
 
 def slow_crc32(data: bytes, start: int = 0) -> int:

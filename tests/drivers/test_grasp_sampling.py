@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.twins.grasp_script import Durations, EndPoint
-from drivers.twins.grasps import recorded_counts
-from drivers.twins.tactile_noise import MeasuredNoise, fresh_residuals
-from drivers.twins.whole_grasps import Moment, Sampling, WholeGrasps, synthetic_grasps
+from drivers.twins.grasps.grasp_script import Durations, EndPoint
+from drivers.twins.grasps.grasps import recorded_counts
+from drivers.twins.grasps.tactile_noise import MeasuredNoise, fresh_residuals
+from drivers.twins.grasps.whole_grasps import Moment, Sampling, WholeGrasps, synthetic_grasps
 
 REST = np.full((3, 24), 3000.0)
 UNPRESSED = EndPoint(REST.astype(np.uint16), False, "nothing")

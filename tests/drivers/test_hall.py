@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.hall import JOINTS, Calibration, CoupledTable, Table, impossible_angles
-from drivers.hall_calibration import CalibrationError, load_calibration, parse_calibration
+from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
+from drivers.palm.hall import JOINTS, Calibration, CoupledTable, Table, impossible_angles
 
 EXAMPLE = Path(__file__).parents[2] / "deploy" / "calibration" / "example_hand.toml"
 FFJ1 = [[3109, 0.0], [2673, 22.5], [1942, 45.0], [1247, 67.5], [649, 90.0]]

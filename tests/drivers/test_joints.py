@@ -13,13 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.base import Driver, JointReading, LinkError
-from drivers.joint_message import (
+from drivers.joints.driver import JointStreamDriver
+from drivers.joints.message import (
     DATAGRAM_BYTES_MAX,
     JointCounters,
     JointMessage,
     JointParser,
 )
-from drivers.joints import JointStreamDriver
 from drivers.link import LinkState
 from drivers.twins.faults import LinkFaults
 from drivers.twins.joints import JointTwin

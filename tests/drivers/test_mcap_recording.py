@@ -13,10 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon.record.mcap import McapRecording, RecordedMessage
+from daemon.record.player import McapReplayDriver
 from daemon.record_files import Joints, MessageFile
 from drivers.base import JointReading, RecordingError, TactileReading
-from drivers.mcap_recording import McapRecording, RecordedMessage
-from drivers.mcap_replay import McapReplayDriver
 
 BOOT = "0123456789abcdef" * 2
 OFFSET_NS = 10**18

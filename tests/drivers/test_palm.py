@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from drivers.base import Driver, LinkError, Reading
-from drivers.datagrams import DatagramReceiver
-from drivers.hall_calibration import CalibrationError
 from drivers.link import LinkState
-from drivers.palm import PalmDriver
-from drivers.palm_packet import Palm
+from drivers.palm.calibration import CalibrationError
+from drivers.palm.driver import PalmDriver
+from drivers.palm.packet import Palm
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import GeneratedContact, recorded_counts
+from drivers.twins.grasps.grasps import GeneratedContact, recorded_counts
 from drivers.twins.palm import PalmTwin
+from drivers.udp.receiver import DatagramReceiver
 from tests.conftest import ROOT, data_dir
 from tests.drivers.palm_stream import (
     MS,
@@ -308,7 +308,7 @@ def test_a_twin_at_full_pace_is_found_again_after_its_link_broke() -> None:
 def test_without_a_calibration_there_are_no_joints_and_no_joint_code() -> None:
     program = (
         "import sys\n"
-        "from drivers.palm import PalmDriver\n"
+        "from drivers.palm.driver import PalmDriver\n"
         f"with PalmDriver({LOOPBACK!r}):\n"
         "    sys.exit(any('hall' in name or 'twins' in name for name in sys.modules))\n"
     )

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm_packet import PalmParser
-from drivers.palm_sweep import PalmSweeps, RoundCounters
+from drivers.palm.packet import PalmParser
+from drivers.palm.rounds import PalmSweeps, RoundCounters
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm_stream import FINGERS, MS, ROUND, Played, play, row_of, rows

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.base import RecordingError
-from drivers.palm import PalmDriver
-from drivers.palm_packet import Palm
+from drivers.palm.driver import PalmDriver
+from drivers.palm.packet import Palm
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm_stream import MS, Clock, datagrams, rows, tactile
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.palm_packet import (
+from drivers.palm.packet import (
     CHANNELS,
     CanRecord,
     Motor,

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault
-from drivers.palm_packet import PalmPacket
-from drivers.palm_sweep import PalmSweeps, RoundCounters
+from drivers.palm.packet import PalmPacket
+from drivers.palm.rounds import PalmSweeps, RoundCounters
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import recorded_counts
+from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.palm import PalmTwin
 from tests.conftest import data_dir
 from tests.drivers.palm_stream import (

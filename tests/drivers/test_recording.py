@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault, RecordingError
-from drivers.recording import (
+from drivers.recordings.csv_rows import (
     LINE_BYTES_MAX,
     Recording,
     open_recording,

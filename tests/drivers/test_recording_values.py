@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.base import ElectrodeFault, RecordingError
-from drivers.recording import (
+from drivers.recordings.csv_rows import (
     count_of,
     number_of,
 )

@@ -19,7 +19,7 @@ from drivers.base import (
     RecordingError,
     TactileReading,
 )
-from drivers.replay import DEMO_TABLE, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_TABLE, Pace, ReplayDriver
 from tests.drivers.tables import ELECTRODES, FINGERS, TABLE_HEADER, count, stream, table, write
 
 MS = 1_000_000

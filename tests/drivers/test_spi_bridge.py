@@ -9,11 +9,11 @@ import pytest
 
 from drivers.base import ElectrodeFault
 from drivers.biotac import E1, PAC, SEQUENCE_ALL, SEQUENCE_INTERLEAVED, SEQUENCE_PRESSURE, TDC
-from drivers.bridge_protocol import DIGEST, Status, Stop, encode
-from drivers.clock import UNKNOWN_DELAY_NS
-from drivers.framing import encode_frame
 from drivers.link import LinkState
-from drivers.spi_bridge import SpiBridgeDriver
+from drivers.spi.clock import UNKNOWN_DELAY_NS
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.framing import encode_frame
+from drivers.spi.messages import DIGEST, Status, Stop, encode
 from tests.drivers.bridge_bench import (
     FINGERS,
     Clock,

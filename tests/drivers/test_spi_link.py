@@ -14,11 +14,11 @@ import pytest
 
 from drivers.base import Driver, DriverError
 from drivers.biotac import SEQUENCE_ALL
-from drivers.bridge_protocol import DIGEST, Ping, Start, Stop, encode
-from drivers.framing import encode_frame
 from drivers.link import LinkState
-from drivers.serial_line import SerialLine
-from drivers.spi_bridge import SpiBridgeDriver
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.framing import encode_frame
+from drivers.spi.line import SerialLine
+from drivers.spi.messages import DIGEST, Ping, Start, Stop, encode
 from tests.drivers.bridge_bench import FINGERS, MS, Clock, Rig, ScriptedBridge, hello, sweep, take
 
 

@@ -15,11 +15,11 @@ from cobs import cobs
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.biotac import SEQUENCE_INTERLEAVED
-from drivers.bridge_protocol import DIGEST
-from drivers.clock import UNKNOWN_DELAY_NS
-from drivers.spi_bridge import SpiBridgeDriver
+from drivers.spi.clock import UNKNOWN_DELAY_NS
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.messages import DIGEST
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps import Counts, GeneratedContact, recorded_counts
+from drivers.twins.grasps.grasps import Counts, GeneratedContact, recorded_counts
 from drivers.twins.spi import SpiTwin
 from tests.conftest import data_dir
 from tests.drivers.bridge_bench import FINGERS, MS, replug_times_s, run

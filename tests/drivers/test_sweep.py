@@ -9,8 +9,8 @@ import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.biotac import PAC, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE
-from drivers.can_decoders import CanCounters
-from drivers.sweep import OUTAGE_NS, PERIODS_NEEDED, SEQUENCES, SampleSweeps
+from drivers.can.decoders import CanCounters
+from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED, SEQUENCES, SampleSweeps
 from tests.drivers.can_words import (
     FINGERS,
     SLOT_NS,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.base import TactileReading
-from drivers.sweep import NEXT_SWEEP_PERIODS, SEQUENCES, SampleSweeps
+from drivers.can.samples import NEXT_SWEEP_PERIODS, SEQUENCES, SampleSweeps
 from tests.drivers.can_words import (
     FINGERS,
     SLOT_NS,

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.base import RecordingError
-from drivers.replay import DEMO_TABLE
-from drivers.twins import synthetic
+from drivers.recordings.csv_player import DEMO_TABLE
+from drivers.twins.grasps import synthetic
 
 RANGE_MARGIN_COUNTS = 250
 

@@ -11,12 +11,18 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.base import RecordingError
-from drivers.replay import DEMO_RECORDING, DEMO_TABLE
-from drivers.twins import whole_grasps
-from drivers.twins.grasp_script import EndPoint, Phase, Timetable
-from drivers.twins.grasps import recorded_counts
-from drivers.twins.tactile_noise import fresh_residuals
-from drivers.twins.whole_grasps import Moment, Sampling, WholeGrasps, rest_above, synthetic_grasps
+from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from drivers.twins.grasps import whole_grasps
+from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
+from drivers.twins.grasps.grasps import recorded_counts
+from drivers.twins.grasps.tactile_noise import fresh_residuals
+from drivers.twins.grasps.whole_grasps import (
+    Moment,
+    Sampling,
+    WholeGrasps,
+    rest_above,
+    synthetic_grasps,
+)
 from tests.drivers.tables import rows_of, stream, table, write
 
 REST = np.full((3, 24), 3000.0)

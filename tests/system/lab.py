@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.twins.grasp_script import Durations
+from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.spi import SpiTwin
-from drivers.twins.whole_grasps import synthetic_grasps
 from tests.system.machine import COMMAND_TIMEOUT_S, Machine
 from tests.system.messages import Message
 

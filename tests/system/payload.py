@@ -34,7 +34,8 @@ def make_payload(cache: Path, disk: Path) -> None:
         _wheel(wheels, "--no-deps", str(PROJECT))
         shutil.copytree(PROJECT / "deploy", content / "deploy")
         shutil.copy(
-            PROJECT / "drivers" / "demo" / "synthetic_grasps.csv", content / "recording.csv"
+            PROJECT / "drivers" / "recordings" / "demo" / "synthetic_grasps.csv",
+            content / "recording.csv",
         )
         shutil.copytree(GUEST, content / "guest", ignore=shutil.ignore_patterns("__pycache__"))
         bytes_ = sum(path.stat().st_size for path in content.rglob("*"))

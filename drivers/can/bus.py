@@ -1,0 +1,276 @@
+"""One bus of python-can, drained without waiting; whatever it raises becomes a link failure.
+
+python-can's `recv` costs several times what the frame itself costs, so on `socketcan` the bus's
+own socket is read instead. Its arrival stamps are wall time, which can step. They are turned into
+monotonic time by the distance of the two clocks at the moment of reading, so that only a step
+between arrival and reading can falsify them: forward makes a frame look old, backward as if it
+had just come. Where the stamps are not wall time of the arrival, a frame is as old as it can be: it
+came after the last moment at which the bus had nothing more to read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import select
+import socket
+import stat
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import can
+
+from drivers.base import DriverError, LinkError
+from drivers.can.frames import (
+    CANFD_FRAME,
+    ERROR,
+    EXTENDED,
+    FD,
+    LOST,
+    REMOTE,
+    CanFrame,
+    unpack_frame,
+)
+from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
+
+FRAMES_PER_DRAIN: Final = 512
+"""Frames taken at once, some 100 ms of a full bus, so that the loop gets its turn."""
+RECEIVE_BUFFER_BYTES: Final = 1 << 20
+"""Asked of the kernel for sockets; the usual 208 KiB hold 60 ms at 4400 frames/s."""
+STAMPED_INTERFACES: Final = frozenset({"socketcan", "udp_multicast", "virtual"})
+"""Interfaces of python-can whose time stamps are wall time of the arrival on this host."""
+
+_OPTIONS: Final[dict[str, dict[str, Any]]] = {
+    # Its defaults wait: 2 s after opening, 1 ms in every read.
+    "slcan": {"sleep_after_open": 0.0, "timeout": 0.0},
+    # Its default queue has no bound; this one holds some 4 s of a full bus.
+    "virtual": {"rx_queue_size": 16384},
+}
+
+_PACKAGES: Final = {"serial": "pyserial"}
+"""Packages whose names are not those of their modules."""
+_MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
+
+Stamped = tuple[CanFrame, int, int]
+"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
+interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
+
+
+def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+    """A bus of python-can. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+    if interface not in can.VALID_INTERFACES:
+        known = "socketcan, slcan, udp_multicast, virtual"
+        raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
+    try:
+        if interface == "socketcan":
+            socket.if_nametoindex(channel)
+        return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
+    except (NotImplementedError, ImportError) as error:
+        raise DriverError(_what_is_missing(interface, error)) from error
+    except Exception as error:
+        raise LinkError(f"cannot open {interface} {channel}: {error}") from error
+
+
+def _what_is_missing(interface: str, error: Exception) -> str:
+    missing = _MISSING_MODULE.search(str(error))
+    if missing is None:
+        return f"python-can's interface {interface!r} does not work here: {error}"
+    name = missing[1] or missing[2]
+    name = _PACKAGES.get(name, name)
+    return f"python-can's interface {interface!r} needs the package {name}: pip install {name}"
+
+
+class CanBus:
+    """Opens, drains and closes one bus."""
+
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        options: Mapping[str, Any],
+        clock: Callable[[], int],
+        wall_clock: Callable[[], int],
+    ) -> None:
+        """`options` go to the constructor of python-can's bus, over the ones that we need."""
+        self.failure: str | None = None
+        """Why the bus is of no use any more, None while it is."""
+        self.more = False
+        """Whether the last drain left frames behind."""
+        self.tap: Callable[[list[Stamped]], None] | None = None
+        """Gets what every drain brings, if it brings anything."""
+        self._malformed = 0
+        self._kernel_drops = 0
+        self._interface = interface
+        self._channel = channel
+        self._options = {**_OPTIONS.get(interface, {}), **options}
+        self._stamped = interface in STAMPED_INTERFACES
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._bus: can.BusABC | None = None
+        self._socket: socket.socket | None = None
+        self._fileno: int | None = None
+        self._drops_seen = 0
+        self._idle_ns = 0
+
+    def open(self) -> None:
+        """Take the bus. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+        self.close()
+        self.failure = None
+        self._idle_ns = self._clock()
+        self._bus = bus = open_bus(self._interface, self._channel, self._options)
+        self._fileno = _fileno(bus)
+        if self._fileno is not None:
+            _enlarge_buffer(self._fileno)
+        if self._interface == "socketcan":
+            self._use_socket(bus)
+
+    def close(self) -> None:
+        """Let go of the bus, whatever state it is in."""
+        bus, self._bus = self._bus, None
+        self._socket = self._fileno = None
+        if bus is None:
+            return
+        with contextlib.suppress(Exception):
+            bus.shutdown()
+        # slcan's shutdown first talks to the adapter, and keeps the port if that fails.
+        port = getattr(bus, "serialPortOrig", None)
+        if port is not None:
+            with contextlib.suppress(Exception):
+                port.close()
+
+    def fileno(self) -> int | None:
+        """Descriptor to wait on, None where the interface has none."""
+        return self._fileno
+
+    def take_malformed(self) -> int:
+        """Records from the socket that are no CAN frames, since the last call."""
+        taken, self._malformed = self._malformed, 0
+        return taken
+
+    def take_kernel_drops(self) -> int:
+        """Frames dropped by the kernel because its buffer was full, since the last call."""
+        taken, self._kernel_drops = self._kernel_drops, 0
+        return taken
+
+    def drain(self) -> list[Stamped]:
+        """Frames that have arrived, oldest first, at most `FRAMES_PER_DRAIN`.
+
+        Never raises and never waits: a broken bus sets `failure`, after the frames before it.
+        """
+        frames: list[Stamped] = []
+        self.more = False
+        try:
+            if self._socket is not None:
+                self._drain_socket(self._socket, frames)
+            elif self._bus is not None:
+                self._drain_bus(self._bus, frames)
+        except BlockingIOError:
+            pass
+        except Exception as error:  # noqa: BLE001 (python-can lets any exception through)
+            self.failure = f"{type(error).__name__}: {error}"
+        else:
+            self.more = len(frames) >= FRAMES_PER_DRAIN
+        if self.tap is not None and frames:
+            self.tap(frames)
+        return frames
+
+    def _use_socket(self, bus: can.BusABC) -> None:
+        """Read the bus's socket ourselves, and have the kernel report what it drops."""
+        raw = getattr(bus, "socket", None)
+        if not isinstance(raw, socket.socket):
+            return
+        self._drops_seen = 0
+        with contextlib.suppress(OSError):
+            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        self._socket = raw
+
+    def _drain_socket(self, raw: socket.socket, frames: list[Stamped]) -> None:
+        now_ns = self._clock()
+        ahead_ns = now_ns - self._wall_clock()
+        for _ in range(FRAMES_PER_DRAIN):
+            record, ancillary, _flags, _sender = raw.recvmsg(
+                CANFD_FRAME.size, ANCILLARY_BYTES, socket.MSG_DONTWAIT
+            )
+            t_ns = now_ns
+            for level, kind, data in ancillary:
+                if level != socket.SOL_SOCKET:
+                    continue
+                if kind == SO_TIMESTAMPNS and len(data) == TIMESPEC.size:
+                    seconds, nanoseconds = TIMESPEC.unpack(data)
+                    t_ns = min(seconds * 1_000_000_000 + nanoseconds + ahead_ns, now_ns)
+                elif kind == SO_RXQ_OVFL and len(data) == DROPS.size:
+                    (total,) = DROPS.unpack(data)
+                    self._count_drops(total, frames)
+            frame = unpack_frame(record)
+            if frame is None:
+                self._malformed += 1
+            else:
+                frames.append((frame, t_ns, t_ns))
+
+    def _count_drops(self, total: int, frames: list[Stamped]) -> None:
+        """The kernel reports a running sum of 32 bits per socket, with the frame after the loss."""
+        dropped = (total - self._drops_seen) % (1 << 32)
+        if dropped:
+            now_ns = self._clock()
+            frames.append((CanFrame(0, b"", LOST), now_ns, now_ns))
+        self._kernel_drops += dropped
+        self._drops_seen = total
+
+    def _drain_bus(self, bus: can.BusABC, frames: list[Stamped]) -> None:
+        if not self._stamped:
+            self._drain_unstamped(bus, frames)
+            return
+        now_ns = self._clock()
+        ahead_ns = now_ns - self._wall_clock()
+        for _ in range(FRAMES_PER_DRAIN):
+            message = bus.recv(timeout=0)
+            if message is None:
+                return
+            t_ns = min(round(message.timestamp * 1e9) + ahead_ns, now_ns)
+            frames.append((_frame_of(message), t_ns, t_ns))
+
+    def _drain_unstamped(self, bus: can.BusABC, frames: list[Stamped]) -> None:
+        since_ns = self._idle_ns
+        for _ in range(FRAMES_PER_DRAIN):
+            before_ns = self._clock()
+            message = bus.recv(timeout=0)
+            if message is not None:
+                frames.append((_frame_of(message), since_ns, self._clock()))
+            elif not _has_more(self._fileno):
+                self._idle_ns = before_ns
+                return
+
+
+def _fileno(bus: can.BusABC) -> int | None:
+    """Descriptor of a bus, None where it has none."""
+    try:
+        descriptor = bus.fileno()
+    except Exception:  # noqa: BLE001 (python-can lets any exception through)
+        return None
+    return descriptor if descriptor >= 0 else None
+
+
+def _has_more(descriptor: int | None) -> bool:
+    """Whether a descriptor is readable: slcan takes an adapter's own words for the end."""
+    if descriptor is None:
+        return False
+    poll = select.poll()
+    poll.register(descriptor, select.POLLIN)
+    return any(event & select.POLLIN for _, event in poll.poll(0))
+
+
+def _enlarge_buffer(descriptor: int) -> None:
+    """Let the kernel keep more frames while the loop is busy, where the descriptor is a socket."""
+    if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+        return
+    with socket.socket(fileno=os.dup(descriptor)) as same, contextlib.suppress(OSError):
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+
+
+def _frame_of(message: can.Message) -> CanFrame:
+    flags = EXTENDED if message.is_extended_id else 0
+    flags |= REMOTE if message.is_remote_frame else 0
+    flags |= ERROR if message.is_error_frame else 0
+    flags |= FD if message.is_fd else 0
+    return CanFrame(message.arbitration_id, bytes(message.data or b""), flags)

@@ -1,0 +1,155 @@
+"""What the data bytes of a CAN frame mean: SynTouch's samples, and sweep frames of our own.
+
+SynTouch's board sends one classic frame per sample: the command byte, then each sensor's raw
+response word. Source: the public driver of that board, `clearpathrobotics/numatac_can_driver`
+(`numatac_can_driver.cpp`, `bt_can.h`); its words are those of `drivers.biotac`. Neither the
+arbitration id nor the frame length is written down in public, so both are configuration.
+
+The sweep frame is graspd's own: one CAN FD frame per finger and sweep. No product sends it.
+Both are described in `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc`.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntFlag, StrEnum
+from typing import Final, NamedTuple
+
+from drivers.base import ELECTRODES, FINGERS
+from drivers.biotac import CHANNELS, sample_command
+from drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
+
+SENSORS_MAX: Final = 3
+"""Sensors whose words fit into a classic frame behind the command byte."""
+WORD_BYTES: Final = 2
+
+SWEEP_VERSION: Final = 1
+"""Version of the sweep frame's layout; it changes with every change of meaning."""
+SWEEP_BASE_ID: Final = 0x5B0
+"""Arbitration id of finger 0 unless the scene says otherwise; finger i has base + i."""
+SWEEP_WORDS_BYTES: Final = ELECTRODES * WORD_BYTES
+_SWEEP_HEAD: Final = struct.Struct("<BBHI")
+_SWEEP_STATUS: Final = struct.Struct("<H")
+_STATUS_AT: Final = _SWEEP_HEAD.size + SWEEP_WORDS_BYTES
+_RESERVED_AT: Final = _STATUS_AT + _SWEEP_STATUS.size
+_RESERVED: Final = bytes(FD_DATA_MAX - _RESERVED_AT)
+
+_CHANNEL_OF_COMMAND: Final = {sample_command(channel): channel for channel in CHANNELS}
+
+
+class CanFormat(StrEnum):
+    """Which of the two formats a bus carries."""
+
+    SYNTOUCH = "syntouch"
+    """SynTouch's board: one classic frame per sample."""
+    SWEEP_FD = "sweep_fd"
+    """graspd's own: one CAN FD frame per finger and sweep."""
+
+
+class Reject(StrEnum):
+    """Why data is not of the format."""
+
+    LENGTH = "wrong length"
+    COMMAND = "unknown command byte"
+    VERSION = "unknown layout version"
+    CONTENT = "contents that the layout forbids"
+
+
+class SynTouchSample(NamedTuple):
+    """One channel sampled by all sensors at once."""
+
+    channel: int
+    words: bytes
+    """The sensors' response words in turn, two bytes each, first byte on the wire first."""
+
+
+class SweepStatus(IntFlag):
+    """Status bits of a sweep frame. The others are reserved and zero."""
+
+    NONE = 0
+    ABSENT = 1
+    """The sensor did not answer when it was last looked for: its words mean nothing."""
+    REPEATED = 2
+    """The words are those of an earlier sweep: nothing new was sampled."""
+    OVERRUN = 4
+    """The sweep began late because the one before it took too long."""
+
+
+_STATUS_BITS: Final = int(SweepStatus.ABSENT | SweepStatus.REPEATED | SweepStatus.OVERRUN)
+
+
+@dataclass(frozen=True, slots=True)
+class SweepFrame:
+    """All electrodes of one finger, sampled in one sweep."""
+
+    finger: int
+    """Place in `drivers.base.FINGERS`: 0 ff, 1 mf, 2 rf, 3 lf, 4 th."""
+    sequence: int
+    """Counts the device's sweeps, the same for all fingers, wraps at 65536."""
+    tick_us: int
+    """The device's clock when the sweep ended, microseconds, wraps at 2**32."""
+    words: bytes
+    """Response words of E1 to E24, 48 bytes, first byte on the SPI wire first."""
+    status: int = 0
+    """`SweepStatus` bits."""
+
+    def to_bytes(self) -> bytes:
+        """The 64 bytes. Raises `ValueError` for a value that does not fit."""
+        if not 0 <= self.finger < len(FINGERS):
+            raise ValueError(f"finger is {self.finger}, must be in 0..{len(FINGERS) - 1}")
+        if len(self.words) != SWEEP_WORDS_BYTES:
+            raise ValueError(f"words have {len(self.words)} bytes, not {SWEEP_WORDS_BYTES}")
+        if self.status & ~_STATUS_BITS:
+            raise ValueError(f"status {self.status:#06x} has reserved bits")
+        if not 0 <= self.sequence < 1 << 16:
+            raise ValueError(f"sequence {self.sequence} does not fit into 16 bits")
+        if not 0 <= self.tick_us < 1 << 32:
+            raise ValueError(f"tick_us {self.tick_us} does not fit into 32 bits")
+        head = _SWEEP_HEAD.pack(SWEEP_VERSION, self.finger, self.sequence, self.tick_us)
+        return head + self.words + _SWEEP_STATUS.pack(self.status) + _RESERVED
+
+
+def encode_sample(channel: int, words: bytes) -> bytes:
+    """Data of a SynTouch frame. Raises `ValueError` for a channel or words that cannot be sent."""
+    if not words or len(words) % WORD_BYTES or len(words) > SENSORS_MAX * WORD_BYTES:
+        raise ValueError(f"{len(words)} bytes are not the words of 1 to {SENSORS_MAX} sensors")
+    return bytes((sample_command(channel),)) + words
+
+
+def parse_sample(data: bytes, sensors: int, length: int) -> SynTouchSample | Reject:
+    """The sample in a frame of `length` bytes of which `1 + 2 * sensors` are used."""
+    if len(data) != length:
+        return Reject.LENGTH
+    channel = _CHANNEL_OF_COMMAND.get(data[0])
+    if channel is None:
+        return Reject.COMMAND
+    return SynTouchSample(channel, data[1 : 1 + WORD_BYTES * sensors])
+
+
+def parse_sweep(data: bytes) -> SweepFrame | Reject:
+    """The sweep frame in the data of a CAN FD frame."""
+    if len(data) != FD_DATA_MAX:
+        return Reject.LENGTH
+    version, finger, sequence, tick_us = _SWEEP_HEAD.unpack_from(data)
+    if version != SWEEP_VERSION:
+        return Reject.VERSION
+    (status,) = _SWEEP_STATUS.unpack_from(data, _STATUS_AT)
+    if finger >= len(FINGERS) or status & ~_STATUS_BITS or data[_RESERVED_AT:] != _RESERVED:
+        return Reject.CONTENT
+    return SweepFrame(finger, sequence, tick_us, data[_SWEEP_HEAD.size : _STATUS_AT], status)
+
+
+def sample_length(sensors: int, length: int | None) -> int:
+    """Length of SynTouch frames: `1 + 2 * sensors` unless given.
+
+    Raises `ValueError` if so many words do not fit into it, or it into a classic frame.
+    """
+    if not 1 <= sensors <= SENSORS_MAX:
+        raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
+    used = 1 + WORD_BYTES * sensors
+    if length is None:
+        return used
+    if not used <= length <= CLASSIC_DATA_MAX:
+        raise ValueError(f"frames of {length} bytes cannot carry {sensors} sensors' samples")
+    return length

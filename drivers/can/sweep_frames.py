@@ -1,0 +1,157 @@
+"""Per-finger frames -> one `TactileReading` per sweep; what is missing is flagged.
+
+Frames are of one sweep if number and tick agree and if they come within two periods; a board that
+was reset repeats numbers, but neither its ticks nor the past.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from drivers.can.samples import OUTAGE_NS, ReadingMaker, SweepCounters
+
+SEQUENCE_JUMP_MAX: Final = 1000
+"""Sweep counters that jump by more have started anew; 1000 sweeps last ten seconds."""
+LATE_FRAMES_MAX: Final = 8
+"""Sweep counters that fall back by up to this are late frames, by more a new start."""
+PATIENCE_PERIODS: Final = 2
+"""After so many periods a frame is neither late nor of the sweep at hand."""
+PATIENCE_NS: Final = 100_000_000
+"""The same while the period is not known, ns."""
+_TICKS: Final = 1 << 32
+
+
+class FrameSweeps:
+    """Sweeps from frames that hold all electrodes of one finger and the sweep's number."""
+
+    def __init__(
+        self, fingers: int, counters: SweepCounters, order: Sequence[int] | None = None
+    ) -> None:
+        """`order`: for each row when its frame comes in a sweep; each in its turn unless given."""
+        self._order = range(fingers) if order is None else order
+        self._furthest = -1
+        self._fingers = fingers
+        self._all = (1 << fingers) - 1
+        self._readings = ReadingMaker(counters)
+        self._counters = counters
+        self._words = np.zeros((fingers, ELECTRODES), dtype=np.uint16)
+        self._faults = np.zeros(fingers, dtype=np.uint8)
+        self._current: int | None = None
+        self._tick_us = 0
+        self._synchronised = False
+        self._finished_ns: int | None = None
+        self._have = 0
+        self._begun_ns = 0
+        self._t_ns = 0
+        self._finished = False
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between sweeps, ns, as measured; None until it is known."""
+        return self._readings.period_ns
+
+    def push(
+        self, row: int, sequence: int, tick_us: int, words: bytes, faults: int, t_ns: int
+    ) -> Sequence[TactileReading]:
+        """Take the frame of finger `row`; the readings that it completes, oldest first.
+
+        `sequence` is the sweep's number, 16 bits; `tick_us` when it ended by the device's clock,
+        32 bits. `words` are 24 response words, two bytes each. `faults`: `ElectrodeFault` bits that
+        hold for all electrodes of the finger; with `MISSING` its words mean nothing.
+        """
+        done: Sequence[TactileReading] = ()
+        if self._current is None or sequence != self._current:
+            if self._is_late(sequence, tick_us, t_ns):
+                self._counters.late_frames += 1
+                return ()
+            done = self._finish()
+            self._advance(sequence, tick_us, t_ns)
+        elif tick_us == self._tick_us and self._have >> row & 1:
+            self._counters.duplicate_frames += 1
+            return ()
+        elif t_ns - self._begun_ns > self._patience_ns():
+            self._counters.restarts += 1
+            done = self._finish()
+            self._readings.miss(1)
+            self._begin(tick_us, t_ns)
+        elif tick_us != self._tick_us:
+            self._counters.contradicting_frames += 1
+            return ()
+        self._counters.reordered_frames += self._order[row] < self._furthest
+        self._furthest = max(self._order[row], self._furthest)
+        self._words[row] = np.frombuffer(words, dtype=">u2")
+        self._faults[row] = faults
+        self._have |= 1 << row
+        self._t_ns = max(t_ns, self._t_ns)
+        return done if self._have != self._all else (*done, *self._finish())
+
+    def interrupt(self) -> None:
+        """The link broke: drop the sweep at hand."""
+        if self._have and not self._finished:
+            self._counters.interrupted_sweeps += 1
+            self._readings.miss(1)
+            self._finished = True
+        self._synchronised = False
+
+    def _patience_ns(self) -> int:
+        period_ns = self._readings.period_ns
+        return PATIENCE_NS if period_ns is None else min(PATIENCE_PERIODS * period_ns, OUTAGE_NS)
+
+    def _begin(self, tick_us: int, t_ns: int) -> None:
+        self._tick_us = tick_us
+        self._have = 0
+        self._furthest = -1
+        self._begun_ns = t_ns
+        self._t_ns = 0
+        self._finished = False
+
+    def _is_late(self, sequence: int, tick_us: int, t_ns: int) -> bool:
+        """Whether a frame is of one of the sweeps just before: by number, time and tick."""
+        if self._current is None or t_ns - self._t_ns > self._patience_ns():
+            return False
+        back = (self._current - sequence) % (1 << 16)
+        return 0 < back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _TICKS // 2
+
+    def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
+        """Begin a sweep; count those left out, or a device that started anew."""
+        if self._current is not None:
+            jump = (sequence - self._current) % (1 << 16)
+            backwards = (tick_us - self._tick_us) % _TICKS >= _TICKS // 2
+            if jump > SEQUENCE_JUMP_MAX or backwards:
+                self._counters.restarts += 1
+                self._readings.miss(1)
+            else:
+                self._readings.miss(jump - 1)
+        self._current = sequence
+        self._begin(tick_us, t_ns)
+
+    def _finish(self) -> Sequence[TactileReading]:
+        """Close the sweep at hand; the first one after opening only if it is complete."""
+        if self._finished or not self._have:
+            return ()
+        self._finished = True
+        here = self._have.bit_count()
+        if not self._synchronised and here < self._fingers:
+            self._synchronised = True
+            self._counters.unsynchronised_frames += here
+            if self._finished_ns is not None:
+                self._readings.miss(1)
+            return ()
+        self._synchronised = True
+        self._counters.lost_frames += self._fingers - here
+        if self._finished_ns is not None and 0 < self._t_ns - self._finished_ns <= OUTAGE_NS:
+            self._readings.learn(self._t_ns - self._finished_ns)
+        self._finished_ns = self._t_ns
+        return (self._reading(),)
+
+    def _reading(self) -> TactileReading:
+        came = np.array([bool(self._have >> row & 1) for row in range(self._fingers)])
+        reported = came & (self._faults & np.uint8(ElectrodeFault.MISSING) != 0)
+        self._counters.unplugged_words += ELECTRODES * int(reported.sum())
+        fingers = np.where(came, self._faults, np.uint8(ElectrodeFault.MISSING))
+        marks = np.repeat(fingers[:, np.newaxis], ELECTRODES, axis=1)
+        return self._readings.make(self._words, marks, self._t_ns)

@@ -1,0 +1,267 @@
+"""Palm packets -> one `TactileReading` per round of 14; what is missing is flagged.
+
+A packet carries two channels of each BioTac, and only its `tactile_type` tells which. Packets have
+no other sequence, so a packet's place is its type, counted on from the furthest before it:
+
+- A packet that does not come leaves its one or two electrodes `MISSING` in this round and moves
+  nothing else. A round that lacks packets is handed over when the first of the next round comes.
+- A packet up to half a round late goes where it belongs while its round is at hand.
+- Two different packets for one place contradict each other (a damaged `tactile_type`, or a request
+  that stands still): both are dropped and the place is `MISSING`.
+- Whole rounds that are lost are found by time alone, `LATE_MAX` packets after one was due.
+
+What cannot be told: damage that leaves a value in 0..4095 and its validity bit set; a damaged
+`tactile_type` that names the place of a packet lost in the same round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import COUNT_MAX, ELECTRODES, FINGERS, ElectrodeFault, TactileReading
+from drivers.palm.packet import (
+    CHANNELS,
+    CYCLE_NS,
+    ROUND,
+    TYPE_METADATA_FIRST,
+    TYPE_METADATA_LAST,
+    VALID_OTHER_0,
+    VALID_OTHER_1,
+    PacketCounters,
+    PalmPacket,
+    position_of,
+)
+
+ROUND_NS: Final = ROUND * CYCLE_NS
+"""Time between two samples of an electrode: 71.43 Hz."""
+LATE_MAX: Final = 10
+"""A packet may come so many cycles late; later than that, a whole round is taken for lost."""
+OUTAGE_NS: Final = 2_000_000_000
+"""After this long, ns, nobody knows how many rounds were made: it counts as one missed."""
+
+_COMPLETE: Final = (1 << ROUND) - 1
+_TELLING: Final = 0b11
+"""The packets with pressure and temperature, by which an absent sensor is told."""
+
+
+@dataclass(slots=True)
+class RoundCounters(PacketCounters):
+    """What happened to packets and values on the way to a reading."""
+
+    lost_packets: int = 0
+    """Packets that a round was handed over without, for whatever reason."""
+    duplicate_packets: int = 0
+    """Packets that came again; the copy is dropped."""
+    reordered_packets: int = 0
+    """Packets that came after their successor and in time for their round."""
+    late_packets: int = 0
+    """Packets that came when their round was over; dropped."""
+    conflicting_packets: int = 0
+    """Packets for a place where another one already was; both are dropped."""
+    unsynchronised_packets: int = 0
+    """Packets dropped until a round began, after opening or an outage."""
+    interrupted_rounds: int = 0
+    """Rounds dropped because the link broke in the middle."""
+    metadata_packets: int = 0
+    """Packets whose tactile part is about the sensors themselves."""
+    unknown_types: int = 0
+    """Packets whose `tactile_type` nobody knows."""
+    held_values: int = 0
+    """Electrode values that the palm marked as not fresh."""
+    not_counts: int = 0
+    """Electrode values outside 0..4095."""
+    invalid_fingers: int = 0
+    """Slots of wanted fingers that the palm marked as not valid."""
+    absent_fingers: int = 0
+    """Fingers of rounds without a sensor: channels that are no counts, or nothing but zeros."""
+
+
+class PalmSweeps:
+    """Rounds of the fingers that are wanted, in the order in which they are wanted."""
+
+    def __init__(
+        self, fingers: Sequence[str], counters: RoundCounters, *, heed_finger_bits: bool = True
+    ) -> None:
+        """Without `heed_finger_bits` the packet's `tactile_valid` is ignored.
+
+        Raises `ValueError` unless `fingers` are different ones of `drivers.base.FINGERS`.
+        """
+        if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
+            raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
+        self._slots = tuple(FINGERS.index(finger) for finger in fingers)
+        self._counters = counters
+        self._heed_finger_bits = heed_finger_bits
+        shape = (len(fingers), ELECTRODES)
+        self._counts = np.zeros(shape, dtype=np.uint16)
+        self._faults = np.zeros(shape, dtype=np.uint8)
+        self._latest = np.zeros(shape, dtype=np.uint16)
+        self._known = np.zeros(shape, dtype=np.bool_)
+        self._was_absent = np.zeros(len(fingers), dtype=np.bool_)
+        self._place: int | None = None
+        """The furthest place so far, counted on over all rounds; None until a round begins."""
+        self._place_t_ns: int | None = None
+        self._begin(0)
+
+    @property
+    def cycles_to_go(self) -> int:
+        """Packets until the round at hand can be complete; 0 while nothing is known."""
+        return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
+
+    @property
+    def packets_kept(self) -> int:
+        """Packets that are remembered, 14 at most."""
+        return sum(packet is not None for packet in self._packets)
+
+    def repeats(self, packet: PalmPacket) -> bool:
+        """Whether the round at hand, or the one just finished, already has this very packet."""
+        position = position_of(packet.tactile_type)
+        return position is not None and self._packets[position] == packet
+
+    def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
+        """Take a packet, received at `t_ns`; the readings that it completes, oldest first."""
+        position = position_of(packet.tactile_type)
+        if position is None:
+            is_metadata = TYPE_METADATA_FIRST <= packet.tactile_type <= TYPE_METADATA_LAST
+            self._counters.metadata_packets += is_metadata
+            self._counters.unknown_types += not is_metadata
+            return ()
+        place = self._place_of(position, t_ns)
+        if place is None:
+            self._counters.unsynchronised_packets += 1
+            return ()
+        is_behind = self._place is not None and place < self._place
+        if not is_behind:
+            self._place, self._place_t_ns = place, t_ns
+        if place // ROUND < self._round:
+            self._counters.late_packets += 1
+            return ()
+        finished: Sequence[TactileReading] = ()
+        if place // ROUND > self._round:
+            finished = self._move_on(place // ROUND)
+        elif self._packets[position] is not None:
+            self._contradict(position)
+            return ()
+        elif is_behind:
+            self._counters.reordered_packets += 1
+        self._store(position, packet, t_ns)
+        return (*finished, self._finish()) if self._have == _COMPLETE else finished
+
+    def interrupt(self) -> None:
+        """The link broke: drop the round at hand, wait for the beginning of another."""
+        self._counters.interrupted_rounds += not self._finished and self._have != 0
+        self._place = None
+        self._known[:] = False
+
+    def _place_of(self, position: int, t_ns: int) -> int | None:
+        if self._place is not None and self._place_t_ns is not None:
+            return self._place + self._step(position, t_ns - self._place_t_ns)
+        if position != 0:
+            return None
+        if self._place_t_ns is None:
+            return 0
+        outage_ns = t_ns - self._place_t_ns
+        missed = outage_ns // ROUND_NS if outage_ns <= OUTAGE_NS else 1
+        self._miss(missed)
+        self._begin(self._round + missed + 1)
+        return self._round * ROUND
+
+    def _step(self, position: int, elapsed_ns: int) -> int:
+        """Places from the furthest to this packet; not above 0 for one that comes late."""
+        place = self._place or 0
+        step = (position - place) % ROUND or ROUND
+        if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
+            return step - ROUND
+        overdue_ns = elapsed_ns - (step + LATE_MAX) * CYCLE_NS
+        return step + max(0, overdue_ns // ROUND_NS + 1) * ROUND
+
+    def _move_on(self, to_round: int) -> Sequence[TactileReading]:
+        """Close the round at hand, incomplete as it may be, and begin another."""
+        finished = () if self._finished else (self._finish(),)
+        self._miss(to_round - self._round - 1)
+        self._begin(to_round)
+        return finished
+
+    def _miss(self, rounds: int) -> None:
+        self._counters.missed_readings += rounds
+        self._counters.lost_packets += rounds * ROUND
+
+    def _begin(self, at_round: int) -> None:
+        self._round = at_round
+        self._have = 0
+        """Bit i: position i has come, in conflict or not."""
+        self._finished = False
+        self._packets: list[PalmPacket | None] = [None] * ROUND
+        self._t_ns = 0
+        self._counts[:] = 0
+        self._faults[:] = ElectrodeFault.MISSING
+        self._absent = [False] * len(self._slots)
+
+    def _store(self, position: int, packet: PalmPacket, t_ns: int) -> None:
+        self._packets[position] = packet
+        self._have |= 1 << position
+        self._t_ns = t_ns
+        first, second = CHANNELS[position]
+        for row, slot in enumerate(self._slots):
+            if self._heed_finger_bits and not packet.tactile_valid >> slot & 1:
+                self._counters.invalid_fingers += 1
+                continue
+            values = packet.tactile[slot]
+            fresh = values.valid & VALID_OTHER_0 != 0
+            self._put(row, first.electrode, values.other_0, fresh=fresh)
+            if second is not None:
+                fresh = values.valid & VALID_OTHER_1 != 0
+                self._put(row, second.electrode, values.other_1, fresh=fresh)
+
+    def _put(self, row: int, electrode: int | None, value: int, *, fresh: bool) -> None:
+        if electrode is None:  # pressure and temperature only tell whether there is a sensor
+            self._absent[row] |= fresh and value > COUNT_MAX
+        elif not fresh:
+            self._counters.held_values += 1
+            if self._known[row, electrode]:
+                self._counts[row, electrode] = self._latest[row, electrode]
+                self._faults[row, electrode] = ElectrodeFault.HELD
+        elif value > COUNT_MAX:
+            self._counters.not_counts += 1
+            self._faults[row, electrode] = ElectrodeFault.NOT_A_COUNT
+        else:
+            self._counts[row, electrode] = self._latest[row, electrode] = value
+            self._faults[row, electrode] = ElectrodeFault.NONE
+            self._known[row, electrode] = True
+
+    def _contradict(self, position: int) -> None:
+        """Drop what is known of this place."""
+        self._counters.conflicting_packets += 1
+        if self._finished:
+            return
+        for channel in CHANNELS[position]:
+            if channel is not None and channel.electrode is not None:
+                self._counts[:, channel.electrode] = 0
+                self._faults[:, channel.electrode] = ElectrodeFault.MISSING
+                self._known[:, channel.electrode] = False
+
+    def _finish(self) -> TactileReading:
+        self._finished = True
+        self._counters.lost_packets += ROUND - self._have.bit_count()
+        self._drop_absent_fingers()
+        faults = self._faults.copy()
+        self._counters.readings += 1
+        self._counters.faulty_readings += bool(faults.any())
+        return TactileReading(self._t_ns, self._round, self._counts.copy(), faults)
+
+    def _drop_absent_fingers(self) -> None:
+        """A finger without a sensor shows memory that nobody wrote: no counts, or zeros only."""
+        silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
+        absent = np.array(self._absent)
+        if self._have & _TELLING != _TELLING:
+            absent |= self._was_absent
+        self._was_absent = absent
+        for row in np.flatnonzero(silent | absent):
+            self._counters.absent_fingers += 1
+            self._counts[row] = 0
+            self._faults[row] = ElectrodeFault.MISSING
+            self._known[row] = False

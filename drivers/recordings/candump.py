@@ -1,0 +1,67 @@
+"""CAN frames as lines of text, as `candump -L` writes and `canplayer` reads them. Text only.
+
+`(1436509052.249713) can0 100#0D3A1F` - seconds with six digits, interface, id in three or eight
+digits, `#`, data. `##` and a digit of flags begin the data of CAN FD, `R` stands for that of a
+remote frame, and bit 29 of an id marks an error frame (can-utils, lib.c and linux/can.h).
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from drivers.can.frames import (
+    CLASSIC_DATA_MAX,
+    ERR_FLAG,
+    ERROR,
+    EXTENDED,
+    EXTENDED_ID_MAX,
+    FD,
+    FD_DATA_MAX,
+    REMOTE,
+    STANDARD_ID_MAX,
+    CanFrame,
+)
+
+LINE_MAX: Final = 256
+"""A frame of CAN FD takes 170 characters."""
+NS_PER_US: Final = 1000
+
+_LINE: Final = re.compile(
+    r"\(([0-9]{1,11})\.([0-9]{6})\) (\S{1,64}) ([0-9A-F]{3}|[0-9A-F]{8})#"
+    r"(?:(#[0-9A-F])?((?:[0-9A-F]{2})*)|(R[0-9A-F]?))(?: [RT])?\s*",
+    re.IGNORECASE | re.ASCII,
+)
+
+
+def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
+    """The line of a frame that came at `wall_ns`, ns since 1970, with its end."""
+    seconds, rest_ns = divmod(wall_ns, 1_000_000_000)
+    word = frame.arbitration_id
+    if frame.flags & ERROR:
+        identifier = f"{word | ERR_FLAG:08X}"
+    else:
+        identifier = f"{word:08X}" if frame.flags & EXTENDED else f"{word:03X}"
+    data = "R" if frame.flags & REMOTE else frame.data.hex().upper()
+    if frame.flags & FD:
+        data = f"#0{data}"
+    return f"({seconds}.{rest_ns // NS_PER_US:06}) {channel} {identifier}#{data}\n"
+
+
+def frame_of(line: str) -> tuple[int, CanFrame] | None:
+    """When a frame came, ns since 1970, and the frame; None for a line that has none."""
+    found = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
+    if found is None:
+        return None
+    wall_ns = int(found[1]) * 1_000_000_000 + int(found[2]) * NS_PER_US
+    word, data = int(found[4], 16), bytes.fromhex(found[6] or "")
+    flags = FD if found[5] else 0
+    if len(data) > (FD_DATA_MAX if flags else CLASSIC_DATA_MAX):
+        return None
+    if found[7]:
+        flags |= REMOTE
+    if len(found[4]) == 3:
+        return (wall_ns, CanFrame(word, data, flags)) if word <= STANDARD_ID_MAX else None
+    if word & ERR_FLAG:
+        return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags | ERROR)
+    return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags | EXTENDED)

@@ -1,0 +1,370 @@
+"""Streams of whole grasps: rest, approach, touch, close, settle, lift or slip, release.
+
+The end points are rows of a grasp table or drawn ones; what lies between them is made up, with the
+measured noise on it. Contact lowers counts, so an end point is a believable contact only where it
+lies at or below the rest; see `rest_above`.
+
+`python -m drivers.twins.grasps.whole_grasps` writes the demo recording again, byte for byte.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import count
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
+from drivers.recordings.csv_columns import OBJECT, SLIPPED, TIME, electrode_columns
+from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.recordings.csv_rows import Recording, open_recording, read_lines
+from drivers.twins.grasps import synthetic
+from drivers.twins.grasps.grasp_script import (
+    JOINT_NAMES,
+    Durations,
+    EndPoint,
+    GraspScript,
+    Phase,
+    Timetable,
+    check_rest,
+)
+from drivers.twins.grasps.tactile_noise import MeasuredNoise, PlayedNoise, TactileNoise
+
+RATE_HZ = 100.0
+"""Rows per second of the public recordings, and sweeps per second of an SPI bridge."""
+PALM_RATE_HZ = 1000 / 14
+"""Sweeps per second of a palm: 14 requests of a millisecond each."""
+HELD_PERIOD_MS = 10
+ROUND_MS = 14
+PLACES_MS = 1 + np.arange(1, ELECTRODES + 1) // 2
+"""Shape (24,): when in a round an electrode is sampled, ms. PDC/TAC, TDC/E1, E2/E3, ... E24."""
+POSITION_NOISE_RAD = 0.0003
+"""Standard deviation of a joint angle that stands still, rad."""
+REST_QUANTILE = 0.98
+"""See `rest_above`."""
+DEMO_GRASPS = 12
+DEMO_SEED = 0
+DEMO_DURATIONS = Durations(
+    first_rest_s=(1.2, 1.2),
+    approach_s=(0.25, 0.35),
+    settle_s=(0.6, 0.7),
+    lift_s=(0.35, 0.45),
+    rest_s=(0.15, 0.25),
+)
+"""Shorter than by default, so that the demo is a small file."""
+REST_DRAWS = 1000
+"""Synthetic grasps whose upper quantile is the rest of synthetic fingers."""
+LOOPED_DRAWS = 200
+"""Different synthetic grasps in an endless stream."""
+
+
+class Sampling(StrEnum):
+    """How values get into a row."""
+
+    FRESH = "fresh"
+    """Every electrode is sampled at the time of the row."""
+    HELD = "held"
+    """Rows of 100 Hz with values of 71.43 Hz, one request per ms, held: the public recordings. Each
+    pair of electrodes repeats in 2 of 7 rows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One row of the stream."""
+
+    t_s: float
+    """Since the first row."""
+    counts: NDArray[np.uint16]
+    """Shape (fingers, 24), raw counts."""
+    joint_names: tuple[str, ...]
+    position_rad: NDArray[np.float64]
+    """Shape (joints,), in the order of `joint_names`."""
+    phase: Phase
+    grasp: int
+    """From 1, from the beginning of the approach to the end of the rest after it; 0 before."""
+    slipped: bool | None
+    """How the lift of this grasp ends; None before the first grasp."""
+    object_name: str | None
+
+
+class WholeGrasps:
+    """A stream of grasps; iterating starts it over, and the same seed gives the same stream.
+
+    Memory does not grow with the length.
+    """
+
+    def __init__(
+        self,
+        rest: NDArray[np.float64],
+        end_points: Sequence[EndPoint],
+        *,
+        sampling: Sampling = Sampling.FRESH,
+        rate_hz: float = RATE_HZ,
+        residuals: NDArray[np.float64] | None = None,
+        durations: Durations = Durations(),  # noqa: B008 (immutable)
+        loop: bool = False,
+        seed: int = 0,
+    ) -> None:
+        """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points for ever.
+
+        Noise is the measured model, or else `residuals`, counts of shape (rows, fingers, 24), one
+        row per sweep in a loop from a random start (see `tactile_noise.fresh_residuals`). Raises
+        `ValueError` for shapes that do not fit, for no end points, and for a rate that is not
+        positive or, held, not 100 Hz.
+        """
+        check_rest(rest)
+        if not end_points:
+            raise ValueError("there are no end points to grasp")
+        if any(end_point.counts.shape != rest.shape for end_point in end_points):
+            raise ValueError(f"an end point has not the shape of the rest, {rest.shape}")
+        if residuals is not None and (not len(residuals) or residuals.shape[1:] != rest.shape):
+            raise ValueError(f"residuals have shape {residuals.shape}, not (rows, *{rest.shape})")
+        if not 0.0 < rate_hz < float("inf"):
+            raise ValueError(f"rate_hz is {rate_hz}, must be positive")
+        if sampling is Sampling.HELD and rate_hz != RATE_HZ:
+            raise ValueError(f"held values come at {RATE_HZ:g} Hz, not {rate_hz}")
+        self._rest = rest.astype(np.float64)
+        self._end_points = end_points
+        self._sampling = sampling
+        self._rate_hz = rate_hz
+        self._residuals = residuals
+        self._durations = durations
+        self._loop = loop
+        self._seed = seed
+
+    def __iter__(self) -> Iterator[Moment]:
+        noise_seed, joint_seed = np.random.SeedSequence([self._seed, 0]).spawn(2)
+        joint_rng = np.random.default_rng(joint_seed)
+        sampler = self._sampler(np.random.default_rng(noise_seed))
+        scripts = self._scripts()
+        script = next(scripts)
+        for row in count():
+            t_s = row / self._rate_hz
+            while t_s >= script.timetable.end_s:
+                following = next(scripts, None)
+                if following is None:
+                    return
+                script = following
+            jitter = joint_rng.normal(0.0, POSITION_NOISE_RAD, len(JOINT_NAMES))
+            counts = sampler.sample(script, t_s)
+            yield _moment(script, t_s, counts, script.position_rad(t_s) + jitter)
+
+    def timetables(self) -> Iterator[Timetable]:
+        """The truth about each grasp in turn, before, while or after the stream is played."""
+        return (script.timetable for script in self._scripts())
+
+    def _scripts(self) -> Iterator[GraspScript]:
+        first_rng = np.random.default_rng([self._seed, 1, 0])
+        start_s = first_rng.uniform(*self._durations.first_rest_s)
+        for index in count():
+            if index >= len(self._end_points) and not self._loop:
+                return
+            # A generator of its own for each grasp: what it draws does not depend on the others.
+            rng = np.random.default_rng([self._seed, 1, index + 1])
+            end_point = self._end_points[index % len(self._end_points)]
+            script = GraspScript(end_point, self._rest, index + 1, start_s, self._durations, rng)
+            yield script
+            start_s = script.timetable.end_s
+
+    def _sampler(self, rng: np.random.Generator) -> _Fresh | _Held:
+        noise: TactileNoise
+        if self._residuals is None:
+            noise = MeasuredNoise(len(self._rest), rng)
+        else:
+            noise = PlayedNoise(self._residuals, rng)
+        kind = _Held if self._sampling is Sampling.HELD else _Fresh
+        return kind(self._rest, noise)
+
+
+class _Fresh:
+    def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
+        self._rest = rest
+        self._noise = noise
+
+    def sample(self, script: GraspScript, t_s: float) -> NDArray[np.uint16]:
+        return self._sweep(script, np.asarray(t_s))
+
+    def _sweep(self, script: GraspScript, t_s: NDArray[np.float64]) -> NDArray[np.uint16]:
+        """Counts, shape (fingers, 24), of electrodes sampled at `t_s`, shape () or (24,)."""
+        counts = self._rest + script.deviation(t_s) + self._noise.sweep(t_s)
+        # Off the rails: a count of 0 or 4095 is that of a broken electrode.
+        readable = np.minimum(np.maximum(np.rint(counts), 1), COUNT_MAX - 1)
+        return readable.astype(np.uint16)
+
+
+class _Held(_Fresh):
+    """Keeps two rounds: an electrode that the present one has not come to yet has its old value."""
+
+    def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
+        super().__init__(rest, noise)
+        self._round: int | None = None
+        self._present = self._former = np.zeros(rest.shape, dtype=np.uint16)
+
+    def sample(self, script: GraspScript, t_s: float) -> NDArray[np.uint16]:
+        number, into_ms = divmod(round(t_s * 1000.0), ROUND_MS)
+        if self._round is None:
+            self._present = self._begin(script, number - 1)
+        if number != self._round:
+            self._former, self._present = self._present, self._begin(script, number)
+        return np.where(into_ms >= PLACES_MS, self._present, self._former)
+
+    def _begin(self, script: GraspScript, number: int) -> NDArray[np.uint16]:
+        self._round = number
+        return self._sweep(script, (number * ROUND_MS + PLACES_MS) / 1000.0)
+
+
+def rest_above(
+    end_points: NDArray[np.uint16], quantile: float = REST_QUANTILE
+) -> NDArray[np.float64]:
+    """A resting level for the grasps of a table: counts (grasps, fingers, 24) -> (fingers, 24).
+
+    A table does not tell what its fingers rest at. Contact lowers counts, and in many grasps an
+    electrode is hardly pressed, so the rest is near the upper end of what an electrode shows. It is
+    a quantile and not the largest, which a single odd grasp decides; the few end points above it
+    rise at contact. Raises `ValueError` for no grasps or a shape that does not fit.
+    """
+    if end_points.ndim != 3 or not len(end_points):
+        raise ValueError(f"end points have shape {end_points.shape}, not (grasps, fingers, 24)")
+    rest = np.asarray(np.quantile(end_points, quantile, axis=0), dtype=np.float64)
+    check_rest(rest)
+    return rest
+
+
+def synthetic_grasps(
+    grasps: int = LOOPED_DRAWS,
+    *,
+    sampling: Sampling = Sampling.FRESH,
+    rate_hz: float = RATE_HZ,
+    durations: Durations = Durations(),  # noqa: B008 (immutable)
+    loop: bool = False,
+    seed: int = 0,
+) -> WholeGrasps:
+    """A stream of grasps that nobody ever grasped, half of them slipping.
+
+    End points and rest are drawn from the model of `drivers.twins.grasps.synthetic`. Raises
+    `ValueError` as `WholeGrasps` does.
+    """
+    model = synthetic.read_model()
+    rng = np.random.default_rng([seed, 2])
+    shape = (-1, len(synthetic.FINGERS), ELECTRODES)
+    rest = rest_above(synthetic.draw(model, rng, REST_DRAWS).counts.reshape(shape))
+    drawn = synthetic.draw(model, rng, grasps)
+    end_points = [
+        EndPoint(counts, bool(slipped), f"{synthetic.OBJECT_PREFIX}_{component + 1}")
+        for counts, slipped, component in zip(
+            drawn.counts.reshape(shape), drawn.slipped, drawn.component, strict=True
+        )
+    ]
+    return WholeGrasps(
+        rest,
+        end_points,
+        sampling=sampling,
+        rate_hz=rate_hz,
+        durations=durations,
+        loop=loop,
+        seed=seed,
+    )
+
+
+def read_end_points(path: Path) -> list[EndPoint]:
+    """The grasps of a labelled table in the order of the file. Raises `RecordingError`."""
+    end_points = []
+    with open_recording(path) as stream:
+        for row in Recording(path, read_lines(path, stream), synthetic.FINGERS, strict=True):
+            note = row.annotation
+            if row.t_s is not None:
+                raise RecordingError(path, "a stream, not a table of grasps", column=TIME)
+            if note.slipped is None:
+                raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
+            end_points.append(EndPoint(row.counts, note.slipped, note.object_name or ""))
+    return end_points
+
+
+def write_stream(moments: Iterable[Moment], file: TextIO, t_decimals: int) -> None:
+    """Write moments of ff, mf, th as a stream that a replay plays.
+
+    A label column holds 0 or 1, so it is 0 before the first grasp, where the object is empty.
+    """
+    electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
+    file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
+    for moment in moments:
+        cells = [f"{moment.t_s:.{t_decimals}f}", moment.object_name or ""]
+        cells += [str(int(moment.slipped or False)), *map(str, moment.counts.ravel().tolist())]
+        cells += [f"{angle:.4f}" for angle in moment.position_rad.tolist()]
+        file.write(",".join(cells) + "\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the demo recording, or a stream of other grasps, size, seed or rate."""
+    parser = argparse.ArgumentParser(prog="python -m drivers.twins.grasps.whole_grasps")
+    parser.add_argument("--out", type=Path, default=DEMO_RECORDING, help="CSV file to write")
+    parser.add_argument("--table", type=Path, metavar="FILE", help="take end points from a table")
+    parser.add_argument(
+        "--grasps", type=int, help=f"(default: {DEMO_GRASPS}, or all grasps of the table)"
+    )
+    parser.add_argument("--seed", type=int, default=DEMO_SEED)
+    parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="rows/s")
+    parser.add_argument(
+        "--fresh", action="store_true", help="sample at the rate, instead of 71.43 Hz and held"
+    )
+    options = parser.parse_args(arguments)
+    try:
+        stream = _stream(options)
+        with options.out.open("w", encoding="utf-8", newline="") as file:
+            # Rows every 10 ms need two decimals, others get microseconds.
+            write_stream(stream, file, 2 if options.rate == RATE_HZ else 6)
+    except (RecordingError, OSError, ValueError) as error:
+        parser.error(str(error))
+
+
+def _stream(options: argparse.Namespace) -> WholeGrasps:
+    sampling = Sampling.FRESH if options.fresh else Sampling.HELD
+    if options.grasps is not None and options.grasps < 1:
+        raise ValueError(f"--grasps is {options.grasps}, must be positive")
+    if options.table is None:
+        return synthetic_grasps(
+            options.grasps or DEMO_GRASPS,
+            sampling=sampling,
+            rate_hz=options.rate,
+            durations=DEMO_DURATIONS,
+            seed=options.seed,
+        )
+    end_points = read_end_points(options.table)
+    return WholeGrasps(
+        rest_above(np.array([end_point.counts for end_point in end_points])),
+        end_points[: options.grasps],
+        sampling=sampling,
+        rate_hz=options.rate,
+        durations=DEMO_DURATIONS,
+        seed=options.seed,
+    )
+
+
+def _moment(
+    script: GraspScript,
+    t_s: float,
+    counts: NDArray[np.uint16],
+    position_rad: NDArray[np.float64],
+) -> Moment:
+    timetable = script.timetable
+    begun = t_s >= timetable.approach_s
+    return Moment(
+        t_s=t_s,
+        counts=counts,
+        joint_names=JOINT_NAMES,
+        position_rad=position_rad,
+        phase=timetable.phase(t_s),
+        grasp=timetable.grasp if begun else 0,
+        slipped=timetable.slipped if begun else None,
+        object_name=timetable.object_name if begun else None,
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,177 @@
+"""A link that consists of datagrams from one sender: heard, silent, or broken and opened again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+from drivers.base import LinkError
+from drivers.link import Link, LinkState
+from drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
+
+DRAIN_MAX = 256
+"""Datagrams taken at once at most: a flood must not keep the loop from its other work."""
+
+
+class DatagramCounters(Protocol):
+    """What the link counts, in the counters of its driver."""
+
+    foreign_datagrams: int
+    """From another sender than the one that is listened to."""
+    kernel_drops: int
+    """Dropped by the kernel because nobody took them in time."""
+    link_losses: int
+    """Times that the link was up and fell silent or broke."""
+
+
+class DatagramLink:
+    """Hands over the datagrams of one sender, each with its time of arrival.
+
+    The first sender of a good datagram is the sender until the link is lost: two hands on one port
+    would otherwise be mixed, as nothing else tells them apart. With `only_from` no other address
+    is ever heard.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        endpoint: Endpoint,
+        counters: DatagramCounters,
+        clock: Callable[[], int],
+        *,
+        bytes_max: int,
+        silence_ns: int,
+        only_from: str | None = None,
+    ) -> None:
+        """Without a good datagram for `silence_ns` the link is lost. `clock` gives monotonic ns."""
+        self._endpoint = endpoint
+        self._bytes_max = bytes_max
+        self._silence_ns = silence_ns
+        self._only_from = only_from
+        self._counters = counters
+        self._clock = clock
+        self._link = Link(name, clock)
+        self._receiver: DatagramReceiver | None = None
+        self._earlier_drops = 0
+        self._sender: Sender | None = None
+        self._heard: Sender = ("", 0)
+        self._t_ns = 0
+        self._good_t_ns = 0
+        self.failure: str | None = None
+        """Why the link is down, if it is and that is known."""
+        self.heard: str | None = None
+        """What was heard last, from whom."""
+
+    @property
+    def state(self) -> LinkState:
+        """`GREETING` while listening and nothing good comes."""
+        return self._link.state
+
+    @property
+    def port(self) -> int | None:
+        """The port that is listened on, or None."""
+        return None if self._receiver is None else self._receiver.port
+
+    def describe(self) -> dict[str, str]:
+        """Address, state, what is heard and why it is not, for people."""
+        known = {"source": str(self._endpoint), "link": str(self._link.state)}
+        if self.heard is not None:
+            known["heard"] = self.heard
+        if self.failure is not None:
+            known["why"] = self.failure
+        return known
+
+    def open(self) -> None:
+        """Listen. Raises `LinkError`: at the start a wrong address is a mistake in the scene."""
+        self.close()
+        self._link.start()
+        self._listen()
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._drop_receiver()
+        self._link.close()
+
+    def fileno(self) -> int | None:
+        """Readable when a datagram waits."""
+        return None if self._receiver is None else self._receiver.fileno()
+
+    def due_ns(self) -> int | None:
+        """When to call `receive` without a datagram: to open again, or to notice silence."""
+        if self._link.state is LinkState.UP:
+            return self._good_t_ns + self._silence_ns
+        return self._link.retry_ns
+
+    def receive(self) -> Iterator[tuple[bytes, int]]:
+        """Datagrams that wait, oldest first, each with its monotonic time of arrival, ns.
+
+        Whoever takes one and finds it good calls `confirm` before the next.
+        """
+        receiver = self._receiver or self._listen_again()
+        if receiver is None:
+            return
+        try:
+            for data, age_ns, sender in receiver.receive(DRAIN_MAX):
+                if not self._is_heard(sender):
+                    self._counters.foreign_datagrams += 1
+                    continue
+                self._heard = sender
+                self._t_ns = max(self._t_ns, self._clock() - age_ns)
+                yield data, self._t_ns
+        except LinkError as error:
+            self._lose(str(error))
+            self._drop_receiver()
+        else:
+            self._counters.kernel_drops = self._earlier_drops + receiver.dropped
+
+    def confirm(self, what: str) -> None:
+        """The datagram at hand is good: `what` sent it, for the log."""
+        self._good_t_ns = self._t_ns
+        if self._link.state is not LinkState.UP:
+            self._sender = self._heard
+            self.heard = f"{what} from {self._heard[0]} port {self._heard[1]}"
+            self.failure = None
+            self._link.up(self.heard)
+
+    def fell_silent(self) -> bool:
+        """Call after `receive`: whether the link is down now and was up the last time."""
+        is_up = self._link.state is LinkState.UP
+        if is_up and self._clock() - self._good_t_ns >= self._silence_ns:
+            self._lose(f"nothing good for {self._silence_ns / 1e6:.0f} ms")
+            self._link.greeting()
+            is_up = False
+        lost = self._sender is not None and not is_up
+        if lost:
+            self._sender = None
+        return lost
+
+    def _is_heard(self, sender: Sender) -> bool:
+        if self._sender is not None:
+            return sender == self._sender
+        return self._only_from is None or sender[0] == self._only_from
+
+    def _lose(self, why: str) -> None:
+        self._counters.link_losses += self._link.state is LinkState.UP
+        self.failure = why
+        self._link.failed(why)
+
+    def _listen(self) -> DatagramReceiver:
+        self._receiver = DatagramReceiver(self._endpoint, self._bytes_max)
+        self._link.greeting()
+        return self._receiver
+
+    def _listen_again(self) -> DatagramReceiver | None:
+        if self._link.retry_ns is None or self._clock() < self._link.retry_ns:
+            return None
+        try:
+            return self._listen()
+        except LinkError as error:
+            self._lose(str(error))
+            return None
+
+    def _drop_receiver(self) -> None:
+        if self._receiver is not None:
+            self._earlier_drops += self._receiver.dropped
+            self._receiver.close()
+            self._receiver = None
+        self._sender = None if self._link.state is LinkState.CLOSED else self._sender
