@@ -36,8 +36,11 @@ COMMANDS = {
         "make a grasp table of what was recorded, for train (extra: record)",
     ),
     "keys": ("daemon.commands.keys", "make and list the keys of those who may connect by TCP"),
-    "train": ("models.training.command", "train and export a model (extra: train)"),
-    "evaluate": ("models.training.evaluate", "measure how good systems are (extra: train)"),
+    "train": ("models.training.commands.train", "train and export a model (extra: train)"),
+    "evaluate": (
+        "models.training.commands.evaluate",
+        "measure how good systems are (extra: train)",
+    ),
     "report": (
         "daemon.commands.report",
         "measure error, time and exactness of the models (extras: train, report)",

@@ -30,7 +30,7 @@ from models import zoo
 from models.bts3 import FINGERS
 from models.contract import Finger, ModelError
 from models.runtime import TactileModel
-from models.training.datasets import DatasetError, Grasps, read_all
+from models.training.data.datasets import DatasetError, Grasps, read_all
 
 READINGS, PACED = 2000, 300
 QUICK_READINGS, QUICK_PACED, QUICK_GRASPS = 100, 5, 300

@@ -21,10 +21,10 @@ from models.inputs import VectorBuilder
 from models.layout import D1
 from models.runtime import single_threaded
 from models.tactile_image import TactileImager
-from models.training.classical import ForestConfig, MlpConfig, SvmConfig, fit_classical
-from models.training.datasets import Grasps
-from models.training.networks import CNN1, build
-from models.training.systems import SYSTEMS
+from models.training.data.datasets import Grasps
+from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig, fit_classical
+from models.training.estimators.networks import CNN1, build
+from models.training.systems.systems import SYSTEMS
 
 CLASSICAL = ("svm", "mlp", "rf")
 

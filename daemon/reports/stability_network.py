@@ -21,8 +21,8 @@ from daemon.reports.stability_steps import StepRow
 from models.contract import METADATA_KEY, ModelContract, VectorInput
 from models.inputs import builder
 from models.runtime import TactileModel
-from models.training.graphs import IR_VERSION, MARGIN_NAME, OPSET, with_probability
-from models.training.networks import IMAGE_SHAPE, NetworkConfig, build, for_inference
+from models.training.estimators.graphs import IR_VERSION, MARGIN_NAME, OPSET, with_probability
+from models.training.estimators.networks import IMAGE_SHAPE, NetworkConfig, build, for_inference
 
 VARIANCES = (0.0, 1e-38, 1e-12, 1.0, 1e12, 1e38)
 """Of batch norm's running statistics, in turn; the last one is near float32's largest number."""

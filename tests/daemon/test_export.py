@@ -24,7 +24,7 @@ from daemon.judge.verdict import (
 from daemon.record_files import MessageFile
 from drivers.base import RecordingError
 from drivers.recordings.csv_player import DEMO_TABLE
-from models.training.datasets import read_table
+from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
 
 BOOT = "0123456789abcdef" * 2

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from daemon.judge.verdict import encode
 from daemon.recording import IGNORED_FIELDS
-from models.training.datasets import read_table
+from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
 from tests.daemon.recorded import Lab, messages, work
 

@@ -30,7 +30,7 @@ from models import zoo
 from models.contract import Finger, SessionInput, Sharpness
 from models.inputs import SessionBuilder, raw_features
 from models.runtime import TactileModel
-from models.training.datasets import read_table
+from models.training.data.datasets import read_table
 from tests.daemon.fakes import Clock, FakeDriver
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.contract import Dataset
-from models.training.datasets import Grasps, concatenate
+from models.training.data.datasets import Grasps, concatenate
 from tests.models.training_samples import HEADER, separable_counts
 
 UNKNOWN = ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case",

@@ -14,7 +14,7 @@ from models import zoo
 from models.contract import SeenCounts
 from models.electrodes import IMPLAUSIBLE, Electrodes
 from models.runtime import TactileModel
-from models.training.datasets import Grasps, read_table
+from models.training.data.datasets import Grasps, read_table
 
 SHAPE = (3, 24)
 NOTHING = np.zeros(SHAPE, dtype=np.bool_)

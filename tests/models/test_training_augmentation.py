@@ -9,7 +9,7 @@ pytest.importorskip("scipy", reason="the train extra is not installed")
 
 from scipy.ndimage import rotate
 
-from models.training.augmentation import Augmentation, augment
+from models.training.data.augmentation import Augmentation, augment
 
 RANDOM = np.random.default_rng(3)
 IMAGES = RANDOM.normal(size=(20, 12, 11, 3)).astype(np.float32)

@@ -7,10 +7,10 @@ import pytest
 
 pytest.importorskip("torch", reason="the train extra is not installed")
 
-from models.training.broken import KINDS, NUMBERS, broken_study
-from models.training.looks import Looks
-from models.training.seen import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
-from models.training.systems import SYSTEMS
+from models.training.evaluating.broken import KINDS, NUMBERS, broken_study
+from models.training.fitting.looks import Looks
+from models.training.fitting.seen import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
+from models.training.systems.systems import SYSTEMS
 from tests.models.evaluation_samples import sessions
 
 
@@ -48,6 +48,6 @@ def test_dead_electrodes_cost_less_once_they_are_repaired(name: str) -> None:
 
 def test_the_study_looks_for_one_more_broken_electrode_than_the_daemon_repairs() -> None:
     from daemon.judge.health import BROKEN_MAX
-    from models.training.broken import LOOKED_FOR_MAX
+    from models.training.evaluating.broken import LOOKED_FOR_MAX
 
     assert LOOKED_FOR_MAX == BROKEN_MAX + 1

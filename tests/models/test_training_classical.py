@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.inputs import VectorBuilder
-from models.training.classical import (
+from models.training.estimators.classical import (
     BoostingConfig,
     ClassicalConfig,
     ForestConfig,

@@ -18,9 +18,10 @@ pytest.importorskip("rich", reason="the train extra is not installed")
 
 from models.contract import Dataset, SessionInput
 from models.runtime import TactileModel
-from models.training import command, jobs
-from models.training.datasets import Grasps
-from models.training.export import ExportError
+from models.training.commands import train
+from models.training.data.datasets import Grasps
+from models.training.evaluating import jobs
+from models.training.making.export import ExportError
 from tests.models.evaluation_samples import OBJECTS, table, write, write_sessions
 from tests.models.training_samples import separable_counts, write_table
 
@@ -31,8 +32,8 @@ GRASPS = 80
 
 def graspd_train(*arguments: str, system: str = SYSTEM) -> int:
     parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return command.run(parser.parse_args([system, *arguments]))
+    train.add_arguments(parser)
+    return train.run(parser.parse_args([system, *arguments]))
 
 
 def smallest() -> Grasps:
@@ -357,7 +358,7 @@ def test_ctrl_c_ends_cleanly_with_130(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "make", interrupted)
+    monkeypatch.setattr(train, "make", interrupted)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 130
     assert capsys.readouterr().err.splitlines()[-1] == (
         "graspd train: interrupted; the same command goes on from here"
@@ -373,6 +374,6 @@ def test_a_failed_export_is_exit_code_1(
     def failing(*_: object) -> None:
         raise ExportError("the exported file differs")
 
-    monkeypatch.setattr(command, "make", failing)
+    monkeypatch.setattr(train, "make", failing)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "graspd train: the exported file differs"

@@ -17,12 +17,18 @@ import torch
 from numpy.typing import NDArray
 from onnx import numpy_helper
 
-from models.training import compression, graphs
-from models.training.campaign import campaign
-from models.training.compression import GraphMargins, HalfWeights, Integers, LowRank, compressed
-from models.training.fitting import fit
-from models.training.networks import NetworkConfig, build
-from models.training.systems import SYSTEMS, digest, with_recipes
+from models.training.estimators import compression, graphs
+from models.training.estimators.compression import (
+    GraphMargins,
+    HalfWeights,
+    Integers,
+    LowRank,
+    compressed,
+)
+from models.training.estimators.networks import NetworkConfig, build
+from models.training.evaluating.campaign import campaign
+from models.training.fitting.fitting import fit
+from models.training.systems.systems import SYSTEMS, digest, with_recipes
 from tests.models.evaluation_samples import sessions
 
 SHAPE = (12, 11, 3)
@@ -122,7 +128,7 @@ def test_a_network_is_trained_once_for_all_its_forms(monkeypatch: pytest.MonkeyP
         trainings.append(arguments)
         return original(*arguments, **more)
 
-    fitting = importlib.import_module("models.training.fitting")
+    fitting = importlib.import_module("models.training.fitting.fitting")
 
     original = fitting.train
     monkeypatch.setattr(fitting, "train", counted)

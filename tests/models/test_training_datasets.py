@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from models.bts3 import TABLES
-from models.training.datasets import (
+from models.training.data.datasets import (
     DatasetError,
     concatenate,
     read_all,

@@ -17,10 +17,11 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 pytest.importorskip("rich", reason="the train extra is not installed")
 
-from models.training import evaluate, jobs
-from models.training.classical import SvmConfig
-from models.training.grid import grid_of
-from models.training.systems import SYSTEMS
+from models.training.commands import evaluate
+from models.training.estimators.classical import SvmConfig
+from models.training.evaluating import jobs
+from models.training.evaluating.grid import grid_of
+from models.training.systems.systems import SYSTEMS
 from tests.models.evaluation_samples import write_sessions
 
 ROOT = Path(__file__).parents[2]
@@ -191,7 +192,7 @@ def test_a_value_out_of_range_is_exit_code_2(
 def test_no_cluster_is_exit_code_1_and_says_so(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cluster = pytest.importorskip("models.training.cluster", reason="no extra: cluster")
+    cluster = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
     monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 1)
     options = ["--data", str(data), "--out", str(tmp_path), "--dask", "tcp://127.0.0.1:9"]
     assert graspd_evaluate("svm", "--quick", *options) == 1

@@ -33,13 +33,13 @@ from models.contract import (
 )
 from models.inputs import builder, raw_features
 from models.runtime import TactileModel
-from models.training.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
-from models.training.datasets import read_whole
-from models.training.export import ExportError, SessionStandards, export
-from models.training.fitting import Fitted, fit
-from models.training.networks import DenseConfig, NetworkConfig, SecondConvolution
-from models.training.recipe import Recipe
-from models.training.systems import (
+from models.training.data.datasets import read_whole
+from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
+from models.training.estimators.networks import DenseConfig, NetworkConfig, SecondConvolution
+from models.training.estimators.recipe import Recipe
+from models.training.fitting.fitting import Fitted, fit
+from models.training.making.export import ExportError, SessionStandards, export
+from models.training.systems.systems import (
     SESSION,
     SYSTEMS,
     BlendConfig,

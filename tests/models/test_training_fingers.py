@@ -15,10 +15,10 @@ from daemon.assembly import build_pipeline, load_model, model_path
 from daemon.scene import parse
 from drivers.base import TactileReading
 from models.contract import ModelError
-from models.training import jobs
-from models.training.jobs import Job
-from models.training.making import Order, make
-from models.training.systems import SYSTEMS, digest, with_recipes
+from models.training.evaluating import jobs
+from models.training.evaluating.jobs import Job
+from models.training.making.making import Order, make
+from models.training.systems.systems import SYSTEMS, digest, with_recipes
 from tests.models.evaluation_samples import sessions
 
 FORMS = {

@@ -14,12 +14,12 @@ pytest.importorskip("sklearn", reason="the train extra is not installed")
 from models.contract import VectorInput
 from models.inputs import SessionBuilder, builder, raw_features
 from models.tactile_image import TactileImager
-from models.training.augmentation import Augmentation
-from models.training.classical import BoostingConfig, ForestConfig, SvmConfig
-from models.training.fitting import Fitted, FittedBlend, FittedNetwork, fit
-from models.training.networks import DenseConfig, NetworkConfig
-from models.training.recipe import Recipe
-from models.training.systems import (
+from models.training.data.augmentation import Augmentation
+from models.training.estimators.classical import BoostingConfig, ForestConfig, SvmConfig
+from models.training.estimators.networks import DenseConfig, NetworkConfig
+from models.training.estimators.recipe import Recipe
+from models.training.fitting.fitting import Fitted, FittedBlend, FittedNetwork, fit
+from models.training.systems.systems import (
     RANKS,
     SYSTEMS,
     BlendConfig,

@@ -18,14 +18,14 @@ from sklearn.neural_network import MLPClassifier
 
 from models.contract import VectorInput
 from models.inputs import SessionBuilder, raw_features
-from models.training import jobs
-from models.training.classical import MlpConfig, SvmConfig
-from models.training.jobs import BrokenResultError, Job, JobResult
-from models.training.networks import NetworkConfig
-from models.training.protocols import splits
-from models.training.recipe import Recipe
-from models.training.standards import SESSION_VARIANTS, Standards, TrainingStandards, sit
-from models.training.system import SessionFeatures, System
+from models.training.data.protocols import splits
+from models.training.estimators.classical import MlpConfig, SvmConfig
+from models.training.estimators.networks import NetworkConfig
+from models.training.estimators.recipe import Recipe
+from models.training.evaluating import jobs
+from models.training.evaluating.jobs import BrokenResultError, Job, JobResult
+from models.training.fitting.standards import SESSION_VARIANTS, Standards, TrainingStandards, sit
+from models.training.systems.system import SessionFeatures, System
 from tests.models.evaluation_samples import sessions
 
 GRASPS = sessions(200)

@@ -12,15 +12,15 @@ pytest.importorskip("sklearn", reason="the train extra is not installed")
 from sklearn.metrics import brier_score_loss, log_loss
 
 from models.seen import SeenCheck
-from models.training.calibration import (
+from models.training.data.folds import TooFewGraspsError, folds_of
+from models.training.evaluating.metrics import score
+from models.training.fitting.calibration import (
     cross_fitted_p_slip,
     fit_temperature,
     p_slip,
     reliability,
 )
-from models.training.folds import TooFewGraspsError, folds_of
-from models.training.metrics import score
-from models.training.seen import (
+from models.training.fitting.seen import (
     held_out_never_seen,
     made_up_never_seen,
     seen_counts,

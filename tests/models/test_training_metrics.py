@@ -11,7 +11,7 @@ pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from sklearn.metrics import brier_score_loss, f1_score, log_loss
 
-from models.training.metrics import (
+from models.training.evaluating.metrics import (
     accuracy_at,
     coverage_curve,
     over_seeds,

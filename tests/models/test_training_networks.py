@@ -13,7 +13,7 @@ from torch import nn
 
 from models.layout import D1
 from models.tactile_image import TactileImager
-from models.training.networks import (
+from models.training.estimators.networks import (
     CNN0,
     CNN1,
     CNN2,
@@ -27,7 +27,7 @@ from models.training.networks import (
     for_margin,
     parameter_count,
 )
-from models.training.recipe import logits, reproducible
+from models.training.estimators.recipe import logits, reproducible
 from tests.models.training_samples import separable_counts
 
 TINY = NetworkConfig(filters=4, hidden=16)

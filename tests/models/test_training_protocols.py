@@ -11,9 +11,9 @@ import pytest
 
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
-from models.training.datasets import Grasps, concatenate, read_all
-from models.training.folds import TooFewGraspsError, fold_seed, object_folds
-from models.training.protocols import (
+from models.training.data.datasets import Grasps, concatenate, read_all
+from models.training.data.folds import TooFewGraspsError, fold_seed, object_folds
+from models.training.data.protocols import (
     ABOUT,
     PROTOCOLS,
     UNKNOWN_OBJECTS,

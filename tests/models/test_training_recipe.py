@@ -13,8 +13,8 @@ from torch import nn
 
 from models.inputs import VectorBuilder
 from models.tactile_image import TactileImager
-from models.training.networks import DenseConfig, NetworkConfig, build
-from models.training.recipe import (
+from models.training.estimators.networks import DenseConfig, NetworkConfig, build
+from models.training.estimators.recipe import (
     PublishedRecipe,
     Recipe,
     logits,

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 
-from models.training import summary as summaries
-from models.training.jobs import JobResult
-from models.training.protocols import Protocol, splits
-from models.training.results import Made, difference, table
-from models.training.standards import SESSION_VARIANTS
-from models.training.summary import Summary, summarise
-from models.training.system import digest
-from models.training.systems import SYSTEMS
+from models.training.data.protocols import Protocol, splits
+from models.training.evaluating import summary as summaries
+from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.results import Made, difference, table
+from models.training.evaluating.summary import Summary, summarise
+from models.training.fitting.standards import SESSION_VARIANTS
+from models.training.systems.system import digest
+from models.training.systems.systems import SYSTEMS
 from tests.models.evaluation_samples import sessions
 
 GRASPS = sessions(200)
@@ -216,14 +216,14 @@ def test_every_row_has_as_many_cells_as_its_header() -> None:
 def fonts_are_open(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Matplotlib keeps the files of its fonts open for the life of the process."""
     pytest.importorskip("matplotlib", reason="no extra: report")
-    from models.training.plots import draw
+    from models.training.evaluating.plots import draw
 
     draw([summary_of("cnn1", "cv", 0.1)], tmp_path_factory.mktemp("plots"))
 
 
 @pytest.mark.usefixtures("fonts_are_open")
 def test_plots_of_everything_are_drawn(tmp_path: Path) -> None:
-    from models.training.plots import draw
+    from models.training.evaluating.plots import draw
 
     session = summary_of("svm-session", "session", 0.2)
     every = dict.fromkeys(SESSION_VARIANTS, session.variants["n50"])

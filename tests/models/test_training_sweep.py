@@ -23,12 +23,12 @@ import joblib
 from joblib.externals.loky import get_reusable_executor
 
 from models.contract import VectorInput
-from models.training import jobs
-from models.training.classical import ForestConfig
-from models.training.datasets import Grasps
-from models.training.jobs import Job, JobResult
-from models.training.sweep import ClusterError, sweep
-from models.training.system import System
+from models.training.data.datasets import Grasps
+from models.training.estimators.classical import ForestConfig
+from models.training.evaluating import jobs
+from models.training.evaluating.jobs import Job, JobResult
+from models.training.evaluating.sweep import ClusterError, sweep
+from models.training.systems.system import System
 from tests.models.evaluation_samples import sessions
 
 GRASPS = sessions(120)
@@ -137,7 +137,7 @@ def test_a_broken_result_is_run_again_with_a_warning(
 def test_a_cluster_that_is_not_there_is_said_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ours = pytest.importorskip("models.training.cluster", reason="no extra: cluster")
+    ours = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
     monkeypatch.setattr(ours, "CONNECT_TIMEOUT_S", 1)
     with pytest.raises(ClusterError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
         sweep(some_jobs(1), GRASPS, tmp_path, dask="tcp://127.0.0.1:9")

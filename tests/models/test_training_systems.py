@@ -10,10 +10,10 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.contract import CountsInput, ImageInput, VectorInput
-from models.training.classical import ForestConfig, MlpConfig, SvmConfig
-from models.training.networks import CNN1, build, parameter_count
-from models.training.recipe import PublishedRecipe, Recipe
-from models.training.systems import (
+from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig
+from models.training.estimators.networks import CNN1, build, parameter_count
+from models.training.estimators.recipe import PublishedRecipe, Recipe
+from models.training.systems.systems import (
     SYSTEMS,
     BlendConfig,
     DistilConfig,

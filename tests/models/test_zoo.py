@@ -17,7 +17,7 @@ from models import zoo
 from models.contract import ModelError
 from models.runtime import TactileModel
 from models.tactile_image import TactileImager
-from models.training.datasets import Grasps, read_whole
+from models.training.data.datasets import Grasps, read_whole
 
 CARD: dict[str, Any] = json.loads((zoo.ZOO / "cnn1.json").read_text())
 

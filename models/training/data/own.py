@@ -1,0 +1,70 @@
+"""Tables of one's own, beside the published ones or alone: read, and refused where they mislead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from models.bts3 import TABLES
+from models.training.data.datasets import (
+    DatasetError,
+    Grasps,
+    concatenate,
+    read_all,
+    read_table,
+)
+
+FEWEST_GRASPS = 20
+"""Of a table of one's own: from so many on the daemon, too, takes a session for calibrated."""
+ENOUGH_GRASPS = 200
+"""Of one's own alone. The daemon refuses readings that are unlike all of the training: of other
+grasps of palm_45, 98 % by 20 of its grasps, 20 % by 100, 6 % by 200, 2.5 % by 500."""
+
+
+def read_with_own(folder: Path | None, own: Sequence[Path]) -> Grasps:
+    """The published tables of a folder, if it is given, and after them each table of one's own.
+
+    Raises `DatasetError` for what is no table, and for an own table that has a published name or
+    that of another, holds a grasp that is there already, has only one kind of grasps or less than
+    `FEWEST_GRASPS`; `ValueError` if there is nothing to read.
+    """
+    parts = [] if folder is None else [read_all(folder)]
+    paths: dict[str, Path] = {}
+    for path in own:
+        _check_name(path, paths)
+        paths[path.stem] = path
+        parts.append(_read_own(path))
+    grasps = concatenate(parts)
+    _check_once(grasps, paths)
+    return grasps
+
+
+def _check_name(path: Path, others: dict[str, Path]) -> None:
+    name = path.stem
+    if not name.isprintable():
+        raise DatasetError(path, "has a name that cannot be printed")
+    if name in {table.name for table in TABLES}:
+        raise DatasetError(path, "has the name of a published table: rename it, or use --data")
+    if name in others:
+        raise DatasetError(path, f"has the same name as {others[name]}: rename one")
+
+
+def _read_own(path: Path) -> Grasps:
+    grasps = read_table(path)
+    if len(grasps) < FEWEST_GRASPS:
+        raise DatasetError(path, f"has {len(grasps)} grasps, {FEWEST_GRASPS} are the fewest")
+    if grasps.slipped.all() or not grasps.slipped.any():
+        kind = "stayed" if grasps.slipped.all() else "slipped"
+        raise DatasetError(path, f"has no grasp that {kind}, a session needs both kinds")
+    return grasps
+
+
+def _check_once(grasps: Grasps, own: dict[str, Path]) -> None:
+    """A grasp that is there twice would be trained on and judged by: figures too good."""
+    first: dict[bytes, str] = {}
+    for table, counts in zip(grasps.table_of.tolist(), grasps.counts, strict=True):
+        name, key = grasps.files[table].name, counts.tobytes()
+        if key in first and name in own:
+            where = "twice" if first[key] == name else f"that are in {first[key]}, too"
+            raise DatasetError(own[name], f"has counts {where}: the same grasp counts once")
+        first.setdefault(key, name)

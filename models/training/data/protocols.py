@@ -1,0 +1,134 @@
+"""What is trained on and what is judged: the splits that every figure stands on.
+
+`cv`, `objects` and `objects-whole` take tables of one's own, which are none of the published, in
+addition; of data that have no published table, these alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from models.bts3 import NEW_SESSION, WHOLE
+from models.training.data.datasets import Grasps, own_tables
+from models.training.data.folds import TooFewGraspsError, folds_of, object_folds
+
+Protocol = Literal[
+    "cv", "unknown", "objects", "objects-whole", "session", "cv-palm-down", "cv-palm-side"
+]
+PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
+STANDARD: tuple[Protocol, ...] = ("cv", "unknown", "objects", "objects-whole", "session")
+"""What is evaluated unless asked for otherwise."""
+ABOUT: dict[Protocol, str] = {
+    "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
+    "unknown": "the paper's 8 objects left out of palm_down + palm_side",
+    "objects": "objects left out in groups, palm_down + palm_side + palm_45",
+    "objects-whole": "objects left out in groups, palm_down + palm_side",
+    "session": "palm_45 by palm_down + palm_side, its objects left out in groups",
+    "cv-palm-down": "stratified folds of palm_down alone",
+    "cv-palm-side": "stratified folds of palm_side alone",
+}
+UNKNOWN_OBJECTS = frozenset(
+    ("juice", "aquarius", "green_gel", "tennis", "football", "milk", "metal_pen_case", "train")
+)
+"""Left out by the authors' notebooks: 485 of 2549 grasps. The paper's text counts 6 objects."""
+FOLDS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Split:
+    """One training and the grasps that it is judged by: indices of rows, ascending."""
+
+    name: str
+    train: NDArray[np.int64]
+    test: NDArray[np.int64]
+    calibration: NDArray[np.int64] | None = None
+    """Grasps of the test's own session, but of other objects, whose labels nobody looks at."""
+
+
+def splits(protocol: Protocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
+    """The splits of a protocol. `unknown` has one, whatever the seed: only the training differs.
+
+    Raises `TooFewGraspsError` if the data do not have the tables, objects or grasps for it.
+    """
+    return _MAKERS[protocol](grasps, seed, folds)
+
+
+def _stratified(*tables: str, own_too: bool = False) -> Callable[[Grasps, int, int], list[Split]]:
+    def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+        rows = _rows(grasps, *tables, own_too=own_too)
+        return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
+
+    return make
+
+
+def _grouped(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
+    def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+        rows = _rows(grasps, *tables, own_too=True)
+        return _leave_out(rows, _object_folds(grasps, rows, folds, seed), folds)
+
+    return make
+
+
+def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
+    rows = _rows(grasps, *WHOLE)
+    out = np.array([grasps.objects[row] in UNKNOWN_OBJECTS for row in rows])
+    if not out.any() or out.all():
+        raise TooFewGraspsError("the data lack the objects that the paper leaves out")
+    return [Split("unknown objects", rows[~out], rows[out])]
+
+
+def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+    """The same groups of objects leave both days: trained without, tested on the later day."""
+    whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
+    rows = np.concatenate((whole, later))
+    fold_of = _object_folds(grasps, rows, folds, seed)
+    of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]
+    made = []
+    for fold in range(folds):
+        test = later[of_later == fold]
+        if not len(test):
+            raise TooFewGraspsError(f"{NEW_SESSION} has no grasp of the objects of fold {fold}")
+        name = f"fold {fold}"
+        made.append(Split(name, whole[of_whole != fold], test, later[of_later != fold]))
+    return made
+
+
+_MAKERS: dict[Protocol, Callable[[Grasps, int, int], list[Split]]] = {
+    "cv": _stratified(*WHOLE, own_too=True),
+    "unknown": _unknown,
+    "objects": _grouped(*WHOLE, NEW_SESSION),
+    "objects-whole": _grouped(*WHOLE),
+    "session": _session,
+    "cv-palm-down": _stratified(WHOLE[0]),
+    "cv-palm-side": _stratified(WHOLE[1]),
+}
+
+
+def _rows(grasps: Grasps, *tables: str, own_too: bool = False) -> NDArray[np.int64]:
+    """Indices of the grasps of these tables, all of which must be there, and of one's own."""
+    names = [file.name for file in grasps.files]
+    if own_too:
+        others = own_tables(grasps.files)
+        tables = others if len(others) == len(names) else (*tables, *others)
+    for table in tables:
+        if table not in names:
+            raise TooFewGraspsError(f"the data lack {table}")
+    wanted = [index for index, name in enumerate(names) if name in tables]
+    return np.flatnonzero(np.isin(grasps.table_of, wanted)).astype(np.int64)
+
+
+def _object_folds(
+    grasps: Grasps, rows: NDArray[np.int64], folds: int, seed: int
+) -> NDArray[np.int64]:
+    return object_folds([grasps.objects[row] for row in rows], folds, seed)
+
+
+def _leave_out(rows: NDArray[np.int64], fold_of: NDArray[np.int64], folds: int) -> list[Split]:
+    return [
+        Split(f"fold {fold}", rows[fold_of != fold], rows[fold_of == fold]) for fold in range(folds)
+    ]

@@ -1,0 +1,354 @@
+"""ONNX graphs of what was trained: from an input (N, *shape) to `margin` or `probability`."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from onnx import helper, numpy_helper
+from skl2onnx import to_onnx
+from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
+from sklearn.neural_network import MLPClassifier
+from sklearn.svm import SVC
+from torch import nn
+
+from models.contract import OUTPUT_NAME
+from models.training.estimators.classical import PROBABILITY_FLOOR, ClassicalModel
+from models.training.estimators.networks import for_inference, for_margin
+
+OPSET = 18
+"""What the exporters are written for; every onnxruntime that the project allows knows it."""
+ML_OPSET = 3
+"""Of the domain `ai.onnx.ml`, which has the trees."""
+IR_VERSION = 10
+"""Of the file format; onnxruntime 1.18 knows it."""
+MARGIN_NAME = "margin"
+
+_Steps = Sequence[tuple[str, Sequence[str], str, dict[str, Any]]]
+"""Nodes as (operator, inputs, output, attributes)."""
+
+
+def network_probability(
+    network: nn.Sequential, shape: Sequence[int], temperature: float, input_name: str
+) -> onnx.ModelProto:
+    """`softmax(logits / temperature)` (N, 2) of a network."""
+    return _from_torch(for_inference(network, temperature), shape, input_name, OUTPUT_NAME)
+
+
+def network_margin(
+    network: nn.Sequential, shape: Sequence[int], input_name: str
+) -> onnx.ModelProto:
+    """Log-odds of slip (N, 1) of a network."""
+    return _from_torch(for_margin(network), shape, input_name, MARGIN_NAME)
+
+
+def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
+    """Log-odds of slip (N, 1) of a classifier on vectors."""
+    match model:
+        case SVC():
+            return _svm(model, input_name)
+        case HistGradientBoostingClassifier():
+            return _boosting(model, input_name)
+        case RandomForestClassifier():
+            return _forest(model, input_name)
+        case MLPClassifier():
+            return _perceptron(model, input_name)
+        case _:
+            raise TypeError(f"no graph for a {type(model).__name__}")
+
+
+def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> onnx.ModelProto:
+    """One graph whose margin is the sum of the parts' margins times their factors."""
+    width = parts[0].graph.input[0]
+    nodes: list[onnx.NodeProto] = []
+    constants: list[onnx.TensorProto] = []
+    terms = []
+    for index, (part, factor) in enumerate(zip(parts, factors, strict=True)):
+        prefix = f"member{index}_"
+        _prefix(part.graph, prefix, keep=width.name)
+        nodes += part.graph.node
+        constants += part.graph.initializer
+        constants.append(_constant(f"{prefix}factor", np.array(factor, np.float32)))
+        term = f"{prefix}term"
+        nodes.append(helper.make_node("Mul", [prefix + MARGIN_NAME, f"{prefix}factor"], [term]))
+        terms.append(term)
+    nodes.append(helper.make_node("Sum", terms, [MARGIN_NAME]))
+    return _model(nodes, constants, width, MARGIN_NAME, 1)
+
+
+def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelProto:
+    """The graph continued to `probability` (N, 2): stable, slip; sigmoid(margin / temperature)."""
+    # softmax(-m / 2T, m / 2T) is 1 - sigmoid(m / T), sigmoid(m / T).
+    share = np.array([[-0.5, 0.5]]) / temperature
+    nodes = [
+        *margin.graph.node,
+        helper.make_node("MatMul", [MARGIN_NAME, "half_over_temperature"], ["tempered"]),
+        helper.make_node("Softmax", ["tempered"], [OUTPUT_NAME], axis=1),
+    ]
+    constants = [
+        *margin.graph.initializer,
+        _constant("half_over_temperature", share.astype(np.float32)),
+    ]
+    return _model(nodes, constants, margin.graph.input[0], OUTPUT_NAME, 2)
+
+
+def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
+    """A copy whose input has this name."""
+    other = copied(model)
+    former = other.graph.input[0].name
+    other.graph.input[0].name = input_name
+    _feed(other.graph, former, input_name)
+    return other
+
+
+def copied(model: onnx.ModelProto) -> onnx.ModelProto:
+    """One that may be changed."""
+    other = onnx.ModelProto()
+    other.CopyFrom(model)
+    return other
+
+
+def standardised(
+    model: onnx.ModelProto, mean: NDArray[np.float32], scale: NDArray[np.float32]
+) -> onnx.ModelProto:
+    """The graph with `(input - mean) * scale` before it; both of the input's shape."""
+    graph = model.graph
+    given = graph.input[0].name
+    _feed(graph, given, "standardised")
+    steps: _Steps = (
+        ("Sub", (given, "input_mean"), "centred", {}),
+        ("Mul", ("centred", "input_scale"), "standardised", {}),
+    )
+    nodes = [*_nodes(steps), *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+    graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
+    return model
+
+
+def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
+    """Let every node that takes `former` take `name` instead."""
+    for node in graph.node:
+        node.input[:] = [name if given == former else given for given in node.input]
+
+
+def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
+    """In double precision: ONNX's own SVMClassifier sums up in float32, and with large C its
+    margins are off by more than a hundredth."""
+    vectors = model.support_vectors_
+    features = vectors.shape[1]
+    gamma = 1.0 / features if model.gamma == "auto" else float(model.gamma)
+    # -gamma * |x - v|**2 = 2 gamma x.v - gamma |v|**2 - gamma |x|**2
+    constants = [
+        # The support vectors are readings, float32 as the input is: nothing is lost here.
+        _constant("vectors", vectors.T.astype(np.float32)),
+        _constant("two_gamma", np.array(2.0 * gamma)),
+        _constant("minus_gamma", np.array(-gamma)),
+        _constant("vector_part", -gamma * np.square(vectors).sum(axis=1)),
+        _constant("weights", model.dual_coef_.reshape(-1, 1).astype(np.float64)),
+        _constant("bias", model.intercept_.astype(np.float64)),
+    ]
+    steps: _Steps = (
+        ("Cast", (input_name,), "x_64", {"to": onnx.TensorProto.DOUBLE}),
+        ("Cast", ("vectors",), "vectors_64", {"to": onnx.TensorProto.DOUBLE}),
+        ("MatMul", ("x_64", "vectors_64"), "products", {}),
+        ("Mul", ("products", "two_gamma"), "both_part", {}),
+        ("ReduceSumSquare", ("x_64", "axis"), "squares", {"keepdims": 1}),
+        ("Mul", ("squares", "minus_gamma"), "x_part", {}),
+        ("Add", ("both_part", "vector_part"), "without_x", {}),
+        ("Add", ("without_x", "x_part"), "exponent", {}),
+        ("Exp", ("exponent",), "kernel", {}),
+        ("MatMul", ("kernel", "weights"), "weighted", {}),
+        ("Add", ("weighted", "bias"), "decision", {}),
+        ("Cast", ("decision",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
+    )
+    constants.append(_constant("axis", np.array([1])))
+    nodes = _nodes(steps)
+    return _model(nodes, constants, _vectors(input_name, features), MARGIN_NAME, 1)
+
+
+def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.ModelProto:
+    """As one TreeEnsembleRegressor; skl2onnx 1.20 cannot write these trees with onnx 1.23."""
+    trees = [predictor.nodes for (predictor,) in model._predictors]
+    of_tree = np.repeat(np.arange(len(trees)), [len(tree) for tree in trees])
+    of_node = np.concatenate([np.arange(len(tree)) for tree in trees])
+    nodes = np.concatenate(trees)
+    leaf = nodes["is_leaf"].astype(np.bool_)
+    node = helper.make_node(
+        "TreeEnsembleRegressor",
+        [input_name],
+        [MARGIN_NAME],
+        domain="ai.onnx.ml",
+        n_targets=1,
+        aggregate_function="SUM",
+        base_values=[float(model._baseline_prediction.item())],
+        nodes_treeids=of_tree.tolist(),
+        nodes_nodeids=of_node.tolist(),
+        nodes_modes=np.where(leaf, "LEAF", "BRANCH_LEQ").tolist(),
+        nodes_featureids=np.where(leaf, 0, nodes["feature_idx"]).tolist(),
+        nodes_values=np.where(leaf, 0.0, _float32_below(nodes["num_threshold"])).tolist(),
+        nodes_truenodeids=np.where(leaf, 0, nodes["left"]).tolist(),
+        nodes_falsenodeids=np.where(leaf, 0, nodes["right"]).tolist(),
+        target_treeids=of_tree[leaf].tolist(),
+        target_nodeids=of_node[leaf].tolist(),
+        target_ids=[0] * int(leaf.sum()),
+        target_weights=nodes["value"][leaf].tolist(),
+    )
+    return _model([node], [], _vectors(input_name, model.n_features_in_), MARGIN_NAME, 1)
+
+
+def _float32_below(thresholds: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The largest float32 not above: a float32 is below it exactly if below the threshold."""
+    nearest = thresholds.astype(np.float32)
+    return np.where(nearest > thresholds, np.nextafter(nearest, np.float32(-np.inf)), nearest)
+
+
+def _forest(model: RandomForestClassifier, input_name: str) -> onnx.ModelProto:
+    """The trees add up votes, not their shares: shares of 1/199 would round differently."""
+    (trees,) = _from_sklearn(model, input_name).graph.node
+    number = len(model.estimators_)
+    (weights,) = (part for part in trees.attribute if part.name == "class_weights")
+    weights.floats[:] = np.array(weights.floats) * number
+    steps: _Steps = (
+        ("Gather", ("probabilities", "slip_column"), "votes", {"axis": 1}),
+        ("Cast", ("votes",), "votes_64", {"to": onnx.TensorProto.DOUBLE}),
+        ("Div", ("votes_64", "trees"), "p", {}),
+        ("Clip", ("p", "floor", "ceiling"), "p_slip", {}),
+        ("Sub", ("one", "p_slip"), "p_stable", {}),
+        ("Div", ("p_slip", "p_stable"), "odds", {}),
+        ("Log", ("odds",), "log_odds", {}),
+        ("Cast", ("log_odds",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
+    )
+    constants = [
+        _constant("slip_column", np.array([1])),
+        _constant("trees", np.array(float(number))),
+        _constant("floor", np.array(PROBABILITY_FLOOR)),
+        _constant("ceiling", np.array(1.0 - PROBABILITY_FLOOR)),
+        _constant("one", np.array(1.0)),
+    ]
+    width = _vectors(input_name, model.n_features_in_)
+    return _model([trees, *_nodes(steps)], constants, width, MARGIN_NAME, 1)
+
+
+def _perceptron(model: MLPClassifier, input_name: str) -> onnx.ModelProto:
+    """Up to the last layer, whose logistic function would lose large margins in float32."""
+    graph = _from_sklearn(model, input_name).graph
+    kinds = [node.op_type for node in graph.node]
+    nodes = list(graph.node[: kinds.index("Sigmoid")])
+    nodes[-1].output[0] = MARGIN_NAME
+    used = {name for node in nodes for name in node.input}
+    constants = [tensor for tensor in graph.initializer if tensor.name in used]
+    width = _vectors(input_name, model.n_features_in_)
+    return _model(nodes, constants, width, MARGIN_NAME, 1)
+
+
+def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
+    """What skl2onnx makes of a classifier: outputs `label` and `probabilities` (N, 2)."""
+    converted: onnx.ModelProto = to_onnx(
+        model,
+        np.zeros((1, model.n_features_in_), dtype=np.float32),
+        target_opset={"": OPSET, "ai.onnx.ml": ML_OPSET},
+        options={id(model): {"zipmap": False}},
+    )
+    _rename_input(converted.graph, input_name)
+    return converted
+
+
+def _rename_input(graph: onnx.GraphProto, input_name: str) -> None:
+    given = graph.input[0].name
+    for node in graph.node:
+        node.input[:] = [input_name if name == given else name for name in node.input]
+
+
+def _from_torch(
+    network: nn.Module, shape: Sequence[int], input_name: str, output_name: str
+) -> onnx.ModelProto:
+    # Two inputs, because one would let the exporter take the batch for a constant.
+    example = torch.zeros(2, *shape)
+    with _quiet_exporter():
+        program = torch.onnx.export(
+            network,
+            (example,),
+            input_names=[input_name],
+            output_names=[output_name],
+            dynamic_shapes=({0: torch.export.Dim("N")},),
+            opset_version=OPSET,
+            external_data=False,
+            dynamo=True,
+            verbose=False,
+        )
+    if program is None:
+        raise RuntimeError("the exporter returned nothing")
+    model: onnx.ModelProto = program.model_proto
+    _strip(model)
+    return model
+
+
+def _strip(model: onnx.ModelProto) -> None:
+    """Take out what tells of the machine: stack traces with paths, in each part's metadata."""
+    graph = model.graph
+    parts = (graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output)
+    for part in (model, *parts):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    del graph.value_info[:]
+
+
+def _prefix(graph: onnx.GraphProto, prefix: str, keep: str) -> None:
+    """Rename everything in a graph but its input, so that it can stand beside others."""
+    for node in graph.node:
+        node.name = prefix + node.name if node.name else ""
+        # An empty name is an input that is left out.
+        node.input[:] = [name if name in (keep, "") else prefix + name for name in node.input]
+        node.output[:] = [prefix + name if name else name for name in node.output]
+    for tensor in graph.initializer:
+        tensor.name = prefix + tensor.name
+
+
+def _model(
+    nodes: Sequence[onnx.NodeProto],
+    constants: Sequence[onnx.TensorProto],
+    given: onnx.ValueInfoProto,
+    output_name: str,
+    columns: int,
+) -> onnx.ModelProto:
+    output = helper.make_tensor_value_info(output_name, onnx.TensorProto.FLOAT, ["N", columns])
+    opsets = [helper.make_opsetid("", OPSET)]
+    if any(node.domain == "ai.onnx.ml" for node in nodes):
+        opsets.append(helper.make_opsetid("ai.onnx.ml", ML_OPSET))
+    graph = helper.make_graph(nodes, "graspd", [given], [output], constants)
+    return helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION)
+
+
+def _nodes(steps: _Steps) -> list[onnx.NodeProto]:
+    return [helper.make_node(op, inputs, [out], **more) for op, inputs, out, more in steps]
+
+
+def _vectors(name: str, width: int) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", width])
+
+
+def _constant(name: str, values: NDArray[np.generic]) -> onnx.TensorProto:
+    return numpy_helper.from_array(np.ascontiguousarray(values), name)
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Hold back what the exporter says of its own inside: nothing that a user could act on."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", category=FutureWarning)
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,236 @@
+"""One training and what it says of the grasps it has not seen: a pure function, kept in a file."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import os
+import threading
+import time
+import warnings
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import joblib
+import numpy as np
+from numpy.typing import NDArray
+
+from models.inputs import builder, raw_features
+from models.training.data.datasets import Grasps
+from models.training.data.folds import fold_seed
+from models.training.data.protocols import FOLDS, Protocol, Split, splits
+from models.training.fitting.fitting import Fitted, fit
+from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, sit
+from models.training.systems.system import SessionFeatures, System, digest, with_recipes
+
+FORMAT = 1
+"""Goes up when a job gives another result for the same configuration, or is written otherwise."""
+MAX_FILE_BYTES = 64 * 2**20
+"""A larger file is no result: 4682 grasps in 8 variants take 0.4 MB."""
+_META, _TEST, _MARGINS, _AGES = "meta", "test", "margins.", "ages."
+_INTERRUPTED = "Training interrupted"
+_ONE_AT_A_TIME = threading.Lock()
+"""torch's random state and its number of threads belong to the process."""
+
+_log = logging.getLogger(__name__)
+
+
+class BrokenResultError(Exception):
+    """A stored result is not what it claims to be: run the job again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One fold of one protocol for one system."""
+
+    system: System
+    protocol: Protocol
+    seed: int
+    """Of the split and, with the fold, of the training."""
+    fold: int
+    folds: int = FOLDS
+
+    def key(self, data: str) -> str:
+        """SHA-256 of all that the result depends on; `data` is the digest of the grasps."""
+        parts = [FORMAT, digest(_alone(self.system)), self.protocol, self.seed, self.fold]
+        text = json.dumps([*parts, self.folds, data])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def file_name(self, data: str) -> str:
+        """Of the stored result: readable, and different for every job."""
+        readable = f"{self.system.name}.{self.protocol}.{self.seed}.{self.fold}"
+        return f"{readable}.{self.key(data)[:16]}.npz"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JobResult:
+    """What a trained system says of the test grasps of a job."""
+
+    test: NDArray[np.int64]
+    """Indices (n,) of the grasps, ascending."""
+    margins: dict[str, NDArray[np.float64]]
+    """By variant: uncalibrated log-odds of slip (n,)."""
+    train_grasps: int
+    seconds: float
+    """Of training and judging."""
+    parameters: int
+    """How many numbers the trained system consists of."""
+    ages: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    """By running variant: grasps (n,) that the session had seen before."""
+
+    def to_bytes(self) -> bytes:
+        """A .npz file without pickled objects."""
+        meta = {
+            "format": FORMAT,
+            "train_grasps": self.train_grasps,
+            "seconds": self.seconds,
+            "parameters": self.parameters,
+        }
+        arrays = {_TEST: self.test, _META: np.frombuffer(json.dumps(meta).encode(), np.uint8)}
+        arrays |= {_MARGINS + variant: values for variant, values in self.margins.items()}
+        arrays |= {_AGES + variant: values for variant, values in self.ages.items()}
+        file = io.BytesIO()
+        np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> JobResult:
+        """The inverse of `to_bytes`. Raises `BrokenResultError`."""
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                result = _result({name: arrays[name] for name in arrays.files})
+        except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
+            raise BrokenResultError(f"is no result of a job: {error}") from error
+        return result
+
+
+def run(job: Job, grasps: Grasps) -> JobResult:
+    """Train on a split and judge the grasps left out, on one thread.
+
+    Depends on the arguments alone, whatever runs beside it. Raises `TooFewGraspsError` if the data
+    do not have that split, `ValueError` if the system cannot learn from it.
+    """
+    split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
+    system, seed = _alone(job.system), fold_seed(job.seed, job.fold)
+    grasps = grasps.of_fingers(system.fingers)
+    # A forest would otherwise send its trees back to the cluster that this job came from.
+    with _ONE_AT_A_TIME, joblib.parallel_config("sequential"), _interruptible():
+        started_s = time.perf_counter()
+        if isinstance(system.input, SessionFeatures):
+            fitted, margins, ages = _run_session(system, system.input, grasps, split, seed)
+        else:
+            inputs = builder(system.input, len(system.fingers)).build_batch(grasps.counts)[0]
+            fitted = fit(system, inputs[split.train], grasps.slipped[split.train], seed=seed)
+            margins, ages = {NONE: fitted.margins(inputs[split.test])}, {}
+        seconds = time.perf_counter() - started_s
+    return JobResult(split.test, margins, len(split.train), seconds, fitted.parameters, ages)
+
+
+def load(folder: Path, job: Job, data: str) -> JobResult | None:
+    """The stored result of a job, None if there is none or, with a warning, if it is broken."""
+    path = folder / job.file_name(data)
+    try:
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise BrokenResultError("is too large")
+        return JobResult.from_bytes(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except BrokenResultError as error:
+        _log.warning("%s %s; it is run again", path, error)
+        return None
+
+
+def save(folder: Path, job: Job, data: str, content: bytes) -> None:
+    """Store the bytes of a result, whole or not at all."""
+    path = folder / job.file_name(data)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """A perceptron of scikit-learn takes Ctrl-C for the end of its training, and only warns."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=_INTERRUPTED, category=UserWarning)
+        try:
+            yield
+        except UserWarning as warning:
+            if str(warning).startswith(_INTERRUPTED):
+                raise KeyboardInterrupt from warning
+            raise
+
+
+def _run_session(
+    system: System, wanted: SessionFeatures, grasps: Grasps, split: Split, seed: int
+) -> tuple[Fitted, dict[str, NDArray[np.float64]], dict[str, NDArray[np.int64]]]:
+    """Each table is a session, standardised by its own training grasps."""
+    features, table_of = raw_features(grasps.counts), grasps.table_of
+    train, test = split.train, split.test
+    standards = TrainingStandards.of(features[train], table_of[train])
+    inputs = standards.apply(features[train], table_of[train], wanted.clip)
+    fitted = fit(system, inputs, grasps.slipped[train], seed=seed)
+    if split.calibration is None:
+        known = standards.apply(features[test], table_of[test], wanted.clip)
+        return fitted, {TRAINING: fitted.margins(known)}, {}
+    sitting = sit(features, test, split.calibration, standards, seed)
+    margins = {
+        variant: fitted.margins(by.apply(features[test], wanted.clip))
+        for variant, by in sitting.standards.items()
+    }
+    return fitted, margins, sitting.ages
+
+
+def _alone(system: System) -> System:
+    return with_recipes(system, threads=1)
+
+
+def _result(arrays: dict[str, NDArray[np.generic]]) -> JobResult:
+    """Raises `KeyError`, `TypeError` or `ValueError` for what is no result."""
+    meta = json.loads(arrays[_META].tobytes())
+    if meta["format"] != FORMAT:
+        raise ValueError(f"format {meta['format']}, not {FORMAT}")
+    test = arrays[_TEST].astype(np.int64)
+    margins = {
+        name: values.astype(np.float64)
+        for name, values in _named(arrays, _MARGINS, test.shape).items()
+    }
+    ages = {
+        name: values.astype(np.int64) for name, values in _named(arrays, _AGES, test.shape).items()
+    }
+    if test.ndim != 1 or not margins:
+        raise ValueError("has no margins")
+    if not all(np.isfinite(values).all() for values in margins.values()):
+        raise ValueError("has margins that are not finite")
+    return JobResult(
+        test,
+        margins,
+        int(meta["train_grasps"]),
+        float(meta["seconds"]),
+        int(meta["parameters"]),
+        ages,
+    )
+
+
+def _named(
+    arrays: dict[str, NDArray[np.generic]], prefix: str, shape: tuple[int, ...]
+) -> dict[str, NDArray[np.generic]]:
+    found = {
+        name.removeprefix(prefix): values
+        for name, values in arrays.items()
+        if name.startswith(prefix)
+    }
+    if any(values.shape != shape for values in found.values()):
+        raise ValueError(f"has {prefix} of another number of grasps")
+    return found

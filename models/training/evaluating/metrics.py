@@ -1,0 +1,223 @@
+"""Figures of verdicts: one test set, many folds and seeds, two systems side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
+
+from models.training.fitting.calibration import ECE_BINS, margins_of, p_slip, reliability
+
+METRICS = ("accuracy", "precision", "recall", "f1", "auc", "brier", "ece", "log_loss")
+"""Names of the figures of `Scores`."""
+Z_95 = 1.959963984540054
+"""Standard normal quantile of a two-sided 95 % interval."""
+CURVE_STEPS = 50
+"""Points of an accuracy-coverage curve."""
+FEWEST_JUDGED = 50
+"""An accuracy over fewer verdicts than this sets no threshold: by chance alone it may be 100 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Figures of one test set as fractions, slip positive."""
+
+    grasps: int
+    accuracy: float
+    precision: float
+    recall: float
+    f1: float
+    auc: float
+    """Area under the ROC curve: does it rank, whatever the threshold. NaN for a single class."""
+    brier: float
+    """Mean squared error of the slip probability."""
+    ece: float
+    """Expected calibration error of the verdict's probability."""
+    log_loss: float
+    """Mean negative log-likelihood, nats."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """A figure over folds and seeds."""
+
+    mean: float
+    """Of the seeds' fold means."""
+    std: float
+    """Population standard deviation over the folds, mean of the seeds; over the seeds where a seed
+    has one fold only."""
+    error: float | None
+    """Standard error of the mean over the seeds; None for one seed."""
+    seeds: int
+    folds: int
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A figure of one system less that of another, on the same splits."""
+
+    mean: float
+    error: float | None
+    """Standard error; None for a single split."""
+    splits: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fraction:
+    """Share of right verdicts, with its 95 % interval (Wilson 1927)."""
+
+    grasps: int
+    accuracy: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """Judging only where max(p_slip, 1 - p_slip) reaches `confidence`."""
+
+    confidence: float
+    accuracy: float
+    coverage: float
+
+
+def score(
+    values: NDArray[np.float64],
+    slipped: NDArray[np.bool_],
+    probability: NDArray[np.float64] | None = None,
+) -> Scores:
+    """Figures of margins (N,) or logits (N, 2) against labels (N,).
+
+    Brier score, calibration error and log loss are those of `probability` (N,) of slip; without it
+    of the uncalibrated one.
+    """
+    margin = margins_of(values)
+    verdict = margin > 0.0
+    precision, recall, f1, _ = precision_recall_fscore_support(
+        slipped, verdict, average="binary", zero_division=0.0
+    )
+    both = len(np.unique(slipped)) == 2
+    reliable = reliability(p_slip(margin) if probability is None else probability, slipped)
+    return Scores(
+        grasps=len(slipped),
+        accuracy=float(accuracy_score(slipped, verdict)),
+        precision=float(precision),
+        recall=float(recall),
+        f1=float(f1),
+        auc=float(roc_auc_score(slipped, margin)) if both else math.nan,
+        brier=reliable.brier,
+        ece=reliable.ece,
+        log_loss=reliable.log_loss,
+    )
+
+
+def over_seeds(figures: Sequence[Sequence[float]]) -> Spread:
+    """Mean and spread of figures (seeds, folds). NaN is left out; all NaN give NaN."""
+    table = np.array(figures)
+    if np.isnan(table).all():  # the mean of nothing is a warning
+        return Spread(math.nan, math.nan, None, *table.shape)
+    means = np.nanmean(table, axis=1)
+    seeds, folds = table.shape
+    std = np.nanstd(table, axis=1).mean() if folds > 1 else means.std()
+    error = float(means.std(ddof=1) / math.sqrt(seeds)) if seeds > 1 else None
+    return Spread(float(means.mean()), float(std), error, seeds, folds)
+
+
+def paired_difference(
+    ours: Sequence[float], theirs: Sequence[float], test_to_train: float
+) -> Difference:
+    """Mean of `ours - theirs` over all splits of all seeds, and its standard error.
+
+    Trainings share most of their grasps, so their errors are not independent: the variance of the
+    mean is `(1 / J + test_to_train)` times that of the J differences (Nadeau & Bengio 2003,
+    Inference for the Generalization Error). `test_to_train` is the ratio of their grasps; 0 where
+    the trainings differ by their seed alone.
+    """
+    differences = np.array(ours) - np.array(theirs)
+    number = len(differences)
+    if number < 2:
+        return Difference(float(differences.mean()), None, number)
+    variance = float(differences.var(ddof=1)) * (1.0 / number + test_to_train)
+    return Difference(float(differences.mean()), math.sqrt(variance), number)
+
+
+def wilson(accuracy: float, grasps: int) -> Fraction:
+    """A share of right verdicts among so many grasps, with its interval."""
+    spread = Z_95**2 / grasps
+    centre = (accuracy + spread / 2.0) / (1.0 + spread)
+    half = math.sqrt(accuracy * (1.0 - accuracy) * spread + spread**2 / 4.0) / (1.0 + spread)
+    # The interval holds the share; at 0 and 1 rounding would just miss it.
+    low, high = min(accuracy, centre - half), max(accuracy, centre + half)
+    return Fraction(grasps, accuracy, max(0.0, low), min(1.0, high))
+
+
+def coverage_curve(
+    probability: NDArray[np.float64], slipped: NDArray[np.bool_], steps: int = CURVE_STEPS
+) -> list[CurvePoint]:
+    """Accuracy of the most confident verdicts, from nearly none to all of them.
+
+    Of slip probabilities (N,) and labels (N,), N > 0; ascending in coverage. Verdicts of the same
+    confidence stay together.
+    """
+    confidence, accuracy = _by_confidence(probability, slipped)
+    number = len(confidence)
+    last = np.append(confidence[1:] != confidence[:-1], True)
+    wanted = np.unique(np.ceil(np.linspace(1.0 / steps, 1.0, steps) * number).astype(int)) - 1
+    ends = np.flatnonzero(last)
+    chosen = np.unique(ends[np.searchsorted(ends, wanted)])
+    return [
+        CurvePoint(float(confidence[end]), float(accuracy[end]), (int(end) + 1) / number)
+        for end in chosen
+    ]
+
+
+def accuracy_at(
+    probability: NDArray[np.float64], slipped: NDArray[np.bool_], coverage: float
+) -> float:
+    """Accuracy of this share of the grasps, the most confident ones; at least one."""
+    _, accuracy = _by_confidence(probability, slipped)
+    return float(accuracy[max(1, round(coverage * len(accuracy))) - 1])
+
+
+def reject_threshold(
+    probability: NDArray[np.float64], slipped: NDArray[np.bool_], wanted: float
+) -> CurvePoint | None:
+    """The lowest confidence from which on verdicts reach the wanted accuracy.
+
+    None if no confidence does so over `FEWEST_JUDGED` verdicts.
+    """
+    confidence, accuracy = _by_confidence(probability, slipped)
+    last = np.append(confidence[1:] != confidence[:-1], True)
+    enough = np.arange(1, len(confidence) + 1) >= FEWEST_JUDGED
+    ends = np.flatnonzero(last & enough & (accuracy >= wanted))
+    if not len(ends):
+        return None
+    end = ends[-1]
+    coverage = (int(end) + 1) / len(confidence)
+    return CurvePoint(float(confidence[end]), float(accuracy[end]), coverage)
+
+
+def reliability_bins(
+    probability: NDArray[np.float64], slipped: NDArray[np.bool_]
+) -> list[tuple[float, float, int]]:
+    """Mean slip probability, share that slipped, and number of grasps of each bin in use."""
+    bins = np.minimum((probability * ECE_BINS).astype(np.int64), ECE_BINS - 1)
+    return [
+        (float(probability[bins == b].mean()), float(slipped[bins == b].mean()), int(number))
+        for b, number in enumerate(np.bincount(bins, minlength=ECE_BINS))
+        if number
+    ]
+
+
+def _by_confidence(
+    probability: NDArray[np.float64], slipped: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Confidences, falling, and the accuracy of all verdicts up to each."""
+    confidence = np.maximum(probability, 1.0 - probability)
+    order = np.argsort(-confidence, kind="stable")
+    right = ((probability > 0.5) == slipped)[order]
+    return confidence[order], np.cumsum(right) / np.arange(1, len(order) + 1)

@@ -1,0 +1,195 @@
+"""Pictures of summaries: reliability, accuracy-coverage, confusion, objects, young sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from models.training.data.protocols import PROTOCOLS
+from models.training.evaluating.summary import Summary
+from models.training.fitting.standards import DRAWS
+
+FORMATS = ("png", "svg")
+DPI = 130
+MOST_CURVES = 8
+"""Curves in one picture that can still be told apart."""
+SLIP, STABLE, LINE, GREY = "#b5402a", "#2a6f97", "#1d3557", "#999999"
+
+
+def draw(summaries: Sequence[Summary], folder: Path) -> list[Path]:
+    """Write the pictures into the folder and return their paths.
+
+    One of each system in each protocol; one per protocol that compares the best of them; one of
+    session calibration, if there is such a system. Raises `OSError`.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for summary in summaries:
+        written += _save(_report(summary), folder / f"{summary.system}.{summary.protocol}")
+    for protocol in PROTOCOLS:
+        here = [summary for summary in summaries if summary.protocol == protocol]
+        if len(here) > 1:
+            written += _save(_comparison(here), folder / f"coverage.{protocol}")
+    sessions = [summary for summary in summaries if len(summary.variants) > 1]
+    if sessions:
+        written += _save(_calibration(sessions), folder / "session-calibration")
+    return written
+
+
+def _save(figure: Figure, stem: Path) -> list[Path]:
+    # Without a canvas of its own, a figure would ask for a window system.
+    FigureCanvasAgg(figure)
+    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in FORMATS]
+    for path in paths:
+        figure.savefig(path, dpi=DPI, metadata={"Date": None} if path.suffix == ".svg" else None)
+    return paths
+
+
+def _report(summary: Summary) -> Figure:
+    figure = Figure(figsize=(13.0, 9.5), layout="constrained")
+    f1 = summary.main.spreads["f1"]
+    figure.suptitle(
+        f"{summary.system}, protocol {summary.protocol} ({summary.headline}): "
+        f"F1 {100 * f1.mean:.1f} % over {f1.seeds} x {f1.folds} trainings",
+        fontsize=13,
+    )
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.15))
+    panels: tuple[Callable[[Axes, Summary], None], ...] = (_reliability, _coverage, _confusion)
+    for row, panel in enumerate(panels):
+        panel(figure.add_subplot(grid[row, 0]), summary)
+    _objects(figure.add_subplot(grid[:, 1]), summary)
+    return figure
+
+
+def _reliability(axes: Axes, summary: Summary) -> None:
+    bins = summary.main.bins
+    total = sum(number for _, _, number in bins)
+    axes.plot((0.0, 1.0), (0.0, 1.0), color=GREY, linewidth=1.0, linestyle="--")
+    predicted, seen = [bin_[0] for bin_ in bins], [bin_[1] for bin_ in bins]
+    axes.plot(predicted, seen, color=LINE, linewidth=1.2)
+    sizes = [10.0 + 300.0 * number / total for _, _, number in bins]
+    axes.scatter(predicted, seen, s=sizes, color=SLIP, zorder=3)
+    ece = summary.main.spreads["ece"].mean
+    axes.set_title(f"Reliability (ECE of a fold {100 * ece:.1f} %)", fontsize=10)
+    axes.set_xlabel("predicted slip probability (size: grasps)")
+    axes.set_ylabel("share that slipped")
+
+
+def _coverage(axes: Axes, summary: Summary) -> None:
+    points = summary.main.curve
+    axes.plot(
+        [100.0 * point.coverage for point in points],
+        [100.0 * point.accuracy for point in points],
+        color=LINE,
+    )
+    for wanted, threshold in summary.main.thresholds.items():
+        if threshold is not None:
+            place = (100.0 * threshold.coverage, 100.0 * threshold.accuracy)
+            to_left = place[0] > 30.0
+            axes.plot(*place, "o", color=SLIP, markersize=4)
+            axes.annotate(
+                f"{100 * float(wanted):g} % from {threshold.confidence:.2f}",
+                place,
+                xytext=(-4, -5) if to_left else (6, 4),
+                textcoords="offset points",
+                ha="right" if to_left else "left",
+                va="top" if to_left else "bottom",
+                fontsize=8,
+            )
+    axes.set_xlim(0.0, 103.0)
+    axes.set_title("Accuracy of the most confident verdicts, and reject thresholds", fontsize=10)
+    axes.set_xlabel("coverage, %")
+    axes.set_ylabel("accuracy, %")
+    axes.grid(alpha=0.3)
+
+
+def _confusion(axes: Axes, summary: Summary) -> None:
+    rows = summary.main.confusion
+    shares = [[number / max(1, sum(row)) for number in row] for row in rows]
+    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    for y, row in enumerate(rows):
+        for x, number in enumerate(row):
+            axes.text(
+                x,
+                y,
+                f"{100 * shares[y][x]:.1f} %\n{number}",
+                ha="center",
+                va="center",
+                color="white" if shares[y][x] > 0.5 else "black",
+            )
+    axes.set_xticks((0, 1), ("judged stable", "judged slip"))
+    axes.set_yticks((0, 1), ("was stable", "slipped"))
+    axes.set_title("Confusion (grasps of all seeds)", fontsize=10)
+
+
+def _objects(axes: Axes, summary: Summary) -> None:
+    """F1 as bars, accuracy with its interval as points: the worst object on top."""
+    ranked = sorted(summary.main.objects.items(), key=lambda item: -item[1].f1)
+    places = range(len(ranked))
+    axes.barh(places, [100.0 * one.f1 for _, one in ranked], color=STABLE, alpha=0.45, label="F1")
+    shares = [one.share for _, one in ranked]
+    axes.errorbar(
+        [100.0 * share.accuracy for share in shares],
+        places,
+        xerr=(
+            [100.0 * (share.accuracy - share.low) for share in shares],
+            [100.0 * (share.high - share.accuracy) for share in shares],
+        ),
+        fmt="o",
+        markersize=3,
+        linewidth=0.9,
+        color=LINE,
+        label="accuracy, 95 %",
+    )
+    axes.set_yticks(places, [f"{name} ({one.share.grasps})" for name, one in ranked], fontsize=7.5)
+    axes.set_ylim(-0.8, len(ranked) - 0.2)
+    axes.set_xlim(0.0, 101.0)
+    axes.set_xlabel("%")
+    axes.set_title("Objects (grasps), slip positive", fontsize=10, loc="left")
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.995), ncols=2, fontsize=8, frameon=False)
+    axes.grid(axis="x", alpha=0.3)
+
+
+def _comparison(summaries: Sequence[Summary]) -> Figure:
+    """Accuracy-coverage curves of the best systems of a protocol."""
+    ranked = sorted(summaries, key=lambda one: -one.main.coverages["0.8"])[:MOST_CURVES]
+    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
+    axes = figure.subplots()
+    for summary in ranked:
+        axes.plot(
+            [100.0 * point.coverage for point in summary.main.curve],
+            [100.0 * point.accuracy for point in summary.main.curve],
+            label=f"{summary.system} ({100 * summary.main.coverages['0.8']:.1f} % at 80 %)",
+        )
+    axes.axvline(80.0, color=GREY, linewidth=0.8, linestyle="--")
+    axes.set_xlabel("coverage, %")
+    axes.set_ylabel("accuracy, %")
+    axes.set_title(f"Accuracy of the most confident verdicts, protocol {ranked[0].protocol}")
+    axes.legend(fontsize=8, loc="lower left")
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def _calibration(summaries: Sequence[Summary]) -> Figure:
+    """F1 in a later session by the number of unlabelled grasps, and of a running session."""
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    variants = ["none", *(f"n{number}" for number in DRAWS), "all", "running", "running-sorted"]
+    shown = len(variants) - 2
+    for index, summary in enumerate(summaries[:MOST_CURVES]):
+        values = [100.0 * summary.variants[name].spreads["f1"].mean for name in variants]
+        colour = f"C{index}"
+        axes.plot(range(shown), values[:shown], "o-", color=colour, label=summary.system)
+        axes.plot(range(shown, len(variants)), values[shown:], "s", color=colour)
+    labels = [name.removeprefix("n") if name[1:].isdigit() else name for name in variants]
+    axes.set_xticks(range(len(variants)), [label.replace("-", ",\n") for label in labels])
+    axes.set_xlabel("unlabelled grasps of the session that calibrate it")
+    axes.set_ylabel("F1, %")
+    axes.set_title("Protocol session: palm_45 by palm_down + palm_side, objects left out")
+    axes.legend(fontsize=8, loc="lower right")
+    axes.grid(alpha=0.3)
+    return figure

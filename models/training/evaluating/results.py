@@ -1,0 +1,306 @@
+"""The reproduction table: the paper's figures beside ours, and the new systems, as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, Protocol
+from models.training.evaluating.metrics import Difference, Spread, paired_difference
+from models.training.evaluating.summary import HEADLINE, Summary
+from models.training.fitting.standards import SESSION_VARIANTS
+from models.training.systems.system import Published, SessionFeatures, System
+from models.training.systems.systems import SYSTEMS
+
+NOT_RUN = "-"
+REFERENCE = "cnn1"
+"""The paper's best network: what every system is compared with."""
+FIGURES = ("f1", "accuracy", "precision", "recall")
+"""Figures that the paper gives."""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """How a table was made."""
+
+    command: str
+    seconds: float
+    made_with: Mapping[str, str]
+    quick: bool = False
+
+
+Found = dict[tuple[str, Protocol], Summary]
+
+
+def table(summaries: Sequence[Summary], made: Made) -> str:
+    """The whole document. Nothing is filled in: what was not run is `-`."""
+    found: Found = {(summary.system, summary.protocol): summary for summary in summaries}
+    sections = (
+        _head(summaries, made),
+        _paper(found),
+        _systems(found),
+        _sessions(found),
+        _differences(found),
+        _everything(summaries),
+        _how(summaries, made),
+    )
+    return "\n".join(line for section in sections for line in (*section, ""))
+
+
+def _head(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
+    yield "# Results"
+    yield ""
+    yield (
+        "F1 in % with slip as the positive class, unless a column says otherwise. `+-` is the "
+        "standard deviation over the folds (`unknown`: over the trainings), s.e. the standard "
+        "error over the split seeds."
+    )
+    if made.quick:
+        yield ""
+        yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"
+    yield ""
+    for protocol in PROTOCOLS:
+        if protocol in STANDARD or any(one.protocol == protocol for one in summaries):
+            yield f"- `{protocol}`: {ABOUT[protocol]}"
+
+
+def _paper(found: Found) -> Iterator[str]:
+    yield "## 1. The paper's systems"
+    yield ""
+    yield from _header(
+        "system", "protocol", "figure", "paper", "ours", "s.e.", "seeds", "difference"
+    )
+    for system in SYSTEMS.values():
+        if isinstance(system.input, SessionFeatures):
+            continue
+        for published in system.published or (None,):
+            yield from _published(system, published, found)
+
+
+def _published(system: System, published: Published | None, found: Found) -> Iterator[str]:
+    """A row for each figure that the paper gives; for F1 alone where it gives none."""
+    protocol: Protocol = published.protocol if published else "cv"
+    summary = found.get((system.name, protocol))
+    for figure in FIGURES:
+        paper = getattr(published, figure) if published else None
+        if paper is None and (published or figure != "f1"):
+            continue
+        ours = summary.main.spreads[figure] if summary else None
+        yield _row(
+            f"`{system.name}`",
+            f"`{protocol}`",
+            figure.replace("f1", "F1"),
+            f"{paper[0]:.1f} +- {paper[1]:.1f}" if paper else NOT_RUN,
+            _value(ours),
+            _error(ours.error if ours else None),
+            str(ours.seeds) if ours else NOT_RUN,
+            f"{100 * ours.mean - paper[0]:+.1f}" if ours and paper else NOT_RUN,
+        )
+
+
+def _systems(found: Found) -> Iterator[str]:
+    yield "## 2. All systems, all protocols"
+    yield ""
+    yield (
+        f"In `session`, systems with session calibration have seen {HEADLINE[1:]} unlabelled "
+        "grasps of other objects of that session, the others none."
+    )
+    yield ""
+    yield from _header("system", "parameters", *(f"`{protocol}`" for protocol in STANDARD))
+    for name in SYSTEMS:
+        row = [found.get((name, protocol)) for protocol in STANDARD]
+        if any(row):
+            sizes = [summary.parameters for summary in row if summary]
+            yield _row(f"`{name}`", f"{max(sizes):,}", *(_with_error(summary) for summary in row))
+
+
+def _sessions(found: Found) -> Iterator[str]:
+    yield "## 3. Session calibration"
+    yield ""
+    yield (
+        "Protocol `session`, by what the session has shown before: nothing; 5 to 50 unlabelled "
+        "grasps of other objects; all of them; a running session from nothing, each grasp judged "
+        "before it counts, with the objects mixed or one after the other."
+    )
+    yield ""
+    columns = [
+        variant[1:] if variant[1:].isdigit() else variant.replace("-", ", ")
+        for variant in SESSION_VARIANTS
+    ]
+    yield from _header("system", *columns)
+    for name in SYSTEMS:
+        summary = found.get((name, "session"))
+        if summary:
+            spreads = {key: value.spreads["f1"] for key, value in summary.variants.items()}
+            yield _row(f"`{name}`", *(_value(spreads.get(key)) for key in SESSION_VARIANTS))
+    yield from _young(found)
+
+
+def _young(found: Found) -> Iterator[str]:
+    """How right the verdicts of a running session are while it is young."""
+    rows = [
+        (name, summary.variants["running"].ages)
+        for name in SYSTEMS
+        if (summary := found.get((name, "session"))) and "running" in summary.variants
+    ]
+    if not rows:
+        return
+    bounds = sorted({age.grasps_before for _, ages in rows for age in ages})
+    yield ""
+    yield "Accuracy, %, in a running session (objects mixed) after at least so many grasps:"
+    yield ""
+    yield from _header("system", *(str(bound) for bound in bounds))
+    for name, ages in rows:
+        by_bound = {age.grasps_before: f"{100 * age.share.accuracy:.1f}" for age in ages}
+        yield _row(f"`{name}`", *(by_bound.get(bound, NOT_RUN) for bound in bounds))
+
+
+def _differences(found: Found) -> Iterator[str]:
+    yield "## 4. Differences on the same splits"
+    yield ""
+    yield (
+        f"F1 of the system less that of `{REFERENCE}`, and less that of the protocol's best, in "
+        "percentage points, with the standard error over all folds of all seeds, corrected for "
+        "trainings that share their grasps (Nadeau and Bengio 2003); in `unknown` over the "
+        "trainings alone."
+    )
+    yield ""
+    yield from _header("system", "protocol", f"to `{REFERENCE}`", "to the best", "best")
+    for protocol in PROTOCOLS:
+        here = [found[name, protocol] for name in SYSTEMS if (name, protocol) in found]
+        if len(here) < 2:
+            continue
+        best = max(here, key=lambda summary: summary.main.spreads["f1"].mean)
+        reference = found.get((REFERENCE, protocol))
+        for summary in here:
+            yield _row(
+                f"`{summary.system}`",
+                f"`{protocol}`",
+                _difference(summary, reference),
+                _difference(summary, best),
+                f"`{best.system}`",
+            )
+
+
+def difference(ours: Summary, theirs: Summary, figure: str = "f1") -> Difference | None:
+    """Ours less theirs on the splits that both have judged; None if there are none."""
+    seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
+    if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
+        return None
+    pairs = [
+        (one, other)
+        for seed in seeds
+        for one, other in zip(_of(ours, figure, seed), _of(theirs, figure, seed), strict=True)
+        if one is not None and other is not None
+    ]
+    if not pairs:
+        return None
+    overlap = ours.test_grasps / ours.train_grasps if ours.folds > 1 else 0.0
+    return paired_difference([one for one, _ in pairs], [other for _, other in pairs], overlap)
+
+
+def _of(summary: Summary, figure: str, seed: int) -> list[float | None]:
+    return summary.main.figures[figure][summary.seeds.index(seed)]
+
+
+def _everything(summaries: Sequence[Summary]) -> Iterator[str]:
+    yield "## 5. Every figure"
+    yield ""
+    yield (
+        "Accuracy, precision, recall and F1 in %; AUC, Brier score and expected calibration error "
+        "(ECE) as fractions, probabilities calibrated by a temperature of the other folds; "
+        "accuracy, %, of the 80 % most confident verdicts; seconds of one training."
+    )
+    yield ""
+    percent, fractions = ("accuracy", "precision", "recall", "f1"), ("auc", "brier", "ece")
+    yield from _header(
+        "system",
+        "protocol",
+        *(name.replace("f1", "F1") for name in percent),
+        *("AUC", "Brier", "ECE"),
+        "at 80 %",
+        "seeds",
+        "s",
+    )
+    for summary in summaries:
+        main = summary.main
+        trainings = len(summary.seeds) * summary.folds
+        yield _row(
+            f"`{summary.system}`",
+            f"`{summary.protocol}`",
+            *(_value(main.spreads[name]) for name in percent),
+            *(f"{main.spreads[name].mean:.3f}" for name in fractions),
+            f"{100 * main.coverages['0.8']:.1f}",
+            str(len(summary.seeds)),
+            f"{summary.seconds / trainings:.1f}",
+        )
+
+
+def _how(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
+    yield "## How this was made"
+    yield ""
+    yield f"    {made.command}"
+    yield ""
+    total = sum(summary.seconds for summary in summaries)
+    trainings = sum(len(summary.seeds) * summary.folds for summary in summaries)
+    yield (
+        f"{trainings} trainings, {_duration(total)} in all on one thread each; this run of the "
+        f"command took {_duration(made.seconds)}, with what was finished before taken as it was. "
+        "Without names, protocols and seeds the same command makes everything, what is `-` too: "
+        "more than a day on two cores, most of it the 300 epochs of `cnn1-faithful`."
+    )
+    yield ""
+    yield ", ".join(f"{name} {version}" for name, version in made.made_with.items()) + "."
+    files = {file.name: file for summary in summaries for file in summary.files}
+    if files:
+        yield ""
+        yield "Data (SHA-256, grasps used):"
+        yield ""
+        for file in files.values():
+            yield f"- `{file.name}.csv` {file.sha256}, {file.rows}"
+
+
+def _header(*columns: str) -> Iterator[str]:
+    yield _row(*columns)
+    yield "|" + "---|" * len(columns)
+
+
+def _row(*cells: str) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+def _value(spread: Spread | None) -> str:
+    if spread is None:
+        return NOT_RUN
+    alone = spread.seeds * spread.folds == 1
+    return f"{100 * spread.mean:.1f}" + ("" if alone else f" +- {100 * spread.std:.1f}")
+
+
+def _error(error: float | None) -> str:
+    return NOT_RUN if error is None else f"{100 * error:.2f}"
+
+
+def _with_error(summary: Summary | None) -> str:
+    if summary is None:
+        return NOT_RUN
+    spread = summary.main.spreads["f1"]
+    error = "" if spread.error is None else f" (s.e. {100 * spread.error:.2f})"
+    return _value(spread) + error
+
+
+def _difference(ours: Summary, theirs: Summary | None) -> str:
+    if theirs is None or ours is theirs:
+        return NOT_RUN
+    found = difference(ours, theirs)
+    if found is None:
+        return NOT_RUN
+    error = "" if found.error is None else f" +- {100 * found.error:.1f}"
+    return f"{100 * found.mean:+.1f}{error}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    if seconds < 7200.0:
+        return f"{seconds / 60.0:.0f} min"
+    return f"{seconds / 3600.0:.1f} h"

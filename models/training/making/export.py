@@ -1,0 +1,107 @@
+"""A trained system into the ONNX file that the daemon runs, proven to judge as it does."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+
+from models.contract import METADATA_KEY, ModelContract
+from models.inputs import SessionBuilder, builder
+from models.runtime import TactileModel
+from models.training.estimators.graphs import OPSET
+from models.training.fitting.fitting import Fitted
+
+__all__ = ["OPSET", "TOLERANCE", "ExportError", "Parity", "SessionStandards", "export"]
+
+TOLERANCE = 1e-5
+"""Largest allowed difference of a probability between the trained system and its file."""
+
+
+class ExportError(Exception):
+    """The exported file does not judge as the trained system does: our bug, nothing is written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parity:
+    """How far the file is from the system it was made from, over `grasps` grasps."""
+
+    grasps: int
+    largest_difference: float
+    """Of a probability: file against trainer, before anything was folded or rounded."""
+    verdicts_flipped: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionStandards:
+    """Statistics by which the readings of a parity check are standardised, in order of reading."""
+
+    mean: NDArray[np.float64]
+    """Shape (N, features)."""
+    spread: NDArray[np.float64]
+    """Shape (N, features), above zero."""
+
+
+def export(
+    fitted: Fitted,
+    temperature: float,
+    contract: ModelContract,
+    counts: NDArray[np.uint16],
+    path: Path,
+    standards: SessionStandards | None = None,
+) -> Parity:
+    """Write `sigmoid(margin / temperature)` with its contract to `path`, one self-contained file.
+
+    The same system and contract give the same bytes. The file is run as the daemon runs it on
+    every reading of counts (N, fingers, 24) first; a session model by `standards`, or by those of
+    its contract. Raises `ExportError` if a probability differs by more than `TOLERANCE` or a
+    verdict flips, and leaves `path` as it was; `ModelError` if the contract does not fit.
+    """
+    model = fitted.to_onnx(temperature, builder(contract.input, len(contract.fingers)).name)
+    onnx.helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    onnx.checker.check_model(model, full_check=True)
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(model.SerializeToString(deterministic=True))
+        parity = _compare(part, fitted, temperature, counts, standards)
+        # Not "greater than": that would let a NaN pass.
+        if not parity.largest_difference <= TOLERANCE or parity.verdicts_flipped:
+            raise ExportError(
+                f"the exported file differs from the system by {parity.largest_difference:.1e} "
+                f"and flips {parity.verdicts_flipped} verdicts of {parity.grasps}"
+            )
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return parity
+
+
+def _compare(
+    path: Path,
+    fitted: Fitted,
+    temperature: float,
+    counts: NDArray[np.uint16],
+    standards: SessionStandards | None,
+) -> Parity:
+    model = TactileModel(path)
+    inputs = np.empty((len(counts), *model.input.shape), dtype=np.float32)
+    actual = np.empty(len(counts))
+    for index, reading in enumerate(counts):
+        if standards is not None and isinstance(model.inputs, SessionBuilder):
+            model.inputs.use(standards.mean[index], standards.spread[index])
+        model.inputs.build(reading, model.input)
+        inputs[index] = model.input
+        stable, actual[index] = model.run()
+        if not abs(stable + actual[index] - 1.0) <= TOLERANCE:
+            raise ExportError(f"probabilities sum up to {stable + actual[index]}")
+    # The logistic function as a tanh: it cannot overflow.
+    expected = 0.5 + 0.5 * np.tanh(0.5 * fitted.margins(inputs) / temperature)
+    return Parity(
+        grasps=len(counts),
+        largest_difference=float(np.abs(actual - expected).max()),
+        verdicts_flipped=int(((actual > 0.5) != (expected > 0.5)).sum()),
+    )

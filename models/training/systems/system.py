@@ -1,0 +1,164 @@
+"""What a system is: one way from counts to a margin, by configuration alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+import msgspec
+
+from models.bts3 import FINGERS, WHOLE
+from models.contract import CountsInput, Finger, ImageInput, VectorInput
+from models.training.data.augmentation import Augmentation
+from models.training.estimators.classical import ClassicalConfig
+from models.training.estimators.compression import Compression
+from models.training.estimators.networks import AnyNetwork
+from models.training.estimators.recipe import AnyRecipe, PublishedRecipe, Recipe
+
+Protocol = Literal["cv", "unknown", "objects", "session"]
+CLIP = 3.0
+"""Standardised session features beyond this say no more: a sensor has moved since."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFeatures:
+    """Input of a session model; the statistics come from the grasps that it is trained on."""
+
+    clip: float = CLIP
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One of the estimators that a blend asks."""
+
+    estimator: AnyNetwork | ClassicalConfig
+    recipe: AnyRecipe | None = None
+    """Of a network."""
+    copies: int = 1
+    """So many, each from another seed."""
+    weight: float = 1.0
+    """Of all copies together."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlendConfig:
+    """Weighted mean of the members' margins, each first divided by its own spread."""
+
+    members: tuple[Member, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DistilConfig:
+    """A small network that learns what a blend says of grasps that the blend has not seen."""
+
+    teacher: BlendConfig
+    student: AnyNetwork
+    hard: float = 0.5
+    """Weight of the labels in the student's targets; the rest is the teacher's probability."""
+    inner_folds: int = 5
+    """The teacher judges each grasp after training on the other folds."""
+
+
+SystemInput = ImageInput | VectorInput | CountsInput | SessionFeatures
+Estimator = AnyNetwork | ClassicalConfig | BlendConfig | DistilConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A figure of the paper, %, slip positive: mean and standard deviation."""
+
+    protocol: Protocol
+    f1: tuple[float, float]
+    accuracy: tuple[float, float] | None = None
+    precision: tuple[float, float] | None = None
+    recall: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """One way from counts to a margin, complete but for data and seed."""
+
+    name: str
+    description: str
+    input: SystemInput
+    estimator: Estimator
+    recipe: AnyRecipe | None = None
+    """Of the network that `estimator` is or, distilled, ends in; None for others."""
+    augmentation: Augmentation | None = None
+    standardise: bool = False
+    """Each value of an input by its own mean and spread in the training, within the model."""
+    compression: Compression | None = None
+    """What is done to the trained network before it judges."""
+    fingers: tuple[Finger, ...] = FINGERS
+    """Those that it judges by."""
+    tables: tuple[str, ...] = WHOLE
+    """What the model that is kept is trained on; protocols say for themselves."""
+    published: tuple[Published, ...] = ()
+
+
+def digest(system: System) -> str:
+    """SHA-256, hexadecimal, of all that decides a fold's result; not of name and description."""
+    names = ["input", "estimator", "recipe", "augmentation", "standardise"]
+    if system.compression is not None:
+        names.append("compression")
+    if system.fingers != FINGERS:
+        names.append("fingers")
+    parts = {name: plain(getattr(system, name)) for name in names}
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def with_recipes(system: System, **changes: float) -> System:
+    """The system with these fields changed in each of its recipes: `epochs=2`, `threads=1`."""
+    return _changed(system, changes)
+
+
+def epochs(system: System) -> int:
+    """How often one `fit` reports an epoch: once per epoch of each network that it trains."""
+    match system.estimator:
+        case BlendConfig() as blend:
+            return _blend_epochs(blend)
+        case DistilConfig() as distil:
+            own = system.recipe.epochs if system.recipe else 0
+            return own + distil.inner_folds * _blend_epochs(distil.teacher)
+        case _:
+            return system.recipe.epochs if system.recipe else 0
+
+
+def _blend_epochs(blend: BlendConfig) -> int:
+    return sum(member.copies * member.recipe.epochs for member in blend.members if member.recipe)
+
+
+def plain(value: object) -> Any:  # noqa: ANN401 - JSON
+    """JSON-like, with the names of the classes: two kinds with the same fields differ."""
+    if isinstance(value, msgspec.Struct):
+        fields = {name: plain(getattr(value, name)) for name in value.__struct_fields__}
+        return {"kind": type(value).__name__, **fields}
+    if dataclasses.is_dataclass(value):
+        fields = {
+            field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
+        return {"kind": type(value).__name__, **fields}
+    if isinstance(value, tuple):
+        return [plain(part) for part in value]
+    return value
+
+
+T = TypeVar("T")
+
+
+def _changed(value: T, changes: dict[str, Any]) -> T:
+    if isinstance(value, Recipe | PublishedRecipe):
+        return dataclasses.replace(value, **changes)
+    if isinstance(value, tuple):
+        return type(value)(_changed(part, changes) for part in value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        parts = {
+            field.name: _changed(getattr(value, field.name), changes)
+            for field in dataclasses.fields(value)
+        }
+        return dataclasses.replace(value, **parts)
+    return value

@@ -1,0 +1,365 @@
+"""Every system that can be trained, by name: its input, its estimator, its recipe."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+from models.bts3 import FINGERS, NEW_SESSION, WHOLE
+from models.contract import CountsInput, Finger, ImageInput, VectorInput
+from models.layout import D1, D2A, D2B, D3
+from models.tactile_image import Composition, Fill, Normalisation
+from models.training.data.augmentation import Augmentation
+from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig
+from models.training.estimators.classical import SvmConfig as Svm
+from models.training.estimators.compression import Compression, HalfWeights, Integers, LowRank
+from models.training.estimators.networks import (
+    CNN0,
+    CNN1,
+    CNN2,
+    CNN3,
+    NetworkConfig,
+    SecondConvolution,
+)
+from models.training.estimators.recipe import PublishedRecipe, Recipe
+from models.training.systems.system import (
+    BlendConfig,
+    DistilConfig,
+    Estimator,
+    Member,
+    Protocol,
+    Published,
+    SessionFeatures,
+    System,
+    SystemInput,
+    digest,
+    epochs,
+    with_recipes,
+)
+
+__all__ = [
+    "SYSTEMS",
+    "BlendConfig",
+    "DistilConfig",
+    "Estimator",
+    "Member",
+    "Protocol",
+    "Published",
+    "SessionFeatures",
+    "System",
+    "SystemInput",
+    "digest",
+    "epochs",
+    "with_recipes",
+]
+
+
+def image(
+    layout: str = D1.name,
+    fill: Fill = Fill.NEIGHBOUR_MEAN,
+    composition: Composition = Composition.CHANNELS,
+    normalisation: Normalisation = Normalisation.FILLED_IMAGE,
+) -> ImageInput:
+    """An image input; the best of the paper unless said otherwise."""
+    return ImageInput(layout, fill.value, normalisation.value, composition.value)
+
+
+EVERY_TABLE = (*WHOLE, NEW_SESSION)
+VECTOR = VectorInput()
+COUNTS = CountsInput()
+SESSION = SessionFeatures()
+
+CNN_RECIPE = Recipe()
+HAND: tuple[Finger, ...] = FINGERS
+RANKS = (8, 16, 32, 64, 128, 256)
+NARROW = ((4, 32), (8, 64), (16, 64))
+"""Filters and hidden units."""
+SHARP_SVM = Svm(c=5.0, gamma=0.02)
+SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
+SMALL_RECIPE = Recipe(epochs=20, weight_decay=1.0, input_noise=0.2)
+SESSION_SVM = Svm(c=3.0, gamma=0.003)
+SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
+SESSION_BLEND = BlendConfig(
+    (
+        Member(SESSION_SVM),
+        Member(SESSION_BOOSTING),
+        Member(SMALL_SESSION, SMALL_RECIPE, copies=2),
+    )
+)
+
+_PAPER = (
+    System(
+        "cnn0",
+        "Conv32 - FC128 on the D1 image, neighbour mean, fingers as channels.",
+        image(),
+        CNN0,
+        CNN_RECIPE,
+        published=(Published("cv", (92.6, 1.7)),),
+    ),
+    System(
+        "cnn1",
+        "Conv32 - FC1024, the paper's best network, in 20 epochs of a one-cycle schedule.",
+        image(),
+        CNN1,
+        CNN_RECIPE,
+        published=(Published("cv", (94.2, 0.8)), Published("unknown", (87.7, 0.4))),
+    ),
+    System(
+        "cnn2",
+        "Conv32 - MaxPool2 - FC1024.",
+        image(),
+        CNN2,
+        CNN_RECIPE,
+        published=(Published("cv", (92.0, 2.0)),),
+    ),
+    System(
+        "cnn3",
+        "Conv32 - MaxPool2 - Conv64 (1 x 1, as in the notebooks) - FC1024.",
+        image(),
+        CNN3,
+        CNN_RECIPE,
+        published=(Published("cv", (92.2, 2.0)),),
+    ),
+    System(
+        "cnn3-3x3",
+        "CNN3 with the second convolution 3 x 3, as in the table of the paper.",
+        image(),
+        dataclasses.replace(CNN3, second=SecondConvolution(kernel=3)),
+        CNN_RECIPE,
+        published=(Published("cv", (92.2, 2.0)),),
+    ),
+    System(
+        "cnn1-faithful",
+        "CNN1 trained as published: 300 epochs of Adam at a falling rate, L2.",
+        image(),
+        CNN1,
+        PublishedRecipe(),
+        published=(Published("cv", (94.2, 0.8)), Published("unknown", (87.7, 0.4))),
+    ),
+    System(
+        "cnn1-augmented",
+        "CNN1 for new objects as published: flips and rotations, dropout, 30 epochs.",
+        image(),
+        dataclasses.replace(CNN1, dropout=0.25),
+        PublishedRecipe(epochs=30, l2=0.015),
+        Augmentation(),
+        published=(Published("unknown", (90.1, 0.4)),),
+    ),
+    System(
+        "cnn1-dropout",
+        "CNN1 with dropout, to see what regularisation does.",
+        image(),
+        dataclasses.replace(CNN1, dropout=0.25),
+        CNN_RECIPE,
+    ),
+    System(
+        "cnn1-plain",
+        "CNN1 without batch norm and L2, to see what regularisation does.",
+        image(),
+        dataclasses.replace(CNN1, batch_norm=False),
+        dataclasses.replace(CNN_RECIPE, weight_decay=0.0),
+    ),
+    System(
+        "svm",
+        "Support vector machine on the 72 z-scored counts.",
+        VECTOR,
+        Svm(c=3.0, gamma=0.1),
+        published=(Published("cv", (88.0, 2.9)),),
+    ),
+    System(
+        "mlp",
+        "Multi-layer perceptron on the 72 z-scored counts.",
+        VECTOR,
+        MlpConfig((300,)),
+    ),
+    System(
+        "rf",
+        "Random forest on the 72 z-scored counts.",
+        VECTOR,
+        ForestConfig(101, None),
+        published=(Published("cv", (92.6, 1.5)), Published("unknown", (90.2, 0.5))),
+    ),
+)
+
+
+def _layouts() -> tuple[System, ...]:
+    """CNN0 on the images of the paper's table I."""
+    least = Fill.LEAST_CONTACT
+    d1 = Published("cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4))
+    d2 = Published("cv", (89.7, 1.5), (89.6, 1.7))
+    d3 = Published("cv", (89.7, 1.4), (89.7, 1.3))
+    return tuple(
+        System(
+            f"cnn0-{layout.name.lower()}-{least.value}",
+            f"CNN0 on the {layout.name} image, gaps filled with the least contact.",
+            image(layout.name, least),
+            CNN0,
+            CNN_RECIPE,
+            published=(published,),
+        )
+        for layout, published in ((D1, d1), (D2A, d2), (D2B, d2), (D3, d3))
+    )
+
+
+def _compositions() -> tuple[System, ...]:
+    """CNN0 on the images of the paper's table II, beside `cnn0` itself."""
+    horizontal = Published("cv", (92.1, 1.7))
+    vertical = Published("cv", (92.3, 1.8))
+    return tuple(
+        System(
+            f"cnn0-{composition.value}",
+            f"CNN0 on one image with the fingers {where}.",
+            image(composition=composition),
+            CNN0,
+            CNN_RECIPE,
+            published=(published,),
+        )
+        for composition, where, published in (
+            (Composition.HORIZONTAL, "side by side", horizontal),
+            (Composition.VERTICAL, "below one another", vertical),
+        )
+    )
+
+
+def _smaller() -> tuple[System, ...]:
+    """CNN1 in smaller forms, and narrower networks: what is error worth in run time?"""
+    cnn1 = next(system for system in _PAPER if system.name == "cnn1")
+    forms: dict[str, tuple[str, Compression]] = {
+        "f16": ("with weights of 16 bits", HalfWeights()),
+        "int8": ("with weights and inputs of layers of 8 bits", Integers(static=False)),
+        "int8-static": ("the same, with ranges taken from the training", Integers(static=True)),
+        **{
+            f"rank-{rank}": (f"its large layer factored to rank {rank}", LowRank(rank))
+            for rank in RANKS
+        },
+    }
+    compressed = (
+        dataclasses.replace(
+            cnn1,
+            name=f"cnn1-{name}",
+            description=f"CNN1 {text}.",
+            compression=how,
+            published=(),
+        )
+        for name, (text, how) in forms.items()
+    )
+    narrow = (
+        System(
+            f"narrow-{filters}x{hidden}",
+            f"Conv{filters} - FC{hidden} on the same image as CNN1.",
+            image(),
+            NetworkConfig(filters=filters, hidden=hidden),
+            CNN_RECIPE,
+        )
+        for filters, hidden in NARROW
+    )
+    return (*compressed, *narrow)
+
+
+_ELECTRODES = (
+    System(
+        "svm-electrodes",
+        "Support vector machine on counts, each electrode standardised by the training.",
+        COUNTS,
+        SHARP_SVM,
+        standardise=True,
+    ),
+    System(
+        "blend-electrodes",
+        "Mean of a support vector machine and two CNN0 on counts, each electrode standardised by "
+        "the training.",
+        COUNTS,
+        BlendConfig((Member(SHARP_SVM), Member(CNN0, CNN_RECIPE, copies=2))),
+        standardise=True,
+    ),
+    System(
+        "cnn0-electrodes",
+        "CNN0 on the image of counts, each electrode standardised by the training.",
+        COUNTS,
+        CNN0,
+        CNN_RECIPE,
+        standardise=True,
+    ),
+    System(
+        "small-electrodes",
+        "Conv16 - FC64 on the image of counts, each electrode standardised by the training.",
+        COUNTS,
+        NetworkConfig(filters=16, hidden=64),
+        CNN_RECIPE,
+        standardise=True,
+    ),
+)
+
+_SESSION = (
+    System(
+        "svm-session",
+        "Support vector machine on session-calibrated features.",
+        SESSION,
+        SESSION_SVM,
+    ),
+    System(
+        "hgb-session",
+        "Gradient boosting on session-calibrated features.",
+        SESSION,
+        SESSION_BOOSTING,
+    ),
+    System(
+        "cnn1-session",
+        "CNN1 on session-calibrated features.",
+        SESSION,
+        dataclasses.replace(CNN1, dropout=0.3),
+        SMALL_RECIPE,
+    ),
+    System(
+        "small-session",
+        "Conv16 - FC64 on session-calibrated features: under 100,000 parameters.",
+        SESSION,
+        SMALL_SESSION,
+        SMALL_RECIPE,
+        tables=EVERY_TABLE,
+    ),
+    System(
+        "blend-session",
+        "Mean of a support vector machine, gradient boosting and two small networks, "
+        "session-calibrated.",
+        SESSION,
+        SESSION_BLEND,
+    ),
+    System(
+        "distilled-session",
+        "Conv16 - FC64 that has learned from the blend, session-calibrated.",
+        SESSION,
+        DistilConfig(SESSION_BLEND, SMALL_SESSION, inner_folds=3),
+        SMALL_RECIPE,
+    ),
+)
+
+
+def _fewer_fingers() -> tuple[System, ...]:
+    """The default system for hands with fewer sensors: fewer channels, no padding."""
+    whole = next(system for system in _SESSION if system.name == "small-session")
+    return tuple(
+        dataclasses.replace(
+            whole,
+            name=f"{whole.name}-{'-'.join(fingers)}",
+            description=f"Conv16 - FC64 on session-calibrated features of {' and '.join(fingers)}.",
+            fingers=fingers,
+        )
+        for number in (1, 2)
+        for fingers in itertools.combinations(HAND, number)
+    )
+
+
+SYSTEMS = {
+    system.name: system
+    for system in (
+        *_PAPER,
+        *_layouts(),
+        *_compositions(),
+        *_smaller(),
+        *_ELECTRODES,
+        *_SESSION,
+        *_fewer_fingers(),
+    )
+}
+"""By name, the paper's first."""
