@@ -18,7 +18,7 @@ def main() -> int:
         if heeded:
             signal.signal(signal.SIGINT, _leave_at_once)
         try:
-            from daemon.output import guarded
+            from daemon.process.streams import guarded
 
             return guarded(lambda: _run(heeded))
         finally:

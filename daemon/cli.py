@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
-from daemon import logs
+from daemon.process import logs
 
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from daemon.judge.decision import Limits
 from daemon.judge.grip import GripLimits
-from daemon.judge.joints import JointLimits
+from daemon.judge.joint_motion import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.verdict import Outcome
+from daemon.publish.messages import Outcome
 from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts

@@ -23,7 +23,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.verdict import Reason, decode_verdict
+from daemon.publish.messages import Reason, decode_verdict
 from models import zoo
 from tests.live import (
     PATIENCE_S,

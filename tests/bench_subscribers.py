@@ -26,7 +26,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon.judge.verdict import Status, Verdict, decode_status, decode_verdict
+from daemon.publish.messages import Status, Verdict, decode_status, decode_verdict
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.live import HEARING, PATIENCE_S, Child, Subscriber, start_daemon, start_listeners, table
 

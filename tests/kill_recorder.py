@@ -20,7 +20,7 @@ from typing import Final
 
 import zmq
 
-from daemon.judge.verdict import decode_verdict
+from daemon.publish.messages import decode_verdict
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 from tests.daemon.recorded import messages

@@ -20,7 +20,7 @@ from typing import Self
 
 import numpy as np
 
-from daemon.judge.verdict import Outcome, Verdict, decode_verdict
+from daemon.publish.messages import Outcome, Verdict, decode_verdict
 from drivers.joints.message import JointMessage
 from drivers.twins.spi import SpiTwin
 from tests.live import PATIENCE_S, Child, Subscriber, held_grasp, start_daemon, tactile_section

@@ -19,10 +19,11 @@ from typing import Any, Final, cast
 
 import msgspec
 
-from daemon import assembly, scene
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.judge.pipeline import Pipeline
-from daemon.recording import IGNORED_FIELDS
-from daemon.reporter import Reporter
+from daemon.publish.outbox import Reporter
 from drivers.base import JointReading, Reading
 from drivers.can.decoders import CanCounters, make_decoder
 from drivers.can.formats import CanFormat

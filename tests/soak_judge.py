@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.verdict import Reason, Status, Verdict, decode_status, decode_verdict
+from daemon.publish.messages import Reason, Status, Verdict, decode_status, decode_verdict
 from tests.live import TALLIED, Usage
 
 SLOPE_MAX_KIB_PER_H = 1024.0

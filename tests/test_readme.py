@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.verdict import decode_verdict
+from daemon.publish.messages import decode_verdict
 from drivers.recordings.csv_player import DEMO_TABLE
 
 ROOT = Path(__file__).parents[1]

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from daemon.judge.verdict import Outcome, Verdict, encode
+from daemon.publish.messages import Outcome, Verdict, encode
 from drivers.twins.faults import LinkFaults
 from tests.live import TALLIED, Kind, Usage
 from tests.soak import Plan, link_faults, soak

@@ -10,16 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
-from daemon import assembly, scene, scene_drivers
-from daemon.text import complain, printable
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.process.text import complain, printable
+from daemon.scene import drivers as scene_drivers
 from drivers.base import DriverError
 from models import zoo
 from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.cost import Footprint
     from daemon.judge.grip import GripLimits
+    from daemon.measure.cost.tables import Footprint
 
 TACTILE_SECTIONS = (
     scene_drivers.ReplayTactile,
@@ -59,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     found = [(path, _check(path, args)) for path in args.scene]
     costs = [(path, checked.cost) for path, checked in found if checked.cost is not None]
     if len(found) > 1 and costs and not args.json:
-        from daemon.cost import markdown
+        from daemon.measure.cost.tables import markdown
 
         sys.stdout.writelines(f"{line}\n" for line in markdown(costs))
     return max(checked.code for _, checked in found)
@@ -79,7 +81,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         return _Checked(WRONG)
     cost = None
     if args.cost:
-        from daemon.cost import CostError, measure
+        from daemon.measure.cost.tables import CostError, measure
 
         try:
             cost = measure(path)
@@ -117,7 +119,7 @@ def _write(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None)
         for key, value in entries.items():
             sys.stdout.write(f"  {key:9} {printable(value)}\n")
     if cost is not None:
-        from daemon.cost import lines
+        from daemon.measure.cost.tables import lines
 
         sys.stdout.writelines(f"{line}\n" for line in lines(cost))
 
@@ -139,7 +141,7 @@ def _try_drivers(wanted: scene.Scene) -> None:
 def _try_keys(wanted: scene.Scene) -> None:
     if wanted.curve is None:
         return
-    from daemon.keys import KeysError, load_clients, load_pair
+    from daemon.publish.keys import KeysError, load_clients, load_pair
 
     try:
         load_pair(wanted.curve.secret_key)

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from daemon.text import complain, printable
+from daemon.process.text import complain, printable
 from models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
 
 MAX_BYTES = 16 * 2**20

@@ -15,16 +15,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from daemon import assembly, scene
-from daemon.arguments import within
-from daemon.diagnosis import (
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.commands.arguments import within
+from daemon.commands.diagnosis import (
     ElectrodeStatistics,
     Finding,
     Level,
     counter_findings,
     rate_finding,
 )
-from daemon.text import complain, printable
+from daemon.process.text import complain, printable
 from drivers.base import Driver, LinkError, TactileReading
 from models.contract import ModelError
 

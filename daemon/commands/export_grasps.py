@@ -9,8 +9,8 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-from daemon.export import Export, collect, write
-from daemon.text import complain
+from daemon.process.text import complain
+from daemon.record.export import Export, collect, write
 from drivers.base import RecordingError
 
 WRONG, FAILED = 2, 1

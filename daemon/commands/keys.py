@@ -7,9 +7,9 @@ import json
 import sys
 from pathlib import Path
 
-from daemon import keys
-from daemon.keys import KeysError
-from daemon.text import complain, printable
+from daemon.process.text import complain, printable
+from daemon.publish import keys
+from daemon.publish.keys import KeysError
 
 FOLDER = Path("/etc/graspd/keys")
 CLIENTS = "clients"

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from daemon.assembly import DEFAULT_MODEL
-from daemon.text import complain, printable
+from daemon.assembly.assembly import DEFAULT_MODEL
+from daemon.process.text import complain, printable
 from models import zoo
 from models.contract import ModelError
 

@@ -9,21 +9,22 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
-from daemon import assembly, scene
-from daemon.arguments import positive, within
-from daemon.binding import PublishError
-from daemon.endpoint import check_endpoint, is_private
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.commands.arguments import positive, within
 from daemon.judge.pipeline import Pipeline
-from daemon.judge.verdict import Verdict
-from daemon.printer import Printer
-from daemon.reporter import Reporter
+from daemon.process.signals import StopSignal
+from daemon.process.sleep import Sleep
+from daemon.process.text import complain
+from daemon.publish.binding import PublishError
+from daemon.publish.messages import Verdict
+from daemon.publish.outbox import Reporter
+from daemon.publish.sockets import Sockets
+from daemon.run.loop import Listener, Service
+from daemon.run.printer import Printer
 from daemon.scene import Scene, SceneError
-from daemon.service import Listener, Service
-from daemon.session_file import SessionFileError, load, statistics_of
-from daemon.sleep import Sleep
-from daemon.sockets import Sockets
-from daemon.stop import StopSignal
-from daemon.text import complain
+from daemon.scene.endpoints import check_endpoint, is_private
+from daemon.session.file import SessionFileError, load, statistics_of
 from drivers.base import Driver, DriverError, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING
 from models.contract import ModelError
@@ -183,11 +184,11 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
     if args.loop or args.strict:
         raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
     if assembly.MCAP not in endings:
-        from daemon.captures import Captures
+        from daemon.assembly.captures import Captures
 
         return Captures(args.recordings, args.scene)
     try:
-        from daemon.playback import Playback
+        from daemon.assembly.playback import Playback
     except ModuleNotFoundError as error:
         raise SceneError(
             f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "

@@ -7,11 +7,11 @@ import importlib
 
 REPORTS = {
     "error-vs-time": (
-        "daemon.reports.error_vs_time",
+        "daemon.measure.error_vs_time.report",
         "how wrong each model is against how long it takes",
     ),
     "stability": (
-        "daemon.reports.stability",
+        "daemon.measure.stability.report",
         "numerical error of the whole chain on stiff and extreme readings",
     ),
 }

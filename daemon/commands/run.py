@@ -11,17 +11,17 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.binding import PublishError
-from daemon.running import Runner
+from daemon.process.signals import StopSignal
+from daemon.process.text import complain
+from daemon.publish.binding import PublishError
+from daemon.run.runner import Runner
 from daemon.scene import SceneError
-from daemon.stop import StopSignal
-from daemon.text import complain
 from drivers.base import DriverError, RecordingError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
-    from daemon.notify import Systemd
-    from daemon.printer import Printer
+    from daemon.run.printer import Printer
+    from daemon.run.systemd import Systemd
 
 DESCRIPTORS_MAX = 1024
 """The loop waits by select(2), which is exact to the microsecond and knows no more of them."""
@@ -69,7 +69,7 @@ def _manager(stack: ExitStack) -> Systemd | None:
     """Whoever started this process, if it wants to be told how it goes."""
     if "NOTIFY_SOCKET" not in os.environ:
         return None
-    from daemon.notify import Systemd
+    from daemon.run.systemd import Systemd
 
     manager = Systemd.of(os.environ)
     if manager is not None:
@@ -80,6 +80,6 @@ def _manager(stack: ExitStack) -> Systemd | None:
 
 
 def _printer() -> Printer:
-    from daemon.printer import Printer
+    from daemon.run.printer import Printer
 
     return Printer(as_json=False, prompt=True)

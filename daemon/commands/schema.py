@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 
-from daemon.judge.verdict import schema
+from daemon.publish.messages import schema
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

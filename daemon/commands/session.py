@@ -12,11 +12,13 @@ from pathlib import Path
 
 import msgspec
 
-from daemon import assembly, scene, scene_drivers
+from daemon import scene
+from daemon.assembly import assembly
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.verdict import Reason
-from daemon.session_file import KeptSession, SessionFile, SessionFileError, load
-from daemon.text import complain, printable
+from daemon.process.text import complain, printable
+from daemon.publish.messages import Reason
+from daemon.scene import drivers as scene_drivers
+from daemon.session.file import KeptSession, SessionFile, SessionFileError, load
 from drivers.base import DriverError, JointReading
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel

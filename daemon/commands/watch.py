@@ -12,9 +12,9 @@ import zmq
 
 from daemon import scene
 from daemon.cli import EXTRAS
-from daemon.keys import KeysError
+from daemon.process.text import complain
+from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
-from daemon.text import complain
 from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import View
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from daemon.judge.verdict import Outcome, Reason
+from daemon.publish.messages import Outcome, Reason
 
 
 @dataclass(frozen=True, slots=True)

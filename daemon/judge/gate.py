@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.stillness import Stillness, mean_distance
-from daemon.judge.verdict import GateCause, GateState, Reason
+from daemon.publish.messages import GateCause, GateState, Reason
 
 CHANGES_MAX = 64
 """Changes kept until somebody takes them; a reading makes three at most."""

@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact, ContactLimits
-from daemon.judge.fresh import FreshMedian
 from daemon.judge.gate import Gate, GateChange, GateLimits
 from daemon.judge.health import Watched
-from daemon.judge.verdict import GateState, Reason
+from daemon.judge.median import FreshMedian
+from daemon.publish.messages import GateState, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.judge.joints import JointLimits, JointMotion
+    from daemon.judge.joint_motion import JointLimits, JointMotion
 
 MEDIAN_SWEEPS = 3
 OUTAGE_NS = 1_000_000_000
@@ -172,6 +172,6 @@ class Grip:
 
 def _joint_motion(limits: JointLimits) -> JointMotion:
     """Imported only where the scene has joints."""
-    from daemon.judge.joints import JointMotion
+    from daemon.judge.joint_motion import JointMotion
 
     return JointMotion(limits)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.pipeline import NO_OPINION, Opinion, Pipeline
-from daemon.judge.verdict import GateState, Reason
+from daemon.publish.messages import GateState, Reason
 
 MAX_BYTES: Final = 1 << 20
 """Before it is compressed; three fingers take 37 kB."""
@@ -154,7 +154,7 @@ class _Joints(_Memory):
         if self._past.keys() != self._latest_ns.keys():
             raise ValueError("joints without a time")
         super().give(part)
-        from daemon.judge.joints import ANGLES  # only where there are joints
+        from daemon.judge.joint_motion import ANGLES  # only where there are joints
 
         part._past = {names: deque(past, ANGLES + 2) for names, past in self._past.items()}
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.verdict import Reason
+from daemon.publish.messages import Reason
 from models.contract import ModelError
 from models.runtime import TactileModel
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 
 if TYPE_CHECKING:
-    from daemon.judge.session import SessionCalibration
+    from daemon.judge.calibration import SessionCalibration
 
 TINY = 1e-12
 """Stands for a probability of zero, whose logarithm there is not."""

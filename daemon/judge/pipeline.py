@@ -13,7 +13,7 @@ from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.health import Health, Watched
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
-from daemon.judge.verdict import GateState, Outcome, Reason
+from daemon.publish.messages import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
@@ -21,9 +21,9 @@ from models.inputs import SessionBuilder
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
+    from daemon.judge.calibration import SessionCalibration
     from daemon.judge.gate import GateChange
     from daemon.judge.grip import Grip, GripLimits
-    from daemon.judge.session import SessionCalibration
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +276,6 @@ def _session(model: TactileModel, electrodes: Electrodes) -> SessionCalibration 
     wanted, inputs = model.contract.input, model.inputs
     if not (isinstance(wanted, SessionInput) and isinstance(inputs, SessionBuilder)):
         return None
-    from daemon.judge.session import SessionCalibration
+    from daemon.judge.calibration import SessionCalibration
 
     return SessionCalibration(wanted, inputs, electrodes.centre, electrodes.spread)

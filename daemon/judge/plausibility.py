@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.health import too_many
-from daemon.judge.verdict import Reason
+from daemon.publish.messages import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import SeenCounts
 from models.electrodes import Electrodes
 from models.seen import SeenCheck
 
 if TYPE_CHECKING:
-    from daemon.judge.session import SessionCalibration
+    from daemon.judge.calibration import SessionCalibration
 
 CONTRADICTING_MAX = 2
 """Electrodes that may contradict the others without anything else being known against them. Of

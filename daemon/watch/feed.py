@@ -10,8 +10,8 @@ import zmq
 import zmq.auth
 from zmq.utils.monitor import recv_monitor_message
 
-from daemon.keys import Z85_KEY, KeysError, load_pair
-from daemon.sleep import boottime_ns
+from daemon.process.sleep import boottime_ns
+from daemon.publish.keys import Z85_KEY, KeysError, load_pair
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX = 2000

@@ -17,7 +17,7 @@ from typing import Self
 from rich.console import Console
 from rich.live import Live
 
-from daemon.stop import StopSignal
+from daemon.process.signals import StopSignal
 from daemon.watch.feed import Feed
 from daemon.watch.pixels import Canvas
 from daemon.watch.terminal import draw

@@ -10,7 +10,7 @@ from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
-from daemon.text import printable
+from daemon.process.text import printable
 from daemon.watch.letters import big
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Snapshot, Tone

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.verdict import (
+from daemon.publish.messages import (
     ADVICE,
     GateMessage,
     GateState,

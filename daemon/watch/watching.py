@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 
-from daemon.sleep import boottime_ns
+from daemon.process.sleep import boottime_ns
 from daemon.watch.feed import Feed
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.view import SNAPSHOTS_HZ, View

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import msgspec
 
-from daemon.stop import StopSignal
+from daemon.process.signals import StopSignal
 from daemon.watch.feed import Feed
 from daemon.watch.view import View
 from daemon.watch.watching import TICK_S, snapshots

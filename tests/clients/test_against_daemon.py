@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.verdict import decode_outcome
-from daemon.keys import make
+from daemon.publish.keys import make
+from daemon.publish.messages import decode_outcome
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Graspd, Keys
 from tests.clients.bench import PATIENCE_S, Daemon, free_endpoint, unlisted, until

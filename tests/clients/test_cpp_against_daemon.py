@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.keys import make
+from daemon.publish.keys import make
 from tests.clients.bench import Daemon, free_endpoint, unlisted
 from tests.clients.building import sleep_at_will
 from tests.clients.messages import frames, verdict

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.judge.verdict import Verdict
+from daemon.publish.messages import Verdict
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench_subscribers import Crowd, Setup, Turn, take_turn
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import zmq
 
-from daemon.judge.verdict import Verdict, decode_verdict
+from daemon.publish.messages import Verdict, decode_verdict
 from daemon.record.mcap import McapRecording
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording

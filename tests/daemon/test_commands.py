@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.verdict import decode_verdict, schema
+from daemon.publish.messages import decode_verdict, schema
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
 

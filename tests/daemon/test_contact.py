@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
-from daemon.judge.fresh import FreshMedian
+from daemon.judge.median import FreshMedian
 from drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.commands.doctor import can_interfaces
-from daemon.diagnosis import (
+from daemon.commands.diagnosis import (
     ElectrodeStatistics,
     Level,
     counter_findings,
     rate_finding,
 )
+from daemon.commands.doctor import can_interfaces
 from drivers.base import ElectrodeFault, TactileReading
 
 FINGERS = ("ff", "mf", "th")

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from daemon import assembly
+from daemon.assembly import assembly
 from daemon.scene import Scene, SceneError, parse
 from drivers.base import DriverError, LinkError, RecordingError
 from drivers.palm.calibration import CalibrationError

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.export import collect
-from daemon.judge.verdict import (
+from daemon.publish.messages import (
     GateState,
     Outcome,
     OutcomeMessage,
@@ -21,7 +20,8 @@ from daemon.judge.verdict import (
     Verdict,
     encode,
 )
-from daemon.record_files import MessageFile
+from daemon.record.export import collect
+from daemon.record.files import MessageFile
 from drivers.base import RecordingError
 from drivers.recordings.csv_player import DEMO_TABLE
 from models.training.data.datasets import read_table

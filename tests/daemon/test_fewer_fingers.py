@@ -10,7 +10,7 @@ from pathlib import Path
 import onnxruntime as ort
 import pytest
 
-from daemon.judge.verdict import Verdict, decode_verdict
+from daemon.publish.messages import Verdict, decode_verdict
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from models import zoo
 from models.contract import FEATURES_PER_FINGER, OUTPUT_NAME

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.judge.verdict import OUTCOME_CODE, Outcome, Reason, Verdict
-from daemon.latency import BUCKETS, LatencyHistogram
-from daemon.summary import Summary
+from daemon.publish.latency import BUCKETS, LatencyHistogram
+from daemon.publish.messages import OUTCOME_CODE, Outcome, Reason, Verdict
+from daemon.run.summary import Summary
 
 
 @pytest.mark.parametrize("seed", range(3))

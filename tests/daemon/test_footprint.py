@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cost import CostError, Footprint, measure
-from daemon.footprint import CORE
+from daemon.measure.cost.footprint import CORE
+from daemon.measure.cost.tables import CostError, Footprint, measure
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
 
@@ -22,16 +22,22 @@ SCENES = sorted((DEPLOY / "scenes").glob("*.toml"))
 NEVER = {
     *("torch", "sklearn", "onnx", "onnxscript", "skl2onnx", "scipy", "pandas", "matplotlib"),
     *("rich", "distributed", "mcap", "msgpack", "pydantic.v1", "pydantic_settings", "yaml"),
-    *("models.training", "drivers.twins", "daemon.reports", "daemon.printer", "daemon.summary"),
-    *("daemon.scene_errors", "daemon.cost", "daemon.doctor"),
-    *("daemon.realtime", "daemon.notify", "daemon.latest", "daemon.watch"),
+    *(
+        "models.training",
+        "drivers.twins",
+        "daemon.measure",
+        "daemon.run.printer",
+        "daemon.run.summary",
+    ),
+    *("daemon.scene.errors", "daemon.measure.cost.tables", "daemon.doctor"),
+    *("daemon.run.realtime", "daemon.run.systemd", "daemon.publish.latest", "daemon.watch"),
     *(
         "daemon.judge.memory",
-        "daemon.recorder",
-        "daemon.record_files",
-        "daemon.recording",
-        "daemon.playback",
-        "daemon.captures",
+        "daemon.record.recorder",
+        "daemon.record.files",
+        "daemon.assembly.recorder",
+        "daemon.assembly.playback",
+        "daemon.assembly.captures",
     ),
     *(
         "daemon.record.mcap",
@@ -39,7 +45,14 @@ NEVER = {
         "drivers.recordings.candump",
         "drivers.recordings.capture_player",
     ),
-    *("zstandard", "lz4", "daemon.gatekeeper", "daemon.keys", "zmq.auth", "zmq.utils.monitor"),
+    *(
+        "zstandard",
+        "lz4",
+        "daemon.publish.access",
+        "daemon.publish.keys",
+        "zmq.auth",
+        "zmq.utils.monitor",
+    ),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
 for a service, realtime, known keys or the latest verdict alone."""
@@ -54,12 +67,12 @@ BUSES = {
     "palm": {"drivers.palm.driver", "drivers.palm.packet"},
 }
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
-JOINTS = {"daemon.judge.joints", "drivers.joints.driver", "drivers.joints.message"}
+JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
 HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
 GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "fresh", "grip", "stillness")}
-STATISTICS = {"daemon.judge.session", "models.session"}
-KEPT = {"daemon.session_file", "daemon.session_keeper"}
-ASK = {"daemon.questions"}
+STATISTICS = {"daemon.judge.calibration", "models.session"}
+KEPT = {"daemon.session.file", "daemon.session.keeper"}
+ASK = {"daemon.publish.questions"}
 
 FORBIDDEN = {
     # The demo's recording has joints; nothing is kept of a replay.
@@ -237,7 +250,7 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     )
     found = measured(written(tmp_path, text))
     parts = {part.name: part for part in found.parts}
-    assert HALL | ASK | {"daemon.judge.joints"} <= set(found.modules)
+    assert HALL | ASK | {"daemon.judge.joint_motion"} <= set(found.modules)
     assert below({"drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
     assert parts["joints"].modules > 0
     assert parts["sockets"].threads == ZMQ_THREADS  # those of one context, for both
@@ -268,9 +281,9 @@ def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training(
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     modules = tuple(json.loads(result.stderr))
-    unwanted = NEVER - {"daemon.printer", "daemon.summary"}
+    unwanted = NEVER - {"daemon.run.printer", "daemon.run.summary"}
     unwanted |= BUSES["spi"] | BUSES["can"] | BUSES["palm"] | HALL | ASK
-    unwanted.add("daemon.session_keeper")
+    unwanted.add("daemon.session.keeper")
     assert below(unwanted, modules) == []
     assert "drivers.recordings.csv_player" in modules
 

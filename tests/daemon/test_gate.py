@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from daemon.judge.gate import GateChange, GateLimits
 from daemon.judge.grip import Grip, GripLimits
 from daemon.judge.health import Watched
-from daemon.judge.joints import JointLimits
-from daemon.judge.verdict import GateState, Reason
+from daemon.judge.joint_motion import JointLimits
+from daemon.publish.messages import GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 

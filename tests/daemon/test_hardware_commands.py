@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.verdict import Verdict, decode_verdict
+from daemon.publish.messages import Verdict, decode_verdict
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 

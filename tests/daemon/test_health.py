@@ -15,7 +15,7 @@ from daemon.judge.health import (
     UNCHANGED_MAX,
     Health,
 )
-from daemon.judge.verdict import Reason
+from daemon.publish.messages import Reason
 from drivers.base import TactileReading
 
 FINGERS = 3

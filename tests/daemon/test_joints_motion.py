@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from daemon.judge.joints import SOURCES_MAX, JointLimits, JointMotion
-from daemon.judge.verdict import Reason
+from daemon.judge.joint_motion import SOURCES_MAX, JointLimits, JointMotion
+from daemon.publish.messages import Reason
 from drivers.base import JointReading
 
 MS = 1_000_000

@@ -15,10 +15,11 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon import gatekeeper, scene
-from daemon.keys import KeysError, load_clients, load_pair, make
+from daemon import scene
+from daemon.publish import access as gatekeeper
+from daemon.publish.keys import KeysError, load_clients, load_pair, make
+from daemon.publish.sockets import Sockets
 from daemon.scene import SceneError
-from daemon.sockets import Sockets
 from tests.daemon.processes import graspd
 
 PORT = 25931

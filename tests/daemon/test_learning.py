@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Pipeline
-from daemon.judge.session import SessionCalibration
 from drivers.base import TactileReading
 from drivers.twins.grasps import synthetic
 from models import zoo

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.logs import BURST, KINDS_MAX, WINDOW_S, JournalFormatter, RateLimit, is_journal
+from daemon.process.logs import BURST, KINDS_MAX, WINDOW_S, JournalFormatter, RateLimit, is_journal
 
 
 def record(level: int, text: str, *values: object) -> logging.LogRecord:

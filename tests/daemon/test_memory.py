@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon import assembly, scene
+from daemon import scene
+from daemon.assembly import assembly
 from daemon.judge.memory import JudgeMemory, decode, encode
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.verdict import Outcome, Reason
+from daemon.publish.messages import Outcome, Reason
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger

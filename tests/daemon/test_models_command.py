@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from daemon.assembly import DEFAULT_MODEL
+from daemon.assembly.assembly import DEFAULT_MODEL
 from models import zoo
 from tests.daemon.processes import graspd
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.verdict import GateState, Outcome, Reason, State, decode_status
-from daemon.notify import Systemd, in_a_line
+from daemon.publish.messages import GateState, Outcome, Reason, State, decode_status
+from daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
 
 GOLDEN = Path(__file__).parent / "golden"

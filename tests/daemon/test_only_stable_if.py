@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from daemon.judge.contact import ContactLimits
 from daemon.judge.gate import GateLimits
 from daemon.judge.grip import GripLimits
-from daemon.judge.joints import JointLimits
+from daemon.judge.joint_motion import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.verdict import Outcome
+from daemon.publish.messages import Outcome
 from drivers.base import ElectrodeFault, JointReading, TactileReading
 from models.contract import Finger
 from models.tactile_image import TactileImager

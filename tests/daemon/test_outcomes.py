@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement
-from daemon.judge.verdict import Outcome, OutcomeMessage, Reason, decode_outcome, schema
-from daemon.questions import MESSAGE_MAX_BYTES, Questions
-from daemon.reporter import JUDGED_MAX, Reporter
+from daemon.publish.messages import Outcome, OutcomeMessage, Reason, decode_outcome, schema
+from daemon.publish.outbox import JUDGED_MAX, Reporter
+from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions
 from tests.daemon.fakes import FINGERS, Clock
 
 BOOT = "0123456789abcdef" * 2

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.text import printable
+from daemon.process.text import printable
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, graspd, start, wait_for
 
@@ -65,7 +65,7 @@ def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) ->
 
 WHILE_LEAVING = """
 import os, signal
-from daemon.stop import StopSignal
+from daemon.process.signals import StopSignal
 leave = StopSignal.__exit__
 def leave_and_interrupt(self, *error):
     os.kill(os.getpid(), signal.SIGINT)

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.binding import PublishError
-from daemon.publisher import Publisher
-from daemon.stop import StopSignal
+from daemon.process.signals import StopSignal
+from daemon.publish.binding import PublishError
+from daemon.publish.publisher import Publisher
 
 WAIT_MS = 5000
 

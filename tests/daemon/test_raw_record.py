@@ -10,8 +10,8 @@ from typing import Any
 
 import can
 
+from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.record.mcap import header_of
-from daemon.recording import IGNORED_FIELDS
 from drivers.base import TactileReading
 from drivers.recordings.can_capture import CanCapture, frames_of
 from drivers.recordings.capture_player import CaptureReplayDriver

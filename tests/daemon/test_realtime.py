@@ -17,20 +17,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon import assembly, scene
-from daemon.judge.verdict import GateState
-from daemon.realtime import Hot
-from daemon.rehearsal import rehearse
-from daemon.running import Parts, Runner, prepare
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.process.signals import StopSignal
+from daemon.publish.messages import GateState
+from daemon.run.realtime import Hot
+from daemon.run.rehearsal import rehearse
+from daemon.run.runner import Parts, Runner, prepare
 from daemon.scene import Realtime
-from daemon.stop import StopSignal
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 
 WORLD = """
 import ctypes, os, resource, sys
-from daemon.realtime import Hot
+from daemon.run.realtime import Hot
 from daemon.scene import Realtime
 """
 NOBODY = 65534

@@ -11,8 +11,8 @@ import jsonschema
 import pytest
 from mcap.reader import make_reader
 
-from daemon.judge.verdict import encode
-from daemon.recording import IGNORED_FIELDS
+from daemon.assembly.recorder import IGNORED_FIELDS
+from daemon.publish.messages import encode
 from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
 from tests.daemon.recorded import Lab, messages, work

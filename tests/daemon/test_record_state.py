@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from daemon import assembly, scene
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.assembly.playback import Playback
+from daemon.assembly.recorder import build_recorder
 from daemon.judge.pipeline import Judgement
-from daemon.playback import Playback
+from daemon.publish.outbox import Reporter
 from daemon.record import mcap as mcap_recording
-from daemon.record_files import MessageFile, Shelf
-from daemon.recorder import Recorder
-from daemon.recording import build_recorder
-from daemon.reporter import Reporter
+from daemon.record.files import MessageFile, Shelf
+from daemon.record.recorder import Recorder
 from daemon.scene import Record
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
@@ -101,7 +102,7 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
 def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_then(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.recorder.RETRY_NS", 100_000_000)
+    monkeypatch.setattr("daemon.record.recorder.RETRY_NS", 100_000_000)
     blocked = tmp_path / "record"
     blocked.write_text("a file where the folder should be")
     loop = Loop()
@@ -132,7 +133,7 @@ class Daemon:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
         self._now_ns = START_NS
-        monkeypatch.setattr("daemon.recorder.Recorder", partial(Recorder, clock=self._clock))
+        monkeypatch.setattr("daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock))
         self.pipeline = assembly.build_pipeline(wanted, model, self._clock)
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)
         assert recorder is not None

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon import recorder as recorder_module
 from daemon import scene
+from daemon.record import recorder as recorder_module
+from daemon.record.files import MessageFile, Shelf, schemas
 from daemon.record.mcap import McapRecording
-from daemon.record_files import MessageFile, Shelf, schemas
-from daemon.recorder import QUEUE_MAX, Recorder
+from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.scene import Record, SceneError
 from drivers.base import JointReading
 from drivers.recordings.csv_player import DEMO_RECORDING
@@ -205,7 +205,7 @@ class StalledDisk:
             self.answers.wait(20)
             real(descriptor)
 
-        monkeypatch.setattr("daemon.record_files.os.fdatasync", stall)
+        monkeypatch.setattr("daemon.record.files.os.fdatasync", stall)
 
 
 def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(

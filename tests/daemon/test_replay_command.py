@@ -14,7 +14,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from daemon.judge.verdict import decode_verdict, schema
+from daemon.publish.messages import decode_verdict, schema
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for

@@ -13,10 +13,10 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
-from daemon.reports import page
-from daemon.reports.error_vs_time import _counts, _errors
-from daemon.reports.peers import loop_image
-from daemon.reports.timing import measure
+from daemon.measure.error_vs_time import page
+from daemon.measure.error_vs_time.peers import loop_image
+from daemon.measure.error_vs_time.report import _counts, _errors
+from daemon.measure.error_vs_time.timing import measure
 from models import zoo
 from models.contract import ModelError
 from models.runtime import TactileModel

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.verdict import (
+from daemon.publish.messages import (
     Outcome,
     Reason,
     State,

@@ -10,9 +10,9 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from daemon.endpoint import check_endpoint
 from daemon.scene import SCENE_MAX_BYTES, Scene, SceneError, load
-from daemon.scene_drivers import ReplayFaultsSection, ReplayTactile
+from daemon.scene.drivers import ReplayFaultsSection, ReplayTactile
+from daemon.scene.endpoints import check_endpoint
 from drivers.recordings.faults import ReplayFaults
 
 GOOD = """

@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import pytest
 
-from daemon.judge.verdict import (
+from daemon.process.signals import StopSignal
+from daemon.process.sleep import Sleep
+from daemon.publish.messages import (
     Outcome,
     Reason,
     State,
@@ -19,10 +21,8 @@ from daemon.judge.verdict import (
     decode_status,
     decode_tactile,
 )
-from daemon.reporter import Reporter
-from daemon.service import Ended, Service, Watchdog
-from daemon.sleep import Sleep
-from daemon.stop import StopSignal
+from daemon.publish.outbox import Reporter
+from daemon.run.loop import Ended, Service, Watchdog
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 

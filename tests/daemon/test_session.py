@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
 from daemon.judge.grip import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.session import SessionCalibration
-from daemon.judge.verdict import GateState, Outcome, Reason
-from daemon.session_file import SessionFile, SessionFileError, exchanged, load
-from daemon.session_keeper import SAVE_PERIOD_NS, SessionKeeper
+from daemon.publish.messages import GateState, Outcome, Reason
+from daemon.session.file import SessionFile, SessionFileError, exchanged, load
+from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -264,7 +264,7 @@ KILLED = """
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from daemon.session_file import SessionFile
+from daemon.session.file import SessionFile
 from tests.daemon.test_session import FINGERS, calibration, observe
 session = calibration()
 with SessionFile(Path(sys.argv[1])) as file:

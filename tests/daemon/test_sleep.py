@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.judge.verdict import Outcome, Reason, State
-from daemon.service import Ended
-from daemon.sleep import Sleep
-from daemon.stop import StopSignal
+from daemon.process.signals import StopSignal
+from daemon.process.sleep import Sleep
+from daemon.publish.messages import Outcome, Reason, State
+from daemon.run.loop import Ended
 from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, reading
 from tests.daemon.test_service import Bench
 

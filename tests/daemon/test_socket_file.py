@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.binding import PublishError
-from daemon.publisher import Publisher
-from daemon.socket_file import SocketFile
+from daemon.publish.binding import PublishError
+from daemon.publish.publisher import Publisher
+from daemon.publish.socket_file import SocketFile
 
 
 def dead_socket(path: Path) -> None:

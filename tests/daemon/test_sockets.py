@@ -16,9 +16,9 @@ import pytest
 import zmq
 
 from daemon import scene
-from daemon.binding import PublishError
-from daemon.publisher import REPEAT_NS, VERDICT_REPEATED_NS, Publisher
-from daemon.sockets import Sockets, plan
+from daemon.publish.binding import PublishError
+from daemon.publish.publisher import REPEAT_NS, VERDICT_REPEATED_NS, Publisher
+from daemon.publish.sockets import Sockets, plan
 from tests.daemon.fakes import Clock
 from tests.daemon.test_publisher import Peers
 

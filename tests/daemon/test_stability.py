@@ -27,11 +27,11 @@ from onnx import helper, numpy_helper
 
 from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.network import Network
-from daemon.judge.verdict import Outcome
-from daemon.reports import stability
-from daemon.reports.reference import Reference, UnknownOperatorError
-from daemon.reports.stability_cases import StabilityCase, recorded
-from daemon.reports.stability_model import Bounds, ModelStability
+from daemon.measure.reference.reference import Reference, UnknownOperatorError
+from daemon.measure.stability import report as stability
+from daemon.measure.stability.cases import StabilityCase, recorded
+from daemon.measure.stability.model import Bounds, ModelStability
+from daemon.publish.messages import Outcome
 from models import zoo
 from models.contract import SessionInput
 from models.inputs import builder
@@ -200,7 +200,7 @@ def test_a_model_or_a_table_that_is_not_there_is_said_in_one_line(
 def test_without_onnx_the_report_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delitem(sys.modules, "daemon.reports.reference")
+    monkeypatch.delitem(sys.modules, "daemon.measure.reference.reference")
     monkeypatch.setitem(sys.modules, "onnx", None)
     assert run("mlp")[0] == 2
     assert "needs the package 'onnx'" in capsys.readouterr().err

@@ -21,10 +21,10 @@ from typing import Self
 import pytest
 
 from daemon import scene
-from daemon.judge.verdict import Outcome, decode_verdict
-from daemon.keys import KeysError, make
-from daemon.publisher import Publisher
-from daemon.sockets import Sockets
+from daemon.publish.keys import KeysError, make
+from daemon.publish.messages import Outcome, decode_verdict
+from daemon.publish.publisher import Publisher
+from daemon.publish.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import View
 from tests.daemon.fakes import Clock

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from daemon.commands.schema import schema_text
-from daemon.judge.verdict import (
+from daemon.publish.messages import (
     ADVICE,
     GateCause,
     GateMessage,

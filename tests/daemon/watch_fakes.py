@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any, Self
 
-from daemon.judge.verdict import (
+from daemon.publish.messages import (
     OUTCOME_CODE,
     GateState,
     Outcome,
@@ -16,7 +16,7 @@ from daemon.judge.verdict import (
     Verdict,
     encode,
 )
-from daemon.publisher import Publisher
+from daemon.publish.publisher import Publisher
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 MS = 1_000_000

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from daemon.scene import STATE_DIRECTORY, Hand, Realtime, Scene
-from daemon.scene_drivers import SpiTactile
+from daemon.scene.drivers import SpiTactile
 from tests.deploy.staging import DEPLOY, INSTALLER
 
 UNIT = DEPLOY / "systemd/graspd@.service"

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from daemon.record.files import Joints, MessageFile
 from daemon.record.mcap import McapRecording, RecordedMessage
 from daemon.record.player import McapReplayDriver
-from daemon.record_files import Joints, MessageFile
 from drivers.base import JointReading, RecordingError, TactileReading
 
 BOOT = "0123456789abcdef" * 2

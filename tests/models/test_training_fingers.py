@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("onnx", reason="the train extra is not installed")
 
-from daemon.assembly import build_pipeline, load_model, model_path
+from daemon.assembly.assembly import build_pipeline, load_model, model_path
 from daemon.scene import parse
 from drivers.base import TactileReading
 from models.contract import ModelError

@@ -1,0 +1,340 @@
+"""From a scene to the parts that it needs, and to no others: a driver is imported when named."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.judge.decision import Limits
+from daemon.judge.pipeline import Pipeline
+from daemon.scene import GateMode, Scene, SceneError
+from daemon.scene.drivers import (
+    CanTactile,
+    PalmJoints,
+    PalmTactile,
+    ReplayFaultsSection,
+    ReplayTactile,
+    SpiTactile,
+    StreamJoints,
+)
+from drivers.base import Driver, DriverError, LinkError
+from models import zoo
+from models.contract import ModelError
+from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.judge.grip import GripLimits
+    from daemon.judge.joint_motion import JointLimits
+    from daemon.session.keeper import SessionKeeper
+    from drivers.recordings.csv_columns import Columns
+
+log = logging.getLogger("graspd")
+
+DEFAULT_MODEL = "small-session"
+MCAP = ".mcap"
+"""Ending of graspd's own recordings."""
+CAPTURES = (".log", ".serial")
+"""Endings of what came over a link: candump text, serial bytes."""
+
+Clock = Callable[[], int]
+"""Gives monotonic ns."""
+
+
+def model_path(scene: Scene) -> Path:
+    """File of the scene's model.
+
+    `model.name` is any name of the zoo; where the zoo has that model in a form for the hand's
+    fingers alone, it is that form. Raises `ModelError` if the zoo does not have it.
+    """
+    if scene.model.path is not None:
+        return scene.model.path
+    name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
+    return zoo.find(zoo.for_hand(name, scene.hand.fingers))
+
+
+def load_model(scene: Scene) -> TactileModel:
+    """The scene's model, warm. Raises `ModelError`."""
+    return TactileModel(model_path(scene))
+
+
+def build_pipeline(
+    scene: Scene,
+    model: TactileModel,
+    clock: Clock = time.monotonic_ns,
+    *,
+    learns: bool = True,
+) -> Pipeline:
+    """The judge of this scene, whose session `learns` from the grasps or stays what it is.
+
+    Raises `ModelError` if the model does not fit the hand or never is right as often as wanted,
+    `SceneError` or `RecordingError` if recordings do not say whether they are grasps or streams.
+    """
+    _refuse_other_fingers(scene, model)
+    limits = Limits(
+        max_age_ns=scene.max_age_ns,
+        slip_threshold=scene.model.slip_threshold,
+        min_confidence=min_confidence(model, scene.model.min_accuracy),
+    )
+    return Pipeline(
+        model,
+        scene.hand.fingers,
+        limits,
+        clock,
+        grip=grip_limits(scene),
+        learns=learns,
+        needs_session=scene.session.required,
+    )
+
+
+def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
+    """Raise `ModelError` saying what to write, if the model is not for the hand's fingers."""
+    wanted, hand = model.contract.fingers, scene.hand.fingers
+    if hand == wanted:
+        return
+    if set(hand) == set(wanted):
+        advice = f"write hand.fingers = {json.dumps(wanted)}{_and_sensors(scene)}"
+    elif names := zoo.judging(hand):
+        advice = f"the zoo has {', '.join(names)} for these"
+    else:
+        advice = "the zoo has no model for these"
+    raise ModelError(
+        f"{model.path}: judges the fingers {', '.join(wanted)} in this order, "
+        f"the hand has {', '.join(hand)}: {advice}"
+    )
+
+
+def _and_sensors(scene: Scene) -> str:
+    """How sensors keep their places where the order of the hand's fingers is that of the wires."""
+    match scene.tactile:
+        case SpiTactile(sensors=None) | CanTactile(sensors=None, format="syntouch"):
+            return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"
+        case _:
+            return ""
+
+
+def gate_mode(scene: Scene) -> GateMode:
+    """When the scene has grasps judged. Raises `SceneError` or `RecordingError`."""
+    if scene.gate.mode is not None:
+        return scene.gate.mode
+    if not isinstance(scene.tactile, ReplayTactile):
+        return "settled"
+    if is_mcap(scene.tactile):
+        return "settled"
+    streams = {columns.time is not None for columns in _columns(scene, scene.tactile)}
+    if len(streams) > 1:
+        raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
+    return "settled" if True in streams else "every"
+
+
+def grip_limits(scene: Scene) -> GripLimits | None:
+    """The conditions of the moment before the lift; None if each reading is a grasp."""
+    mode, gate = gate_mode(scene), scene.gate
+    if mode == "every":
+        if gate.sweeps == 3:
+            raise SceneError("gate.sweeps 3: readings that are each a grasp have no median")
+        return None
+    from daemon.judge.contact import ContactLimits
+    from daemon.judge.gate import GateLimits
+    from daemon.judge.grip import MEDIAN_SWEEPS, GripLimits
+
+    return GripLimits(
+        on_request=mode == "request",
+        sweeps=MEDIAN_SWEEPS if gate.sweeps is None else gate.sweeps,
+        required=gate.fingers,
+        contact=ContactLimits(counts=gate.contact_counts, sigmas=gate.contact_sigmas),
+        gate=GateLimits(
+            hold_ns=round(gate.hold_ms * 1e6),
+            rate_counts_per_s=gate.rate_counts_per_s,
+            change_counts=gate.change_counts,
+            request_ns=round(gate.request_ms * 1e6),
+            gap_ns=round(gate.gap_ms * 1e6),
+        ),
+        joints=joint_limits(scene),
+    )
+
+
+def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
+    from drivers.recordings.csv_rows import columns_of
+
+    return [columns_of(path, scene.hand.fingers) for path in options.recordings]
+
+
+def is_mcap(options: ReplayTactile) -> bool:
+    """Whether graspd itself recorded what is replayed. Raises `SceneError` if only some of it."""
+    found = {path.suffix == MCAP for path in options.recordings}
+    if len(found) > 1:
+        raise SceneError("tactile.recordings: both CSV and MCAP files")
+    return True in found
+
+
+def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
+    if not is_mcap(options):
+        return any(columns.joints for columns in _columns(scene, options))
+    from daemon.record.mcap import header_of
+
+    return any(header_of(path).joints for path in options.recordings)
+
+
+def joint_limits(scene: Scene) -> JointLimits | None:
+    """None if the scene has no joints, not even in its recordings."""
+    tactile = scene.tactile
+    recorded = isinstance(tactile, ReplayTactile) and _has_joints(scene, tactile)
+    if scene.joints is None and not recorded:
+        return None
+    from daemon.judge.joint_motion import JointLimits
+
+    return JointLimits(
+        rad_per_s=scene.gate.joint_rad_per_s, lost_ns=round(scene.gate.joints_lost_ms * 1e6)
+    )
+
+
+def min_confidence(model: TactileModel, min_accuracy: float | None) -> float:
+    """From which confidence on the model's verdicts are right as often as wanted; 0 for None.
+
+    By the accuracy-coverage curve of its contract, measured on objects that were left out. Raises
+    `ModelError` if it has none, or if not even its surest verdicts are.
+    """
+    if min_accuracy is None:
+        return 0.0
+    curve = model.contract.confidence
+    if not curve:
+        raise ModelError(
+            f"{model.path}: model.min_accuracy needs a model whose accuracy by confidence was "
+            "measured: this one's was not"
+        )
+    reached = list(itertools.takewhile(lambda s: s.accuracy >= min_accuracy, reversed(curve)))
+    if not reached:
+        raise ModelError(
+            f"{model.path}: model.min_accuracy {min_accuracy:g} is more than the model reaches "
+            f"where it is surest: {curve[-1].accuracy:g} of those verdicts were right"
+        )
+    return reached[-1].confidence
+
+
+def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
+    """The drivers of this scene, not yet open, the tactile one first.
+
+    Raises `SceneError` naming the section where values do not fit the driver or each other.
+    """
+    with _section("tactile"):
+        drivers = [_tactile(scene, clock)]
+    if isinstance(scene.joints, StreamJoints):
+        from drivers.joints.driver import JointStreamDriver
+
+        with _section("joints"):
+            drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
+    return drivers
+
+
+def build_keeper(
+    wanted: Scene, pipeline: Pipeline, tactile: Driver, stack: ExitStack
+) -> SessionKeeper | None:
+    """Who keeps the session; None if model or scene need none, or if there is no place for it."""
+    if pipeline.session is None or not wanted.keeps_session:
+        return None
+    from daemon.session.file import SessionFile, SessionFileError
+    from daemon.session.keeper import SessionKeeper
+
+    try:
+        file = SessionFile(wanted.session_path)
+    except SessionFileError as error:
+        log.warning("%s; every start begins a new session", error)
+        return None
+    stack.callback(file.close)
+    return SessionKeeper(
+        pipeline.session,
+        wanted.hand.fingers,
+        tactile,
+        file,
+        on_exchange=pipeline.sensors_exchanged,
+    )
+
+
+def open_driver(driver: Driver) -> None:
+    """Open a driver.
+
+    Raises `LinkError` where a later try may succeed, and `SceneError` where none can: a recording
+    or calibration with mistakes, a device of a kind that there is not.
+    """
+    try:
+        driver.open()
+    except LinkError:
+        raise
+    except (DriverError, ValueError) as error:
+        raise SceneError(str(error)) from error
+
+
+@contextmanager
+def _section(name: str) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise SceneError(f"[{name}] {error}") from error
+
+
+def _tactile(scene: Scene, clock: Clock) -> Driver:
+    match scene.tactile:
+        case ReplayTactile() as options:
+            return _replay(scene, options, clock)
+        case SpiTactile() as options:
+            from drivers.spi.driver import SpiBridgeDriver
+
+            wanted = options.model_dump(exclude={"driver"})
+            return SpiBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
+        case CanTactile() as options:
+            from drivers.can.driver import CanBridgeDriver
+
+            wanted = options.model_dump(exclude={"driver"})
+            return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
+        case PalmTactile() as options:
+            from drivers.palm.driver import PalmDriver
+
+            joints = scene.joints
+            calibration = joints.calibration if isinstance(joints, PalmJoints) else None
+            return PalmDriver(
+                options.source,
+                scene.hand.fingers,
+                calibration=calibration,
+                only_from=options.only_from,
+                heed_finger_bits=options.heed_finger_bits,
+                clock=clock,
+            )
+
+
+def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
+    if is_mcap(options):
+        return _replay_mcap(scene, options, clock)
+    from drivers.recordings.csv_player import Pace, ReplayDriver
+    from drivers.recordings.faults import ReplayFaults
+
+    return ReplayDriver(
+        options.recordings,
+        scene.hand.fingers,
+        pace=Pace(options.pace),
+        speed=options.speed,
+        rate_hz=options.rate_hz,
+        loop=options.loop,
+        strict=options.strict,
+        faults=ReplayFaults(**options.faults.model_dump()),
+        clock=clock,
+    )
+
+
+def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
+    if options.loop or options.strict or options.faults != ReplayFaultsSection():
+        raise ValueError("MCAP files are replayed as they are: no loop, strict or faults")
+    try:
+        from daemon.record.player import McapReplayDriver
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
+            "folder of graspd's source"
+        ) from error
+    speed = options.speed if options.pace == "realtime" else None
+    return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed, clock=clock)

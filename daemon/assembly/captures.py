@@ -1,0 +1,101 @@
+"""What came over a link, judged again: which scene it is of, and the driver that decodes it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.judge.pipeline import Pipeline
+from daemon.scene import Scene, SceneError
+from daemon.scene.drivers import CanTactile, SpiTactile
+from drivers.recordings.capture_player import CANDUMP, SERIAL, CaptureReplayDriver
+from models.runtime import TactileModel
+
+_DRIVER = {CANDUMP: "can", SERIAL: "spi"}
+_SECTIONS = ("hand", "tactile", "model", "gate", "session")
+"""Those that say how readings are judged; a capture has no joints."""
+
+
+class Captures:
+    """Files of one kind, in the order of time, and the scene that they are of."""
+
+    def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
+        """`path` is of the scene; without it the link is one of this kind with the usual options.
+
+        Raises `SceneError` if the files are of several kinds.
+        """
+        endings = {path.suffix for path in paths}
+        if len(endings) > 1:
+            raise SceneError(f"files of {' and '.join(sorted(endings))} are not one recording")
+        self._paths = tuple(paths)
+        self._ending = paths[0].suffix
+        self._scene_path = path
+        self._driver: CaptureReplayDriver | None = None
+
+    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
+        """The scene of the link, with another model or gate mode if given. Raises `SceneError`."""
+        driver = _DRIVER[self._ending]
+        if self._scene_path is None:
+            port = {"port": "capture"} if self._ending == SERIAL else {}
+            sections: dict[str, dict[str, Any]] = {"tactile": {"driver": driver, **port}}
+        else:
+            wanted = scene.load(self._scene_path)
+            if wanted.tactile.driver != driver:
+                raise SceneError(f"{self._scene_path}: tactile.driver must be {driver}")
+            chosen = wanted.model_dump(mode="json", exclude_unset=True)
+            sections = {name: chosen[name] for name in _SECTIONS if name in chosen}
+        return scene.parse(
+            changed(sections, publish, model, mode), self._scene_path or Path("command line")
+        )
+
+    def build_driver(self, wanted: Scene, speed: float | None) -> CaptureReplayDriver:
+        """The driver of the captures, not yet open. Raises `SceneError`."""
+        try:
+            self._driver = _driver(wanted, self._paths, speed)
+        except ValueError as error:
+            raise SceneError(f"[tactile] {error}") from error
+        return self._driver
+
+    def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
+        """The judge of what the driver plays, which finds readings as old as they were then."""
+        driver = self._driver
+        clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
+        return assembly.build_pipeline(wanted, model, clock, learns=learns)
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Nothing: a capture does not know the session."""
+
+
+def changed(
+    sections: dict[str, dict[str, Any]],
+    publish: dict[str, Any],
+    model: dict[str, Any],
+    mode: str | None,
+) -> dict[str, dict[str, Any]]:
+    """Sections of a scene with these instead: thresholds stay where the model is another."""
+    former = sections.get("model", {})
+    if model:
+        former = {key: value for key, value in former.items() if key not in ("name", "path")}
+    gate = sections.get("gate", {}) | ({} if mode is None else {"mode": mode})
+    return {**sections, "model": former | model, "gate": gate, "publish": publish}
+
+
+def _driver(wanted: Scene, paths: Sequence[Path], speed: float | None) -> CaptureReplayDriver:
+    tactile, fingers = wanted.tactile, wanted.hand.fingers
+    if isinstance(tactile, SpiTactile):
+        from drivers.recordings.serial_capture import SerialCapture, records_of
+
+        bridge = SerialCapture(fingers, tactile.sensors)
+        return CaptureReplayDriver(paths, records_of, bridge, speed=speed)
+    if not isinstance(tactile, CanTactile):
+        raise ValueError("captures are of the drivers can and spi")
+    from drivers.recordings.can_capture import CanCapture, frames_of
+
+    options = tactile.model_dump(
+        exclude={"driver", "interface", "channel", "bitrate", "data_bitrate"}
+    )
+    return CaptureReplayDriver(paths, frames_of, CanCapture(fingers, **options), speed=speed)

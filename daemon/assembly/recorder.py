@@ -1,0 +1,114 @@
+"""From a scene to its recorder, and what a recording must say to be judged again the same way."""
+
+from __future__ import annotations
+
+import base64
+import json
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from daemon.assembly import assembly
+from daemon.judge.memory import JudgeMemory, encode
+from daemon.judge.pipeline import Pipeline
+from daemon.scene import Scene, SceneError
+from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.record.raw import Tap
+    from daemon.record.recorder import Recorder
+
+log = logging.getLogger("graspd")
+
+IGNORED_FIELDS = frozenset(
+    {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}
+)
+"""Fields of a verdict that are of the run and not of the readings: a recording that is played again
+gives all others bit for bit."""
+
+
+def build_recorder(
+    wanted: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
+) -> Recorder | None:
+    """The recorder of a scene, at work; None if it wants none.
+
+    The session must be what it is at the start. `tap` holds what came over the link.
+    Raises `SceneError` without the package `mcap`.
+    """
+    directory = wanted.record_directory
+    if wanted.record is None or directory is None:
+        return None
+    try:
+        from daemon.record.files import Shelf
+        from daemon.record.recorder import Recorder
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in {"mcap", "zstandard", "lz4"}:
+            raise
+        raise SceneError(
+            f"[record] needs the package '{package}': run pip install '.[record]' in the folder of "
+            "graspd's source"
+        ) from error
+    options = wanted.record
+    shelf = Shelf(
+        directory,
+        wanted.hand.name,
+        boot_id,
+        keep_files=options.keep_files,
+        keep_bytes=round(options.keep_mb * 1e6),
+    )
+    recorder = Recorder(
+        shelf,
+        options,
+        header_of(wanted, model, boot_id),
+        make_raw=None if tap is None else tap.make_file,
+        take_state=lambda: state_of(pipeline),
+    )
+    pipeline.on_exchange = recorder.exchanged
+    if tap is not None:
+        tap.pass_on(recorder.raw)
+    return recorder
+
+
+def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> dict[str, str]:
+    """What stands in front of every file: fingers, the scene's way to judge, model."""
+    network = wanted.model.model_dump(mode="json", exclude_none=True)
+    if wanted.model.path is not None:
+        network["path"] = str(wanted.model.path.absolute())
+    sections = {
+        "hand": wanted.hand.model_dump(mode="json"),
+        "model": network,
+        "gate": {
+            **wanted.gate.model_dump(mode="json", exclude_none=True),
+            "mode": assembly.gate_mode(wanted),
+        },
+        "session": {"learn": wanted.session_learns, "required": wanted.session.required},
+    }
+    return {
+        "fingers": json.dumps(wanted.hand.fingers),
+        "joints": json.dumps(assembly.joint_limits(wanted) is not None),
+        "boot_id": boot_id,
+        "scene": json.dumps(sections),
+        "model": model.contract.name,
+        "model_sha256": model.sha256,
+    }
+
+
+def state_of(pipeline: Pipeline) -> Callable[[], dict[str, str]]:
+    """What judge and session know, so that a file can be judged again without those before it.
+
+    Takes some 50 us, and what is given back puts it into words, which takes longer.
+    """
+    judge, session, axis_ns = JudgeMemory.of(pipeline), pipeline.session, pipeline.axis_ns
+    known = None if session is None else session.state()
+
+    def texts() -> dict[str, str]:
+        return {
+            "judge": base64.b64encode(encode(judge)).decode(),
+            "axis_ns": str(axis_ns),
+            "session": "" if known is None else msgspec.json.encode(known).decode(),
+        }
+
+    return texts

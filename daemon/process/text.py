@@ -1,0 +1,31 @@
+"""Text from files and peers on its way to a terminal, which must not obey it."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from daemon.process.logs import JOURNAL_ERROR, is_journal
+
+
+def printable(text: str, length_max: int | None = None) -> str:
+    """The text with everything escaped that moves a cursor or hides; cut at `length_max`."""
+    if length_max is not None and len(text) > length_max:
+        text = text[: length_max - 3] + "..."
+    if text.isprintable():
+        return text
+    return "".join(
+        character
+        if character.isprintable()
+        else character.encode("unicode_escape", "surrogatepass").decode("ascii")
+        for character in text
+    )
+
+
+def complain(problem: object) -> None:
+    """Say on stderr what is wrong, one line per line of the message."""
+    lines = [printable(line) for line in str(problem).split("\n")]
+    if is_journal(os.environ):
+        sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
+    else:
+        sys.stderr.write("graspd: " + "\n".join(lines) + "\n")

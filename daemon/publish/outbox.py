@@ -1,0 +1,262 @@
+"""Judgements to messages: numbers them, stamps them, encodes them once, hands them out."""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.publish.latency import LatencyHistogram
+from daemon.publish.messages import (
+    OUTCOME_CODE,
+    GateMessage,
+    Outcome,
+    OutcomeMessage,
+    Reason,
+    State,
+    Status,
+    Tactile,
+    Verdict,
+    encode,
+)
+from drivers.base import JointReading, TactileReading
+from models.contract import Finger
+
+if TYPE_CHECKING:
+    from daemon.judge.gate import GateChange
+    from daemon.publish.deadlines import Deadlines
+
+SHA_DIGITS = 12
+JUDGED_MAX = 1024
+"""Grasps of which it is remembered that they were judged: those of hours, or of ten seconds where
+every reading is one."""
+
+
+class Output(Protocol):
+    """Takes finished messages; a `Publisher` is one."""
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Pass one message on, without blocking."""
+
+    def wanted(self, topic: bytes) -> bool:
+        """Whether anybody gets what is sent on a topic."""
+
+
+class Reporter:
+    """Makes the verdict and status messages of one run of the daemon."""
+
+    def __init__(
+        self,
+        hand: str,
+        fingers: Sequence[Finger],
+        model: str,
+        model_sha256: str,
+        output: Output | None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        wall_clock: Callable[[], float] = time.time,
+        *,
+        boot_id: str | None = None,
+    ) -> None:
+        """`hand` is its name; `clock` gives monotonic ns, `wall_clock` seconds since 1970.
+
+        `boot_id` is a new one unless given.
+        """
+        self.latency = LatencyHistogram()
+        self.outcomes: Counter[Outcome] = Counter()
+        self.reasons: Counter[Reason] = Counter()
+        self._repaired: Counter[str] = Counter()
+        self._verdict_topic = f"verdict.{hand}".encode()
+        self._gate_topic = f"gate.{hand}".encode()
+        self._tactile_topic = f"tactile.{hand}".encode()
+        self._fingers = tuple(fingers)
+        self._status_topic = f"status.{hand}".encode()
+        self._model = model
+        self._model_sha = model_sha256[:SHA_DIGITS]
+        self._output = output
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._boot_id = uuid.uuid4().hex if boot_id is None else boot_id
+        self._verdict_seq = 0
+        self._gate_seq = 0
+        self._tactile_seq = 0
+        self._status_seq = 0
+        self._outcome_topic = f"outcome.{hand}".encode()
+        self._outcome_seq = 0
+        self._judged: dict[int, None] = {}
+        """Grasps that were judged last, oldest first."""
+        self._versions = {
+            "graspd": version("graspd"),
+            "onnxruntime": version("onnxruntime"),
+            "python": platform.python_version(),
+        }
+
+    def verdict(
+        self, judgement: Judgement, received_ns: int, silence_ns: int
+    ) -> tuple[Verdict, bytes]:
+        """Send one verdict, and before it what the gate did.
+
+        `received_ns` is when the driver handed the reading over, `silence_ns` how long no message
+        may come before the consumer must take it for unknown.
+        """
+        for change in judgement.changes:
+            self._gate_change(judgement.t_ns, change)
+        now_ns = self._clock()
+        latency_us = max(now_ns - received_ns, 0) / 1e3
+        message = Verdict(
+            boot_id=self._boot_id,
+            seq=self._verdict_seq,
+            t=self._wall_clock(),
+            t_mono_ns=judgement.t_ns,
+            grasp=judgement.grasp,
+            verdict=judgement.outcome,
+            verdict_code=OUTCOME_CODE[judgement.outcome],
+            p_slip=judgement.p_slip,
+            valid=judgement.outcome is not Outcome.UNKNOWN,
+            reasons=list(judgement.reasons),
+            age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
+            latency_us=latency_us,
+            repaired=list(judgement.repaired),
+            session_calibrated=judgement.session_calibrated,
+            judged=judgement.judged,
+            gate=judgement.gate,
+            contact=None if judgement.contact is None else list(judgement.contact),
+            silence_ms=silence_ns / 1e6,
+            model=self._model,
+            model_sha=self._model_sha,
+        )
+        payload = encode(message)
+        if self._output is not None:
+            self._output.send(self._verdict_topic, payload)
+        self._verdict_seq += 1
+        self.latency.add(latency_us)
+        self.outcomes[judgement.outcome] += 1
+        self.reasons.update(judgement.reasons)
+        self._repaired.update(judgement.repaired)
+        if judgement.judged:
+            self._remember(judgement.grasp)
+        return message, payload
+
+    def _remember(self, grasp: int) -> None:
+        self._judged[grasp] = None
+        if len(self._judged) > JUDGED_MAX:
+            del self._judged[next(iter(self._judged))]
+
+    def outcome(
+        self,
+        boot_id: str,
+        grasp: int,
+        outcome: Literal["stable", "slip"],
+        object_name: str | None = None,
+    ) -> str | None:
+        """Send how the lift of a grasp ended, and what was lifted; or say why not."""
+        if boot_id != self._boot_id:
+            return "unknown boot_id: not of this start"
+        if grasp not in self._judged:
+            return "unknown grasp: not judged, or too long ago"
+        message = OutcomeMessage(
+            boot_id=boot_id,
+            seq=self._outcome_seq,
+            t=self._wall_clock(),
+            t_mono_ns=self._clock(),
+            grasp=grasp,
+            outcome=outcome,
+            object=object_name,
+        )
+        self._outcome_seq += 1
+        if self._output is not None:
+            self._output.send(self._outcome_topic, encode(message))
+        return None
+
+    def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
+        """Send one reading, with the newest joint angles, if somebody wants it."""
+        if self._output is None or not self._output.wanted(self._tactile_topic):
+            return
+        message = Tactile(
+            boot_id=self._boot_id,
+            seq=self._tactile_seq,
+            t=self._wall_clock(),
+            t_mono_ns=reading.t_ns,
+            fingers=list(self._fingers),
+            counts=reading.counts.tolist(),
+            faults=reading.faults.tolist(),
+            joints={} if joints is None else _angles(joints),
+        )
+        self._tactile_seq += 1
+        self._output.send(self._tactile_topic, encode(message))
+
+    def _gate_change(self, t_ns: int, change: GateChange) -> None:
+        message = GateMessage(
+            boot_id=self._boot_id,
+            seq=self._gate_seq,
+            t=self._wall_clock(),
+            t_mono_ns=t_ns,
+            grasp=change.grasp,
+            former=change.former,
+            state=change.state,
+            cause=change.cause,
+        )
+        self._gate_seq += 1
+        if self._output is not None:
+            self._output.send(self._gate_topic, encode(message))
+
+    def status(
+        self,
+        state: State,
+        readings_hz: float,
+        drivers: dict[str, dict[str, int]],
+        pipeline: Pipeline,
+        deadlines: Deadlines,
+    ) -> Status:
+        """Send one status message."""
+        session, grip = pipeline.session, pipeline.grip
+        health = pipeline.health()
+        if state is State.SILENT:
+            health["link"] = Reason.STALE
+        message = Status(
+            boot_id=self._boot_id,
+            seq=self._status_seq,
+            t=self._wall_clock(),
+            t_mono_ns=self._clock(),
+            state=state,
+            readings_hz=readings_hz,
+            verdicts={outcome: self.outcomes[outcome] for outcome in Outcome},
+            reasons=dict(self.reasons),
+            drivers=drivers,
+            repaired=dict(self._repaired),
+            session_grasps=None if session is None else session.grasps,
+            session_calibrated=None if session is None else session.calibrated,
+            gate=None if grip is None else grip.state,
+            tared=None if grip is None else list(grip.tared),
+            health=health,
+            latency_us=_spread_us(self.latency),
+            jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
+            late_readings=deadlines.late,
+            worst_age_ms=deadlines.worst_age_ms,
+            model=self._model,
+            model_sha=self._model_sha,
+            versions=self._versions,
+        )
+        self._status_seq += 1
+        if self._output is not None:
+            self._output.send(self._status_topic, encode(message))
+        return message
+
+
+def _angles(joints: JointReading) -> dict[str, float]:
+    """The joints that have an angle, rad: JSON has no NaN."""
+    pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
+    return {name: angle for name, angle in pairs if math.isfinite(angle)}
+
+
+def _spread_us(durations: LatencyHistogram) -> dict[Literal["p50", "p99", "max"], float]:
+    return {
+        "p50": durations.quantile_us(0.5),
+        "p99": durations.quantile_us(0.99),
+        "max": durations.max_us,
+    }

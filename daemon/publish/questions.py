@@ -1,0 +1,149 @@
+"""The socket on which a grasp controller asks whether it may lift, and tells how lifts ended."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import zmq
+
+from daemon.publish.binding import Binding, Bound
+from daemon.publish.messages import OBJECT_PATTERN
+
+QUESTION = b"judge"
+TELLING = b"outcome"
+"""First word of `outcome <boot_id> <grasp> <stable|slip> [<object>]`."""
+FRAMES_MAX = 3
+"""Of a question: who asks, an empty frame from a REQ socket, the question."""
+MESSAGE_MAX_BYTES = 128
+"""The longest outcome; a peer that sends more asks nothing and is disconnected."""
+WAITING_MAX = 16
+"""Questions that wait for an answer; the oldest is given up for a newer one."""
+QUEUE_MAX = 16
+"""Messages queued per peer in either direction."""
+_TOLD = re.compile(
+    rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
+)
+MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
+NOBODY = "nobody takes outcomes here"
+TAKEN_MAX = 64
+"""Messages, and at most so many frames, taken in one round: a flood must not hold up readings."""
+
+
+TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
+"""Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
+does not."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Question:
+    envelope: tuple[bytes, ...]
+    due_ns: int
+
+
+class Questions(Bound):
+    """Takes questions and answers them; never blocks.
+
+    libzmq has no limit on the number of frames of a message, and holds them all before it hands the
+    first one over. So only those who may make the daemon grow should be able to connect: keep the
+    socket in a folder of yours.
+    """
+
+    def __init__(self, endpoint: str, patience_ns: int, binding: Binding | None = None) -> None:
+        """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
+        super().__init__(endpoint, binding)
+        self.counters: Counter[str] = Counter()
+        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken and
+        `outcomes_refused`."""
+        self.on_outcome: TakeOutcome | None = None
+        self._patience_ns = patience_ns
+        self._waiting: deque[_Question] = deque()
+        self._frames: list[bytes] = []
+        """Of the message at hand, as far as it has been read."""
+        self.renew()
+
+    def _open(self) -> zmq.Socket[bytes]:
+        made = self._context.socket(zmq.ROUTER)
+        made.linger = 0
+        made.sndhwm = made.rcvhwm = QUEUE_MAX
+        made.maxmsgsize = MESSAGE_MAX_BYTES
+        self._bind(made, "take questions")
+        return made
+
+    @property
+    def waiting(self) -> int:
+        """Questions without an answer."""
+        return len(self._waiting)
+
+    def fileno(self) -> int:
+        """Becomes readable when something may have come; call `take` before waiting for it."""
+        return int(self.socket.fileno())
+
+    def due_ns(self) -> int | None:
+        """When the oldest question must be answered, monotonic ns."""
+        return self._waiting[0].due_ns if self._waiting else None
+
+    def take(self, now_ns: int) -> int:
+        """Take in what has come; how many questions it was."""
+        taken = 0
+        if not self.is_open:
+            return taken
+        for _ in range(TAKEN_MAX):
+            if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:
+                break
+            frame = self.socket.recv(zmq.NOBLOCK)
+            if len(self._frames) <= FRAMES_MAX:
+                self._frames.append(frame)
+            if not self.socket.get(zmq.RCVMORE):
+                taken += self._take_message(now_ns)
+                self._frames.clear()
+        self.counters["asked"] += taken
+        return taken
+
+    def _take_message(self, now_ns: int) -> bool:
+        *envelope, question = self._frames
+        well = len(self._frames) <= FRAMES_MAX and envelope[1:] in ([], [b""])
+        if well and question.partition(b" ")[0] == TELLING:
+            self._tell(envelope, question)
+            return False
+        if question != QUESTION or not well:
+            self.counters["malformed"] += 1
+            return False
+        if len(self._waiting) >= WAITING_MAX:
+            self._waiting.popleft()
+            self.counters["given_up"] += 1
+        self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
+        return True
+
+    def _tell(self, envelope: list[bytes], question: bytes) -> None:
+        """Pass on how a lift ended, and say at once whether that was of use."""
+        told = _TOLD.fullmatch(question)
+        if told is None:
+            why: str | None = MALFORMED
+        elif self.on_outcome is None:
+            why = NOBODY
+        else:
+            outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
+            named = None if told[4] is None else told[4].decode()
+            why = self.on_outcome(told[1].decode(), int(told[2]), outcome, named)
+        refused = "malformed" if why == MALFORMED else "outcomes_refused"
+        self.counters["outcomes" if why is None else refused] += 1
+        said = {"v": 1, "ok": True} if why is None else {"v": 1, "ok": False, "why": why}
+        answer = json.dumps(said, separators=(",", ":")).encode()
+        self.socket.send_multipart((*envelope, answer), flags=zmq.NOBLOCK)
+
+    def answer(self, payload: bytes, now_ns: int | None = None) -> None:
+        """Answer all questions, or with `now_ns` those that can wait no longer.
+
+        Whoever is gone misses it.
+        """
+        while (
+            self.is_open and self._waiting and (now_ns is None or self._waiting[0].due_ns <= now_ns)
+        ):
+            question = self._waiting.popleft()
+            self.socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
+            self.counters["answered"] += 1

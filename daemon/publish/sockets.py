@@ -1,0 +1,181 @@
+"""All sockets of a scene: where messages go, where questions come from, who is let in."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import zmq
+
+from daemon.publish.binding import Binding, PublishError
+from daemon.publish.publisher import VERDICT, Publisher
+from daemon.scene import Curve, Scene, SceneError
+
+if TYPE_CHECKING:
+    from daemon.publish.access import Gatekeeper
+    from daemon.publish.latest import Latest
+    from daemon.publish.questions import Questions
+
+log = logging.getLogger("graspd")
+
+
+class Sockets:
+    """Open from the start until `close`."""
+
+    def __init__(self, wanted: Scene) -> None:
+        """Raises `PublishError`, and `SceneError` for keys that are wrong."""
+        self.plan = plan(wanted)
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
+        self._curve = wanted.curve
+        self._keys_seen: object = None
+        self._lost = False
+        """Whether a port could not be had again."""
+        self.gatekeeper: Gatekeeper | None = None
+        self.publisher: Publisher
+        self.latest: Latest | None = None
+        self.questions: Questions | None = None
+        try:
+            self._open(wanted)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, wanted: Scene) -> None:
+        pair = None
+        if wanted.curve is not None:
+            pair = self._let_in_only_known(wanted.curve)
+        publish = wanted.publish
+        mode = None if publish.file_mode is None else int(publish.file_mode, 8)
+        binding = Binding(self._context, mode, publish.group, pair)
+        self.publisher = Publisher(wanted.endpoint, publish.high_water_mark, binding)
+        if publish.latest_endpoint is not None:
+            from daemon.publish.latest import Latest
+
+            self.latest = Latest(publish.latest_endpoint, binding)
+        if wanted.ask_endpoint is not None:
+            from daemon.publish.questions import Questions
+
+            patience_ns = round(wanted.gate.request_ms * 1e6)
+            self.questions = Questions(wanted.ask_endpoint, patience_ns, binding)
+        self._watch()
+
+    def _let_in_only_known(self, curve: Curve) -> tuple[bytes, bytes]:
+        from daemon.publish.access import Gatekeeper
+        from daemon.publish.keys import KeysError, load_clients, load_pair
+
+        try:
+            pair, admitted = load_pair(curve.secret_key), load_clients(curve.clients)
+        except KeysError as error:
+            raise SceneError(str(error)) from error
+        self._keys_seen = _state(curve.clients)
+        self.gatekeeper = Gatekeeper(self._context, admitted)
+        return pair
+
+    def _watch(self) -> None:
+        if self.gatekeeper is not None:
+            for bound in self._bound():
+                if bound.endpoint.startswith("tcp://") and bound.is_open:
+                    self.gatekeeper.watch(bound.socket)
+
+    def _bound(self) -> list[Publisher | Latest | Questions]:
+        wanted = (getattr(self, "publisher", None), self.latest, self.questions)
+        return [each for each in wanted if each is not None]
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Publish one message."""
+        self.publisher.send(topic, payload)
+        if self.latest is not None and topic.startswith(VERDICT):
+            self.latest.send(payload)
+
+    def wanted(self, topic: bytes) -> bool:
+        """Whether somebody subscribes to a topic."""
+        return self.publisher.wanted(topic)
+
+    def filenos(self) -> list[int]:
+        """Become readable when a peer may want something; call `take` before waiting for them."""
+        asked = [each for each in (self.publisher, self.questions) if each is not None]
+        found = [each.fileno() for each in asked if each.is_open]
+        return found if self.gatekeeper is None else found + self.gatekeeper.filenos()
+
+    def take(self) -> None:
+        """See to peers that come; questions are taken by themselves."""
+        if self.publisher.is_open:
+            self.publisher.take()
+        if self.gatekeeper is not None:
+            self.gatekeeper.take()
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What peers did, by the part that counted it."""
+        parts = {"publish": self.publisher, "ask": self.questions, "keys": self.gatekeeper}
+        return {name: dict(part.counters) for name, part in parts.items() if part is not None}
+
+    def mind_keys(self) -> None:
+        """If the list of those who may connect has changed, take it; who is off it is cut off.
+
+        A list that cannot be read changes nothing, and is tried again. A port that somebody else
+        has taken meanwhile is left to them, and tried again.
+        """
+        if self._curve is None or self.gatekeeper is None:
+            return
+        now = _state(self._curve.clients)
+        if now == self._keys_seen and not self._lost:
+            return
+        from daemon.publish.keys import KeysError, load_clients
+
+        try:
+            admitted = load_clients(self._curve.clients)
+        except KeysError as error:
+            log.error("%s; the former list stands", error)
+            return
+        if now != self._keys_seen:
+            log.info("%d keys may connect", len(admitted))
+        self._keys_seen = now
+        if self.gatekeeper.admit(admitted) or self._lost:
+            self._cut_off()
+
+    def _cut_off(self) -> None:
+        """Close all connections by TCP: libzmq cannot cut off one peer alone."""
+        if self.gatekeeper is not None:
+            self.gatekeeper.unwatch()
+        self._lost = False
+        for bound in self._bound():
+            if bound.endpoint.startswith("tcp://"):
+                try:
+                    bound.renew()
+                except PublishError as error:
+                    log.error("%s; nobody can connect there", error)
+                    self._lost = True
+        self._watch()
+
+    def close(self) -> None:
+        """Close them all. May be called again."""
+        for bound in self._bound():
+            bound.close()
+        if self.gatekeeper is not None:
+            self.gatekeeper.close()
+        self._context.term()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.close()
+
+
+def plan(wanted: Scene) -> object:
+    """What of a scene is about its sockets: equal for scenes that can share them."""
+    asked = (wanted.ask_endpoint, wanted.gate.request_ms)
+    own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
+    return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
+
+
+def _state(folder: Path) -> object:
+    """Differs from one look to the next when a file in the folder was put, changed or removed."""
+    try:
+        with os.scandir(folder) as entries:
+            found = [(entry.name, entry.stat()) for entry in entries]
+    except OSError as error:
+        return error.errno
+    return sorted((name, each.st_mtime_ns, each.st_ctime_ns, each.st_size) for name, each in found)

@@ -1,0 +1,138 @@
+"""What comes over a link, on its way into a file beside the recording."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from daemon.record.files import create
+from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
+from drivers.base import Driver
+from drivers.can.frames import LOST
+from drivers.recordings.candump import line_of
+from drivers.recordings.serial_file import Way, encode_records
+
+if TYPE_CHECKING:
+    from daemon.record.recorder import RawFile
+    from drivers.can.bus import Stamped
+
+EARLY_MAX: Final = 1000
+"""Entries held while the recorder is not there yet: those of the link's opening."""
+
+Taker = Callable[[object, int], None]
+"""Takes an entry and its monotonic time, ns."""
+
+
+class Tap:
+    """Passes on what comes over a link; holds it until somebody takes it."""
+
+    def __init__(
+        self, make_file: Callable[[Path], RawFile], clock: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self.make_file = make_file
+        """Makes the file of these entries by its name without ending."""
+        self._clock = clock
+        self._early: deque[tuple[object, int]] = deque(maxlen=EARLY_MAX)
+        self._taker: Taker | None = None
+
+    def pass_on(self, taker: Taker) -> None:
+        """Hand over what is held, and from now on everything at once."""
+        while self._early:
+            taker(*self._early.popleft())
+        self._taker = taker
+
+    def frames(self, stamped: list[Stamped]) -> None:
+        """CAN frames have come."""
+        self._take(stamped)
+
+    def bytes(self, way: Way, data: bytes) -> None:
+        """Bytes went over a serial line."""
+        self._take((way, data))
+
+    def _take(self, entry: object) -> None:
+        if self._taker is None:
+            self._early.append((entry, self._clock()))
+        else:
+            self._taker(entry, self._clock())
+
+
+def tap_of(driver: Driver, section: Tactile) -> Tap | None:
+    """A tap on the link of a driver; None for one that has no link of these kinds."""
+    if isinstance(section, CanTactile):
+        from drivers.can.driver import CanBridgeDriver
+
+        channel = section.channel
+        tap = Tap(lambda name: CandumpFile(name, channel))
+        if isinstance(driver, CanBridgeDriver):
+            driver.tap(tap.frames)
+        return tap
+    if isinstance(section, SpiTactile):
+        from drivers.spi.driver import SpiBridgeDriver
+
+        tap = Tap(SerialFile)
+        if isinstance(driver, SpiBridgeDriver):
+            driver.tap(tap.bytes)
+        return tap
+    return None
+
+
+class _File:
+    """A file beside the recording. All methods raise `OSError` when there is no room."""
+
+    def __init__(self, name: Path, ending: str) -> None:
+        self._stream = create(name.with_name(name.name + ending))
+
+    def flush(self) -> int:
+        """Have the disk keep it; the file's size, bytes."""
+        self._stream.flush()
+        os.fdatasync(self._stream.fileno())
+        return self._stream.tell()
+
+    def close(self) -> None:
+        """Flush and close."""
+        try:
+            self.flush()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close as it is."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+
+class CandumpFile(_File):
+    """CAN frames as `candump -L` writes them. What the kernel lost has no line."""
+
+    def __init__(self, name: Path, channel: str) -> None:
+        super().__init__(name, ".can.log")
+        self._channel = channel.replace(" ", "_")
+
+    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
+        """Take the frames of one drain: each has its own time."""
+        if not isinstance(entry, list):
+            return
+        lines = [
+            line_of(frame, max(until_ns + offset_ns, 0), self._channel)
+            for frame, _, until_ns in entry
+            if not frame.flags & LOST
+        ]
+        self._stream.write("".join(lines).encode())
+
+
+class SerialFile(_File):
+    """Serial bytes in the frames of `drivers.recordings.serial_file`, with monotonic times."""
+
+    def __init__(self, name: Path) -> None:
+        super().__init__(name, ".serial")
+
+    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
+        """Take bytes that came or went at once."""
+        if isinstance(entry, tuple):
+            way, data = entry
+            self._stream.write(encode_records(way, at_ns, data))

@@ -1,0 +1,360 @@
+"""Keeps what comes and what is said of it in files, without ever holding the loop up.
+
+The loop appends to a queue with a bound; a thread writes. Whatever the disk does, the loop does not
+notice: what finds no place is dropped and counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import msgspec
+
+from daemon.publish.sockets import Sockets
+from daemon.record.files import Joints, MessageFile, Shelf
+from daemon.record.mcap import ASKED, EXCHANGED
+from daemon.scene import Record
+from drivers.base import JointReading
+
+if TYPE_CHECKING:
+    from daemon.publish.questions import Questions
+
+log = logging.getLogger("graspd")
+
+QUEUE_MAX: Final = 20_000
+"""Entries that wait for the disk, some 12 MB: a minute of readings at 100 Hz, with verdicts and
+joints. The newest are dropped beyond."""
+RETRY_NS: Final = 60_000_000_000
+"""After a failure of the disk, ns."""
+ROUNDS_PER_FLUSH: Final = 10
+"""How often the thread takes what waits, between two flushes: seldom, so that it hardly ever wants
+the interpreter when the loop does."""
+FLUSH_AFTER: Final = 0.8
+"""Of the flush interval: so that, with a round and the writing, nothing waits longer than that."""
+SWITCH_S: Final = 0.0005
+"""How long the thread may go on while the loop wants to run, s; Python's own is ten times that."""
+CLOSE_S: Final = 0.5
+"""How long the end waits for a disk that does not answer, s."""
+
+
+class RawFile(Protocol):
+    """Keeps what came over a link."""
+
+    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
+        """Take what came over at monotonic `at_ns`; wall time is that plus `offset_ns`."""
+
+    def flush(self) -> int:
+        """Have the disk keep it; the file's size, bytes."""
+
+    def close(self) -> None:
+        """Flush and close."""
+
+    def abandon(self) -> None:
+        """Close as it is."""
+
+
+MakeRaw = Callable[[Path], RawFile]
+"""Makes a raw file by its name without ending."""
+
+Texts = Callable[[], Mapping[str, str]]
+"""Puts into words, in the thread, what was known when it was taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """Stands in the queue between what belongs into one file and into the next."""
+
+    texts: Texts
+
+
+_Entry = tuple[int, bytes, object]
+"""When, monotonic ns; topic, none for what came over a link; content."""
+
+
+@dataclass(slots=True, eq=False)
+class _Open:
+    """Files that are being written, and since when."""
+
+    messages: MessageFile
+    raw: RawFile | None
+    offset_ns: int
+    since_ns: int
+    size: int = 0
+    """At the last flush, bytes."""
+    unflushed: int = 0
+    """Entries taken for these files that the disk may not have."""
+
+
+class Recorder:
+    """Records one run of the daemon. `send`, `joints` and `raw` never block and never raise."""
+
+    def __init__(
+        self,
+        shelf: Shelf,
+        options: Record,
+        header: Mapping[str, str],
+        *,
+        make_raw: MakeRaw | None = None,
+        take_state: Callable[[], Texts] | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+        wall_clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Start the thread, which makes the first file. `header` stands in front of every file.
+
+        So does what `take_state` gives. It is called in the loop, here and then where a file is to
+        end: after a status, when no reading is on its way to a verdict.
+        """
+        self._shelf = shelf
+        self._rotate_bytes = round(options.rotate_mb * 1e6)
+        self._rotate_ns = round(options.rotate_minutes * 60e9)
+        self._flush_ns = round(options.flush_ms * 1e6)
+        self._header = dict(header)
+        self._make_raw = make_raw
+        self._take_state = take_state
+        self._clock = clock
+        self._wall_clock = wall_clock
+        self._queue: deque[_Entry] = deque()
+        self._joints_topic = f"joints.{shelf.hand}".encode()
+        self._asked_topic = f"{ASKED}.{shelf.hand}".encode()
+        self._exchanged_topic = f"{EXCHANGED}.{shelf.hand}".encode()
+        self._status_topic = f"status.{shelf.hand}".encode()
+        self._encoder = msgspec.json.Encoder()
+        self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
+        self._dropped = 0
+        self._open: _Open | None = None
+        self._number = 0
+        self._flush_due_ns = clock() + self._flush_ns
+        self._retry_due_ns: int | None = None
+        self._awaits_turn = take_state is not None
+        """Whether a `_Turn` is on its way, or will be when `_wants_turn` is seen."""
+        self._wants_turn = False
+        if take_state is not None:
+            self._queue.append((clock(), b"", _Turn(take_state())))
+        self._stopping = threading.Event()
+        self._switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Record one message."""
+        self._put(topic, payload)
+        if self._wants_turn and self._take_state is not None and topic == self._status_topic:
+            self._wants_turn = False
+            self._queue.append((self._clock(), b"", _Turn(self._take_state())))
+
+    def joints(self, reading: JointReading) -> None:
+        """Record joint angles."""
+        self._put(self._joints_topic, reading)
+
+    def asked(self) -> None:
+        """Record that the controller asks for a judgement."""
+        self._put(self._asked_topic, b"{}")
+
+    def exchanged(self) -> None:
+        """Record that a sensor is another one than before."""
+        self._put(self._exchanged_topic, b"{}")
+
+    def raw(self, entry: object, at_ns: int) -> None:
+        """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""
+        self._put(b"", entry, at_ns)
+
+    def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
+        if len(self._queue) >= QUEUE_MAX:
+            self._dropped += 1
+        else:
+            self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
+
+    def counters(self) -> dict[str, int]:
+        """Since the start: entries `recorded`, `dropped` because the disk was too slow, `lost` with
+        a failure of it; `files` begun and `removed`, `failures`; `writing`, 0 while there is none.
+        """
+        writing = self._open is not None
+        return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
+
+    def close(self) -> None:
+        """Write what waits and end the files; leave a disk that does not answer alone."""
+        if self._stopping.is_set():
+            return
+        self._stopping.set()
+        self._thread.join(CLOSE_S)
+        if self._thread.is_alive():
+            log.warning("record: the disk does not answer, the end of the recording is lost")
+        sys.setswitchinterval(self._switch_s)
+
+    def _work(self) -> None:
+        with contextlib.suppress(OSError):  # never in the way of the loop, if that is realtime
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        try:
+            while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
+                self._go_round()
+            self._flush_due_ns = 0
+            self._go_round()
+        except BaseException:
+            self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
+            raise
+        finally:
+            self._finish()
+
+    def _go_round(self) -> None:
+        """Write what waits; after a failure let it go until it is time to try again."""
+        entries = [self._queue.popleft() for _ in range(len(self._queue))]
+        now_ns = self._clock()
+        if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
+            self._turn(now_ns)
+        waiting: list[_Entry] = []
+        for entry in entries:
+            if isinstance(entry[2], _Turn):
+                self._write(waiting)
+                waiting = []
+                self._take_turn(entry[2], now_ns)
+            else:
+                waiting.append(entry)
+        self._write(waiting)
+        if self._open is not None and now_ns >= self._flush_due_ns:
+            self._flush(self._open, now_ns)
+
+    def _turn(self, now_ns: int) -> None:
+        """Go on in new files, now or where the loop says what is known there."""
+        if self._take_state is None:
+            self._finish()
+            self._begin(now_ns, {})
+        elif not self._awaits_turn:
+            self._awaits_turn = self._wants_turn = True
+
+    def _take_turn(self, turn: _Turn, now_ns: int) -> None:
+        """Go on in new files, but not for the little that comes after the end."""
+        self._awaits_turn = False
+        if self._open is None or not self._stopping.is_set():
+            self._finish()
+            self._begin(now_ns, turn.texts())
+
+    def _begin(self, now_ns: int, state: Mapping[str, str]) -> None:
+        """Begin new files, if the disk lets us."""
+        offset_ns = self._wall_clock() - now_ns
+        try:
+            self._counted["removed"] += self._shelf.make_room(self._rotate_bytes)
+            name = self._shelf.name(self._number)
+            path = name.with_name(f"{name.name}.mcap")
+            header = {**self._header, **state, "file": str(self._number)}
+            messages = MessageFile(path, header, offset_ns)
+            raw = None
+            try:
+                raw = None if self._make_raw is None else self._make_raw(name)
+            except OSError:
+                messages.remove()
+                raise
+        except OSError as error:
+            self._fail(error)
+            return
+        log.info("record: %s", path)
+        self._retry_due_ns = None
+        self._number += 1
+        self._counted["files"] += 1
+        self._open = _Open(messages, raw, offset_ns, now_ns)
+
+    def _write(self, entries: list[_Entry]) -> None:
+        """Write entries, or count them as lost."""
+        files = self._open
+        if files is None:
+            self._counted["lost"] += len(entries)
+            return
+        files.unflushed += len(entries)  # all of them, wherever among them the disk fails
+        try:
+            for at_ns, topic, content in entries:
+                if isinstance(content, JointReading):
+                    content = self._encoder.encode(Joints.of(content))
+                if topic and isinstance(content, bytes):
+                    files.messages.write(topic, content, at_ns)
+                elif files.raw is not None:
+                    files.raw.write(content, at_ns, files.offset_ns)
+        except OSError as error:
+            self._fail(error)
+
+    def _flush(self, files: _Open, now_ns: int) -> None:
+        try:
+            files.size = files.messages.flush()
+            if files.raw is not None:
+                files.size += files.raw.flush()
+        except OSError as error:
+            self._fail(error)
+            return
+        self._counted["recorded"] += files.unflushed
+        files.unflushed = 0
+        self._flush_due_ns = now_ns + round(self._flush_ns * FLUSH_AFTER)
+        if files.size >= self._rotate_bytes or now_ns - files.since_ns >= self._rotate_ns:
+            self._turn(now_ns)
+
+    def _finish(self) -> None:
+        files = self._open
+        if files is None:
+            return
+        try:
+            files.messages.close()
+            if files.raw is not None:
+                files.raw.close()
+        except OSError as error:
+            self._fail(error)
+            return
+        self._open = None
+        self._counted["recorded"] += files.unflushed
+
+    def _fail(self, error: OSError) -> None:
+        """The disk does not take it: one warning, and another try in a minute."""
+        files, self._open = self._open, None
+        self._number += 1  # the next file does not go on where the last one ends
+        if files is not None:
+            self._counted["lost"] += files.unflushed
+            files.messages.abandon()
+            if files.raw is not None:
+                files.raw.abandon()
+        self._counted["failures"] += 1
+        first = self._retry_due_ns is None
+        self._retry_due_ns = self._clock() + RETRY_NS
+        say = log.warning if first else log.debug
+        say("record: %s: %s; nothing is recorded", self._shelf.directory, error.strerror or error)
+
+
+class Recorded:
+    """The sockets, with everything that is sent recorded too."""
+
+    def __init__(self, sockets: Sockets, recorder: Recorder) -> None:
+        self._sockets = sockets
+        self._recorder = recorder
+
+    @property
+    def questions(self) -> Questions | None:
+        """Who takes questions, if anybody."""
+        return self._sockets.questions
+
+    def filenos(self) -> list[int]:
+        """Become readable when a peer may want something."""
+        return self._sockets.filenos()
+
+    def take(self) -> None:
+        """See to peers that come."""
+        self._sockets.take()
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """What peers and the recorder did."""
+        return self._sockets.counters() | {"record": self._recorder.counters()}
+
+    def wanted(self, topic: bytes) -> bool:
+        """Always: what nobody subscribes to is recorded all the same."""
+        return True
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        """Publish and record one message; readings are published only if somebody wants them."""
+        if not topic.startswith(b"tactile.") or self._sockets.wanted(topic):
+            self._sockets.send(topic, payload)
+        self._recorder.send(topic, payload)

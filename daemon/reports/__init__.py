@@ -1,1 +1,0 @@
-"""Reports that measure graspd itself: behind the `train` extra, never part of a running daemon."""

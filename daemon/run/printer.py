@@ -1,0 +1,77 @@
+"""Verdicts on standard output, for people or for programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+from daemon.judge.pipeline import Judgement
+from daemon.process.text import printable
+from daemon.publish.messages import GateState, Verdict
+from daemon.run.summary import Summary
+from drivers.base import Annotation, TactileReading
+
+NAME_MAX = 80
+"""Characters of an object's name that are shown."""
+
+
+class Printer:
+    """Writes verdicts as they come, and a summary at the end."""
+
+    def __init__(self, *, as_json: bool, prompt: bool) -> None:
+        """`as_json`: the messages themselves on stdout, and the summary as JSON on stderr.
+
+        `prompt`: each line goes out at once, also into a pipe, for readings that come in time.
+        """
+        self._prompt = prompt
+        self._as_json = as_json
+        self._summary = Summary()
+        self._start_s = time.monotonic()
+        self._gate: GateState | None = None
+
+    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Write one verdict; `reading` is None where the verdict is about silence."""
+        annotation = reading.annotation if reading else None
+        self._summary.add(verdict, annotation.slipped if annotation else None)
+        if not self._as_json and not self._is_news(verdict):
+            return
+        line = payload.decode() if self._as_json else _line(verdict, annotation)
+        sys.stdout.write(line + "\n")
+        if self._prompt:
+            sys.stdout.flush()
+
+    def _is_news(self, verdict: Verdict) -> bool:
+        """Whether people want to read it: behind a gate, where something changed."""
+        if verdict.gate is None or verdict.judged or verdict.gate is not self._gate:
+            self._gate = verdict.gate
+            return True
+        return False
+
+    def without_session(self, judgement: Judgement, reading: TactileReading, grasp: int) -> None:
+        """Count what would have been judged of this grasp without session calibration."""
+        annotation = reading.annotation
+        self._summary.compare(judgement, annotation.slipped if annotation else None, grasp)
+
+    def summary(self) -> None:
+        """Write the summary of everything since the start."""
+        wall_s = time.monotonic() - self._start_s
+        if self._as_json:
+            sys.stdout.flush()
+            sys.stderr.write(json.dumps(self._summary.as_dict(wall_s)) + "\n")
+        else:
+            sys.stdout.write("\n" + "\n".join(self._summary.lines(wall_s)) + "\n")
+
+
+def _line(verdict: Verdict, annotation: Annotation | None) -> str:
+    if verdict.p_slip is None:
+        finding = ", ".join(verdict.reasons)
+    else:
+        finding = f"p_slip {verdict.p_slip:.3f}"
+    gate = "" if verdict.gate is None else f"{verdict.gate:9}"
+    line = f"{verdict.grasp:6d}  {gate}{verdict.verdict:8}{finding:16}{verdict.latency_us:6.0f} us"
+    if annotation is not None:
+        line += f"  {printable(annotation.object_name or '', NAME_MAX)}"
+        if annotation.slipped is not None:
+            line += f" (was {'slip' if annotation.slipped else 'stable'})"
+    return line.rstrip()

@@ -1,0 +1,113 @@
+"""What systemd is told: ready, alive, how it goes (sd_notify(3)). Nobody else hears it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping
+
+from daemon.publish.messages import Status
+
+log = logging.getLogger("graspd")
+
+FEEDINGS_PER_TIMEOUT = 4
+"""The watchdog is fed this often within its timeout; systemd asks for two at least."""
+RELOAD_PATIENCE_US = 60_000_000
+"""Reading a scene and loading its model may take so long before the watchdog bites."""
+NS_PER_US = 1000
+
+
+class Systemd:
+    """Messages to the service manager that started this process.
+
+    A manager that does not listen costs one warning and nothing else: it is not what graspd is for.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        watchdog_us: int | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """`address` is a socket's path, or `@` and an abstract name; `clock` gives monotonic ns.
+
+        `watchdog_us` is how long the manager waits for a sign of life, us; None if it does not.
+        """
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address
+        self._watchdog_us = watchdog_us
+        self._clock = clock
+        self._period_ns = (watchdog_us or 0) * NS_PER_US // FEEDINGS_PER_TIMEOUT
+        self._due_ns = clock()
+        self._warned = False
+        kind = socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK
+        self._socket = socket.socket(socket.AF_UNIX, kind)
+
+    @classmethod
+    def of(cls, environment: Mapping[str, str]) -> Systemd | None:
+        """The manager that the environment names (sd_notify(3), sd_watchdog_enabled(3))."""
+        address = environment.get("NOTIFY_SOCKET", "")
+        if address[:1] not in ("/", "@"):
+            return None
+        timeout, process = environment.get("WATCHDOG_USEC", ""), environment.get("WATCHDOG_PID", "")
+        mine = timeout.isdecimal() and int(timeout) > 0 and process in ("", str(os.getpid()))
+        return cls(address, int(timeout) if mine else None)
+
+    def ready(self, what: str) -> None:
+        """Model and drivers are there, or are there again after a reload."""
+        lines = ["READY=1", f"STATUS={what}"]
+        if self._watchdog_us is not None:
+            lines += [f"WATCHDOG_USEC={self._watchdog_us}", "WATCHDOG=1"]
+        self._send(*lines)
+
+    def reloading(self) -> None:
+        """The scene is read again; until `ready` the watchdog has patience."""
+        lines = ["RELOADING=1", f"MONOTONIC_USEC={self._clock() // NS_PER_US}"]
+        if self._watchdog_us is not None:
+            lines += [f"WATCHDOG_USEC={RELOAD_PATIENCE_US}", "WATCHDOG=1"]
+        self._send(*lines)
+
+    def stopping(self) -> None:
+        """The process is about to end."""
+        self._send("STOPPING=1", "STATUS=stopping")
+
+    def status(self, status: Status) -> None:
+        """Show in `systemctl status` how it goes."""
+        self._send(f"STATUS={in_a_line(status)}")
+
+    def due_ns(self) -> int | None:
+        """When the watchdog wants to be fed next, monotonic ns; None if nobody watches."""
+        return None if self._watchdog_us is None else self._due_ns
+
+    def feed(self) -> None:
+        """Say that the loop has gone round, if it is time to."""
+        if self._watchdog_us is not None and self._clock() >= self._due_ns:
+            self._due_ns = self._clock() + self._period_ns
+            self._send("WATCHDOG=1")
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()
+
+    def _send(self, *lines: str) -> None:
+        try:
+            self._socket.sendto("\n".join(lines).encode(), self._address)
+        except OSError as error:
+            level = logging.DEBUG if self._warned else logging.WARNING
+            log.log(level, "the service manager cannot be told: %s", error.strerror)
+            self._warned = True
+
+
+def in_a_line(status: Status) -> str:
+    """How it goes, for people."""
+    parts = [f"{status.state}: {status.readings_hz:.1f} readings/s"]
+    parts += [f"{number} {outcome}" for outcome, number in status.verdicts.items() if number]
+    if status.gate is not None:
+        parts.append(f"gate {status.gate}")
+    if status.late_readings:
+        parts.append(f"{status.late_readings} late")
+    parts += [f"{part} {reason}" for part, reason in list(status.health.items())[:4]]
+    if len(status.health) > 4:
+        parts.append(f"{len(status.health) - 4} more not well")
+    return ", ".join(parts)

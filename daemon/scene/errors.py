@@ -1,0 +1,108 @@
+"""What is wrong with a scene, in the words of the file: one line per mistake, naming the key."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import get_args
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from daemon.process.text import printable
+
+Section = type[BaseModel]
+
+LINES_MAX = 20
+"""Whoever has made more mistakes has named the wrong file."""
+SHOWN_MAX = 80
+"""Characters of a key or value that are shown."""
+MESSAGE_MAX = 320
+"""Characters of an explanation that may have such a value in it."""
+
+
+def lines_of(error: ValidationError, scene: Section, path: Path) -> list[str]:
+    """Lines for what pydantic found wrong in a scene of this class, the first twenty in full."""
+    mistakes = error.errors(include_url=False)
+    inner = {mistake["loc"][:depth] for mistake in mistakes for depth in range(len(mistake["loc"]))}
+    # A wrong item also makes its list wrong; only the item is worth a line.
+    single = [mistake for mistake in mistakes if mistake["loc"] not in inner]
+    lines = [_line(path, scene, mistake) for mistake in single[:LINES_MAX]]
+    if len(single) > LINES_MAX:
+        lines.append(f"{path}: and {len(single) - LINES_MAX} more")
+    return lines
+
+
+def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
+    keys, section = _place(scene, tuple(mistake["loc"]))
+    key = printable(".".join(keys) or "scene", SHOWN_MAX)
+    if mistake["type"] == "extra_forbidden":
+        return f"{path}: {key}: no such key{_suggestion(keys[-1], section)}"
+    if mistake["type"] == "missing":
+        return f"{path}: {key}: is missing"
+    if mistake["type"] == "union_tag_not_found":
+        return f"{path}: {key}.driver: is missing"
+    if mistake["type"] == "union_tag_invalid":
+        context = mistake["ctx"]
+        known = context["expected_tags"].replace("'", "")
+        tag = printable(context["tag"], SHOWN_MAX)
+        return f"{path}: {key}.driver: no driver '{tag}'; there are: {known}"
+    message = mistake["msg"].removeprefix("Value error, ").replace("tuple", "list")
+    message = printable(message, MESSAGE_MAX)
+    given = mistake["input"]
+    shown = "" if isinstance(given, dict | BaseModel) else f" (is {_shown(given)})"
+    return f"{path}: {key}: {message[0].lower()}{message[1:]}{shown}"
+
+
+def _shown(value: object) -> str:
+    """As Python would write it, cut: `repr` of a long number fails, of a deep list too."""
+    try:
+        return printable(repr(value), SHOWN_MAX)
+    except (ValueError, RecursionError):
+        return "too large to show"
+
+
+def _place(scene: Section, location: tuple[int | str, ...]) -> tuple[list[str], Section | None]:
+    """Keys of the file that lead to a location, and the section that holds the last of them.
+
+    Where a section depends on its driver, pydantic puts the driver's name between the keys; it is
+    left out here.
+    """
+    keys: list[str] = []
+    section: Section | None = scene
+    inside: Section | None = scene
+    choices: dict[str, Section] = {}
+    for part in map(str, location):
+        if part in choices:
+            inside = choices[part]
+            choices = {}
+            continue
+        keys.append(part)
+        section = inside
+        field = section.model_fields.get(part) if section else None
+        sections = list(_sections(field.annotation)) if field else []
+        choices = {tag: each for each in sections for tag in _tags(each)}
+        inside = sections[0] if len(sections) == 1 else None
+    return keys, section
+
+
+def _sections(annotation: object) -> Iterator[Section]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _sections(argument)
+
+
+def _tags(section: Section) -> tuple[str, ...]:
+    driver = section.model_fields.get("driver")
+    return get_args(driver.annotation) if driver else ()
+
+
+def _suggestion(wrong: str, section: Section | None) -> str:
+    known = list(section.model_fields) if section else []
+    stem = wrong.rsplit("_", 1)[0]  # `max_age_s` for `max_age_ms`: the unit is the mistake
+    close = difflib.get_close_matches(wrong, known, n=1) or [
+        name for name in known if name.rsplit("_", 1)[0] == stem
+    ]
+    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(known)}"

@@ -1,0 +1,375 @@
+"""The scene: one TOML file that says what this hand has and how to judge with it."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    AfterValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+
+from daemon.process.text import printable
+from daemon.scene.drivers import (
+    CanTactile,
+    FilePath,
+    Joints,
+    Name,
+    PalmJoints,
+    PalmTactile,
+    ReplayTactile,
+    Section,
+    SpiTactile,
+    Tactile,
+)
+from daemon.scene.endpoints import check_endpoint, is_private
+from models.contract import Finger
+
+SCENE_MAX_BYTES = 1 << 20
+"""A scene has a kilobyte; a larger file was named by mistake."""
+
+
+STATE_DIRECTORY = Path("/var/lib/graspd")
+"""Where a service keeps its state (file-hierarchy(7))."""
+
+
+class SceneError(Exception):
+    """The scene file is missing or wrong; the message is one line per mistake, naming the key."""
+
+
+class Hand(Section):
+    """`[hand]`: which hand, and which of its fingers carry a BioTac SP."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_-]{1,32}$")] = "right"
+    """Part of the topics and of the default socket's name."""
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] = ("ff", "mf", "th")
+
+    @field_validator("fingers")
+    @classmethod
+    def _no_finger_twice(cls, fingers: tuple[Finger, ...]) -> tuple[Finger, ...]:
+        if len(set(fingers)) != len(fingers):
+            raise ValueError("names a finger twice")
+        return fingers
+
+
+class Model(Section):
+    """`[model]`: which network judges."""
+
+    name: Name | None = None
+    """A model of the zoo, `small-session` when neither name nor path is given; for a hand of fewer
+    fingers in its form for these, where the zoo has one."""
+    path: FilePath | None = None
+    """A model file of your own, relative to the scene file."""
+    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """`p_slip` from here on is slip."""
+    min_accuracy: Annotated[float, Field(gt=0.5, lt=1.0)] | None = None
+    """Verdicts must be right this often, by the model's card; less sure ones become `unknown`."""
+
+    @field_validator("path")
+    @classmethod
+    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        base: Path = (info.context or {}).get("base", Path())
+        return None if path is None else base / path
+
+    @model_validator(mode="after")
+    def _one_of_name_and_path(self) -> Self:
+        if self.name is not None and self.path is not None:
+            raise ValueError("give either name or path, not both")
+        return self
+
+
+class Session(Section):
+    """`[session]`: where a session model keeps what it knows of today's sensors."""
+
+    keep: bool | None = None
+    """False: begin a new session at every start, and write nothing. Unless given, kept for live
+    sensors and not for recordings."""
+    learn: bool | None = None
+    """Whether what is judged counts as a grasp of the session. Unless given, yes, except for live
+    sensors with gate mode `every`: most of their readings are of an open hand."""
+    required: bool = False
+    """Whether nothing is judged before the session is calibrated."""
+    file: FilePath | None = None
+    """`/var/lib/graspd/<hand>.session.json` unless given; relative to the scene file."""
+
+    @field_validator("file")
+    @classmethod
+    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        base: Path = (info.context or {}).get("base", Path())
+        return None if path is None else base / path
+
+
+GateMode = Literal["settled", "every", "request"]
+Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0)]
+
+
+class Gate(Section):
+    """`[gate]`: when a grasp is judged, and when it is refused."""
+
+    mode: GateMode | None = None
+    """`settled`: once per grasp, when it has settled; `every`: each reading is a grasp of its own;
+    `request`: when the controller asks. Unless given, `settled` for live sensors and for recorded
+    streams, `every` for grasp tables."""
+    max_age_ms: Milliseconds = 100.0
+    """An older reading gives `unknown`; so does silence for that long."""
+    sweeps: Literal[1, 3] | None = None
+    """What is judged: 1, a single reading; 3, each electrode's median of three fresh ones. Unless
+    given, 3, and with mode `every` 1."""
+    fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
+    """Fingers that must touch; all of `hand.fingers` unless given."""
+    contact_counts: Annotated[float, Field(ge=5.0, le=1000.0)] = 20.0
+    """A finger touches when three electrodes fall by so much below where they rest, counts ..."""
+    contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0)] = 5.0
+    """... and by so many standard deviations of its noise."""
+    rate_counts_per_s: Annotated[float, Field(ge=10.0, le=10_000.0)] = 120.0
+    """Electrodes of a finger that change faster, in the mean, are moving, counts/s."""
+    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.1
+    """A joint that turns faster is moving, rad/s; only with `[joints]`."""
+    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = 1000.0
+    """Late joint angles block a verdict no longer than this, ms; only with `[joints]`."""
+    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 60.0
+    """All this must last so long, ms."""
+    request_ms: Milliseconds = 1000.0
+    """A question that cannot be answered with a judgement by then is answered with `unknown`."""
+    gap_ms: Milliseconds = 100.0
+    """After so long without a usable reading the grasp must settle anew, ms. More than two periods
+    of the readings."""
+    change_counts: Annotated[float, Field(ge=10.0, le=1000.0)] = 40.0
+    """Electrodes of a finger that are so far from where they were judged, in the mean, are another
+    grasp, counts."""
+
+
+def _checked(endpoint: str) -> str:
+    check_endpoint(endpoint)
+    return endpoint
+
+
+Endpoint = Annotated[str, AfterValidator(_checked)]
+
+
+class Publish(Section):
+    """`[publish]`: where verdicts go."""
+
+    endpoint: Endpoint | None = None
+    """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
+    addresses."""
+    latest_endpoint: Endpoint | None = None
+    """Where verdicts are published as messages of one frame too, for `ZMQ_CONFLATE`."""
+    high_water_mark: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    """Messages kept for a subscriber that is slow; those that come then are lost to it."""
+    file_mode: Annotated[str, Field(pattern=r"^0?[0-7]{3}$")] | None = None
+    """Of the files of `ipc://` sockets, as in chmod: who may write may connect. As the umask has it
+    unless given."""
+    group: Name | None = None
+    """Of the files of `ipc://` sockets; the process's unless given."""
+
+
+class Curve(Section):
+    """`[curve]`: who may connect by `tcp://` (`graspd keys`). All that do need keys then."""
+
+    secret_key: FilePath
+    """The daemon's own `.key_secret` file, of mode 0600; relative to the scene file."""
+    clients: FilePath
+    """Folder with the `.key` files of those who may connect; looked at once a second."""
+
+    @field_validator("secret_key", "clients")
+    @classmethod
+    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
+        base: Path = (info.context or {}).get("base", Path())
+        return base / path
+
+
+class Ask(Section):
+    """`[ask]`: where the grasp controller asks for a verdict (deploy/wire/README.md)."""
+
+    endpoint: Endpoint | None = None
+    """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
+    addresses."""
+
+
+class Realtime(Section):
+    """`[realtime]`: run before everything that is not. Without it nothing of this is done."""
+
+    priority: Annotated[int, Field(ge=1, le=98)] | None = 50
+    """Of SCHED_FIFO; below that of the hand's own controller."""
+    cpus: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] | None = None
+    """Processors to run on, numbered from 0; all unless given."""
+    lock_memory: bool = True
+    """Keep what was touched in memory (mlockall), so that no reading waits for a disk."""
+
+
+class Record(Section):
+    """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
+
+    directory: Annotated[FilePath | None, Field(strict=False)] = None
+    """`/var/lib/graspd/record` unless given; relative to the scene file. Made if it is not there.
+    """
+    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0)] = 1000.0
+    """What a killed daemon or a power cut may cost, ms."""
+    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0)] = 256.0
+    """A file that is larger is followed by the next, MB."""
+    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0)] = 60.0
+    """So is one that is older, minutes."""
+    keep_files: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    """Of this hand; the oldest are removed."""
+    keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0)] = 4096.0
+    """All files of this hand together, the one being written included, MB."""
+    raw: bool = False
+    """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
+
+    @field_validator("directory")
+    @classmethod
+    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
+        base: Path = (info.context or {}).get("base", Path())
+        return None if path is None else base / path
+
+
+class Scene(Section):
+    """The whole file."""
+
+    hand: Hand = Hand()
+    tactile: Tactile
+    joints: Joints | None = None
+    model: Model = Model()
+    session: Session = Session()
+    gate: Gate = Gate()
+    publish: Publish = Publish()
+    ask: Ask | None = None
+    curve: Curve | None = None
+    realtime: Realtime | None = None
+    record: Record | None = None
+
+    @model_validator(mode="after")
+    def _sections_fit_together(self) -> Self:
+        tactile, fingers = self.tactile, self.hand.fingers
+        for finger in self.gate.fingers or ():
+            if finger not in fingers:
+                raise ValueError(f"gate.fingers names {finger}, not in hand.fingers")
+        if isinstance(tactile, ReplayTactile):
+            for finger in tactile.faults.fingers or ():
+                if finger not in fingers:
+                    raise ValueError(f"tactile.faults.fingers names {finger}, not in hand.fingers")
+        if isinstance(tactile, SpiTactile | CanTactile) and tactile.sensors is not None:
+            without = [finger for finger in fingers if finger not in tactile.sensors]
+            if without or len(set(tactile.sensors)) != len(tactile.sensors):
+                raise ValueError("tactile.sensors must name every finger of hand.fingers once")
+            if isinstance(tactile, CanTactile) and tactile.format == "sweep_fd":
+                raise ValueError("tactile.sensors is for syntouch: frames of sweep_fd say whose")
+        if isinstance(tactile, CanTactile) and tactile.format == "syntouch" and len(fingers) > 3:
+            raise ValueError("tactile.format syntouch carries three sensors, hand.fingers has more")
+        self._refuse_strangers()
+        raw = self.record is not None and self.record.raw
+        if raw and not isinstance(tactile, SpiTactile | CanTactile):
+            raise ValueError("record.raw is for tactile.driver spi and can")
+        if isinstance(self.joints, PalmJoints) and not isinstance(tactile, PalmTactile):
+            raise ValueError("joints.driver palm needs tactile.driver palm: it is the same stream")
+        return self
+
+    def _refuse_strangers(self) -> None:
+        endpoints = {
+            "publish.endpoint": self.publish.endpoint,
+            "publish.latest_endpoint": self.publish.latest_endpoint,
+            "ask.endpoint": None if self.ask is None else self.ask.endpoint,
+        }
+        given = [endpoint for endpoint in endpoints.values() if endpoint is not None]
+        if len(set(given)) != len(given):
+            raise ValueError("publish.endpoint, latest_endpoint and ask.endpoint must differ")
+        for key, endpoint in endpoints.items():
+            if endpoint is not None and self.curve is None and not is_private(endpoint):
+                raise ValueError(
+                    f"{key} {endpoint} is not a loopback address; anyone could listen: [curve] "
+                    "says who may"
+                )
+
+    @property
+    def endpoint(self) -> str:
+        """Where verdicts are published."""
+        return self.publish.endpoint or f"ipc:///run/graspd/{self.hand.name}.ipc"
+
+    @property
+    def ask_endpoint(self) -> str | None:
+        """Where questions are taken; None if nobody asks."""
+        if self.ask is None and self.gate.mode != "request":
+            return None
+        endpoint = None if self.ask is None else self.ask.endpoint
+        return endpoint or f"ipc:///run/graspd/{self.hand.name}.ask.ipc"
+
+    @property
+    def session_path(self) -> Path:
+        """Where the session is kept."""
+        return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
+
+    @property
+    def record_directory(self) -> Path | None:
+        """Where recordings are kept; None if nothing is recorded."""
+        if self.record is None:
+            return None
+        return self.record.directory or STATE_DIRECTORY / "record"
+
+    @property
+    def keeps_session(self) -> bool:
+        """Whether the session outlives the daemon."""
+        if self.session.keep is None:
+            return not isinstance(self.tactile, ReplayTactile)
+        return self.session.keep
+
+    @property
+    def session_learns(self) -> bool:
+        """Whether readings are taken into the session."""
+        if self.session.learn is None:
+            return isinstance(self.tactile, ReplayTactile) or self.gate.mode != "every"
+        return self.session.learn
+
+    @property
+    def max_age_ns(self) -> int:
+        """Age limit of a reading, ns."""
+        return round(self.gate.max_age_ms * 1e6)
+
+
+def load(path: Path) -> Scene:
+    """Read a scene file. Raises `SceneError`, whose text has one line per mistake."""
+    try:
+        text = _read(path).decode()
+    except OSError as error:
+        raise SceneError(f"{path}: cannot read the scene: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from error
+    try:
+        data = tomllib.loads(text)
+    except RecursionError as error:
+        raise SceneError(f"{path}: not TOML that can be read: nested too deeply") from error
+    except ValueError as error:  # TOMLDecodeError, and Python's own limit on long numbers
+        from daemon.scene.errors import MESSAGE_MAX
+
+        raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error
+    return parse(data, path)
+
+
+def _read(path: Path) -> bytes:
+    """The content of a regular file of bounded size, without waiting for anything else."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise SceneError(f"{path}: cannot read the scene: not a regular file")
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        content = file.read(SCENE_MAX_BYTES + 1)
+    if len(content) > SCENE_MAX_BYTES:
+        raise SceneError(f"{path}: larger than {SCENE_MAX_BYTES} bytes, not a scene")
+    return content
+
+
+def parse(data: Mapping[str, Any], path: Path) -> Scene:
+    """Check the content of a scene file at `path`. Raises `SceneError`."""
+    try:
+        return Scene.model_validate(data, context={"base": path.parent})
+    except ValidationError as error:
+        from daemon.scene.errors import lines_of
+
+        raise SceneError("\n".join(lines_of(error, Scene, path))) from error

@@ -1,0 +1,127 @@
+"""Keeps the session of a running daemon: restores it, saves it, drops it with the sensor."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+from daemon.judge.calibration import SessionCalibration
+from daemon.session.file import SessionFile, SessionFileError, exchanged, statistics_of
+from drivers.base import Driver
+from models.session import SessionState
+
+log = logging.getLogger("graspd")
+
+WAIT_S = 0.4
+"""For a disk, at the end: the daemon has a second."""
+SAVE_PERIOD_NS = 10_000_000_000
+"""What a power cut may cost: the grasps of ten seconds."""
+
+
+class SessionKeeper:
+    """Looks after one session from time to time; never raises for a file that cannot be had."""
+
+    def __init__(
+        self,
+        session: SessionCalibration,
+        fingers: Sequence[str],
+        tactile: Driver,
+        file: SessionFile,
+        clock: Callable[[], int] = time.monotonic_ns,
+        on_exchange: Callable[[], None] | None = None,
+    ) -> None:
+        """Restore what `file` has; a new session, and a warning, if that is none of this hand.
+
+        `on_exchange` is done when a sensor is another one than before; it must reset the session,
+        which is what is done unless it is given.
+        """
+        self._session = session
+        self._on_exchange = on_exchange or session.reset
+        self._fingers = tuple(fingers)
+        self._tactile = tactile
+        self._file = file
+        self._clock = clock
+        self._serials: dict[str, str] = {}
+        self._restore()
+        self._saved = self._what_is_known()
+        self._save_due_ns = clock() + SAVE_PERIOD_NS
+        self._warned = False
+        self._thread: threading.Thread | None = None
+
+    def mind(self) -> None:
+        """Before readings are judged: has a sensor been exchanged? And save if it is time."""
+        self._mind_serials()
+        if self._clock() >= self._save_due_ns and not self._saving():
+            self._begin_to_save()
+
+    def save(self) -> None:
+        """Save if there is anything new, now; one warning if that cannot be done."""
+        self.wait()
+        self._begin_to_save()
+        self.wait()
+
+    def wait(self) -> None:
+        """Until what is being saved is on the disk, or is not; not for a disk that hangs."""
+        if self._thread is not None:
+            self._thread.join(WAIT_S)
+            self._thread = None
+
+    def _saving(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def _begin_to_save(self) -> None:
+        """In a thread: a disk may take its time, and readings do not wait."""
+        self._save_due_ns = self._clock() + SAVE_PERIOD_NS
+        known = self._what_is_known()
+        if known == self._saved:
+            return
+        what = (self._session.state(), dict(self._serials), known)
+        self._thread = threading.Thread(target=self._write, args=what, name="session", daemon=True)
+        self._thread.start()
+
+    def _write(
+        self, state: SessionState, serials: dict[str, str], known: tuple[int, dict[str, str]]
+    ) -> None:
+        with contextlib.suppress(OSError):  # a thread begins with the priority of the loop
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        try:
+            self._file.save(state, self._fingers, serials)
+        except SessionFileError as error:
+            if not self._warned:
+                log.warning("%s; the next start begins a new session", error)
+            self._warned = True
+        else:
+            self._saved = known
+            self._warned = False
+
+    def _what_is_known(self) -> tuple[int, dict[str, str]]:
+        return self._session.grasps, dict(self._serials)
+
+    def _restore(self) -> None:
+        try:
+            kept = self._file.load()
+            if kept is None:
+                return
+            self._session.restore(statistics_of(kept, self._fingers))
+        except (SessionFileError, ValueError) as error:
+            log.warning("%s; a new session begins", error)
+            return
+        self._serials = dict(kept.serials)
+        log.info("session of %d grasps restored from %s", self._session.grasps, self._file.path)
+
+    def _mind_serials(self) -> None:
+        serials = self._tactile.serials
+        changed = exchanged(self._serials, serials)
+        if changed:
+            log.warning(
+                "new sensor on %s: the session's %d grasps no longer count",
+                ", ".join(changed),
+                self._session.grasps,
+            )
+            self._on_exchange()
+            self._save_due_ns = self._clock()
+        self._serials.update(serials)
