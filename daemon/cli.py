@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
 from daemon.process import logs
+from daemon.process.extras import EXTRAS
 
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
@@ -48,14 +49,6 @@ COMMANDS = {
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
-EXTRAS = {
-    "export-grasps": "record",
-    "train": "train",
-    "evaluate": "train",
-    "report": "train,report",
-    "watch": "watch",
-}
-"""Extras that a command needs."""
 WRONG = 2
 
 

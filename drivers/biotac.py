@@ -56,6 +56,13 @@ SEQUENCE_INTERLEAVED = tuple(
 SEQUENCE_PRESSURE = (PAC, PDC)
 """Vibration and pressure only: 2 samples (manual table 12)."""
 
+SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
+    "electrodes": SEQUENCE_ELECTRODES,
+    "all": SEQUENCE_ALL,
+    "interleaved": SEQUENCE_INTERLEAVED,
+}
+"""Sampling sequences by the name that a scene gives them."""
+
 REFERENCE_OHM = 10_000.0
 """Resistor in series with an electrode (manual section 5.1)."""
 

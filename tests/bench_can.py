@@ -27,10 +27,10 @@ import numpy as np
 from can.interfaces.socketcan import SocketcanBus
 
 from drivers.base import TactileReading
+from drivers.biotac import SEQUENCES
 from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
 from drivers.can.driver import CanBridgeDriver
 from drivers.can.frames import CanFrame, pack_frame
-from drivers.can.samples import SEQUENCES
 from drivers.twins.can import CanTwin
 from drivers.twins.grasps.grasps import Counts, GeneratedContact
 from tests.drivers.can_standin import LOOPBACK, SocketBus

@@ -19,7 +19,7 @@ from daemon.judge.decision import Limits
 from daemon.judge.grip import GripLimits
 from daemon.judge.joint_motion import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.publish.messages import Outcome
+from daemon.judge.reasons import Outcome
 from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts

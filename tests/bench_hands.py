@@ -23,7 +23,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.publish.messages import Reason, decode_verdict
+from daemon.judge.reasons import Reason
+from daemon.publish.messages import decode_verdict
 from models import zoo
 from tests.live import (
     PATIENCE_S,

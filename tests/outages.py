@@ -20,7 +20,8 @@ from typing import Self
 
 import numpy as np
 
-from daemon.publish.messages import Outcome, Verdict, decode_verdict
+from daemon.judge.reasons import Outcome
+from daemon.publish.messages import Verdict, decode_verdict
 from drivers.joints.message import JointMessage
 from drivers.twins.spi import SpiTwin
 from tests.live import PATIENCE_S, Child, Subscriber, held_grasp, start_daemon, tactile_section

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.publish.messages import Reason, Status, Verdict, decode_status, decode_verdict
+from daemon.judge.reasons import Reason
+from daemon.publish.messages import Status, Verdict, decode_status, decode_verdict
 from tests.live import TALLIED, Usage
 
 SLOPE_MAX_KIB_PER_H = 1024.0

@@ -11,7 +11,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from daemon.publish.messages import Outcome, Verdict, encode
+from daemon.judge.reasons import Outcome
+from daemon.publish.messages import Verdict, encode
 from drivers.twins.faults import LinkFaults
 from tests.live import TALLIED, Kind, Usage
 from tests.soak import Plan, link_faults, soak

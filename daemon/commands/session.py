@@ -15,8 +15,8 @@ import msgspec
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import Reason
 from daemon.process.text import complain, printable
-from daemon.publish.messages import Reason
 from daemon.scene import drivers as scene_drivers
 from daemon.session.file import KeptSession, SessionFile, SessionFileError, load
 from drivers.base import DriverError, JointReading

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from drivers.base import DriverError
-from drivers.can.samples import SEQUENCES
+from drivers.biotac import SEQUENCES
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, synthetic_grasps

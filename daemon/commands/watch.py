@@ -11,7 +11,7 @@ from typing import NamedTuple
 import zmq
 
 from daemon import scene
-from daemon.cli import EXTRAS
+from daemon.process.extras import EXTRAS
 from daemon.process.text import complain
 from daemon.publish.keys import KeysError
 from daemon.scene import SceneError

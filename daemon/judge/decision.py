@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from daemon.publish.messages import Outcome, Reason
+from daemon.judge.reasons import Outcome, Reason
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.reasons import GateCause, GateState, Reason
 from daemon.judge.stillness import Stillness, mean_distance
-from daemon.publish.messages import GateCause, GateState, Reason
 
 CHANGES_MAX = 64
 """Changes kept until somebody takes them; a reading makes three at most."""

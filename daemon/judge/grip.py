@@ -13,7 +13,7 @@ from daemon.judge.contact import Contact, ContactLimits
 from daemon.judge.gate import Gate, GateChange, GateLimits
 from daemon.judge.health import Watched
 from daemon.judge.median import FreshMedian
-from daemon.publish.messages import GateState, Reason
+from daemon.judge.reasons import GateState, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.publish.messages import Reason
+from daemon.judge.reasons import Reason
 from drivers.base import JointReading
 
 ANGLES = 16

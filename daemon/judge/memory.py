@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.pipeline import NO_OPINION, Opinion, Pipeline
-from daemon.publish.messages import GateState, Reason
+from daemon.judge.reasons import GateState, Reason
 
 MAX_BYTES: Final = 1 << 20
 """Before it is compressed; three fingers take 37 kB."""

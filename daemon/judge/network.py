@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.publish.messages import Reason
+from daemon.judge.reasons import Reason
 from models.contract import ModelError
 from models.runtime import TactileModel
 from models.tactile_image import SPREAD_FLOOR_COUNTS

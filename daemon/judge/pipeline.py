@@ -13,7 +13,7 @@ from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.health import Health, Watched
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
-from daemon.publish.messages import GateState, Outcome, Reason
+from daemon.judge.reasons import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.health import too_many
-from daemon.publish.messages import Reason
+from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import SeenCounts
 from models.electrodes import Electrodes

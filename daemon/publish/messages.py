@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
+from daemon.judge.reasons import GateCause, GateState, Outcome, Reason
 from models.contract import Finger
 
 WIRE_VERSION: Final = 1
@@ -26,112 +27,12 @@ _HAND = msgspec.Meta(max_length=5)
 """A hand has five fingers."""
 
 
-class Outcome(StrEnum):
-    """What graspd says of a grasp."""
-
-    STABLE = "stable"
-    SLIP = "slip"
-    UNKNOWN = "unknown"
-
-
 OUTCOME_CODE: dict[Outcome, Literal[0, 1, 2]] = {
     Outcome.UNKNOWN: 0,
     Outcome.STABLE: 1,
     Outcome.SLIP: 2,
 }
 """The same as a number, because plotting tools draw numbers and skip text."""
-
-
-class Reason(StrEnum):
-    """Why a verdict is `unknown`, or a part is not well; `ADVICE` says what to do about each."""
-
-    STALE = "stale"
-    SENSOR_MISSING = "sensor-missing"
-    NOT_A_COUNT = "not-a-count"
-    CUT_OFF = "cut-off"
-    PARITY = "parity"
-    ERROR_WORD = "error-word"
-    HELD = "held"
-    FROZEN = "frozen"
-    SATURATED = "saturated"
-    FLAT = "flat"
-    NEVER_SEEN = "never-seen"
-    ELECTRODES_BROKEN = "electrodes-broken"
-    ELECTRODE_DEAD = "electrode-dead"
-    ELECTRODE_JUMPS = "electrode-jumps"
-    ELECTRODE_IMPLAUSIBLE = "electrode-implausible"
-    NOT_TARED = "not-tared"
-    NO_CONTACT = "no-contact"
-    MOVING = "moving"
-    SETTLING = "settling"
-    SEQUENCE_GAP = "sequence-gap"
-    JOINTS_LATE = "joints-late"
-    NOT_ASKED = "not-asked"
-    NOT_CALIBRATED = "not-calibrated"
-    LOW_CONFIDENCE = "low-confidence"
-    MODEL_MISMATCH = "model-mismatch"
-    MODEL_FAILED = "model-failed"
-
-
-ADVICE: dict[Reason, str] = {
-    Reason.STALE: "no fresh reading within the age limit: check cable, power and bus load",
-    Reason.SENSOR_MISSING: "electrodes without a sample: check the finger's plug and chip select",
-    Reason.NOT_A_COUNT: "values outside 0..4095: the recording or the sensor is broken",
-    Reason.CUT_OFF: "the recording ends in the middle of a line: copy it again",
-    Reason.PARITY: "words with bad parity: check the SPI wiring and clock",
-    Reason.ERROR_WORD: "the sensor answers with error words: check the sampling delay",
-    Reason.HELD: "values repeat an earlier sweep: wait for a fresh sweep",
-    Reason.FROZEN: "a finger repeats itself to the count: power-cycle the sensor",
-    Reason.SATURATED: "electrodes at 0 or 4095: a dead electrode or far too much force",
-    Reason.FLAT: "a finger's electrodes read about the same: it touches nothing or does not work",
-    Reason.NEVER_SEEN: "counts unlike all grasps of the training: check sensor, reset session",
-    Reason.ELECTRODES_BROKEN: "too many electrodes to repair: check finger and plug",
-    Reason.ELECTRODE_DEAD: "an electrode keeps its count: repaired; exchange the finger",
-    Reason.ELECTRODE_JUMPS: "an electrode jumps alone: repaired; a loose contact in finger or plug",
-    Reason.ELECTRODE_IMPLAUSIBLE: "an electrode contradicts the others: repaired; does it stay?",
-    Reason.NOT_TARED: "where the fingers rest is not known yet: open the hand for two seconds",
-    Reason.NO_CONTACT: "not all fingers touch: close the hand; or open it once, to tare",
-    Reason.MOVING: "fingers or object move: wait until they are still",
-    Reason.SETTLING: "still for too short a time yet: wait for the hold time",
-    Reason.SEQUENCE_GAP: "readings were lost, so motion is not known: check cable and bus load",
-    Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
-    Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
-    Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
-    Reason.LOW_CONFIDENCE: "too close to call for min_accuracy: grasp again",
-    Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
-    Reason.MODEL_FAILED: "the network gave no probability: check the model file",
-}
-
-
-class GateState(StrEnum):
-    """Where in a grasp the hand is."""
-
-    IDLE = "idle"
-    """Nothing touches."""
-    CLOSING = "closing"
-    """Some finger touches; not all do, or something moves, or too little time has passed."""
-    SETTLED = "settled"
-    """All fingers touch and are still; waits to be judged."""
-    JUDGED = "judged"
-    """The verdict of the grasp stands as long as readings confirm it."""
-    RELEASED = "released"
-    """Nothing touches any more, for a moment."""
-
-
-class GateCause(StrEnum):
-    """Why the gate changed its state."""
-
-    CONTACT = "contact"
-    STILL = "still"
-    JUDGED = "judged"
-    MOVED = "moved"
-    CHANGED = "changed"
-    """The grasp is another than the one that was judged."""
-    CONTACT_LOST = "contact-lost"
-    GAP = "gap"
-    """No usable reading for too long."""
-    ASKED = "asked"
-    TIME = "time"
 
 
 class Verdict(msgspec.Struct, frozen=True, kw_only=True):

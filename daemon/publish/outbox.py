@@ -12,13 +12,12 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import Outcome, Reason
 from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import (
     OUTCOME_CODE,
     GateMessage,
-    Outcome,
     OutcomeMessage,
-    Reason,
     State,
     Status,
     Tactile,

@@ -7,8 +7,9 @@ import sys
 import time
 
 from daemon.judge.pipeline import Judgement
+from daemon.judge.reasons import GateState
 from daemon.process.text import printable
-from daemon.publish.messages import GateState, Verdict
+from daemon.publish.messages import Verdict
 from daemon.run.summary import Summary
 from drivers.base import Annotation, TactileReading
 

@@ -7,8 +7,9 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from daemon.judge.pipeline import Judgement
+from daemon.judge.reasons import Outcome, Reason
 from daemon.publish.latency import LatencyHistogram
-from daemon.publish.messages import Outcome, Reason, Verdict
+from daemon.publish.messages import Verdict
 
 
 class Tally:

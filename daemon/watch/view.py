@@ -10,13 +10,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.reasons import ADVICE, GateState, Outcome, Reason
 from daemon.publish.messages import (
-    ADVICE,
     GateMessage,
-    GateState,
-    Outcome,
     OutcomeMessage,
-    Reason,
     Status,
     Tactile,
     Verdict,

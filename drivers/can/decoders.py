@@ -9,7 +9,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from drivers.base import FINGERS, ElectrodeFault, TactileReading
-from drivers.biotac import decode_words
+from drivers.biotac import SEQUENCES, decode_words
 from drivers.can.formats import (
     CanFormat,
     Reject,
@@ -25,7 +25,7 @@ from drivers.can.frames import (
     STANDARD_ID_MAX,
     CanFrame,
 )
-from drivers.can.samples import SEQUENCES, SampleSweeps, SweepCounters
+from drivers.can.samples import SampleSweeps, SweepCounters
 from drivers.can.sweep_frames import FrameSweeps
 
 _ABSENT, _REPEATED, _OVERRUN = (

@@ -32,18 +32,8 @@ from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileRead
 from drivers.biotac import (
     E1,
     E24,
-    SEQUENCE_ALL,
-    SEQUENCE_ELECTRODES,
-    SEQUENCE_INTERLEAVED,
     decode_words,
 )
-
-SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
-    "electrodes": SEQUENCE_ELECTRODES,
-    "all": SEQUENCE_ALL,
-    "interleaved": SEQUENCE_INTERLEAVED,
-}
-"""Sampling sequences by the name that a scene gives them."""
 
 REORDER_MAX: Final = 3
 """Samples may come so many electrodes late: adapters with two or three receive buffers swap

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import DriverCounters
-from drivers.recordings.csv_columns import joint_name
+from drivers.hand import joint_name
 
 DATAGRAM_BYTES_MAX = 4096
 """All 28 joints in full precision have about 900 bytes."""

@@ -7,20 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.base import ELECTRODES, FINGERS, RecordingError
+from drivers.hand import joint_name
 
 TIME = "t"
 """Seconds, any offset. A file with this column is a stream; one without it is a grasp table."""
 OBJECT = "object"
 SLIPPED = "slipped"
-HAND_PREFIXES = ("rh_", "lh_")
-"""Shadow's prefixes of a right and a left hand."""
-JOINTS = frozenset(
-    [f"{finger}J{joint}" for finger in ("FF", "MF", "RF") for joint in range(5)]
-    + [f"LFJ{joint}" for joint in range(6)]
-    + [f"THJ{joint}" for joint in range(1, 6)]
-    + ["WRJ1", "WRJ2"]
-)
-"""Joint names of the Shadow hand; J0 is the coupled sum of J1 and J2."""
 
 
 def electrode_columns(finger: str) -> list[str]:
@@ -70,13 +62,6 @@ class Columns:
             joint_names=tuple(joints.values()),
             ignored=tuple(name for name in names if name not in known),
         )
-
-
-def joint_name(column: str) -> str | None:
-    """The joint that a column holds, without hand prefix, or None: `rh_FFJ3` gives `FFJ3`."""
-    if column.startswith(HAND_PREFIXES):
-        column = column.partition("_")[2]
-    return column if column in JOINTS else None
 
 
 def _refuse_duplicates(

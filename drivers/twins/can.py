@@ -13,7 +13,7 @@ from typing import Any, Final
 import can
 
 from drivers.base import ELECTRODES, FINGERS, DriverError, LinkError, Opened
-from drivers.biotac import E1, E24, PAC, PDC, TAC, TDC, encode_word
+from drivers.biotac import E1, E24, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
 from drivers.can.bus import open_bus
 from drivers.can.formats import (
     SWEEP_BASE_ID,
@@ -23,7 +23,6 @@ from drivers.can.formats import (
     encode_sample,
 )
 from drivers.can.frames import STANDARD_ID_MAX
-from drivers.can.samples import SEQUENCES
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import Counts
 

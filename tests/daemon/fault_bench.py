@@ -17,7 +17,7 @@ from daemon.judge.gate import GateLimits
 from daemon.judge.grip import GripLimits
 from daemon.judge.joint_motion import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.publish.messages import GateState, Outcome, Reason
+from daemon.judge.reasons import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps

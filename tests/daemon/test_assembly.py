@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from daemon.assembly import assembly
-from daemon.publish.messages import Outcome
+from daemon.judge.reasons import Outcome
 from daemon.scene import Scene, parse
 from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from drivers.spi.driver import SpiBridgeDriver

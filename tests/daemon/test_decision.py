@@ -15,7 +15,7 @@ import pytest
 
 from daemon.judge import decision
 from daemon.judge.decision import Case, Limits, decide
-from daemon.publish.messages import Outcome, Reason
+from daemon.judge.reasons import Outcome, Reason
 from tests.daemon.mutants import load, mutants
 
 LIMIT_NS = 100

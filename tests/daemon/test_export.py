@@ -12,14 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.publish.messages import (
-    GateState,
-    Outcome,
-    OutcomeMessage,
-    Tactile,
-    Verdict,
-    encode,
-)
+from daemon.judge.reasons import GateState, Outcome
+from daemon.publish.messages import OutcomeMessage, Tactile, Verdict, encode
 from daemon.record.export import collect
 from daemon.record.files import MessageFile
 from drivers.base import RecordingError

@@ -12,7 +12,7 @@ from functools import cache
 
 import pytest
 
-from daemon.publish.messages import GateState, Outcome, Reason
+from daemon.judge.reasons import GateState, Outcome, Reason
 from tests.daemon.fault_bench import UNDER_FAULT, Finding, grasp
 from tests.daemon.judge_faults import EARLIER, FAULTS, JOINTS_LOST_FOR
 

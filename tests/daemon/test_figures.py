@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from daemon.judge.reasons import Outcome, Reason
 from daemon.publish.latency import BUCKETS, LatencyHistogram
-from daemon.publish.messages import OUTCOME_CODE, Outcome, Reason, Verdict
+from daemon.publish.messages import OUTCOME_CODE, Verdict
 from daemon.run.summary import Summary
 
 

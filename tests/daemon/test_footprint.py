@@ -25,7 +25,7 @@ NEVER = {
     *(
         "models.training",
         "drivers.twins",
-        "daemon.measure",
+        *(f"daemon.measure.{room}" for room in ("error_vs_time", "stability", "reference")),
         "daemon.run.printer",
         "daemon.run.summary",
     ),
@@ -69,7 +69,7 @@ BUSES = {
 """Modules that only this driver needs; python-can brings asyncio and sqlite3."""
 JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
 HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
-GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "fresh", "grip", "stillness")}
+GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "median", "grip", "stillness")}
 STATISTICS = {"daemon.judge.calibration", "models.session"}
 KEPT = {"daemon.session.file", "daemon.session.keeper"}
 ASK = {"daemon.publish.questions"}

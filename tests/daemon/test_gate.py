@@ -13,7 +13,7 @@ from daemon.judge.gate import GateChange, GateLimits
 from daemon.judge.grip import Grip, GripLimits
 from daemon.judge.health import Watched
 from daemon.judge.joint_motion import JointLimits
-from daemon.publish.messages import GateState, Reason
+from daemon.judge.reasons import GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 

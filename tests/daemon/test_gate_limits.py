@@ -11,7 +11,7 @@ import pytest
 from daemon.judge.gate import CHANGES_MAX, Gate, GateChange, GateLimits
 from daemon.judge.grip import Grip
 from daemon.judge.health import Watched
-from daemon.publish.messages import GateCause, GateState, Reason
+from daemon.judge.reasons import GateCause, GateState, Reason
 from tests.daemon.test_gate import (
     ALL,
     FINGERS,

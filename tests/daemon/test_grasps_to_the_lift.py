@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish.messages import Outcome
+from daemon.judge.reasons import Outcome
 from models import zoo
 from models.runtime import TactileModel
 from tests.bench_gate import Study, end_points, streams, study

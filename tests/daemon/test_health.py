@@ -15,7 +15,7 @@ from daemon.judge.health import (
     UNCHANGED_MAX,
     Health,
 )
-from daemon.publish.messages import Reason
+from daemon.judge.reasons import Reason
 from drivers.base import TactileReading
 
 FINGERS = 3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from daemon.judge.joint_motion import SOURCES_MAX, JointLimits, JointMotion
-from daemon.publish.messages import Reason
+from daemon.judge.reasons import Reason
 from drivers.base import JointReading
 
 MS = 1_000_000

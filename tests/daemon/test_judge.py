@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from daemon.judge.health import REASON_OF_FAULT
-from daemon.publish.messages import ADVICE, Outcome, Reason
+from daemon.judge.reasons import ADVICE, Outcome, Reason
 from drivers.base import ElectrodeFault, TactileReading
 from models.contract import ModelError
 from tests.daemon.fakes import FINGERS, HIGH, LOW, MARGIN, MS, Clock, FakeModel, pipeline, reading

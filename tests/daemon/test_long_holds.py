@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.grip import Grip, GripLimits
 from daemon.judge.health import Watched
-from daemon.publish.messages import GateState
+from daemon.judge.reasons import GateState
 from drivers.base import TactileReading
 from tests.daemon.test_contact import PRESSED, Hand, at_rest, noisy, still
 

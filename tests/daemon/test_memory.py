@@ -18,7 +18,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.judge.memory import JudgeMemory, decode, encode
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.publish.messages import Outcome, Reason
+from daemon.judge.reasons import Outcome, Reason
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger

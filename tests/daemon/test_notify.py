@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish.messages import GateState, Outcome, Reason, State, decode_status
+from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.publish.messages import State, decode_status
 from daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
 

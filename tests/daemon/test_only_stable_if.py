@@ -23,7 +23,7 @@ from daemon.judge.gate import GateLimits
 from daemon.judge.grip import GripLimits
 from daemon.judge.joint_motion import JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.publish.messages import Outcome
+from daemon.judge.reasons import Outcome
 from drivers.base import ElectrodeFault, JointReading, TactileReading
 from models.contract import Finger
 from models.tactile_image import TactileImager

@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement
-from daemon.publish.messages import Outcome, OutcomeMessage, Reason, decode_outcome, schema
+from daemon.judge.reasons import Outcome, Reason
+from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Reporter
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions
 from tests.daemon.fakes import FINGERS, Clock

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 import zmq
 
+from daemon.judge.reasons import Outcome, Reason
 from daemon.publish.binding import PublishError
-from daemon.publish.messages import Outcome, Reason, Verdict, decode_verdict
+from daemon.publish.messages import Verdict, decode_verdict
 from daemon.publish.questions import WAITING_MAX, Questions
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for

@@ -19,8 +19,8 @@ import pytest
 
 from daemon import scene
 from daemon.assembly import assembly
+from daemon.judge.reasons import GateState
 from daemon.process.signals import StopSignal
-from daemon.publish.messages import GateState
 from daemon.run.realtime import Hot
 from daemon.run.rehearsal import rehearse
 from daemon.run.runner import Parts, Runner, prepare

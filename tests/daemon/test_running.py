@@ -14,15 +14,8 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.publish.messages import (
-    Outcome,
-    Reason,
-    State,
-    Status,
-    Verdict,
-    decode_status,
-    decode_verdict,
-)
+from daemon.judge.reasons import Outcome, Reason
+from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD
 

@@ -10,17 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 import pytest
 
+from daemon.judge.reasons import Outcome, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
-from daemon.publish.messages import (
-    Outcome,
-    Reason,
-    State,
-    Status,
-    Verdict,
-    decode_status,
-    decode_tactile,
-)
+from daemon.publish.messages import State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Reporter
 from daemon.run.loop import Ended, Service, Watchdog
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading

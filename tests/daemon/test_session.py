@@ -20,7 +20,7 @@ from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
 from daemon.judge.grip import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.publish.messages import GateState, Outcome, Reason
+from daemon.judge.reasons import GateState, Outcome, Reason
 from daemon.session.file import SessionFile, SessionFileError, exchanged, load
 from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
 from drivers.base import ElectrodeFault, TactileReading

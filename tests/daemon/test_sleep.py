@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from daemon.judge.reasons import Outcome, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
-from daemon.publish.messages import Outcome, Reason, State
+from daemon.publish.messages import State
 from daemon.run.loop import Ended
 from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, reading
 from tests.daemon.test_service import Bench

@@ -27,11 +27,11 @@ from onnx import helper, numpy_helper
 
 from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.network import Network
+from daemon.judge.reasons import Outcome
 from daemon.measure.reference.reference import Reference, UnknownOperatorError
 from daemon.measure.stability import report as stability
 from daemon.measure.stability.cases import StabilityCase, recorded
 from daemon.measure.stability.model import Bounds, ModelStability
-from daemon.publish.messages import Outcome
 from models import zoo
 from models.contract import SessionInput
 from models.inputs import builder

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daemon.publish.messages import ADVICE, GateState, Outcome, OutcomeMessage, Reason, encode
+from daemon.judge.reasons import ADVICE, GateState, Outcome, Reason
+from daemon.publish.messages import OutcomeMessage, encode
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, Rest, image
 from daemon.watch.letters import big
 from daemon.watch.pixels import Canvas

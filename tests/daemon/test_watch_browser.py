@@ -12,7 +12,7 @@ from typing import Literal
 import msgspec
 import pytest
 
-from daemon.publish.messages import Outcome
+from daemon.judge.reasons import Outcome
 from daemon.watch.feed import Feed
 from daemon.watch.view import View
 from daemon.watch.watching import TICK_S, snapshots

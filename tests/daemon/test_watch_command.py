@@ -21,8 +21,9 @@ from typing import Self
 import pytest
 
 from daemon import scene
+from daemon.judge.reasons import Outcome
 from daemon.publish.keys import KeysError, make
-from daemon.publish.messages import Outcome, decode_verdict
+from daemon.publish.messages import decode_verdict
 from daemon.publish.publisher import Publisher
 from daemon.publish.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys

@@ -13,14 +13,10 @@ import msgspec
 import pytest
 
 from daemon.commands.schema import schema_text
+from daemon.judge.reasons import ADVICE, GateCause, GateState, Outcome, Reason
 from daemon.publish.messages import (
-    ADVICE,
-    GateCause,
     GateMessage,
-    GateState,
-    Outcome,
     OutcomeMessage,
-    Reason,
     State,
     Status,
     Tactile,

@@ -5,17 +5,8 @@ from __future__ import annotations
 import threading
 from typing import Any, Self
 
-from daemon.publish.messages import (
-    OUTCOME_CODE,
-    GateState,
-    Outcome,
-    Reason,
-    State,
-    Status,
-    Tactile,
-    Verdict,
-    encode,
-)
+from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.publish.messages import OUTCOME_CODE, State, Status, Tactile, Verdict, encode
 from daemon.publish.publisher import Publisher
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"

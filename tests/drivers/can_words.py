@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import TactileReading
-from drivers.biotac import E1
+from drivers.biotac import E1, SEQUENCES
 from drivers.can.decoders import CanCounters
-from drivers.can.samples import SEQUENCES, SampleSweeps
+from drivers.can.samples import SampleSweeps
 
 FINGERS = 3
 SLOT_NS = 227_000

@@ -12,6 +12,7 @@ import math
 import random
 
 from drivers.base import COUNT_MAX, FINGERS
+from drivers.hand import JOINTS
 from drivers.joints.message import (
     ANGLE_MAX_RAD,
     JointCounters,
@@ -21,7 +22,6 @@ from drivers.joints.message import (
 )
 from drivers.palm.packet import Palm, PalmPacket, PalmParser
 from drivers.palm.rounds import PalmSweeps, RoundCounters
-from drivers.recordings.csv_columns import JOINTS
 from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.palm import PalmTwin
 from tests.fuzz import Target

@@ -11,9 +11,9 @@ import can
 import pytest
 
 from drivers.base import Driver, DriverError, LinkError, TactileReading
+from drivers.biotac import SEQUENCES
 from drivers.can.driver import CanBridgeDriver
 from drivers.can.formats import CanFormat
-from drivers.can.samples import SEQUENCES
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from drivers.twins.grasps.grasps import Counts, recorded_counts

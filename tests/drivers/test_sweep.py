@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.biotac import PAC, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE
+from drivers.biotac import PAC, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE, SEQUENCES
 from drivers.can.decoders import CanCounters
-from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED, SEQUENCES, SampleSweeps
+from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED, SampleSweeps
 from tests.drivers.can_words import (
     FINGERS,
     SLOT_NS,

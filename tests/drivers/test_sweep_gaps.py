@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from drivers.base import TactileReading
-from drivers.can.samples import NEXT_SWEEP_PERIODS, SEQUENCES, SampleSweeps
+from drivers.biotac import SEQUENCES
+from drivers.can.samples import NEXT_SWEEP_PERIODS, SampleSweeps
 from tests.drivers.can_words import (
     FINGERS,
     SLOT_NS,

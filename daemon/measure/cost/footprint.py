@@ -85,8 +85,8 @@ class Meter:
 def main(arguments: list[str]) -> int:
     """Measure; `arguments` are the scene, a folder for sockets, and the monotonic ns of the start.
 
-    One JSON object on stdout, as `tables.Footprint` reads it. 2 and a line on stderr if the scene, its
-    model or its files are wrong.
+    One JSON object on stdout, as `tables.Footprint` reads it. 2 and a line on stderr if the
+    scene, its model or its files are wrong.
     """
     path, folder, started_ns = arguments
     meter = Meter(int(started_ns))

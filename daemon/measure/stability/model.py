@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.network import Network
 from daemon.judge.pipeline import Pipeline
+from daemon.judge.reasons import Outcome, Reason
 from daemon.measure.reference.exact import Exact, exact_input, exact_softening, exact_standard
 from daemon.measure.stability.cases import StabilityCase
-from daemon.publish.messages import Outcome, Reason
 from drivers.base import TactileReading
 from models.contract import ModelContract, SessionInput
 from models.electrodes import Electrodes

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from daemon.judge.grip import Grip, GripLimits
 from daemon.judge.health import Watched
 from daemon.judge.joint_motion import JointLimits, JointMotion
+from daemon.judge.reasons import Reason
 from daemon.measure.stability.steps import StepRow
-from daemon.publish.messages import Reason
 from drivers.base import COUNT_MAX, ELECTRODES, JointReading, TactileReading
 from drivers.palm.calibration import CalibrationError, parse_calibration
 from drivers.palm.hall import CoupledTable, Table

@@ -16,8 +16,8 @@ from onnx import helper, numpy_helper
 from torch import nn
 
 from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.reasons import Outcome
 from daemon.measure.stability.steps import StepRow
-from daemon.publish.messages import Outcome
 from models.contract import METADATA_KEY, ModelContract, VectorInput
 from models.inputs import builder
 from models.runtime import TactileModel
