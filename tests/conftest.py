@@ -28,11 +28,11 @@ IN_REAL_TIME = {
     *("test_can_link", "test_can_slcan", "test_can_socket", "test_can_twin"),
     *("test_commands", "test_cpp_against_daemon", "test_export", "test_fewer_fingers"),
     *("test_hardware_commands", "test_joints", "test_keys", "test_lift", "test_logs"),
-    *("test_notify", "test_outages", "test_outcomes", "test_palm", "test_process"),
+    *("test_systemd", "test_outages", "test_outcomes", "test_palm", "test_process"),
     *("test_publisher", "test_questions", "test_raw_record", "test_readme"),
-    *("test_realtime", "test_record_and_replay", "test_recorder", "test_running"),
+    *("test_realtime", "test_record_and_replay", "test_recorder", "test_runner"),
     *("test_soak", "test_sockets", "test_spi_bridge", "test_spi_twin", "test_subscribers"),
-    *("test_training_sweep", "test_watch_browser", "test_watch_command", "test_watch_web"),
+    *("test_run_jobs", "test_watch_browser", "test_watch_command", "test_watch_web"),
 }
 """Files whose tests work with processes, links and clocks as they are. A shared computer stalls now
 and then, so they are tried three times; what is wrong fails each time, and what fails once is

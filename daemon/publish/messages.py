@@ -1,7 +1,7 @@
 """The messages on the wire, version 1, as JSON objects without NaN.
 
-`graspd schema` prints their JSON Schema; golden messages stand in `tests/daemon/golden/`. Fields
-are only ever added; `v` changes when a meaning does.
+`graspd schema` prints their JSON Schema; golden messages stand in `tests/daemon/publish/golden/`.
+Fields are only ever added; `v` changes when a meaning does.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class DeviceClock:
     Measured over 600 s of sweeps at 100 Hz, with a device's clock wrong by 100 ppm, a PING per
     second, an exponential delay of 1 ms on both ways and arrivals in batches of 16 ms: mapped
     times are 0.00 to 1.86 ms too old, median 0.18 ms. With 0.1 ms and no batches: 0.00 to 0.60 ms,
-    median 0.04 ms (`python -m tests.drivers.clock_error`).
+    median 0.04 ms (`python -m tests.drivers.spi.clock_error`).
     """
 
     def __init__(self, tick_hz: int) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from daemon.publish.messages import Verdict
 from drivers.recordings.csv_player import DEMO_TABLE
-from tests.bench_subscribers import Crowd, Setup, Turn, take_turn
+from tests.bench.subscribers import Crowd, Setup, Turn, take_turn
 
 CROWD = Crowd(listeners=27, stopped=3, flood=True, garbage=True)
 SETUP = Setup(learns=False, high_water_mark=1000)

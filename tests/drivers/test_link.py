@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from drivers.link import BACKOFF_FIRST_S, BACKOFF_MAX_S, Link, LinkState
-from tests.drivers.bridge_bench import Clock
+from tests.drivers.spi.bridge_bench import Clock
 
 
 def test_patience_grows_up_to_a_limit_and_begins_anew_when_the_link_is_up() -> None:

@@ -1,0 +1,193 @@
+"""How soon the grasp controller knows that something is gone: a sensor, the link, joints, graspd.
+
+`python -m tests.bench.outages --rounds 20` prints, for each outage, the times from the deed to the
+first `unknown` at a subscriber in another process than the daemon: real processes, a real serial
+line and real sockets; only the hardware is a twin.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import queue
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from daemon.judge.reasons import Outcome
+from daemon.publish.messages import Verdict, decode_verdict
+from drivers.joints.message import JointMessage
+from drivers.twins.spi import SpiTwin
+from tests.bench.live import (
+    PATIENCE_S,
+    Child,
+    Subscriber,
+    held_grasp,
+    start_daemon,
+    tactile_section,
+)
+
+JOINTS = ("FFJ3", "MFJ3", "THJ5")
+JOINT_PERIOD_S = 0.01
+
+
+class Bench:
+    """Daemon, twin, joints and subscriber, with a grasp held and judged."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._stop = threading.Event()
+        self._deeds: queue.SimpleQueue[tuple[Callable[[], object], threading.Event]] = (
+            queue.SimpleQueue()
+        )
+        self.joints_flow = threading.Event()
+        self.joints_flow.set()
+        self.twin = SpiTwin(folder / "bridge", held_grasp())
+        self._subscriber = Subscriber(f"ipc://{folder}/graspd")
+        self.last: Verdict | None = None
+        self.last_s = 0.0
+        """When the last message came, s."""
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(self._subscriber)
+            stack.enter_context(self.twin)
+            joint_socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(("127.0.0.1", 0))
+                port = probe.getsockname()[1]
+            joint_socket.connect(("127.0.0.1", port))
+            threads = [
+                threading.Thread(target=self.twin.serve, args=(self._ends,)),
+                threading.Thread(target=self._send_joints, args=(joint_socket,)),
+            ]
+            for thread in threads:
+                thread.start()
+                stack.callback(thread.join)
+            stack.callback(self._stop.set)
+            self.daemon: Child = stack.enter_context(start_daemon(self._scene(port)))
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self._stack.close()
+
+    def on_twin(self, deed: Callable[[], object]) -> Callable[[], None]:
+        """The deed, done by the twin's own thread; returns when it is done."""
+
+        def ask() -> None:
+            done = threading.Event()
+            self._deeds.put((deed, done))
+            done.wait(PATIENCE_S)
+
+        return ask
+
+    def _ends(self) -> bool:
+        while not self._deeds.empty():
+            deed, done = self._deeds.get()
+            deed()
+            done.set()
+        return self._stop.is_set()
+
+    def _scene(self, port: int) -> Path:
+        path = self._folder / "scene.toml"
+        path.write_text(
+            f"{tactile_section('spi', str(self._folder / 'bridge'))}"
+            f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
+            f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{self._folder}/graspd"\n'
+        )
+        return path
+
+    def _send_joints(self, joint_socket: socket.socket) -> None:
+        seq = 0
+        while not self._stop.wait(JOINT_PERIOD_S):
+            if self.joints_flow.is_set():
+                message = JointMessage(seq, None, JOINTS, np.full(len(JOINTS), 0.8))
+                with contextlib.suppress(OSError):  # the daemon is not there
+                    joint_socket.send(message.to_bytes())
+                seq += 1
+
+    def take(self, timeout_s: float = PATIENCE_S) -> Verdict | None:
+        """The next verdict; None if none comes in time."""
+        message = self._subscriber.take(timeout_s)
+        if message is None:
+            return None
+        self.last_s = self._subscriber.received_ns / 1e9
+        self.last = decode_verdict(message[1])
+        return self.last
+
+    def wait_for(self, wanted: Callable[[Verdict], bool]) -> Verdict:
+        """The first verdict like that from now on. Raises `TimeoutError`."""
+        while self._subscriber.take(0.0):
+            pass
+        deadline_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline_s:
+            verdict = self.take(deadline_s - time.monotonic())
+            if verdict is not None and wanted(verdict):
+                return verdict
+        raise TimeoutError(f"the last verdict was {self.last}")
+
+    def until_unknown_s(self, deed: Callable[[], object]) -> tuple[float, Verdict]:
+        """Do it while a verdict stands; s until an unknown one came, and that one."""
+        self.wait_for(is_valid)
+        began_s = time.monotonic()
+        deed()
+        verdict = self.wait_for(lambda verdict: verdict.verdict is Outcome.UNKNOWN)
+        return self.last_s - began_s, verdict
+
+    def until_silence_s(self, deed: Callable[[], object]) -> float:
+        """Do it while a verdict stands; s until a subscriber knows by silence alone."""
+        verdict: Verdict | None = self.wait_for(is_valid)
+        began_s = time.monotonic()
+        deed()
+        while verdict is not None:
+            verdict = self.take(verdict.silence_ms / 1e3)
+        return time.monotonic() - began_s
+
+
+def is_valid(verdict: Verdict) -> bool:
+    """Whether the verdict says anything."""
+    return verdict.valid
+
+
+def outages(bench: Bench) -> Iterator[tuple[str, float, tuple[str, ...]]]:
+    """Cause each outage once: its name, s until unknown, and the reasons given."""
+    twin = bench.twin
+    took_s, verdict = bench.until_unknown_s(bench.on_twin(lambda: twin.pull_fingers(1)))
+    yield "sensor", took_s, tuple(verdict.reasons)
+    bench.on_twin(twin.pull_fingers)()
+    took_s, verdict = bench.until_unknown_s(bench.on_twin(twin.unplug))
+    yield "link", took_s, tuple(verdict.reasons)
+    bench.on_twin(twin.plug)()
+    took_s, verdict = bench.until_unknown_s(bench.joints_flow.clear)
+    yield "joints", took_s, tuple(verdict.reasons)
+    began_s = time.monotonic()
+    bench.wait_for(is_valid)
+    yield "joints, and judged without them", took_s + bench.last_s - began_s, ()
+    bench.joints_flow.set()
+    yield "daemon", bench.until_silence_s(bench.daemon.process.kill), ()
+
+
+def main() -> None:
+    """Print the times."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.outages", description=__doc__)
+    parser.add_argument("--rounds", type=int, default=20)
+    rounds = parser.parse_args().rounds
+    times: dict[str, list[float]] = {}
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory() as folder, Bench(Path(folder)) as bench:
+            for name, took_s, _ in outages(bench):
+                times.setdefault(name, []).append(1e3 * took_s)
+    for name, found in times.items():
+        middle, low, high = np.median(found), min(found), max(found)
+        print(f"{name:32} {middle:6.0f} ms ({low:.0f} to {high:.0f})")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main()

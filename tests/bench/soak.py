@@ -1,0 +1,282 @@
+"""Whether graspd lives for months: a daemon under faults and outages, watched for what it loses.
+
+`python -m tests.bench.soak --seconds 120` prints what was found beside its limits, and exits 1 if
+one is broken. The daemon, the twin and the subscribers are processes of their own, the link is a
+serial line (`spi`) or multicast (`can`). With `--rate 1000` an hour's worth of readings takes six
+minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import json
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from drivers.base import ELECTRODES
+from drivers.twins.faults import LinkFaults
+from tests.bench.live import (
+    PATIENCE_S,
+    STOP_S,
+    TALLIED,
+    Kind,
+    Subscriber,
+    TwinPlan,
+    Usage,
+    end_children_at_sigterm,
+    new_tally,
+    start_daemon,
+    start_listeners,
+    start_twin,
+    table,
+    tactile_section,
+    usage,
+    where_of,
+)
+from tests.bench.soak_judge import Found, Heard, judge
+
+SAMPLE_S = 0.5
+IDLE_S = 0.05
+"""Longest that nobody looks what is due."""
+SETTLED_S = 0.3
+"""Until everything has arrived."""
+BETWEEN_S = (1.0, 8.0)
+"""Between two outages."""
+HURRY_S = 60.0
+"""A shorter run has shorter outages, so that it has some of each kind."""
+QUIET_END_S = 3.0
+"""No outage begins so late that its end would not be seen."""
+AWAY_S = (0.1, 2.0)
+"""How long a killed twin stays away."""
+STOPPED_S = (1.0, 5.0)
+"""How long a subscriber is stopped: less than its queue holds at 100 Hz."""
+DEFAULT_FAULTS: Mapping[Kind, LinkFaults] = {
+    "spi": LinkFaults(
+        bit_flip_probability=0.002,
+        drop_probability=0.002,
+        duplicate_probability=0.002,
+        disconnect_every_frames=500,
+        dead_electrodes=((0, 3), (2, 17)),
+    ),
+    # A CAN controller drops a damaged frame, and a bus does not break in the middle of one.
+    "can": LinkFaults(
+        drop_probability=0.002,
+        duplicate_probability=0.002,
+        reorder_probability=0.002,
+        dead_electrodes=((0, 3), (2, 17)),
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a soak shall do."""
+
+    seconds: float
+    kind: Kind = "spi"
+    rate_hz: float = 100.0
+    faults: LinkFaults | None = None
+    """Of the link; those of `DEFAULT_FAULTS` unless given."""
+    seed: int = 0
+
+
+class Soak:
+    """A daemon, a twin that is killed now and then, and subscribers, one of which is stopped."""
+
+    def __init__(self, folder: Path, plan: Plan) -> None:
+        self._plan = plan
+        self._random = random.Random(plan.seed)
+        self._endpoint = f"ipc://{folder}/graspd"
+        self._scene = folder / "scene.toml"
+        self._log = folder / "daemon.log"
+        self._tally = new_tally(folder / "tally")
+        where = where_of(plan.kind, folder)
+        self._scene.write_text(
+            f"{tactile_section(plan.kind, where)}"
+            f'[session]\nfile = "{folder}/session.json"\n'
+            f'[publish]\nendpoint = "{self._endpoint}"\n'
+        )
+        self._twin_plan = TwinPlan(
+            kind=plan.kind,
+            where=where,
+            tally=str(folder / "tally"),
+            rate_hz=plan.rate_hz,
+            faults=DEFAULT_FAULTS[plan.kind] if plan.faults is None else plan.faults,
+        )
+        # The path of a serial bridge alone: on CAN the numbers go on, so that all is counted.
+        self._ends_ns = np.zeros(0, dtype=np.int64)
+        if plan.kind == "spi":
+            sweeps = round(plan.rate_hz * (plan.seconds + PATIENCE_S))
+            ends = folder / "ends"
+            self._ends_ns = np.memmap(ends, dtype=np.int64, mode="w+", shape=sweeps)
+            self._twin_plan = msgspec.structs.replace(self._twin_plan, ends=str(ends))
+        self._heard = Heard()
+        self._samples: list[Usage] = []
+        self._sample_s = time.monotonic()
+        self._deeds: deque[tuple[float, Callable[[], None]]] = deque()
+        self._kills = self._stops = 0
+        self._ended_early = False
+
+    def run(self) -> Found:
+        """Do it. Raises `RuntimeError` if the daemon does not start, with what it said."""
+        topics = ("verdict.", "status.")
+        with (
+            Subscriber(self._endpoint, topics=topics) as self._subscriber,
+            start_daemon(self._scene, self._log) as self._daemon,
+            start_listeners(self._endpoint, 2) as self._other,
+            ExitStack() as self._twins,
+        ):
+            self._hear(lambda: self._has_begun() or self._has_ended(), PATIENCE_S)
+            if not self._has_begun():
+                raise RuntimeError(f"no word of the daemon: {self._log.read_text()}")
+            self._other.line()
+            self._add_twin()
+            self._hear(lambda: self._heard.readings > 0 or self._has_ended(), PATIENCE_S)
+            self._samples.clear()
+            self._plan_deeds()
+            self._hear(self._has_ended, self._plan.seconds)
+            self._ended_early = self._has_ended()
+            self._twin.process.terminate()
+            self._hear(lambda: self._twin.process.poll() is not None, STOP_S)
+            self._hear(lambda: False, SETTLED_S)
+            return self._end()
+
+    def _has_begun(self) -> bool:
+        return self._heard.status is not None and self._heard.messages > 1
+
+    def _has_ended(self) -> bool:
+        return self._daemon.process.poll() is not None
+
+    def _hear(self, done: Callable[[], bool], seconds: float) -> None:
+        """Listen, do what is due and look at the daemon, so long at most."""
+        until_s = time.monotonic() + seconds
+        while (now_s := time.monotonic()) < until_s and not done():
+            message = self._subscriber.take(min(until_s - now_s, IDLE_S))
+            if message is not None:
+                self._heard.add(*message, self._subscriber.received_ns)
+            while self._deeds and self._deeds[0][0] <= now_s:
+                self._deeds.popleft()[1]()
+            if now_s >= self._sample_s and not self._has_ended():
+                self._samples.append(usage(self._daemon.pid))
+                self._sample_s = now_s + SAMPLE_S
+
+    def _end(self) -> Found:
+        began_s = time.monotonic()
+        code, _ = self._daemon.terminate()
+        stop_s = time.monotonic() - began_s
+        self._hear(lambda: False, SETTLED_S)
+        status = self._heard.status
+        self._wake_other()  # if the daemon ended while it was stopped
+        _, missed = self._other.terminate()
+        return Found(
+            samples=self._samples,
+            heard=self._heard,
+            twin=dict(zip(TALLIED, map(int, self._tally), strict=True)),
+            ends_ns=self._ends_ns[self._ends_ns > 0],
+            driver={} if status is None else status.drivers[self._plan.kind],
+            missed_by_stopped=int(missed or 0),
+            kills=self._kills,
+            stops=self._stops,
+            exit_code=code,
+            stop_s=stop_s,
+            planned=self._plan.rate_hz * self._plan.seconds,
+            ended_early=self._ended_early,
+        )
+
+    def _plan_deeds(self) -> None:
+        """Each outage and its end, in the order of time, both kinds in turn."""
+        end_s = time.monotonic() + self._plan.seconds - QUIET_END_S
+        pace = min(self._plan.seconds / HURRY_S, 1.0)
+        at_s = time.monotonic() + pace * self._random.uniform(*BETWEEN_S)
+        kinds = itertools.cycle(
+            [
+                (self._kill_twin, self._add_twin, AWAY_S),
+                (self._stop_other, self._wake_other, STOPPED_S),
+            ]
+        )
+        for begin, end, lasts_s in kinds:
+            back_s = at_s + pace * self._random.uniform(*lasts_s)
+            if back_s >= end_s:
+                return
+            self._deeds += [(at_s, begin), (back_s, end)]
+            at_s = back_s + pace * self._random.uniform(*BETWEEN_S)
+
+    def _kill_twin(self) -> None:
+        # As with a real adapter its path goes with it: else it leads to the next terminal that gets
+        # this number, and that may be anybody's.
+        self._twin.process.send_signal(signal.SIGSTOP)
+        if self._plan.kind == "spi":
+            Path(self._twin_plan.where).unlink(missing_ok=True)
+        self._twin.kill()
+        self._kills += 1
+
+    def _add_twin(self) -> None:
+        seed = self._plan.seed + self._kills
+        faults = dataclasses.replace(self._twin_plan.faults, seed=seed)
+        plan = msgspec.structs.replace(self._twin_plan, faults=faults)
+        self._twin = self._twins.enter_context(start_twin(plan))
+
+    def _stop_other(self) -> None:
+        self._other.process.send_signal(signal.SIGSTOP)
+        self._stops += 1
+
+    def _wake_other(self) -> None:
+        self._other.process.send_signal(signal.SIGCONT)
+
+
+def soak(plan: Plan) -> Found:
+    """Do one. Raises `RuntimeError` if the daemon does not start, with what it said."""
+    with tempfile.TemporaryDirectory() as folder:
+        return Soak(Path(folder), plan).run()
+
+
+def link_faults(text: str) -> LinkFaults:
+    """Of `name=value,...` by the fields of `LinkFaults`; of `dead`, how many electrodes are.
+
+    Raises `ValueError` or `TypeError` for what it does not have.
+    """
+    given: dict[str, Any] = {}
+    for name, _, value in (part.partition("=") for part in text.split(",") if part):
+        given[name] = json.loads(value)
+    dead = given.pop("dead", 0)
+    places = random.Random(0).sample([(f, e) for f in range(3) for e in range(ELECTRODES)], dead)
+    return LinkFaults(dead_electrodes=tuple(places), **given)
+
+
+def main() -> int:
+    """Print the table; 1 if a limit is broken."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.soak", description=__doc__)
+    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--rate", type=float, default=100.0, metavar="HZ")
+    parser.add_argument("--link", choices=tuple(DEFAULT_FAULTS), default="spi")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--faults",
+        type=link_faults,
+        metavar="NAME=VALUE,...",
+        help="fields of LinkFaults, such as drop_probability=0.01,disconnect_every_frames=500,"
+        "dead=3 (default: a little of each)",
+    )
+    given = parser.parse_args()
+    end_children_at_sigterm()
+    rows = judge(soak(Plan(given.seconds, given.link, given.rate, given.faults, given.seed)))
+    sys.stdout.write(table(("", "found", "at most"), [row.cells() for row in rows]))
+    return int(any(row.broken for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,75 @@
+"""Every parser against damaged frames, and the harness against parsers that break a promise."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import pytest
+
+from drivers.spi.framing import DELIMITER, FrameParser, encode_frame
+from tests.bench.fuzz import FRAMES, TARGETS, FuzzError, Target, fuzz, load, main
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_parser_keeps_its_promises_whatever_it_is_fed(name: str) -> None:
+    seed = random.SystemRandom().randrange(1 << 31)
+    report = fuzz(load(name), FRAMES, seed)
+    assert report.frames == FRAMES
+    assert report.survived < FRAMES / 2
+    assert min(report.damages.values()) > FRAMES / 20
+
+
+class Faulty(FrameParser):
+    """A parser that breaks one promise."""
+
+    def __init__(self, fault: str) -> None:
+        super().__init__()
+        self._fault = fault
+        self._fed = 0
+
+    def feed(self, chunk: bytes) -> list[tuple[int, bytes]]:
+        self._fed += len(chunk)
+        before = self.counters.bad_crc
+        frames = super().feed(chunk)
+        if self.counters.bad_crc > before:
+            if self._fault == "raises":
+                raise IndexError("out of range")
+            if self._fault == "invents":
+                return [*frames, (1, b"invented")]
+            if self._fault == "loses":
+                self._overlong = True
+        return frames
+
+    @property
+    def held_bytes(self) -> int:
+        return self._fed if self._fault == "hoards" else super().held_bytes
+
+
+def frame(rng: random.Random) -> tuple[bytes, tuple[int, bytes]]:
+    payload = rng.randbytes(rng.randint(0, 40))
+    return encode_frame(7, payload), (7, payload)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("raises", "IndexError"),
+        ("invents", "became"),
+        ("loses", "the good frame"),
+        ("hoards", "held back"),
+    ],
+)
+def test_a_parser_that_breaks_a_promise_is_caught_with_its_seed(fault: str, message: str) -> None:
+    def target(parser: Callable[[], FrameParser]) -> Target:
+        return Target("faulty", frame, parser, 1024, DELIMITER)
+
+    fuzz(target(FrameParser), 2000, seed=5)
+    with pytest.raises(FuzzError, match=message) as caught:
+        fuzz(target(lambda: Faulty(fault)), 2000, seed=5)
+    assert "python -m tests.bench.fuzz faulty --seed 5 --first" in str(caught.value)
+
+
+def test_the_command_runs_what_it_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["framing", "--frames", "100", "--seed", "3"]) == 0
+    assert capsys.readouterr().out.startswith("framing: 100 frames damaged")

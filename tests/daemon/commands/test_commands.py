@@ -1,0 +1,181 @@
+"""The commands as a user runs them: real processes, real files, real sockets."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daemon.publish.messages import decode_verdict, schema
+from drivers.recordings.csv_player import DEMO_TABLE
+from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
+
+
+def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    endpoint = f"ipc://{tmp_path}/graspd"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "{endpoint}"\n'
+    )
+    with start("run", scene) as process:
+        command = [sys.executable, "-c", SUBSCRIBER, endpoint, "20"]
+        received = subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=TIMEOUT_S)
+    verdicts = [decode_verdict(line) for line in received.stdout.splitlines()]
+    assert [verdict.seq - verdicts[0].seq for verdict in verdicts] == list(range(20))
+    assert process.returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scene.toml"]
+
+
+def test_run_says_in_one_line_why_it_cannot_start(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[tactile]\ndriver = "replay"\nrecordings = ["absent.csv"]\n[hnad]\n')
+    result = graspd("run", scene)
+    assert result.returncode == 2
+    assert result.stderr == f"graspd: {scene}: hnad: no such key; did you mean hand?\n"
+
+
+FAULTS = {
+    "off_from = 3": "stale",
+    "stuck_from = 3": "frozen",
+    "garbage_probability = 1.0": "not-a-count",
+    "wrong_counts = 4000": "saturated",
+    "slow_every = 50": "stale",
+    "delayed_s = 0.5": "stale",
+    "intermittent_probability = 0.97": "stale",
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_sensor_that_fails_ends_in_unknown_at_the_subscriber(tmp_path: Path, fault: str) -> None:
+    scene = tmp_path / "scene.toml"
+    endpoint = f"ipc://{tmp_path}/graspd"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[tactile.faults]\n{fault}\n[publish]\nendpoint = "{endpoint}"\n'
+    )
+    with start("run", scene) as process:
+        command = [sys.executable, "-c", SUBSCRIBER, endpoint, "12"]
+        received = subprocess.run(command, capture_output=True, check=True, timeout=TIMEOUT_S)
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=TIMEOUT_S)
+    verdicts = [decode_verdict(line) for line in received.stdout.splitlines()]
+    assert len(verdicts) == 12
+    assert FAULTS[fault] in {reason for verdict in verdicts for reason in verdict.reasons}
+    if not fault.startswith(("slow", "intermittent")):
+        assert {verdict.verdict for verdict in verdicts[4:]} == {"unknown"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["replay", "--model", "nonsense"], "no model 'nonsense' in the zoo"),
+        (["replay", "--model", "absent.onnx"], "absent.onnx: cannot read the model"),
+        (["replay", "--model", __file__ + ".onnx"], "cannot read the model"),
+        (["replay", "--speed", "0"], "0 is not a positive number"),
+        (["replay", "--speed", "nan"], "nan is not a positive number"),
+        (["replay", "--publish", "tcp://1.2.3.4:5"], "not a loopback address"),
+        (["replay", "--publish", "ipc://*"], "needs a path that subscribers can know"),
+        (["replay", "--publish", "tcp://127.0.0.1:*"], "needs a port"),
+        (["replay", "--publish", ""], "must start with ipc://"),
+        (["replay", "--model", ""], "model.name: string should have at least 1"),
+        (["replay", "--wait", "1"], "--wait is for subscribers: it needs --publish"),
+        (["replay", "--wait", "-1"], "-1 is not a number from 0 to 3600"),
+        (["replay", "--wait", "3601"], "3601 is not a number from 0 to 3600"),
+        (["replay", "--wait", "nan"], "nan is not a number from 0 to 3600"),
+        (["replay", "--rate", "abc"], "argument --rate: abc is not a positive number"),
+        (["replay", "--speed", "abc"], "argument --speed: abc is not a positive number"),
+        (["doctor", "--listen", "inf"], "inf is not a number from 0.1 to 3600"),
+        (["run", "absent.toml"], "absent.toml: cannot read the scene"),
+        (["nonsense"], "invalid choice"),
+        ([], "required"),
+    ],
+)
+def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) -> None:
+    result = graspd(*arguments)
+    assert result.returncode == 2
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_check_says_what_is_in_and_what_is_left_out() -> None:
+    scene = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
+    people = graspd("check", scene)
+    assert people.returncode == 0, people.stderr
+    assert "fine" in people.stdout
+    assert re.search(r"number \d+ of \d+ on known objects, [0-9.]+ times as fast", people.stdout)
+    content = json.loads(graspd("check", scene, "--json").stdout)
+    assert "synthetic_stream.csv" in content["in"]["tactile"]
+    assert "small-session" in content["in"]["model"]
+    assert "not kept" in content["in"]["session"]
+    assert "rf, lf" in content["left_out"]["fingers"]
+    assert content["in"]["joints"] == "those of the recordings"
+    assert "joints" not in content["left_out"]
+
+
+def test_check_finds_a_recording_that_is_not_there(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[tactile]\ndriver = "replay"\nrecordings = ["absent.csv"]\n')
+    result = graspd("check", scene)
+    assert result.returncode == 2
+    assert "absent.csv" in result.stderr
+
+
+def test_check_does_not_look_for_devices(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[tactile]\ndriver = "can"\ninterface = "nothing-of-this-name"\n')
+    assert graspd("check", scene).returncode == 0
+    scene.write_text('[tactile]\ndriver = "spi"\nport = "nothing://of-this-name"\n')
+    assert graspd("check", scene).returncode == 0
+
+
+PALM = '[tactile]\ndriver = "palm"\n'
+WRONG_PARTS = {
+    '[tactile]\ndriver = "can"\nbitrate = 500000\n': "[tactile] bit rates of socketcan are set by",
+    PALM + 'source = "udp://127.0.0.1:9870"\n[joints]\ndriver = "palm"\n'
+    'calibration = "absent.toml"\n': "absent.toml: cannot be read: No such file or directory",
+}
+
+
+@pytest.mark.parametrize("command", ["check", "run", "doctor"])
+@pytest.mark.parametrize("text", WRONG_PARTS, ids=["bit rate", "calibration"])
+def test_what_a_driver_cannot_use_is_one_line(tmp_path: Path, command: str, text: str) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f'{text}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n')
+    result = graspd(command, scene)
+    assert result.returncode == 2, result
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("graspd: ")
+    assert WRONG_PARTS[text] in line
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+def test_check_refuses_a_palm_file_that_is_not_there(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(PALM + 'source = "absent.bin"\n')
+    result = graspd("check", scene)
+    assert result.returncode == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "absent.bin" in result.stderr
+
+
+def test_check_refuses_a_hand_that_the_model_does_not_know(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[hand]\nfingers = ["ff", "rf"]\n[tactile]\ndriver = "replay"\n'
+        f'recordings = ["{DEMO_TABLE}"]\n'
+    )
+    result = graspd("check", scene)
+    assert result.returncode == 2
+    assert "judges the fingers ff, mf, th in this order, the hand has ff, rf" in result.stderr
+
+
+def test_the_schema_is_printed() -> None:
+    assert json.loads(graspd("schema").stdout) == schema()

@@ -1,0 +1,208 @@
+"""The faults of the table, each as a change of what comes from a hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
+from drivers.palm.packet import ROUND, PalmParser
+from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
+from drivers.twins.faults import LinkFaults
+from drivers.twins.palm import PalmTwin
+from tests.daemon.fakes import FINGERS, MS
+from tests.daemon.judge.fault_bench import Fault, Step
+
+JOINTS_LOST_FOR = 120
+"""Readings at 100 Hz: longer than `joints_lost_ms` of the scene, 1000 ms."""
+SYNCHRONISING = 3
+"""Sound rounds from which the parts behind a palm know where in the stream they are."""
+
+
+def replayed(**faults: int | float | tuple[int, ...] | tuple[str, ...]) -> Fault:
+    """A fault of the replay; the reading before the fault is its number 0."""
+    wanted = ReplayFaults(**faults)  # type: ignore[arg-type]
+
+    def spoil(sound: Sequence[Step]) -> list[Step]:
+        injector = FaultInjector(wanted, FINGERS, ReplayCounters())
+        steps = []
+        for number, step in enumerate(sound):
+            reading = step.tactile
+            if reading is None:
+                continue
+            counts, flags = reading.counts.copy(), reading.faults.copy()
+            injector.observe(number, counts, flags)
+            if number and injector.makes(number) and not injector.loses():
+                injector.spoil(counts, flags)
+                reading = dataclasses.replace(reading, counts=counts, faults=flags)
+            elif number:
+                reading = None
+            now_ns = step.now_ns + round(wanted.delayed_s * 1e9)
+            steps.append(dataclasses.replace(step, now_ns=now_ns, tactile=reading))
+        return steps[1:]
+
+    return spoil
+
+
+def in_tactile(change: Callable[[TactileReading, TactileReading], TactileReading]) -> Fault:
+    """A change of each reading, given the last sound one."""
+
+    def spoil(sound: Sequence[Step]) -> list[Step]:
+        before = sound[0].tactile
+        return [
+            dataclasses.replace(step, tactile=change(step.tactile, before))
+            for step in sound[1:]
+            if step.tactile is not None and before is not None
+        ]
+
+    return spoil
+
+
+Electrodes = tuple[int, slice]
+ONE: Electrodes = (0, slice(6, 7))
+NINE: Electrodes = (0, slice(9))
+FINGER: Electrodes = (1, slice(24))
+
+
+def flagged(fault: ElectrodeFault, where: Electrodes) -> Fault:
+    """Electrodes that the driver flags, with a count that means nothing."""
+
+    def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
+        counts, faults = reading.counts.copy(), reading.faults.copy()
+        counts[where], faults[where] = 0, fault
+        return dataclasses.replace(reading, counts=counts, faults=faults)
+
+    return in_tactile(change)
+
+
+def reading_only(count: int, where: Electrodes) -> Fault:
+    """Electrodes that read the same count for ever."""
+
+    def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
+        counts = reading.counts.copy()
+        counts[where] = count
+        return dataclasses.replace(reading, counts=counts)
+
+    return in_tactile(change)
+
+
+def shifted(time_ms: int) -> Fault:
+    """Readings whose time jumps by so much, once."""
+
+    def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
+        return dataclasses.replace(reading, t_ns=reading.t_ns + time_ms * MS)
+
+    return in_tactile(change)
+
+
+def standing_still(reading: TactileReading, before: TactileReading) -> TactileReading:
+    """A reading whose time is that of the last sound one."""
+    return dataclasses.replace(reading, t_ns=before.t_ns)
+
+
+def in_joints(change: Callable[[NDArray[np.float64], float], NDArray[np.float64]]) -> Fault:
+    """A change of the angles, given the seconds under fault."""
+
+    def spoil(sound: Sequence[Step]) -> list[Step]:
+        steps = []
+        for step in sound[1:]:
+            joints = step.joints
+            if joints is not None:
+                since_s = (step.now_ns - sound[0].now_ns) / 1e9
+                angles = change(joints.position_rad, since_s)
+                joints = dataclasses.replace(joints, position_rad=angles)
+            steps.append(dataclasses.replace(step, joints=joints))
+        return steps
+
+    return spoil
+
+
+def without_joints(sound: Sequence[Step]) -> list[Step]:
+    """No angles come any more."""
+    return [dataclasses.replace(step, joints=None) for step in sound[1:]]
+
+
+def on_a_palm_link(faults: LinkFaults) -> Fault:
+    """A fault between palm and host: packets by the millisecond, through the driver's parts."""
+
+    def spoil(sound: Sequence[Step]) -> list[Step]:
+        counts = [step.tactile.counts for step in sound if step.tactile is not None]
+        joints = {step.now_ns: step.joints for step in sound}
+        counters = RoundCounters()
+        parser, sweeps = PalmParser(counters), PalmSweeps(FINGERS, counters)
+        before = PalmTwin([counts[0]] * SYNCHRONISING, seed=1).packets()
+        lead_in = ([packet.to_bytes()] for packet in before)
+        steps: list[Step] = []
+        start_ns = sound[0].now_ns
+        now_ns = start_ns - SYNCHRONISING * ROUND * MS
+        for datagrams in itertools.chain(lead_in, PalmTwin(counts[1:], faults=faults).cycles()):
+            now_ns += MS
+            packets = [packet for data in datagrams if (packet := parser.parse(data))]
+            readings = [
+                reading
+                for packet in packets
+                if not sweeps.repeats(packet)
+                for reading in sweeps.push(packet, now_ns)
+            ]
+            if now_ns > start_ns:
+                steps.append(Step(now_ns, None, joints.get(now_ns)))
+                steps += [Step(now_ns, reading, None) for reading in readings]
+        return steps
+
+    return spoil
+
+
+SINGLE = (
+    ElectrodeFault.MISSING,
+    ElectrodeFault.NOT_A_COUNT,
+    ElectrodeFault.PARITY,
+    ElectrodeFault.ERROR_WORD,
+    ElectrodeFault.HELD,
+    ElectrodeFault.CUT_OFF,
+)
+FAULTS: dict[str, Fault] = {
+    "replay off": replayed(off_from=1),
+    "replay stuck": replayed(stuck_from=1),
+    "replay stuck electrode": replayed(stuck_from=1, fingers=("ff",), electrodes=(7,)),
+    "replay garbage": replayed(garbage_probability=1.0),
+    "replay wrong by +500": replayed(wrong_counts=500),
+    "replay wrong by -500": replayed(wrong_counts=-500),
+    "replay slow, 20th": replayed(slow_every=20),
+    "replay delayed, 0.2 s": replayed(delayed_s=0.2),
+    "replay lossy, half": replayed(intermittent_probability=0.5),
+    **{
+        f"{fault.name}, {name}".lower().replace("_", "-"): flagged(fault, where)
+        for fault in SINGLE
+        for name, where in (("one", ONE), ("nine", NINE), ("finger", FINGER))
+    },
+    "at 0, one": reading_only(0, ONE),
+    "at 0, nine": reading_only(0, NINE),
+    "at 4095, one": reading_only(COUNT_MAX, ONE),
+    "at 4095, nine": reading_only(COUNT_MAX, NINE),
+    "joints silent": without_joints,
+    "joints lost": without_joints,
+    "joints not valid": in_joints(lambda angles, _: np.full_like(angles, np.nan)),
+    "joints move": in_joints(lambda angles, s: angles + 0.5 * s),
+    "time stands still": in_tactile(standing_still),
+    "time back by 50 ms": shifted(-50),
+    "time back by 1 s": shifted(-1000),
+    "time ahead by 50 ms": shifted(50),
+    "palm drops 5 %": on_a_palm_link(LinkFaults(drop_probability=0.05)),
+    "palm drops half": on_a_palm_link(LinkFaults(drop_probability=0.5)),
+    "palm sends twice": on_a_palm_link(LinkFaults(duplicate_probability=1.0)),
+    "palm reorders": on_a_palm_link(LinkFaults(reorder_probability=0.3)),
+    "palm flips bits": on_a_palm_link(LinkFaults(bit_flip_probability=0.2)),
+    "palm sends in bursts": on_a_palm_link(LinkFaults(burst_frames=70)),
+    "palm disconnects": on_a_palm_link(LinkFaults(disconnect_every_frames=70)),
+    "palm, later version": on_a_palm_link(LinkFaults(wrong_version=True)),
+    "palm, dead electrode": on_a_palm_link(LinkFaults(dead_electrodes=((0, 6),))),
+    "palm, unplugged": on_a_palm_link(LinkFaults(unplugged_fingers=(2,))),
+    "palm's request stands": on_a_palm_link(LinkFaults(stuck_clock=True)),
+}
+"""`one`, `nine`: electrodes of one finger. Those of a palm come through its packets."""
+EARLIER = {"joints lost": JOINTS_LOST_FOR}

@@ -1,0 +1,125 @@
+"""The final verdict: every combination against the rule as the documentation states it."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import coverage
+import pytest
+
+from daemon.judge import decision
+from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.reasons import Outcome, Reason
+from tests.daemon.judge.mutants import load, mutants
+
+LIMIT_NS = 100
+THRESHOLD = 0.4
+CONFIDENCE = 0.75
+LIMITS = Limits(max_age_ns=LIMIT_NS, slip_threshold=THRESHOLD, min_confidence=CONFIDENCE)
+ANY_CONFIDENCE = Limits(max_age_ns=LIMIT_NS, slip_threshold=THRESHOLD, min_confidence=0.0)
+
+# Probability, and what it is worth by the rule: slip from 0.4 on; as sure as 0.75.
+PROBABILITIES: list[tuple[float | None, str]] = [
+    (0.0, "stable"),
+    (0.2, "stable"),
+    (0.25, "stable"),
+    (0.250001, "unsure stable"),
+    (0.399999, "unsure stable"),
+    (0.4, "unsure slip"),
+    (0.6, "unsure slip"),
+    (0.749999, "unsure slip"),
+    (0.75, "slip"),
+    (1.0, "slip"),
+    (None, "nothing"),
+    (math.nan, "nothing"),
+    (math.inf, "nothing"),
+    (-math.inf, "nothing"),
+    (-1e-9, "nothing"),
+    (1.0000001, "nothing"),
+]
+AGES = [(0, True), (1, True), (LIMIT_NS, True), (LIMIT_NS + 1, False), (-1, False), (10**12, False)]
+HEALTH: list[tuple[Reason, ...]] = [(), (Reason.PARITY,), (Reason.FLAT, Reason.SATURATED)]
+GATE: list[tuple[Reason, ...]] = [(), (Reason.NO_CONTACT,), (Reason.NOT_TARED, Reason.NO_CONTACT)]
+CASES = list(itertools.product(PROBABILITIES, AGES, HEALTH, GATE, (False, True), (False, True)))
+
+
+def expected(
+    worth: str, fresh: bool, health: tuple[Reason, ...], gate: tuple[Reason, ...], well: bool
+) -> tuple[str, set[Reason]]:
+    """The rule, written down once more: everything must be well, or it is unknown."""
+    against = set(health)
+    if not well:
+        against |= set(gate) or {Reason.MOVING}
+    if not fresh:
+        against |= {Reason.STALE}
+    if worth.startswith("unsure"):
+        against |= {Reason.LOW_CONFIDENCE}
+    if worth == "nothing" and not against:
+        against = {Reason.MODEL_FAILED}
+    return ("unknown" if against else worth), against
+
+
+def broken_cases(judge: Callable[[Case, Limits], Any]) -> int:
+    """How many of all combinations are not judged by the rule; counts an exception too."""
+    wrong = 0
+    for case_of, limits in itertools.product(CASES, (LIMITS, ANY_CONFIDENCE)):
+        (p_slip, worth), (age_ns, fresh), health, gate, contact, settled = case_of
+        worth = worth.removeprefix("unsure ") if limits is ANY_CONFIDENCE else worth
+        case = Case(p_slip, health, contact, settled, gate, age_ns)
+        outcome, against = expected(worth, fresh, health, gate, contact and settled)
+        try:
+            found, reasons = judge(case, limits)
+            wrong += (found, set(reasons), len(reasons)) != (outcome, against, len(against))
+        except Exception:  # noqa: BLE001 - a mutant may raise anything
+            wrong += 1
+    return wrong
+
+
+def test_every_combination_is_judged_by_the_rule() -> None:
+    assert broken_cases(decide) == 0
+    assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2
+
+
+@pytest.mark.parametrize("reason", Reason)
+@pytest.mark.parametrize("where", ["health", "gate"])
+def test_any_reason_makes_the_verdict_unknown(reason: Reason, where: str) -> None:
+    health, gate = ((reason,), ()) if where == "health" else ((), (reason,))
+    case = Case(0.0, health, in_contact=where == "health", settled=True, gate=gate, age_ns=0)
+    assert decide(case, LIMITS) == (Outcome.UNKNOWN, (reason,))
+
+
+def test_the_defaults_ask_for_no_confidence() -> None:
+    limits = Limits(max_age_ns=LIMIT_NS)
+    for p_slip, outcome in ((0.499999, Outcome.STABLE), (0.5, Outcome.SLIP)):
+        case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
+        assert decide(case, limits) == (outcome, ())
+
+
+def test_every_small_mistake_in_the_rule_would_be_noticed() -> None:
+    changed = list(mutants(inspect.getsource(decision), "decide"))
+    assert len(changed) > 30
+    survivors = [
+        what for what, source in changed if not broken_cases(load(source, decision)["decide"])
+    ]
+    assert survivors == []
+
+
+def test_every_branch_of_the_rule_is_taken(tmp_path: Path) -> None:
+    module = decision.__file__
+    measure = coverage.Coverage(
+        branch=True, include=[module], data_file=None, config_file=False, messages=False
+    )
+    with measure.collect():
+        broken_cases(decide)
+    measure.json_report(outfile=str(tmp_path / "report.json"))
+    (report,) = json.loads((tmp_path / "report.json").read_text())["files"].values()
+    summary = report["functions"]["decide"]["summary"]
+    assert summary["num_branches"] > 0
+    assert summary["missing_branches"] == 0
+    assert summary["missing_lines"] == 0

@@ -1,0 +1,319 @@
+"""The gate's limits to the nanosecond, its invariants, and what a grip hands over to judge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from daemon.judge.gate import CHANGES_MAX, Gate, GateChange, GateLimits
+from daemon.judge.grip import Grip
+from daemon.judge.health import Watched
+from daemon.judge.reasons import GateCause, GateState, Reason
+from tests.daemon.judge.test_gate import (
+    ALL,
+    FINGERS,
+    GATE,
+    GRASPED,
+    LIMITS,
+    MS,
+    SHAPE,
+    START_NS,
+    UP,
+    Scenario,
+    check_chain,
+    play,
+    readings,
+    spike,
+)
+
+NOTHING = (False, False, False)
+"""No finger touches."""
+
+
+class Steps:
+    """Feeds a gate constant counts, so that times and limits can be told to the nanosecond."""
+
+    def __init__(self, *, on_request: bool = False, limits: GateLimits = GATE) -> None:
+        self.gate = Gate(np.ones(3, dtype=np.bool_), limits, on_request=on_request)
+        self.t_ns = START_NS
+
+    def step(
+        self,
+        after_ms: float = 10.0,
+        counts: float = 3000.0,
+        touching: Sequence[bool] = (True, True, True),
+        against: tuple[Reason, ...] = (),
+    ) -> GateState:
+        """One reading: all electrodes of FF read `counts`, the others 3000."""
+        self.t_ns += round(after_ms * MS)
+        median = np.full(SHAPE, 3000, dtype=np.uint16)
+        median[0] = round(counts)
+        self.gate.step(self.t_ns, median, ALL, np.array(touching), against)
+        if self.gate.wants_judgement:
+            assert self.gate.state is GateState.SETTLED
+            self.gate.judged(self.t_ns, median)
+        return self.gate.state
+
+    def rest(self, seconds: float = 0.2) -> None:
+        for _ in range(round(seconds * 100)):
+            self.step(touching=NOTHING)
+
+    def grasp(self) -> None:
+        """Rest, touch, and hold until it is judged."""
+        self.rest()
+        for _ in range(9):
+            self.step()
+        assert self.gate.settled
+
+    def story(self) -> str:
+        return " ".join(f"{change.state}:{change.cause}" for change in self.gate.take_changes())
+
+
+@pytest.mark.parametrize("period_ms", [1.0, 8.0, 10.0, 16.0, 20.0, 40.0, 80.0])
+@pytest.mark.parametrize("hold_ms", [0, 80, 400])
+def test_hold_time_is_kept_to_the_nanosecond(period_ms: float, hold_ms: int) -> None:
+    steps = Steps(limits=replace(GATE, hold_ns=hold_ms * MS))
+    steps.rest()
+    steps.step(period_ms)
+    touched_ns = steps.t_ns
+    while steps.gate.state is GateState.CLOSING:
+        assert steps.gate.reasons == (Reason.SETTLING,)
+        assert steps.t_ns - touched_ns < hold_ms * MS
+        steps.step(period_ms)
+    assert steps.gate.settled
+    assert steps.t_ns - touched_ns == hold_ms * MS
+    assert [c.t_ns for c in steps.gate.take_changes()] == [touched_ns, steps.t_ns, steps.t_ns]
+
+
+def test_the_hold_time_begins_anew_after_every_motion() -> None:
+    steps = Steps()
+    steps.rest()
+    for _ in range(20):
+        for _ in range(8):  # 70 ms
+            assert steps.step() is GateState.CLOSING
+        assert steps.step(against=(Reason.MOVING,)) is GateState.CLOSING
+    for _ in range(8):
+        assert steps.step() is GateState.CLOSING
+    assert steps.step() is GateState.JUDGED
+
+
+@pytest.mark.parametrize(("counts_per_s", "moves"), [(110, False), (-110, False), (130, True)])
+def test_a_finger_moves_above_the_limit_of_the_rate(counts_per_s: float, moves: bool) -> None:
+    steps = Steps()
+    steps.rest()
+    for place in range(30):
+        steps.step(counts=3000.0 + counts_per_s * place / 100)
+        assert not moves or place < 8 or steps.gate.reasons == (Reason.MOVING,)
+    assert (GateState.JUDGED in [c.state for c in steps.gate.take_changes()]) is not moves
+
+
+@pytest.mark.parametrize(("counts", "state"), [(40, "judged"), (-40, "judged"), (41, "closing")])
+def test_another_grasp_is_more_than_the_limit_away(counts: int, state: str) -> None:
+    steps = Steps()
+    steps.grasp()
+    assert steps.step(counts=3000 + counts) == state
+    assert not steps.gate.settled, "it moves"
+
+
+@pytest.mark.parametrize(
+    ("gap_ms", "causes"), [(100, ""), (100.001, "closing:gap"), (-1, "closing:gap")]
+)
+def test_a_gap_is_longer_than_its_limit(gap_ms: float, causes: str) -> None:
+    steps = Steps()
+    steps.grasp()
+    steps.story()
+    steps.step(gap_ms)
+    assert steps.story() == causes
+    assert steps.gate.settled is (not causes)
+
+
+@pytest.mark.parametrize(("after_ms", "state"), [(99.999, "released"), (100, "idle")])
+def test_released_lasts_its_time(after_ms: float, state: str) -> None:
+    steps = Steps()
+    steps.grasp()
+    assert steps.step(touching=NOTHING) is GateState.RELEASED
+    assert steps.step(50, touching=NOTHING) is GateState.RELEASED
+    assert steps.step(after_ms - 50, touching=NOTHING) == state
+
+
+@pytest.mark.parametrize(("after_ms", "judged"), [(1000, True), (1000.001, False)])
+def test_a_request_expires_after_its_time(after_ms: float, judged: bool) -> None:
+    steps = Steps(on_request=True)
+    steps.rest()
+    steps.gate.ask()
+    for _ in range(18):
+        steps.step(50, against=(Reason.MOVING,))
+    steps.step(after_ms - 930)  # its time runs from the first reading after it
+    assert steps.step(80) is (GateState.JUDGED if judged else GateState.SETTLED)
+    assert steps.gate.reasons == (() if judged else (Reason.NOT_ASKED,))
+
+
+@pytest.mark.parametrize("reason", [Reason.NOT_TARED, Reason.MOVING, Reason.JOINTS_LATE])
+def test_what_others_say_against_it_keeps_a_grasp_from_settling(reason: Reason) -> None:
+    steps = Steps()
+    steps.rest()
+    for _ in range(50):
+        assert steps.step(against=(reason,)) is GateState.CLOSING
+        assert steps.gate.reasons == (reason,)
+    for _ in range(9):
+        steps.step()
+    assert steps.gate.settled
+    steps.step(against=(reason,))
+    assert steps.gate.state is GateState.JUDGED
+    assert not steps.gate.settled
+    assert steps.gate.reasons == (reason,)
+    steps.step()
+    assert steps.gate.settled, "the same grasp, so its verdict stands"
+
+
+def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> None:
+    steps = Steps()
+    steps.grasp()
+    usable, median = ALL.copy(), np.full(SHAPE, 3000, dtype=np.uint16)
+    usable[0, :12] = False
+    for place in range(50):
+        median[0, :12] = 4095 * (place % 2)
+        steps.t_ns += 10 * MS
+        steps.gate.step(steps.t_ns, median.copy(), usable, np.ones(3, dtype=np.bool_))
+        assert steps.gate.settled
+
+
+def test_changes_that_nobody_takes_are_bounded() -> None:
+    steps = Steps()
+    for _ in range(1000):
+        steps.step()
+        steps.step(touching=NOTHING)
+    assert len(steps.gate.take_changes()) == CHANGES_MAX == 64
+    assert steps.gate.take_changes() == []
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    gate = Gate(np.array([True, seed % 2 == 0, True]), GATE, on_request=seed % 3 == 0)
+    changes: list[GateChange] = []
+    touching, median, t_ns = np.zeros(3, dtype=np.bool_), np.full(SHAPE, 3000), START_NS
+    for _ in range(4000):
+        t_ns += round(MS * random.choice([0, 1, 10, 10, 10, 10, 10, 90, 101, 5000, -20]))
+        if random.random() < 0.05:
+            touching = random.random(3) < random.choice([0.1, 0.9])
+        if random.random() < 0.05:
+            median = random.integers(2900, 3000, SHAPE)
+        if random.random() < 0.05:
+            gate.ask()
+        against = (Reason.JOINTS_LATE,) if random.random() < 0.02 else ()
+        if random.random() < 0.05:
+            gate.skip(t_ns)
+        else:
+            gate.step(t_ns, median.astype(np.uint16), random.random(SHAPE) < 0.9, touching, against)
+        if gate.wants_judgement:
+            assert gate.state is GateState.SETTLED
+            assert gate.in_contact
+            if random.random() < 0.8:  # else the model is slow, or the reading is too old
+                gate.judged(t_ns, median.astype(np.uint16))
+        assert not gate.settled or (gate.state is GateState.JUDGED and gate.in_contact)
+        assert gate.settled == (not gate.reasons)
+        new = gate.take_changes()
+        assert len(new) <= 5
+        changes += new
+    check_chain(changes)
+    begun = [change for change in changes if change.cause is GateCause.CONTACT]
+    assert [change.grasp for change in begun] == list(range(1, gate.grasp + 1))
+    assert {change.state for change in changes} == set(GateState), "the walk saw all of it"
+
+
+def settle_s(scenario: Scenario) -> float:
+    """When a scenario settles, s."""
+    return play(scenario).first_s(GateState.SETTLED)
+
+
+@pytest.mark.parametrize(("sweeps", "shows"), [(1, True), (3, False)])
+def test_a_spike_in_the_very_sweep_shows_in_a_single_reading_and_not_in_a_median(
+    sweeps: int, shows: bool
+) -> None:
+    firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, sweeps=sweeps))
+    moment_s = settle_s(firm)
+    spiked = replace(firm, spoil=spike((0, 1), (2, 8), at_s=moment_s - 1e-3, sweeps=1))
+    (plain,), (judged,) = play(firm).judged, play(spiked).judged
+    depth = plain.astype(np.int64) - judged
+    assert ([depth[0, 1], depth[2, 8]] == [150, 150]) is shows
+    assert np.count_nonzero(np.abs(depth) > 20) == (2 if shows else 0)
+
+
+def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> None:
+    hasty = replace(GATE, hold_ns=0, rate_window_ns=10 * MS, rate_counts_per_s=1e4)
+    firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, gate=hasty))
+    grip, none = Grip(FINGERS, firm.limits), Watched((), ~ALL)
+    sweeps = [(t_s, reading) for t_s, reading in readings(firm) if not 0.5 < t_s < 0.75]
+    after = [reading.counts for t_s, reading in sweeps if t_s >= 0.75]
+    for t_s, reading in sweeps:
+        grip.feel(reading, none)
+        counts = grip.counts_to_judge(reading, none)
+        if counts is not None:
+            grip.judged()
+        if counts is not None and t_s > 0.5:
+            since = round((t_s - 0.75) * 100) + 1
+            assert since >= 3
+            window = np.array(after[:since])
+            assert (counts >= window.min(axis=0)).all()
+            assert (counts <= window.max(axis=0)).all()
+            return
+    pytest.fail("it was never judged again")
+
+
+def test_a_single_reading_is_judged_as_it_came() -> None:
+    firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, sweeps=1))
+    moment_s = settle_s(firm)
+    (judged,) = play(firm).judged
+    came = [reading.counts for t_s, reading in readings(firm) if abs(t_s - moment_s) < 1e-3]
+    np.testing.assert_array_equal(judged, came[0])
+
+
+def test_a_finger_lost_while_settled_is_contact_lost() -> None:
+    steps = Steps(on_request=True)
+    steps.rest()
+    for _ in range(9):
+        steps.step()
+    assert steps.gate.state is GateState.SETTLED
+    steps.step(touching=(True, True, False))
+    assert steps.gate.take_changes()[-1].cause is GateCause.CONTACT_LOST
+
+
+def test_released_ends_though_time_went_back() -> None:
+    steps = Steps()
+    steps.grasp()
+    steps.step(touching=NOTHING)
+    steps.step(-60_000.0, touching=NOTHING)
+    steps.rest(1.0)
+    assert steps.gate.state is GateState.IDLE
+
+
+def test_a_request_expires_though_time_went_back() -> None:
+    steps = Steps(on_request=True)
+    steps.rest()
+    steps.gate.ask()
+    steps.step(-60_000.0, touching=NOTHING)
+    steps.rest(2.0)
+    for _ in range(20):
+        steps.step()
+    assert steps.gate.state is GateState.SETTLED
+
+
+def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_values() -> None:
+    firm = Scenario("firm", GRASPED, UP)
+    moment_s = settle_s(firm)
+    grip, lost = Grip(FINGERS, LIMITS), ~ALL
+    lost[0, [0, 3, 6, 9, 12]] = True  # five of the eight that are pressed by 300 counts
+    for t_s, reading in readings(firm):
+        away = -0.05 <= t_s < moment_s - 1e-3
+        watched = Watched((), lost if away else ~ALL)
+        grip.feel(reading, watched)
+        counts = grip.counts_to_judge(reading, watched)
+        if counts is not None:
+            assert t_s >= moment_s - 1e-3
+            assert np.abs(counts.astype(np.int64) - reading.counts).max() < 30
+            return
+    pytest.fail("it was never judged")

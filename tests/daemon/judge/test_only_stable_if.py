@@ -1,0 +1,394 @@
+"""Whatever comes, in whatever order: a verdict is given only if all that it needs holds.
+
+What it needs is stated here once more, after the documentation and without the judge's own code.
+Where the judge remembers more than is followed here, the bounds are loose, and true.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from daemon.judge.contact import ContactLimits
+from daemon.judge.gate import GateLimits
+from daemon.judge.grip import GripLimits
+from daemon.judge.joint_motion import JointLimits
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import Outcome
+from drivers.base import ElectrodeFault, JointReading, TactileReading
+from models.contract import Finger
+from models.tactile_image import TactileImager
+from tests.daemon.fakes import FINGERS, MS, Clock, FakeModel, pipeline
+from tests.daemon.judge.necessity import (
+    AGE_MAX_MS,
+    GAP_MS,
+    HOLD_MS,
+    JOINT_RAD_PER_S,
+    JOINTS_LATE_MS,
+    JOINTS_LOST_MS,
+    RATE_COUNTS_PER_S,
+    WINDOW_MS,
+    Necessity,
+)
+
+Counts = NDArray[np.uint16]
+PERIOD_NS = 10 * MS
+NOISE = 2
+"""Counts are drawn so far around a pose, evenly: standard deviation 1.4."""
+QUIET_READINGS = 130
+STEPS_MAX = 120
+JOINTS = ("FFJ3", "MFJ3", "THJ5")
+STILL_RAD = 0.5
+AHEAD_NS = 300 * MS
+TURN_RAD = 0.01
+"""Per reading: at 100 Hz ten times what a joint that is still may do."""
+
+
+def _poses() -> dict[str, NDArray[np.int64]]:
+    """Counts without noise, shape (3, 24), within what the fake model has seen."""
+    random = np.random.default_rng(5)
+    rest = random.integers(2000, 3000, (3, 24))
+    grasp, other, light, faint, two = (rest.copy() for _ in range(5))
+    for finger in range(3):
+        places = random.permutation(24)
+        grasp[finger, places[:8]] -= random.integers(150, 600, 8)
+        other[finger, places[4:12]] -= random.integers(150, 600, 8)
+        light[finger, places[:8]] -= 15  # no touch, and too deep to let go
+        faint[finger, places[:8]] -= 40  # a touch that ends without a large change
+    two[:2] = grasp[:2]
+    return {
+        "grasp": grasp,
+        "rest": rest,
+        "other": other,
+        "light": light,
+        "faint": faint,
+        "two": two,
+        "lifted": grasp - 30,
+    }
+
+
+POSES = _poses()
+
+
+@dataclass(frozen=True, slots=True)
+class Flaw:
+    """What is wrong with some electrodes of a finger."""
+
+    finger: int
+    first: int
+    number: int
+    bits: int
+    count: int | None
+    """What they read; None: what they would without a flaw."""
+
+
+@dataclass(frozen=True, slots=True)
+class Feel:
+    """Readings of one kind, one after the other."""
+
+    pose: str = "grasp"
+    times: int = 1
+    step_ns: int = PERIOD_NS
+    """What the daemon's clock moves on by before each."""
+    age_ns: int = 0
+    """Of the first reading."""
+    lag_ns: int = 0
+    """By so much each reading is older than the one before."""
+    repeats: bool = False
+    """Whether all have the counts of the first."""
+    flaws: tuple[Flaw, ...] = ()
+    joints: str = "still"
+    answer: float | None = 0.1
+    """Of the network; None: it fails."""
+    asks: bool = False
+    """Whether the controller asks once before the first reading."""
+
+
+class Hand:
+    """A pipeline whose fingers are tared, and what is necessary for a verdict."""
+
+    def __init__(self, gate: GripLimits) -> None:
+        self.model, self.clock = FakeModel(), Clock()
+        self.pipeline: Pipeline = pipeline(self.model, self.clock, grip=gate)
+        self.necessity = Necessity(POSES["rest"], FINGERS, gate.required or FINGERS)
+        self.answer: float | None = None
+        """What the network said when it was last asked."""
+        self.asked = 0
+        self.random = np.random.default_rng(1)
+        self.turned_rad = 0.0
+
+    def play(self, feel: Feel) -> list[Judgement]:
+        """Feel, and check each judgement."""
+        self.model.answer = RuntimeError("no session") if feel.answer is None else feel.answer
+        first: Counts | None = None
+        said = []
+        if feel.asks:
+            self.pipeline.ask()
+            self.asked += 1
+        for number in range(feel.times):
+            self.clock.now_ns += feel.step_ns
+            self._turn(feel.joints)
+            reading = self._reading(feel, first, feel.age_ns + number * feel.lag_ns)
+            first = reading.counts if feel.repeats else None
+            said.append(self._judge(reading, feel.answer))
+        return said
+
+    def _judge(self, reading: TactileReading, answer: float | None) -> Judgement:
+        runs = self.model.runs
+        self.necessity.feel(reading)
+        judgement = self.pipeline.judge(reading)
+        if self.model.runs != runs:
+            self.answer = answer
+        unknown = judgement.outcome is Outcome.UNKNOWN
+        assert unknown is bool(judgement.reasons)
+        assert unknown is (judgement.p_slip is None)
+        if not unknown:
+            p_slip = self.answer
+            assert p_slip is not None
+            assert 0.0 <= p_slip <= 1.0
+            assert judgement.p_slip == p_slip
+            assert (judgement.outcome is Outcome.SLIP) is (p_slip >= 0.5)
+            assert 0 <= self.clock() - reading.t_ns <= AGE_MAX_MS * MS
+            assert not self.necessity.lacks(), self.necessity.lacks()
+        return judgement
+
+    def _reading(self, feel: Feel, first: Counts | None, age_ns: int) -> TactileReading:
+        faults = np.zeros((3, 24), dtype=np.uint8)
+        counts = self._counts(feel.pose) if first is None else first
+        if len(counts) == len(faults) and first is None:
+            for flaw in feel.flaws:
+                where = flaw.finger, slice(flaw.first, flaw.first + flaw.number)
+                if flaw.count is not None:
+                    counts[where] = flaw.count
+        for flaw in feel.flaws:
+            faults[flaw.finger, flaw.first : flaw.first + flaw.number] |= flaw.bits
+        return TactileReading(self.clock() - age_ns, 0, counts, faults[: len(counts)])
+
+    def _counts(self, pose: str) -> Counts:
+        if pose == "wild":
+            return self.random.integers(0, 65536, (3, 24), dtype=np.uint16)
+        if pose == "any":
+            return self.random.integers(1000, 3000, (3, 24), dtype=np.uint16)
+        if pose == "other fingers":
+            return self.random.integers(1000, 3000, (2, 24), dtype=np.uint16)
+        noise = self.random.integers(-NOISE, NOISE + 1, (3, 24))
+        return (POSES[pose] + noise).astype(np.uint16)
+
+    def _turn(self, kind: str) -> None:
+        if kind == "none":
+            return
+        self.turned_rad += TURN_RAD * (kind == "moving")
+        noise = self.random.uniform(-0.0005, 0.0005, len(JOINTS))
+        angles = STILL_RAD + self.turned_rad + noise
+        if kind == "not valid":
+            angles[:] = np.nan
+        elif kind == "one not valid":
+            angles[1] = np.nan
+        t_ns = self.clock() + AHEAD_NS * (kind == "ahead")
+        reading = JointReading(t_ns, 0, JOINTS, angles)
+        self.necessity.turn(reading)
+        self.pipeline.turn(reading)
+
+
+def limits(
+    *, on_request: bool = False, sweeps: int = 3, required: tuple[Finger, ...] = FINGERS
+) -> GripLimits:
+    """Those that `Necessity` knows."""
+    return GripLimits(
+        on_request=on_request,
+        sweeps=sweeps,
+        required=required,
+        contact=ContactLimits(counts=20.0),
+        gate=GateLimits(
+            hold_ns=HOLD_MS * MS,
+            rate_window_ns=WINDOW_MS * MS,
+            rate_counts_per_s=RATE_COUNTS_PER_S,
+            gap_ns=GAP_MS * MS,
+        ),
+        joints=JointLimits(
+            rad_per_s=JOINT_RAD_PER_S,
+            window_ns=WINDOW_MS * MS,
+            late_ns=JOINTS_LATE_MS * MS,
+            lost_ns=JOINTS_LOST_MS * MS,
+        ),
+    )
+
+
+@cache
+def _tared(gate: GripLimits) -> Hand:
+    hand = Hand(gate)
+    hand.play(Feel("rest", times=QUIET_READINGS))
+    return hand
+
+
+def tared(gate: GripLimits) -> Hand:
+    """A hand of its own that has rested for long enough."""
+    hand = _tared(gate)
+    contract = hand.model.contract  # large, and never changed
+    return copy.deepcopy(hand, {id(contract): contract})
+
+
+def often(usual: object, *others: object, times: int = 9) -> st.SearchStrategy[object]:
+    """The usual, so many times as often as all others together."""
+    return st.sampled_from([usual] * (times * len(others)) + [*others])
+
+
+flaws = st.builds(
+    Flaw,
+    finger=st.integers(0, 2),
+    first=st.integers(0, 23),
+    number=st.sampled_from([1, 1, 2, 4, 8, 9, 24]),
+    bits=st.sampled_from([0, 1, 2, 4, 8, 1, 2, 4, 8, 16, 32, 64, 128]),
+    count=st.sampled_from([None, 0, 4095, 65535, 1234]),
+)
+few_everywhere = st.builds(
+    lambda number, first: tuple(Flaw(finger, first, number, 1, 0) for finger in range(3)),
+    st.integers(1, 6),
+    st.integers(0, 18),
+)
+"""In some, more than can be repaired in a hand, and not in a finger."""
+feels = st.builds(
+    Feel,
+    pose=often(
+        "grasp", "rest", "other", "light", "faint", "two", "lifted", "wild", "any", "other fingers"
+    ),
+    times=st.sampled_from([1, 3, 10, 20, 30]),
+    step_ns=often(PERIOD_NS, 0, MS, 14 * MS, 50 * MS, 3000 * MS, -PERIOD_NS, -1000 * MS),
+    lag_ns=often(0, 5 * MS, PERIOD_NS, times=5),
+    age_ns=often(0, 60 * MS, 100 * MS, 101 * MS, 10_000 * MS, -1),
+    repeats=often(False, True, times=9),
+    flaws=st.one_of(
+        st.just(()), st.just(()), st.lists(flaws, max_size=2).map(tuple), few_everywhere
+    ),
+    joints=often("still", "moving", "none", "not valid", "one not valid", "ahead"),
+    answer=st.one_of(st.sampled_from([0.1, 0.9, 0.4999, 0.5]), st.floats(), st.none()),
+    asks=often(False, True, times=3),
+)
+begins = st.sampled_from(
+    [
+        (),
+        (Feel(times=30, asks=True),),
+        (Feel("faint", times=30, asks=True),),
+        (Feel(times=30, asks=True, answer=0.9),),
+    ]
+)
+gates = st.builds(
+    limits,
+    on_request=st.booleans(),
+    sweeps=st.sampled_from([1, 3]),
+    required=st.sampled_from([FINGERS, ("ff", "th")]),
+)
+
+
+HELD = Feel(times=30, asks=True)
+SCENARIOS = {
+    "two fingers of three": (Feel("two", times=30),),
+    "let go without a large change": (Feel("faint", times=30), Feel("rest", times=20)),
+    "let go and taken again": (
+        Feel("faint", times=30),
+        Feel("rest", times=4),
+        Feel("faint", times=20),
+    ),
+    "lifted": (HELD, Feel("lifted", times=20)),
+    "another object": (HELD, Feel("other", times=30)),
+    "old readings": (HELD, Feel(times=20, lag_ns=PERIOD_NS)),
+    "a gap": (HELD, Feel(step_ns=101 * MS), Feel(times=20)),
+    "time back": (HELD, Feel(step_ns=-PERIOD_NS), Feel(times=20)),
+    "joints late, then lost": (HELD, Feel(times=90, joints="none")),
+    "joints away and back": (
+        HELD,
+        Feel(times=30, joints="none"),
+        Feel(times=10, joints="moving"),
+        Feel(times=10),
+    ),
+    "joints of a later time": (HELD, Feel(times=10, joints="ahead"), Feel(times=10)),
+    "joints that move": (HELD, Feel(times=10, joints="moving"), Feel(times=20)),
+    "asked once": (HELD, Feel("other", times=30), Feel("grasp", times=30)),
+}
+
+
+@pytest.mark.parametrize("on_request", [False, True])
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_verdict_is_given_only_if_all_that_it_needs_holds_in(
+    name: str, *, on_request: bool
+) -> None:
+    check(limits(on_request=on_request), SCENARIOS[name])
+
+
+@given(gate=gates, begin=begins, feels=st.lists(feels, min_size=3, max_size=12))
+@settings(max_examples=400)
+def test_a_verdict_is_given_only_if_all_that_it_needs_holds(
+    gate: GripLimits, begin: Sequence[Feel], feels: Sequence[Feel]
+) -> None:
+    for outcome in check(gate, (*begin, *feels)):
+        event(outcome)
+
+
+def check(gate: GripLimits, feels: Sequence[Feel]) -> set[Outcome]:
+    """Play to a tared hand as much of it as there is time for; the outcomes."""
+    hand = tared(gate)
+    left = STEPS_MAX
+    outcomes = set()
+    for feel in feels:
+        part = dataclasses.replace(feel, times=min(feel.times, left))
+        outcomes |= {said.outcome for said in hand.play(part)}
+        left -= part.times
+    if gate.on_request:
+        assert hand.model.runs <= hand.asked
+    return outcomes
+
+
+def test_a_hand_that_closes_and_keeps_still_gets_a_verdict() -> None:
+    outcomes = [said.outcome for said in tared(limits()).play(Feel(times=40))]
+    # Two or three sweeps until the median touches, 80 ms to know the motion, 80 ms of stillness.
+    first = outcomes.index(Outcome.STABLE)
+    assert first in {1 + 8 + 8, 2 + 8 + 8}
+    assert set(outcomes[first:]) == {Outcome.STABLE}
+
+
+class Watched(TactileImager):
+    """Keeps what was judged last."""
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
+        self.counts = counts.copy()
+        return super().build(counts, out)
+
+
+def test_electrodes_that_come_back_are_not_judged_by_an_earlier_grasp() -> None:
+    hand = tared(limits())
+    hand.model.inputs = watched = Watched(3)
+    assert hand.play(Feel("grasp", times=40))[-1].outcome is Outcome.STABLE
+    lost = (Flaw(0, 0, 8, int(ElectrodeFault.MISSING), 0),)
+    hand.play(Feel("rest", times=40, flaws=lost))
+    closing = Feel("other", times=40, flaws=lost)
+    number = [said.judged for said in copy.deepcopy(hand).play(closing)].index(True)
+    hand.play(dataclasses.replace(closing, times=number))
+    watched.counts = POSES["other"]
+    [said] = hand.play(Feel("other"))
+    assert "ff_1" not in said.repaired
+    assert np.abs(watched.counts - POSES["other"]).max() <= NOISE
+
+
+def test_joints_that_come_back_moving_are_not_taken_for_still() -> None:
+    hand = tared(limits())
+    assert hand.play(Feel(times=40))[-1].outcome is Outcome.STABLE
+    assert hand.play(Feel(times=50, joints="none"))[-1].outcome is Outcome.UNKNOWN
+    outcomes = {said.outcome for said in hand.play(Feel(times=8, joints="moving"))}
+    assert outcomes == {Outcome.UNKNOWN}
+
+
+def test_fingers_that_repeat_themselves_are_frozen_with_a_flagged_electrode_too() -> None:
+    hand = tared(limits())
+    assert hand.play(Feel(times=40))[-1].outcome is Outcome.STABLE
+    missing = tuple(Flaw(finger, 0, 1, int(ElectrodeFault.MISSING), 0) for finger in range(3))
+    _, *repeated = hand.play(Feel(times=10, repeats=True, flaws=missing))
+    assert {said.outcome for said in repeated} == {Outcome.UNKNOWN}

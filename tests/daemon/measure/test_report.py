@@ -1,0 +1,172 @@
+"""`graspd report error-vs-time`: every model is in it, and the page needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("matplotlib")
+
+from daemon.measure.error_vs_time import page
+from daemon.measure.error_vs_time.peers import loop_image
+from daemon.measure.error_vs_time.report import _counts, _errors
+from daemon.measure.error_vs_time.timing import measure
+from models import zoo
+from models.contract import ModelError
+from models.runtime import TactileModel
+from models.tactile_image import TactileImager
+from tests.daemon.fakes import FakeModel, contract
+from tests.daemon.processes import graspd
+from tests.models.training.evaluation_samples import sessions
+
+
+@pytest.fixture(scope="module")
+def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("report")
+    result = graspd("report", "error-vs-time", "--data", bts3_dir, "--out", out, "--quick")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == (out / "error-vs-time.md").read_text()
+    return out
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "error-vs-time.json").read_text())
+    return content
+
+
+def test_every_model_of_the_zoo_is_in_the_report_with_error_time_and_exactness(
+    found: dict[str, Any],
+) -> None:
+    rows = {row["name"]: row for row in found["rows"]}
+    assert set(zoo.names()) <= set(rows)
+    for name in zoo.names():
+        row = rows[name]
+        cv = next(m for m in zoo.card(name)["contract"]["measured"] if m["protocol"] == "cv")
+        assert row["error"]["cv"]["f1"] == cv["f1_mean"]
+        assert row["error"]["cv"]["low"] < cv["f1_mean"] < row["error"]["cv"]["high"]
+        assert row["numerical"]["largest"] < 1e-5
+        assert row["numerical"]["flipped"] == 0
+        assert row["bytes"] == zoo.find(name).stat().st_size
+        assert 0 < row["time"]["hot_p50_us"] <= row["time"]["hot_p99_us"]
+        assert row["start_ms"] > 0
+
+
+def test_peers_floor_and_stages_are_there(found: dict[str, Any]) -> None:
+    kinds = {row["kind"] for row in found["rows"]}
+    assert kinds == {"model", "peer", "floor"}
+    assert len(found["stages"]["us"]) == 8
+    assert found["bandwidth_bytes_per_s"] > 1e8
+
+
+def test_the_page_needs_nothing_from_elsewhere(folder: Path, found: dict[str, Any]) -> None:
+    text = (folder / "error-vs-time.html").read_text()
+    links = re.findall(r"""(?:src|href)\s*=\s*["']([^"'#][^"']*)""", text)
+    assert links == []
+    assert "<script" not in text
+    for row in found["rows"]:
+        assert row["name"].split(",")[0] in text
+    picture = (folder / "error-vs-time.svg").read_text()
+    assert all(re.search(rf"<!-- +[0-9]+ +{name} -->", picture) for name in zoo.names())
+
+
+def test_an_interval_is_nadeaus_and_bengios() -> None:
+    figures = {
+        "folds": 10,
+        "train_grasps": 900.0,
+        "test_grasps": 100.0,
+        "spreads": {
+            "f1": {"mean": 0.9, "std": 0.01},
+            **{name: {"mean": 0.5} for name in ("accuracy", "brier", "ece")},
+        },
+    }
+    found = _errors(figures)
+    # By hand: 2.262 (t, 9 degrees of freedom, 95 %) * 0.01 * sqrt(1/10 + 1/9) = 0.010394
+    assert found["high"] - found["f1"] == pytest.approx(0.010394, abs=2e-6)
+    assert found["f1"] - found["low"] == pytest.approx(0.010394, abs=2e-6)
+
+
+def test_the_published_loops_make_the_same_image() -> None:
+    counts = np.random.default_rng(0).integers(500, 3500, (3, 24), dtype=np.uint16)
+    expected, _ = TactileImager(3).build_batch(counts[np.newaxis])
+    np.testing.assert_allclose(loop_image(counts), expected[0], atol=1e-5)
+
+
+def test_candidates_take_turns_and_each_reading_is_timed() -> None:
+    order: list[str] = []
+    steps = {name: lambda _index, name=name: order.append(name) for name in ("a", "b")}
+    times = measure(steps, readings=20, paced=3)
+    assert len(times["a"].hot_us) == 20
+    assert len(times["a"].paced_us) == 3
+    assert order[-6:] == ["a", "b"] * 3
+    assert order[40:44] == ["a", "a", "b", "b"], "after the warm-up: two of each per round"
+
+
+def row(
+    name: str, f1: float, paced_us: float, fingers: tuple[str, ...] = ("ff", "mf", "th")
+) -> dict[str, Any]:
+    error = {"f1": f1, "low": f1 - 0.01, "high": f1 + 0.01}
+    return {
+        "name": name,
+        "kind": "model",
+        "fingers": fingers,
+        "sha256": f"digest of {name}",
+        "error": {"cv": error, "objects": error},
+        "time": {"paced_p50_us": paced_us},
+    }
+
+
+def test_the_advice_names_the_fastest_within_the_interval_of_cnn1() -> None:
+    rows = [row("cnn1", 0.94, 800.0), row("good", 0.935, 100.0), row("bad", 0.92, 10.0)]
+    texts = list(page.advice(rows))
+    assert texts[0] == "For objects that are known, no other day: `cnn1`, F1 94.0 %."
+    assert "`good`, 8.0 times as fast as `cnn1`" in texts[-1]
+
+
+HANDS = [
+    row("cnn1", 0.94, 800.0),
+    row("quick", 0.92, 200.0),
+    row("quick-ff", 0.93, 100.0, ("ff",)),
+    row("quick-ff-th", 0.95, 160.0, ("ff", "th")),
+    row("slow-ff-th", 0.96, 400.0, ("ff", "th")),
+]
+
+
+def test_models_stand_among_those_of_the_same_fingers() -> None:
+    found = page.standing({"machine": {}, "rows": HANDS})["models"]
+    ranks = {of["name"]: (of["f1_rank"], of["models"], of["speed"]) for of in found.values()}
+    assert ranks == {
+        "cnn1": (1, 2, 1.0),
+        "quick": (2, 2, 4.0),
+        "quick-ff": (1, 1, 8.0),
+        "quick-ff-th": (2, 2, 5.0),
+        "slow-ff-th": (1, 2, 2.0),
+    }
+
+
+def test_advice_for_a_hand_is_of_models_of_its_own_fingers() -> None:
+    texts = list(page.advice(HANDS))
+    assert texts[0].endswith("`cnn1`, F1 94.0 %.")
+    assert "For ff and th alone, known objects: `slow-ff-th`, F1 96.0 %." in texts
+    assert "For ff alone, known objects: `quick-ff`, F1 93.0 %." in texts
+    assert "interval of `cnn1`: `cnn1`, 1.0 times" in texts[-1]
+
+
+def test_a_model_of_fingers_that_were_never_recorded_is_refused() -> None:
+    model = FakeModel()
+    model.contract = contract(("ff", "lf"))
+    with pytest.raises(ModelError, match="have not the fingers ff, lf"):
+        _counts(cast(TactileModel, model), sessions(20))
+
+
+def test_wrong_folders_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    result = graspd("report", "error-vs-time", "--data", tmp_path)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    assert len(result.stderr.splitlines()) == 1

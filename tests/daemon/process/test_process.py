@@ -1,0 +1,253 @@
+"""What a process of graspd must survive: signals at any time, and streams of any kind."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from daemon.process.text import printable
+from drivers.recordings.csv_player import DEMO_TABLE
+from tests.daemon.processes import GRASPD, TIMEOUT_S, graspd, start, wait_for
+
+ROOT = Path(__file__).parents[3]
+DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
+
+
+def python(code: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run code, then graspd, in one process."""
+    code += "\nimport sys\nfrom daemon.__main__ import main\nsys.exit(main())\n"
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        check=False,
+        cwd=ROOT,
+    )
+
+
+AT_IMPORT = """
+import os, signal, sys
+class Finder:
+    def find_spec(name, path=None, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Finder)
+"""
+"""Ctrl-C in the moment in which a module is imported."""
+
+
+@pytest.mark.parametrize(
+    "module", ["daemon.cli", "daemon.commands.replay", "pydantic", "numpy", "onnxruntime", "zmq"]
+)
+def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
+    result = python(AT_IMPORT.format(module=module), "replay")
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "")
+
+
+def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    )
+    result = python(AT_IMPORT.format(module="drivers.recordings.faults"), "run", scene)
+    assert result.returncode == 0, result.stderr
+    assert "Traceback" not in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+WHILE_LEAVING = """
+import os, signal
+from daemon.process.signals import StopSignal
+leave = StopSignal.__exit__
+def leave_and_interrupt(self, *error):
+    os.kill(os.getpid(), signal.SIGINT)
+    leave(self, *error)
+    os.kill(os.getpid(), signal.SIGINT)
+StopSignal.__exit__ = leave_and_interrupt
+"""
+AT_THE_VERY_END = """
+import atexit, os, signal
+atexit.register(os.kill, os.getpid(), signal.SIGINT)
+"""
+
+
+@pytest.mark.parametrize(
+    ("code", "expected"), [(WHILE_LEAVING, 130), (AT_THE_VERY_END, 0)], ids=["leaving", "end"]
+)
+def test_ctrl_c_while_leaving_ends_without_a_traceback(code: str, expected: int) -> None:
+    result = python(code, "replay")
+    assert (result.returncode, result.stderr) == (expected, "")
+
+
+def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/graspd"
+    with start("replay", "--loop", "--speed", 1, "--json", "--publish", endpoint) as process:
+        wait_for(tmp_path / "graspd")
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode in (130, -signal.SIGINT)  # both are 130 to a shell
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_descriptor_gets_a_number_that_the_loop_cannot_wait_for(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    )
+    with start("run", scene, before=("prlimit", "--nofile=4096")) as process:
+        wait_for(tmp_path / "graspd")
+        limits = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
+        process.terminate()
+    assert limits == (1024, 4096)  # FD_SETSIZE of select(2)
+
+
+@pytest.mark.parametrize("package", ["torch", "rich"])
+def test_a_missing_extra_is_asked_for_from_the_source_and_from_no_index(package: str) -> None:
+    if package == "torch":  # which is looked for after it
+        pytest.importorskip("sklearn", reason="the train extra is not installed")
+    code = (
+        "import sys, importlib.abc\n"
+        "class Absent(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        f"        if name.split('.')[0] == {package!r}:\n"
+        "            raise ModuleNotFoundError(f'No module named {name!r}', name=name)\n"
+        "sys.meta_path.insert(0, Absent())"
+    )
+    result = python(code, "train", "cnn1", "--data", "absent")
+    assert result.returncode == 2
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"graspd: train needs the package '{package}'")
+    assert "pip install '.[train]'" in line
+    assert "graspd[" not in line
+
+
+def redirected(redirection: str, *arguments: object, **environment: str) -> tuple[int, str, str]:
+    """Exit code, output and errors of a command run by a shell."""
+    result = subprocess.run(
+        ["sh", "-c", f'exec "$@" {redirection}', "sh", *GRASPD, *map(str, arguments)],
+        capture_output=True,
+        timeout=TIMEOUT_S,
+        check=False,
+        env=os.environ | environment,
+        cwd=ROOT,
+    )
+    return result.returncode, result.stdout.decode("latin-1"), result.stderr.decode()
+
+
+WRITERS = [
+    ["replay"],
+    ["replay", "--json"],
+    ["replay", "--speed", "100"],
+    ["check", DEMO_SCENE],
+    ["check", DEMO_SCENE, "--json"],
+    ["run", "--print", DEMO_SCENE],
+    ["doctor", DEMO_SCENE, "--listen", "0.1"],
+    ["schema"],
+    ["--help"],
+    ["--version"],
+]
+
+
+@pytest.mark.parametrize("arguments", WRITERS, ids=lambda arguments: " ".join(map(str, arguments)))
+@pytest.mark.parametrize(
+    ("redirection", "why"),
+    [(">/dev/full", "No space left on device"), (">&-", "Bad file descriptor")],
+)
+def test_an_output_that_cannot_be_written_is_one_line(
+    tmp_path: Path, arguments: list[object], redirection: str, why: str
+) -> None:
+    if DEMO_SCENE in arguments:
+        scene = tmp_path / "scene.toml"
+        scene.write_text(
+            f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
+            f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+        )
+        arguments = [scene if word == DEMO_SCENE else word for word in arguments]
+    code, _, errors = redirected(redirection, *arguments)
+    told = [line for line in errors.splitlines() if not line.startswith("graspd: INFO: ")]
+    assert told == [f"graspd: cannot write to standard output: {why}"]
+    assert code == 1
+
+
+def test_a_daemon_needs_no_output(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    )
+    assert redirected(">&- 2>&-", "run", scene) == (0, "", "")
+    assert redirected("<&- >&- 2>&-", "run", scene) == (0, "", "")
+
+
+def test_closed_errors_do_not_change_the_exit_code() -> None:
+    assert redirected("2>&-", "run", "absent.toml") == (2, "", "")
+
+
+def test_only_an_output_that_nobody_reads_may_break_quietly() -> None:
+    code = """
+import daemon.commands.schema
+def run(args):
+    raise BrokenPipeError(32, "the serial line broke")
+daemon.commands.schema.run = run
+"""
+    result = python(code, "schema")
+    assert result.returncode == 1
+    assert "the serial line broke" in result.stderr
+
+
+def recording_of(folder: Path, name: str) -> Path:
+    """The demo recording, its first object named like that."""
+    header, first, *rest = DEMO_TABLE.read_text().splitlines()
+    recording = folder / "grasps.csv"
+    text = "\n".join([header, name + first[first.index(",") :], *rest]) + "\n"
+    recording.write_text(text, encoding="utf-8", newline="")
+    return recording
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_an_object_may_have_any_name_on_any_terminal(tmp_path: Path, encoding: str) -> None:
+    recording = recording_of(tmp_path, "größe 漢")
+    code, output, errors = redirected("", "replay", recording, PYTHONIOENCODING=encoding)
+    assert (code, errors) == (0, "")
+    shown = "größe 漢".encode(encoding, "backslashreplace").decode("latin-1")
+    assert f"  {shown} (was " in output.splitlines()[0]
+
+
+def test_the_name_of_an_object_does_not_move_the_cursor(tmp_path: Path) -> None:
+    result = graspd("replay", recording_of(tmp_path, "\x1b[2J\x07mug\x9b" + "x" * 200))
+    first = result.stdout.splitlines()[0]
+    assert "\\x1b[2J\\x07mug\\x9bxxx" in first
+    assert first.isprintable()
+    assert "x" * 100 not in first
+
+
+def test_a_path_does_not_move_the_cursor_either(tmp_path: Path) -> None:
+    result = graspd("run", tmp_path / "\x1b[2J.toml")
+    assert result.returncode == 2
+    assert "/\\x1b[2J.toml: cannot read the scene" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("größe", "größe"),
+        ("a\nb", r"a\nb"),
+        ("\x1b[0m", r"\x1b[0m"),
+        ("\u202egum", r"\u202egum"),
+        ("\udcff", r"\udcff"),
+        ("\U000e0001", r"\U000e0001"),
+    ],
+)
+def test_what_could_hide_is_escaped(text: str, shown: str) -> None:
+    assert printable(text) == shown

@@ -1,0 +1,32 @@
+"""What is lost in the middle of a grasp is `unknown` at the subscriber, as soon as is promised."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.bench.outages import Bench, outages
+
+PROMISED_S = {
+    "sensor": 0.02,
+    "link": 0.1,
+    "joints": 0.15,
+    "joints, and judged without them": 1.0,
+    "daemon": 0.1,
+}
+"""README: two periods; the age limit; late joints; lost joints; silence. Measured by
+`python -m tests.bench.outages`."""
+STALL_S = 1.0
+"""A machine that does other things too may hold a process up for so long."""
+
+
+def test_every_outage_is_unknown_in_time_and_says_why(tmp_path: Path) -> None:
+    with Bench(tmp_path) as bench:
+        found = {name: (took_s, reasons) for name, took_s, reasons in outages(bench)}
+    assert found.keys() == PROMISED_S.keys()
+    late = {
+        name: took_s for name, (took_s, _) in found.items() if took_s > PROMISED_S[name] + STALL_S
+    }
+    assert not late
+    assert "sensor-missing" in found["sensor"][1]
+    assert "stale" in found["link"][1]
+    assert "joints-late" in found["joints"][1]

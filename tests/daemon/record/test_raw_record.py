@@ -1,0 +1,135 @@
+"""What came over a link is kept with its times; the real decoder gives the same verdicts again."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import can
+
+from daemon.assembly.recorder import IGNORED_FIELDS
+from daemon.record.mcap import header_of
+from drivers.base import TactileReading
+from drivers.recordings.can_capture import CanCapture, frames_of
+from drivers.recordings.capture_player import CaptureReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING
+from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.record.recorded import messages
+
+GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
+LINKS = {
+    "spi": 'driver = "spi"\nport = "{folder}/bridge"',
+    "can": 'driver = "can"\ninterface = "udp_multicast"\nchannel = "{group}"\n'
+    'sequence = "electrodes"\narbitration_id = 256',
+}
+TWINS = {
+    "spi": ("--path", "{folder}/bridge"),
+    "can": ("--channel", "{group}", "--sequence", "electrodes"),
+}
+FAULTS = ("--drop", "0.0005", "--bit-flip", "0.0005", "--seed", "5")
+
+
+def filled(text: str, folder: Path) -> str:
+    return text.format(folder=folder, group=GROUP)
+
+
+def scene(kind: str, folder: Path) -> Path:
+    path = folder / "scene.toml"
+    path.write_text(
+        f"[tactile]\n{filled(LINKS[kind], folder)}\n"
+        f'[model]\nname = "cnn1"\n[session]\nkeep = false\n'
+        f'[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        '[record]\ndirectory = "record"\nraw = true\n'
+    )
+    return path
+
+
+def record(kind: str, folder: Path) -> tuple[Path, Path]:
+    """The recording of a twin that plays the demo grasps under faults, and the capture."""
+    options = [filled(option, folder) for option in TWINS[kind]]
+    path = scene(kind, folder)
+    with start("run", path) as daemon:
+        wait_for(folder / "graspd")
+        with start("twin", kind, *options, "--recording", DEMO_RECORDING, *FAULTS) as twin:
+            try:
+                twin.wait(9.0)  # three grasps, when it is not busy
+            except subprocess.TimeoutExpired:
+                twin.send_signal(signal.SIGTERM)
+            twin.communicate(timeout=TIMEOUT_S)
+        daemon.terminate()
+        _, said = daemon.communicate(timeout=TIMEOUT_S)
+    assert daemon.returncode == 0, said
+    (recording,) = (folder / "record").glob("*.mcap")
+    (capture,) = set((folder / "record").iterdir()) - {recording}
+    return recording, capture
+
+
+def compared(verdict: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
+
+
+def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given(
+    tmp_path: Path,
+) -> None:
+    recording, capture = record("spi", tmp_path)
+    assert capture.suffix == ".serial"
+    kept = messages(recording)
+    times = {content["t_mono_ns"] for what, content in kept if what == "tactile"}
+    before: dict[int, dict[str, Any]] = {}
+    for what, content in kept:
+        if what == "verdict" and content["t_mono_ns"] in times:
+            before.setdefault(content["t_mono_ns"], content)
+    result = graspd("replay", "--json", capture, "--scene", tmp_path / "scene.toml")
+    assert result.returncode == 0, result.stderr
+    now = [json.loads(line) for line in result.stdout.splitlines()]
+    assert len(before) > 400
+    # Ages are those of the file's own times: what a busy machine was late with is not there.
+    prompt = [
+        (compared(new), compared(old))
+        for new, old in zip(now, before.values(), strict=True)
+        if "stale" not in new["reasons"] + old["reasons"]
+    ]
+    assert len(prompt) > 0.9 * len(before)
+    assert all(new == old for new, old in prompt)
+
+
+def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_were(
+    tmp_path: Path,
+) -> None:
+    recording, capture = record("can", tmp_path)
+    offset_ns = header_of(recording).wall_minus_monotonic_ns
+    board = CanCapture(("ff", "mf", "th"), arbitration_id=0x100, sequence="electrodes")
+    decoded: dict[int, TactileReading] = {}
+    readings = 0
+    with CaptureReplayDriver([capture], frames_of, board) as driver:
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                assert isinstance(reading, TactileReading)
+                decoded[reading.made_ns // 1000] = reading
+                readings += 1
+    known = [content for what, content in messages(recording) if what == "tactile"]
+    assert len(known) > 400
+    same = 0
+    for content in known:
+        found = decoded.get((content["t_mono_ns"] + offset_ns) // 1000)
+        if found is not None and found.counts.tolist() == content["counts"]:
+            same += found.faults.tolist() == content["faults"]
+    # A machine that is too busy to look at the bus for 100 ms takes it for silent, and cuts sweeps.
+    assert same > 0.95 * len(known)
+    result = graspd("replay", "--json", capture, "--scene", tmp_path / "scene.toml")
+    assert result.returncode == 0, result.stderr
+    assert len(result.stdout.splitlines()) == readings
+
+
+def test_candump_text_is_what_other_programs_read(tmp_path: Path) -> None:
+    _, capture = record("can", tmp_path)
+    assert capture.name.endswith(".can.log")
+    with can.CanutilsLogReader(capture) as reader:
+        frames = list(reader)
+    assert len(frames) > 5000
+    assert {frame.arbitration_id for frame in frames} == {0x100}
+    stamps = [frame.timestamp for frame in frames]
+    assert 5.0 < stamps[-1] - stamps[0] < 20.0

@@ -1,0 +1,213 @@
+"""What is recorded can be judged again, bit for bit, and become a grasp table to learn from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from mcap.reader import make_reader
+
+from daemon.assembly.recorder import IGNORED_FIELDS
+from daemon.publish.messages import encode
+from models.training.data.datasets import read_table
+from tests.daemon.processes import graspd
+from tests.daemon.record.recorded import Lab, messages, work
+
+GRASPS = 4
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """Twelve seconds in a lab, judged by the network that knows no session."""
+    return work(tmp_path_factory.mktemp("lab"), GRASPS, '[model]\nname = "cnn1"\n')
+
+
+def compared(verdict: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
+
+
+def of_kind(path: Path, kind: str) -> list[dict[str, Any]]:
+    return [content for which, content in messages(path) if which == kind]
+
+
+def of_readings(path: Path) -> list[dict[str, Any]]:
+    """The verdicts without those on silence, which repeat the time of a reading."""
+    found: dict[int, dict[str, Any]] = {}
+    for verdict in of_kind(path, "verdict"):
+        found.setdefault(verdict["t_mono_ns"], verdict)
+    times = {reading["t_mono_ns"] for reading in of_kind(path, "tactile")}
+    return [verdict for t_ns, verdict in found.items() if t_ns in times]
+
+
+def again(*arguments: object) -> list[dict[str, Any]]:
+    """The verdicts of `graspd replay`."""
+    result = graspd("replay", "--json", *arguments)
+    assert result.returncode == 0, result.stderr
+    return [json.loads(line) for line in result.stdout.splitlines()]
+
+
+def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None:
+    (path,) = lab.files
+    kinds = [kind for kind, _ in messages(path)]
+    assert set(kinds) == {"tactile", "joints", "verdict", "gate", "outcome", "status"}
+    assert kinds.count("tactile") == kinds.count("joints") == len(of_readings(path)) > 0
+    recorded = {content["seq"]: content for content in of_kind(path, "verdict")}
+    published = {verdict.seq: json.loads(encode(verdict)) for verdict in lab.verdicts}
+    for seq, verdict in published.items():
+        assert recorded[seq] == verdict
+    last = of_kind(path, "status")[-1]
+    assert last["drivers"]["record"]["dropped"] == last["drivers"]["record"]["lost"] == 0
+    assert last["drivers"]["ask"]["outcomes"] == GRASPS - 1
+
+
+def test_the_library_reads_it_and_every_message_is_as_its_schema_says(lab: Lab) -> None:
+    with lab.files[0].open("rb") as stream:
+        seen: dict[str, int] = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            assert schema.encoding == "jsonschema"
+            assert channel.message_encoding == "json"
+            seen[channel.topic] = seen.get(channel.topic, 0) + 1
+            if seen[channel.topic] < 20:
+                jsonschema.validate(json.loads(message.data), json.loads(schema.data))
+    assert set(seen) >= {"tactile.right", "joints.right", "verdict.right", "outcome.right"}
+
+
+def test_a_replay_gives_the_same_verdicts_bit_for_bit(lab: Lab) -> None:
+    (path,) = lab.files
+    before = of_readings(path)
+    now = again(path)
+    assert sum(verdict["judged"] for verdict in before) >= GRASPS
+    assert [compared(v) for v in now] == [compared(v) for v in before]
+
+
+def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:
+    now = again(lab.files[0], "--model", "mlp")
+    assert {verdict["model"] for verdict in now} == {"mlp"}
+    assert len(now) == len(of_kind(lab.files[0], "tactile"))
+
+
+@pytest.fixture(scope="module")
+def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
+    """A session model at work, and files that end after three seconds, whatever is held then."""
+    options = "rotate_minutes = 0.05\nflush_ms = 200"
+    return work(tmp_path_factory.mktemp("rotated"), GRASPS, record=options)
+
+
+def test_a_session_goes_on_in_the_replay_where_it_was(rotated: Lab) -> None:
+    assert len(rotated.files) > 2
+    before = [verdict for path in rotated.files for verdict in of_readings(path)]
+    now = again(*rotated.files)
+    assert {verdict["model"] for verdict in now} == {"small-session"}
+    assert [compared(v) for v in now] == [compared(v) for v in before]
+
+
+def test_each_file_of_a_run_is_judged_as_then_without_those_before_it(rotated: Lab) -> None:
+    for path in rotated.files:
+        now = again(path)
+        assert [compared(v) for v in now] == [compared(v) for v in of_readings(path)]
+
+
+def test_files_that_do_not_follow_each_other_are_named(rotated: Lab) -> None:
+    first, _, third = rotated.files[:3]
+    result = graspd("replay", "--json", first, third)
+    assert result.returncode == 0
+    assert f"{third}: does not go on where the file before it ends" in result.stderr
+    assert "does not go on" not in graspd("replay", "--json", *rotated.files[:3]).stderr
+
+
+def test_questions_are_in_the_recording_and_are_asked_again(tmp_path: Path) -> None:
+    import zmq
+
+    from tests.daemon.processes import start, wait_for
+    from tests.daemon.record.recorded import scene
+
+    with (
+        start("run", scene(tmp_path, more='[gate]\nmode = "request"\n')) as daemon,
+        zmq.Context() as context,
+        context.socket(zmq.REQ) as asker,
+    ):
+        wait_for(tmp_path / "ask")
+        asker.linger = 0
+        asker.connect(f"ipc://{tmp_path}/ask")
+        judged = 0
+        for _ in range(40):
+            asker.send(b"judge")
+            assert asker.poll(5000)
+            judged += json.loads(asker.recv())["judged"]
+            if judged == 2:
+                break
+        daemon.terminate()
+        daemon.communicate(timeout=20)
+    (path,) = (tmp_path / "record").glob("*.mcap")
+    before = of_readings(path)
+    assert sum(verdict["judged"] for verdict in before) >= 2
+    assert [compared(v) for v in again(path)] == [compared(v) for v in before]
+
+
+def test_grasps_with_an_outcome_become_a_table_that_training_takes(
+    lab: Lab, tmp_path: Path
+) -> None:
+    table = tmp_path / "lab.csv"
+    result = graspd("export-grasps", *lab.files, "--out", table, "--object", "mug")
+    assert result.returncode == 0, result.stderr
+    assert "1 left out without an outcome" in result.stdout
+    grasps = read_table(table)
+    slipped = [outcome == "slip" for outcome in lab.told.values()]
+    assert grasps.slipped.tolist() == slipped
+    assert set(grasps.objects) == {"mug"}
+
+
+def test_the_counts_in_the_table_give_the_very_probability_of_the_verdict(
+    lab: Lab, tmp_path: Path
+) -> None:
+    table = tmp_path / "lab.csv"
+    assert graspd("export-grasps", *lab.files, "--out", table).returncode == 0
+    judged: dict[int, float] = {}
+    wanted = []
+    for kind, content in messages(lab.files[0]):
+        if kind == "verdict" and content["judged"]:
+            judged[content["grasp"]] = content["p_slip"]
+        if kind == "outcome":
+            wanted.append(judged[content["grasp"]])  # what may be judged later is another grip
+    found = [v["p_slip"] for v in again(table, "--model", "cnn1", "--gate", "every")]
+    assert found == wanted
+
+
+@pytest.mark.parametrize(
+    ("spoil", "problem"),
+    [
+        (lambda _: b"", "is empty"),
+        (lambda _: b"\x89MCAP0\r\n" + bytes(50), "no|not"),
+        (lambda _: b"object,slipped\n" * 100, "no MCAP"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_refused(
+    tmp_path: Path, spoil: Callable[[bytes], bytes], problem: str
+) -> None:
+    path = tmp_path / "wrong.mcap"
+    path.write_bytes(spoil(b""))
+    for command in (("replay", path), ("export-grasps", path, "--out", tmp_path / "t.csv")):
+        result = graspd(*command)
+        assert result.returncode == 2
+        assert "Traceback" not in result.stderr
+        assert "wrong.mcap" in result.stderr
+
+
+def test_a_file_that_was_cut_anywhere_is_played_as_far_as_it_goes(lab: Lab, tmp_path: Path) -> None:
+    whole = lab.files[0].read_bytes()
+    before = of_readings(lab.files[0])
+    for part in (0.3, 0.61803, 0.99):
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(whole[: int(len(whole) * part)])
+        now = of_readings(path)
+        assert now == before[: len(now)]
+        # A second between two flushes, at 100 readings/s; the rest is how dense a file is.
+        assert len(now) > part * len(before) - 250
+    played = [compared(verdict) for verdict in again(path)]
+    assert played[: len(now)] == [compared(verdict) for verdict in before[: len(now)]]
+    assert len(played) - len(now) in {0, 1}  # cut between a reading and its verdict

@@ -1,0 +1,242 @@
+"""Each file says what was known where it begins, and what changed that from outside is in it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.assembly.playback import Playback
+from daemon.assembly.recorder import build_recorder
+from daemon.judge.pipeline import Judgement
+from daemon.publish.outbox import Reporter
+from daemon.record import mcap as mcap_recording
+from daemon.record.files import MessageFile, Shelf
+from daemon.record.recorder import Recorder
+from daemon.scene import Record
+from drivers.base import TactileReading
+from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
+from tests.daemon.record.recorded import messages
+
+BOOT = "0123456789abcdef" * 2
+STATUS, VERDICT = b"status.right", b"verdict.right"
+START_NS = 10**12
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+class Loop:
+    """Counts what it sends, and knows how much that was."""
+
+    def __init__(self) -> None:
+        self.sent = 0
+
+    def state(self) -> Callable[[], Mapping[str, str]]:
+        known = str(self.sent)
+        return lambda: {"known": known}
+
+    def send(self, recorder: Recorder, topic: bytes) -> None:
+        payload = json.dumps({"number": self.sent}).encode()
+        self.sent += 1
+        recorder.send(topic, payload)
+
+
+def make(folder: Path, loop: Loop, **options: float) -> Recorder:
+    shelf = Shelf(folder / "record", "right", BOOT, 100, 10**9)
+    header = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT}
+    wanted = Record(**{"flush_ms": 100.0, **options})  # type: ignore[arg-type]
+    return Recorder(shelf, wanted, header, take_state=loop.state)
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted((folder / "record").glob("*.mcap"))
+
+
+def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_path: Path) -> None:
+    loop = Loop()
+    loop.sent = 7
+    recorder = make(tmp_path, loop, rotate_minutes=0.01)
+    while recorder.counters()["files"] < 4:
+        for _ in range(20):
+            loop.send(recorder, VERDICT)
+        loop.send(recorder, STATUS)
+        time.sleep(0.02)
+    loop.send(recorder, STATUS)
+    recorder.close()
+    number = 7
+    for path in files(tmp_path):
+        assert mcap_recording.header_of(path).texts["known"] == str(number)
+        found = messages(path)
+        assert [content["number"] for _, content in found] == [*range(number, number + len(found))]
+        assert found[-1][0] == "status"
+        number += len(found)
+    assert number == loop.sent
+    assert recorder.counters()["recorded"] == loop.sent - 7
+
+
+def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
+    loop = Loop()
+    recorder = make(tmp_path, loop, rotate_minutes=0.01)
+    for _ in range(90):
+        loop.send(recorder, VERDICT)
+        time.sleep(0.01)
+    assert recorder.counters()["files"] == 1
+    loop.send(recorder, STATUS)
+    wait_until(lambda: recorder.counters()["files"] == 2)
+    recorder.close()
+    assert mcap_recording.header_of(files(tmp_path)[1]).texts["known"] == str(loop.sent)
+
+
+def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_then(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.record.recorder.RETRY_NS", 100_000_000)
+    blocked = tmp_path / "record"
+    blocked.write_text("a file where the folder should be")
+    loop = Loop()
+    recorder = make(tmp_path, loop)
+    wait_until(lambda: recorder.counters()["failures"] == 1)
+    blocked.unlink()
+    while not recorder.counters()["writing"]:
+        loop.send(recorder, VERDICT)
+        loop.send(recorder, STATUS)
+        time.sleep(0.01)
+    loop.send(recorder, VERDICT)
+    recorder.close()
+    (path,) = files(tmp_path)
+    known = int(mcap_recording.header_of(path).texts["known"])
+    assert [content["number"] for _, content in messages(path)] == [*range(known, loop.sent)]
+    assert recorder.counters()["lost"] == known > 0
+
+
+class Daemon:
+    """Judges sweeps of the demo recording, recorded: the parts that matter to that, and no time."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        path = folder / "scene.toml"
+        path.write_text(
+            '[tactile]\ndriver = "spi"\nport = "/dev/null"\n[session]\nkeep = false\n'
+            '[record]\ndirectory = "record"\nrotate_minutes = 0.05\nflush_ms = 100\n'
+        )
+        wanted = scene.load(path)
+        model = assembly.load_model(wanted)
+        self._now_ns = START_NS
+        monkeypatch.setattr("daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock))
+        self.pipeline = assembly.build_pipeline(wanted, model, self._clock)
+        recorder = build_recorder(wanted, model, self.pipeline, BOOT)
+        assert recorder is not None
+        self.recorder = recorder
+        self._reporter = Reporter("right", wanted.hand.fingers, "any", BOOT, Output(recorder))
+
+    def _clock(self) -> int:
+        return self._now_ns
+
+    def judge(self, reading: TactileReading) -> Judgement:
+        """And every second a status, if the thread has had time to look."""
+        self._now_ns = reading.t_ns
+        self._reporter.tactile(reading, None)
+        judgement = self.pipeline.judge(reading)
+        self.pipeline.learn()
+        if reading.seq % 100 == 99:
+            time.sleep(0.05)
+            self.recorder.send(STATUS, b"{}")
+        return judgement
+
+
+class Output:
+    """Everything is wanted."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.send = recorder.send
+
+    def wanted(self, topic: bytes) -> bool:
+        return bool(topic)
+
+
+def sweeps() -> list[TactileReading]:
+    """Those of the demo recording, as if they came live, with the pace of it."""
+    found = []
+    with ReplayDriver([DEMO_RECORDING], pace=Pace.FAST, clock=lambda: 0) as driver:
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                if isinstance(reading, TactileReading):
+                    t_ns = START_NS + reading.made_ns
+                    found.append(replace(reading, t_ns=t_ns, recorded_ns=None, annotation=None))
+    return found
+
+
+def again(*paths: Path) -> list[Judgement]:
+    """What is judged in a replay, at the times of then."""
+    playback = Playback(paths)
+    wanted = playback.scene({}, {}, None)
+    driver = playback.build_driver(wanted, None)
+    pipeline = playback.pipeline(wanted, assembly.load_model(wanted), learns=True)
+    playback.restore(pipeline)
+    found = []
+    with driver:
+        while not driver.exhausted:
+            for reading in driver.read_ready():
+                assert isinstance(reading, TactileReading)
+                found.append(replace(pipeline.judge(reading), t_ns=reading.made_ns))
+                pipeline.learn()
+    return found
+
+
+def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(tmp_path, monkeypatch)
+    expected = []
+    for reading in sweeps()[:2000]:
+        if reading.seq == 1250:
+            assert daemon.pipeline.session is not None
+            assert daemon.pipeline.session.grasps > 0
+            daemon.pipeline.sensors_exchanged()
+        expected.append(daemon.judge(reading))
+    daemon.recorder.close()
+    assert expected[1249].reasons != expected[1250].reasons
+    paths = files(tmp_path)
+    assert again(*paths) == expected
+    assert len(paths) > 3
+    for path in paths:
+        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
+        assert again(path) == [each for each in expected if each.t_ns in times]
+
+
+def rewritten(path: Path, texts: Mapping[str, str], to: Path) -> Path:
+    """A recording with other words in front."""
+    header = mcap_recording.header_of(path)
+    file = MessageFile(to, {**header.texts, **texts}, header.wall_minus_monotonic_ns)
+    for kind, content in messages(path):
+        file.write(f"{kind}.right".encode(), json.dumps(content).encode(), content["t_mono_ns"])
+    file.close()
+    return to
+
+
+@pytest.mark.parametrize("judge", ["", "AAAA", "no base 64"])
+def test_a_file_from_within_a_run_that_does_not_say_what_was_known_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, judge: str
+) -> None:
+    daemon = Daemon(tmp_path, monkeypatch)
+    for reading in sweeps()[:50]:
+        daemon.judge(reading)
+    daemon.recorder.close()
+    (path,) = files(tmp_path)
+    first = rewritten(path, {"judge": judge}, tmp_path / "first.mcap")
+    later = rewritten(path, {"judge": judge, "file": "3"}, tmp_path / "later.mcap")
+    assert len(again(first)) == 50
+    assert not caplog.records
+    assert len(again(later)) == 50
+    assert "later.mcap: begins in the middle of a run" in caplog.text

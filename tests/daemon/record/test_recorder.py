@@ -1,0 +1,384 @@
+"""The recorder keeps what it gets, in bounds; what the disk does is not the loop's affair."""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon import scene
+from daemon.record import recorder as recorder_module
+from daemon.record.files import MessageFile, Shelf, schemas
+from daemon.record.mcap import McapRecording
+from daemon.record.recorder import QUEUE_MAX, Recorder
+from daemon.scene import Record, SceneError
+from drivers.base import JointReading
+from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.recordings.csv_rows import open_recording
+from tests.bench import kill_recorder
+from tests.daemon.record.recorded import messages
+
+BOOT = "0123456789abcdef" * 2
+HEADER = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT}
+TOPIC = b"verdict.right"
+
+
+def shelf(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Shelf:
+    return Shelf(folder / "record", "right", BOOT, keep_files, keep_bytes)
+
+
+Make = Callable[..., Recorder]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Make]:
+    made: list[Recorder] = []
+
+    def new(where: Shelf | None = None, **options: Any) -> Recorder:  # noqa: ANN401
+        wanted = Record(**{"flush_ms": 100.0, **options})
+        made.append(Recorder(where or shelf(tmp_path), wanted, HEADER))
+        return made[-1]
+
+    yield new
+    for recorder in made:
+        recorder.close()
+
+
+def payload(number: int, size: int = 0) -> bytes:
+    # Digits that do not repeat: files would not grow by what compresses well.
+    noise = np.random.default_rng(number).bytes(size // 2).hex()
+    return json.dumps({"number": number, "noise": noise}).encode()
+
+
+def numbers(folder: Path) -> list[int]:
+    paths = sorted((folder / "record").glob("*.mcap"))
+    return [content["number"] for path in paths for _, content in messages(path)]
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: Make) -> None:
+    recorder = make()
+    for number in range(1000):
+        recorder.send(TOPIC, payload(number))
+    recorder.close()
+    assert numbers(tmp_path) == list(range(1000))
+    assert recorder.counters() == {
+        "recorded": 1000,
+        "dropped": 0,
+        "lost": 0,
+        "files": 1,
+        "removed": 0,
+        "failures": 0,
+        "writing": 0,
+    }
+
+
+def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
+    tmp_path: Path, make: Make
+) -> None:
+    recorder = make()
+    before_ns = time.monotonic_ns()
+    recorder.send(TOPIC, payload(0))
+    after_ns = time.monotonic_ns()
+    recorder.close()
+    (path,) = (tmp_path / "record").iterdir()
+    with open_recording(path) as stream:
+        recording = McapRecording(path, stream)
+        (message,) = recording
+    assert recording.header.fingers == ("ff",)
+    assert recording.header.boot_id == BOOT
+    assert before_ns <= message.at_ns <= after_ns
+    assert abs(recording.header.wall_minus_monotonic_ns + after_ns - time.time_ns()) < 10**9
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_an_angle_that_there_is_not_is_null(tmp_path: Path, make: Make) -> None:
+    recorder = make()
+    recorder.joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
+    recorder.close()
+    (path,) = (tmp_path / "record").iterdir()
+    assert messages(path) == [
+        (
+            "joints",
+            {
+                "v": 1,
+                "seq": 3,
+                "t_mono_ns": 5,
+                "names": ["FFJ3", "THJ4"],
+                "position_rad": [0.25, None],
+            },
+        )
+    ]
+
+
+def test_every_kind_of_message_has_a_schema_that_is_an_object() -> None:
+    found = schemas()
+    assert set(found) == {"verdict", "gate", "tactile", "outcome", "status", "joints"}
+    for text in found.values():
+        assert json.loads(text)["type"] == "object"
+
+
+def test_what_was_sent_is_in_the_file_while_it_is_still_written(tmp_path: Path, make: Make) -> None:
+    recorder = make()
+    recorder.send(TOPIC, payload(7))
+    wait_until(lambda: recorder.counters()["recorded"] == 1)
+    assert numbers(tmp_path) == [7]
+
+
+def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
+    tmp_path: Path, make: Make
+) -> None:
+    recorder = make(rotate_mb=0.1)
+    for number in range(300):
+        recorder.send(TOPIC, payload(number, 4000))
+        if number % 30 == 29:
+            wait_until(lambda n=number: recorder.counters()["recorded"] > n)  # type: ignore[misc]
+    recorder.close()
+    paths = sorted((tmp_path / "record").iterdir())
+    assert 4 <= len(paths) <= 12  # 300 of 2 kB each, compressed from hex
+    assert numbers(tmp_path) == list(range(300))
+
+
+def test_files_follow_each_other_by_age(tmp_path: Path, make: Make) -> None:
+    recorder = make(rotate_minutes=0.01)
+    wait_until(lambda: recorder.counters()["files"] == 3)
+    recorder.close()
+    assert len(list((tmp_path / "record").iterdir())) == 3
+
+
+def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
+    path = folder / f"right-20200101T{hour:02}0000Z-00000000-0000.{ending}"
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(bytes(size))
+    return path
+
+
+def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "record"
+    files = [old(folder, hour, 10) for hour in range(5)]
+    beside = old(folder, 0, 10, "can.log")
+    strangers = [folder / "right-notes.mcap", folder / "left-20200101T000000Z-00000000-0000.mcap"]
+    for path in strangers:
+        path.write_bytes(b"")
+    assert shelf(tmp_path, keep_files=4).make_room(0) == 2
+    assert not files[0].exists()
+    assert not beside.exists()
+    assert not files[1].exists()
+    assert all(path.exists() for path in [*files[2:], *strangers])
+
+
+def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
+    for hour in range(5):
+        old(tmp_path / "record", hour, 1000)
+    assert shelf(tmp_path, keep_bytes=4500).make_room(1000) == 2
+    assert shelf(tmp_path, keep_bytes=10).make_room(1000) == 3
+    assert shelf(tmp_path, keep_bytes=10).make_room(1000) == 0
+
+
+class StalledDisk:
+    """Does not answer until told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.answers = threading.Event()
+        self.asked = threading.Event()
+        real = os.fdatasync
+
+        def stall(descriptor: int) -> None:
+            self.asked.set()
+            self.answers.wait(20)
+            real(descriptor)
+
+        monkeypatch.setattr("daemon.record.files.os.fdatasync", stall)
+
+
+def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
+    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = StalledDisk(monkeypatch)
+    recorder = make()
+    assert disk.asked.wait(20)
+    for number in range(QUEUE_MAX + 500):
+        recorder.send(TOPIC, payload(number))
+    assert recorder.counters()["dropped"] == 500
+    disk.answers.set()
+    recorder.close()
+    assert numbers(tmp_path) == list(range(QUEUE_MAX))
+
+
+def test_the_end_does_not_wait_for_a_disk_that_never_answers(
+    make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = StalledDisk(monkeypatch)
+    monkeypatch.setattr(recorder_module, "CLOSE_S", 0.05)
+    recorder = make()
+    assert disk.asked.wait(20)
+    recorder.close()
+    assert "does not answer" in caplog.text
+    disk.answers.set()
+    wait_until(lambda: threading.active_count() == 1 or not _recording())
+
+
+def _recording() -> bool:
+    return any(thread.name == "recorder" for thread in threading.enumerate())
+
+
+def test_a_disk_that_refuses_is_told_once_and_tried_again_every_minute(
+    tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    monkeypatch.setattr(recorder_module, "RETRY_NS", 300_000_000)
+    blocked = tmp_path / "record"
+    blocked.write_text("a file where the folder should be")
+    recorder = make()
+    wait_until(lambda: recorder.counters()["failures"] >= 3)
+    recorder.send(TOPIC, payload(1))
+    wait_until(lambda: recorder.counters()["lost"] == 1)
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert recorder.counters()["writing"] == 0
+    blocked.unlink()
+    wait_until(lambda: recorder.counters()["writing"] == 1)
+    recorder.send(TOPIC, payload(2))
+    recorder.close()
+    assert numbers(tmp_path) == [2]
+
+
+def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten entries wait for a flush; of the twenty that follow the disk refuses the fifth.
+
+    The test goes the rounds itself: with this interval the thread's first one comes after 6 s.
+    """
+    recorder = make(flush_ms=60_000.0)
+    real, written = MessageFile.write, list[int]()
+
+    def write(file: MessageFile, topic: bytes, payload: bytes, at_ns: int) -> None:
+        if len(written) == 14:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(at_ns)
+        real(file, topic, payload, at_ns)
+
+    monkeypatch.setattr(MessageFile, "write", write)
+    for number in range(10):
+        recorder.send(TOPIC, payload(number))
+    recorder._go_round()
+    for number in range(20):
+        recorder.send(TOPIC, payload(number))
+    recorder._go_round()
+    recorder.send(TOPIC, payload(0))
+    recorder.close()
+    counted = recorder.counters()
+    assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
+
+
+FULL = """
+import resource, signal, sys
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, resource.RLIM_INFINITY))
+from daemon.cli import main
+sys.exit(main(["run", sys.argv[1]]))
+"""
+"""The daemon where no file may have more than 60 kB, as on a disk that is full."""
+
+
+def test_a_full_disk_stops_the_recording_and_not_the_daemon(tmp_path: Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\nspeed = 4.0\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+        '[record]\ndirectory = "record"\nflush_ms = 100\n'
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", FULL, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=50,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stderr.count("nothing is recorded") == 1
+    assert "File too large" in result.stderr
+    (written,) = (tmp_path / "record").iterdir()
+    kept = [content["seq"] for kind, content in messages(written) if kind == "tactile"]
+    assert kept == list(range(len(kept)))
+    assert len(kept) > 50
+
+
+WITHOUT = """
+import sys
+sys.modules["mcap"] = sys.modules["zstandard"] = None
+from daemon.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+"""graspd where the extra `record` is not installed."""
+
+
+@pytest.mark.parametrize("command", [["run", "scene.toml"], ["replay", "a.mcap"]])
+def test_without_the_extra_it_is_said_what_to_install(tmp_path: Path, command: list[str]) -> None:
+    (tmp_path / "scene.toml").write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n[record]\n'
+    )
+    (tmp_path / "a.mcap").write_bytes(b"")
+    result = subprocess.run(
+        [sys.executable, "-c", WITHOUT, command[0], str(tmp_path / command[1])],
+        capture_output=True,
+        text=True,
+        timeout=50,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert "pip install '.[record]'" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_daemon_that_is_killed_loses_no_more_than_the_flush_interval(tmp_path: Path) -> None:
+    losses_ms = kill_recorder.kill_often(tmp_path, kills=3, seed=1)
+    assert len(losses_ms) == 3
+    assert max(losses_ms) <= kill_recorder.FLUSH_MS
+
+
+@pytest.mark.parametrize(
+    ("text", "mistake"),
+    [
+        ("flush_ms = 1", "record.flush_ms"),
+        ("rotate_mb = 0", "record.rotate_mb"),
+        ("keep_files = 0", "record.keep_files"),
+        ("folder = 'x'", "record.folder: no such key"),
+        ("raw = true", "record.raw is for tactile.driver spi and can"),
+    ],
+)
+def test_a_wrong_record_section_is_named(tmp_path: Path, text: str, mistake: str) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:1"\n[record]\n{text}\n')
+    with pytest.raises(SceneError, match=mistake):
+        scene.load(path)
+
+
+def test_recordings_stand_beside_the_scene_or_with_the_state_of_the_service(tmp_path: Path) -> None:
+    head = '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:1"\n'
+    path = tmp_path / "scene.toml"
+    path.write_text(f'{head}[record]\ndirectory = "kept"\n')
+    assert scene.load(path).record_directory == tmp_path / "kept"
+    path.write_text(f"{head}[record]\n")
+    assert scene.load(path).record_directory == Path("/var/lib/graspd/record")
+    path.write_text(head)
+    assert scene.load(path).record_directory is None

@@ -1,0 +1,203 @@
+"""Realtime: taken where it may be had, one warning where not, given back at the end."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import itertools
+import logging
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.judge.reasons import GateState
+from daemon.process.signals import StopSignal
+from daemon.run.realtime import Hot
+from daemon.run.rehearsal import rehearse
+from daemon.run.runner import Parts, Runner, prepare
+from daemon.scene import Realtime
+from drivers.base import TactileReading
+from drivers.recordings.csv_player import DEMO_TABLE
+from drivers.twins.grasps.grasps import Counts, recorded_counts
+
+WORLD = """
+import ctypes, os, resource, sys
+from daemon.run.realtime import Hot
+from daemon.scene import Realtime
+"""
+NOBODY = 65534
+
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root to have and to lose rights")
+
+
+@pytest.fixture
+def as_before() -> Iterator[None]:
+    processors = os.sched_getaffinity(0)
+    yield
+    gc.enable()
+    os.sched_setaffinity(0, processors)
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    ctypes.CDLL(None).munlockall()
+
+
+def in_a_process(text: str, folder: Path) -> str:
+    """What a process of its own prints, which may give up rights that never come back."""
+    return subprocess.run(
+        [sys.executable, "-c", WORLD + text],
+        cwd=Path(__file__).parents[3],
+        env={**os.environ, "HOME": str(folder)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=50,
+    ).stdout
+
+
+def fifo_may_be_had() -> bool:
+    """Some containers refuse it even to root."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except OSError:
+        return False
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    return True
+
+
+def test_every_thread_gets_priority_and_processor_and_gives_them_back(as_before: None) -> None:
+    if not fifo_may_be_had():
+        pytest.skip("SCHED_FIFO is refused here")
+    processor = max(os.sched_getaffinity(0))
+    with Hot(Realtime(priority=7, cpus=(processor,), lock_memory=False)) as hot:
+        assert hot.lacking == []
+        for thread in map(int, os.listdir("/proc/self/task")):
+            assert os.sched_getscheduler(thread) == os.SCHED_FIFO
+            assert os.sched_getparam(thread).sched_priority == 7
+            assert os.sched_getaffinity(thread) == {processor}
+        assert not gc.isenabled()
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
+    assert len(os.sched_getaffinity(0)) >= 1
+    assert gc.isenabled()
+
+
+def test_memory_is_locked_where_that_is_allowed(tmp_path: Path) -> None:
+    said = in_a_process(
+        """
+with Hot(Realtime(priority=None)) as hot:
+    kib = [int(line.split()[1]) for line in open("/proc/self/status") if "VmLck" in line]
+    print(len(hot.lacking), *kib)
+""",
+        tmp_path,
+    )
+    lacking, locked_kib = map(int, said.split())
+    if lacking:
+        pytest.skip("memory may not be locked here")
+    assert locked_kib > 0
+
+
+def test_a_processor_that_is_not_there_is_named(
+    as_before: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    with Hot(Realtime(priority=None, cpus=(1000,), lock_memory=False)) as hot:
+        assert len(hot.lacking) == 1
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert "realtime.cpus" in caplog.text
+
+
+@needs_root
+def test_without_rights_one_warning_says_what_to_grant(tmp_path: Path) -> None:
+    said = in_a_process(
+        f"""
+import logging
+logging.basicConfig(stream=sys.stdout, format="%(message)s")
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
+os.setgroups([]); os.setresgid({NOBODY}, {NOBODY}, {NOBODY})
+os.setresuid({NOBODY}, {NOBODY}, {NOBODY})
+with Hot(Realtime(priority=50)) as hot:
+    hold = bytearray(1 << 26)  # far above the limit: must not be refused
+print("lives on")
+""",
+        tmp_path,
+    )
+    warning, end = said.splitlines()
+    assert "LimitRTPRIO=50" in warning
+    assert "LimitMEMLOCK=infinity" in warning
+    assert end == "lives on"
+
+
+def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None) -> None:
+    collected = []
+
+    class Loop:
+        def __init__(self) -> None:
+            self.me = self
+
+        def __del__(self) -> None:
+            collected.append(True)
+
+    with Hot(Realtime(priority=None, lock_memory=False)) as hot:
+        Loop()
+        assert collected == []
+        hot.tidy()
+        assert collected == [True]
+
+
+@pytest.mark.parametrize("model", ["small-session", "cnn1"])
+def test_the_rehearsal_goes_through_a_whole_grasp(model: str) -> None:
+    wanted = scene.parse(
+        {
+            "model": {"name": model},
+            "gate": {"mode": "settled"},
+            "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        },
+        Path("any.toml"),
+    ).model_copy(update={"tactile": None})
+    loaded = assembly.load_model(wanted)
+    seen: list[GateState | None] = []
+
+    pipeline = rehearse(
+        lambda clock: assembly.build_pipeline(wanted, loaded, clock), loaded.contract.seen
+    )
+    assert pipeline.grip is not None
+    seen.append(pipeline.grip.state)
+    assert pipeline.grip.grasp == 1
+    assert seen[-1] in (GateState.RELEASED, GateState.IDLE)
+    if pipeline.session is not None:
+        assert pipeline.session.grasps == 1
+
+
+def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Path) -> None:
+    """Also what its session has learned, which scales the input of its model."""
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
+        "[session]\nlearn = false\n[realtime]\nlock_memory = false\npriority = 1\n"
+    )
+    rows = list(itertools.islice(recorded_counts(DEMO_TABLE), 80))
+    judged = []
+    for rehearsed in (False, True):
+        parts = prepare(path)
+        judged.append(p_slips(parts, rows[:40]))
+        if rehearsed:
+            with StopSignal() as stop, ExitStack() as stack:
+                assert Runner(path, stop)._hot(parts, stack) is not None
+        judged[-1] += p_slips(parts, rows[40:])
+    assert judged[0] == judged[1]
+
+
+def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
+    return [
+        parts.pipeline.judge(
+            TactileReading(time.monotonic_ns(), 0, row, np.zeros(row.shape, dtype=np.uint8))
+        ).p_slip
+        for row in rows
+    ]

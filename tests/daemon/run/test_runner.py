@@ -1,0 +1,245 @@
+"""A scene is taken anew: what wants the same stays, and a wrong one changes nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon.judge.reasons import Outcome, Reason
+from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
+from tests.clients.building import sleep_at_will
+from tests.daemon.processes import GRASPD
+
+DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
+PATIENCE_S = 20.0
+
+SCENE = """
+[hand]
+name = "{hand}"
+[tactile]
+driver = "replay"
+recordings = ["{recording}"]
+loop = true
+[model]
+name = "{model}"
+[publish]
+endpoint = "ipc://{folder}/{socket}"
+"""
+
+
+class Running:
+    """A daemon, who it tells how it goes, and a subscriber."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.scene = folder / "scene.toml"
+        self.write()
+
+    def write(self, **changes: object) -> None:
+        wanted = {"hand": "right", "recording": DEMO, "model": "small-session", "socket": "v"}
+        self.scene.write_text(SCENE.format(**{**wanted, "folder": self.folder, **changes}))
+
+    @contextmanager
+    def started(self) -> Iterator[Running]:
+        with (
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as self.ears,
+            zmq.Context() as self.context,
+            self.context.socket(zmq.SUB) as self.subscriber,
+        ):
+            self.ears.bind(str(self.folder / "notify"))
+            self.ears.settimeout(PATIENCE_S)
+            self.subscriber.connect(f"ipc://{self.folder}/v")
+            self.subscriber.subscribe("")
+            environment = {
+                **os.environ,
+                "NOTIFY_SOCKET": str(self.folder / "notify"),
+                "WATCHDOG_USEC": "400000",
+            }
+            self.process = subprocess.Popen(
+                [*GRASPD, "run", str(self.scene)],
+                stdin=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+                env=environment,
+            )
+            try:
+                yield self
+            finally:
+                self.process.kill()
+                self.process.communicate()
+
+    def told(self, line: str) -> list[str]:
+        """The message to the manager that has a line that begins so; others are passed over."""
+        while True:
+            message = self.ears.recv(4096).decode().split("\n")
+            if any(text.startswith(line) for text in message):
+                return message
+
+    def verdict(self) -> Verdict:
+        while True:
+            assert self.subscriber.poll(int(PATIENCE_S * 1e3)), "no message"
+            topic, payload = self.subscriber.recv_multipart()
+            if topic.startswith(b"verdict."):
+                return decode_verdict(payload)
+
+    def last_status(self) -> Status:
+        """The newest status, after all messages that are there."""
+        statuses = []
+        while self.subscriber.poll(500):
+            topic, payload = self.subscriber.recv_multipart()
+            if topic.startswith(b"status."):
+                statuses.append(decode_status(payload))
+        return statuses[-1]
+
+    def hang_up(self) -> None:
+        self.process.send_signal(signal.SIGHUP)
+        self.told("RELOADING=1")
+
+    def stop(self) -> tuple[int, str]:
+        self.process.terminate()
+        said = self.process.communicate(timeout=PATIENCE_S)[1]
+        return self.process.returncode, said
+
+
+@pytest.fixture
+def running(tmp_path: Path) -> Iterator[Running]:
+    with Running(tmp_path).started() as running:
+        assert running.told("READY=1")[0] == "READY=1"
+        yield running
+
+
+def test_ready_comes_when_it_runs_and_the_watchdog_is_fed_from_then_on(running: Running) -> None:
+    assert running.verdict().model == "small-session"
+    for _ in range(3):
+        assert running.told("WATCHDOG=1") == ["WATCHDOG=1"]
+    assert "readings/s" in running.told("STATUS=running")[0]
+    code, said = running.stop()
+    assert code == 0, said
+    assert running.told("STOPPING=1")
+    assert running.last_status().state is State.STOPPING
+
+
+def test_another_model_takes_over_on_the_same_socket(running: Running) -> None:
+    before = running.verdict()
+    running.write(model="cnn1")
+    running.hang_up()
+    running.told("READY=1")
+    deadline_s = time.monotonic() + PATIENCE_S
+    while (after := running.verdict()).model != "cnn1":
+        assert time.monotonic() < deadline_s
+    assert after.boot_id != before.boot_id
+    assert after.seq < before.seq + 1000
+    assert running.stop()[0] == 0
+
+
+def test_a_hand_of_another_name_gets_its_topic_and_a_new_socket(running: Running) -> None:
+    running.write(hand="left", socket="w")
+    running.subscriber.connect(f"ipc://{running.folder}/w")
+    running.hang_up()
+    running.told("READY=1")
+    deadline_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline_s:
+        assert running.subscriber.poll(int(PATIENCE_S * 1e3))
+        if running.subscriber.recv_multipart()[0] == b"verdict.left":
+            break
+    else:
+        pytest.fail("no message of the left hand")
+    assert not (running.folder / "v").exists()
+    assert running.stop()[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"model": "no-such"}, "no-such"),
+        ({"hand": "Not A Name"}, "hand.name"),
+        ({"recording": "/missing.csv"}, "/missing.csv"),
+        ({"socket": "no/such/folder"}, "cannot publish"),
+    ],
+)
+def test_a_wrong_scene_changes_nothing_and_is_told(
+    running: Running, changes: dict[str, object], word: str
+) -> None:
+    before = running.verdict()
+    running.write(**changes)
+    running.hang_up()
+    running.told("READY=1")
+    deadline_s = time.monotonic() + PATIENCE_S
+    while (after := running.verdict()).t_mono_ns < before.t_mono_ns + 1_000_000_000:
+        assert time.monotonic() < deadline_s
+    assert (after.model, after.model_sha) == (before.model, before.model_sha)
+    code, said = running.stop()
+    assert code == 0
+    assert word in said
+    assert "the former scene goes on" in said
+
+
+def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> None:
+    before = running.verdict()
+    running.scene.write_text("[hand\n")
+    running.hang_up()
+    running.told("READY=1")
+    after = running.verdict()
+    assert after.boot_id == before.boot_id
+    assert running.stop()[0] == 0
+
+
+def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept = sleep_at_will(tmp_path, monkeypatch)
+    with Running(tmp_path).started() as running:
+        running.told("READY=1")
+        before = running.verdict()
+        slept.touch()
+        assert running.told("READY=1")
+        deadline_s = time.monotonic() + PATIENCE_S
+        while (after := running.verdict()).boot_id == before.boot_id:
+            former = after
+            assert time.monotonic() < deadline_s
+        assert former.verdict is Outcome.UNKNOWN
+        assert former.reasons[0] is Reason.STALE
+        assert (after.seq, after.grasp) < (before.seq + 1000, before.grasp + 1)
+        code, said = running.stop()
+    assert code == 0
+    assert said.count("the computer has slept") == 1
+
+
+def test_what_is_not_back_yet_after_a_sleep_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording, away = tmp_path / "demo.csv", tmp_path / "away"
+    slept = sleep_at_will(tmp_path, monkeypatch)
+    recording.write_bytes(DEMO.read_bytes())
+    waiting = Running(tmp_path)
+    waiting.write(recording=recording)
+    with waiting.started() as running:
+        running.told("READY=1")
+        before = running.verdict()
+        recording.rename(away)
+        slept.touch()
+        time.sleep(2.5)  # two tries
+        assert running.process.poll() is None
+        away.rename(recording)
+        running.told("READY=1")
+        while running.verdict().boot_id == before.boot_id:
+            pass
+        code, said = running.stop()
+    assert code == 0
+    assert said.count("another try in 1 s") >= 1
+
+
+def test_a_scene_that_is_wrong_at_the_start_ends_with_2(tmp_path: Path) -> None:
+    wrong = Running(tmp_path)
+    wrong.write(model="no-such")
+    with wrong.started():
+        assert wrong.process.wait(PATIENCE_S) == 2

@@ -1,0 +1,59 @@
+"""A computer that sleeps stops the monotonic clock: nothing of before it counts afterwards."""
+
+from __future__ import annotations
+
+import pytest
+
+from daemon.judge.reasons import Outcome, Reason
+from daemon.process.signals import StopSignal
+from daemon.process.sleep import Sleep
+from daemon.publish.messages import State
+from daemon.run.loop import Ended
+from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, reading
+from tests.daemon.run.test_loop import Bench
+
+HOUR_NS = 3600 * 1000 * MS
+
+
+class Sleeper(FakeModel):
+    """While it judges for the third time, the computer sleeps."""
+
+    def __init__(self, boot: Clock) -> None:
+        super().__init__()
+        self.boot = boot
+
+    def run(self) -> tuple[float, float]:
+        if self.runs == 2:
+            self.boot.now_ns += HOUR_NS
+        return super().run()
+
+
+def test_a_reading_of_before_a_sleep_gives_no_verdict_however_fresh_it_looks() -> None:
+    clock, boot = Clock(), Clock()
+    driver = FakeDriver([reading(clock(), seed) for seed in range(9)], clock)
+    with StopSignal() as stop:
+        bench = Bench(driver, clock, stop, Sleeper(boot), sleep=Sleep(clock, boot))
+        assert bench.service.run() is Ended.SLEPT
+    *before, last = bench.verdicts
+    assert [verdict.verdict for verdict in before] == [Outcome.STABLE] * 2
+    assert (last.verdict, last.reasons) == (Outcome.UNKNOWN, [Reason.STALE])
+    assert bench.output.statuses()[-1].state is State.STOPPING
+
+
+def test_who_comes_late_after_a_sleep_is_told_nothing_of_before_it() -> None:
+    clock, boot = Clock(), Clock()
+    sleep = Sleep(clock, boot)
+    boot.now_ns += HOUR_NS
+    with StopSignal() as stop:
+        bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, sleep=sleep)
+        assert bench.service.run() is Ended.SLEPT  # before it has looked who has come
+    assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN]
+
+
+@pytest.mark.parametrize(("apart_ms", "slept"), [(0, False), (49, False), (-90, False), (51, True)])
+def test_a_sleep_is_when_the_clocks_move_apart(apart_ms: int, slept: bool) -> None:
+    clock, boot = Clock(), Clock(7 * HOUR_NS)
+    sleep = Sleep(clock, boot)
+    clock.now_ns += HOUR_NS
+    boot.now_ns += HOUR_NS + apart_ms * MS
+    assert sleep.has_slept() is slept

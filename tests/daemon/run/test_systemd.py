@@ -1,0 +1,154 @@
+"""What systemd hears, as sd_notify(3) and sd_watchdog_enabled(3) have it."""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.publish.messages import State, decode_status
+from daemon.run.systemd import Systemd, in_a_line
+from tests.daemon.fakes import MS, Clock
+
+GOLDEN = Path(__file__).parents[1] / "publish" / "golden"
+
+
+@pytest.fixture
+def ears(tmp_path: Path) -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
+        ears.bind(str(tmp_path / "notify"))
+        ears.settimeout(5.0)
+        yield ears
+
+
+@pytest.fixture
+def systemd(ears: socket.socket) -> Iterator[Systemd]:
+    manager = Systemd.of({"NOTIFY_SOCKET": ears.getsockname(), "WATCHDOG_USEC": "2000000"})
+    assert manager is not None
+    yield manager
+    manager.close()
+
+
+def heard(ears: socket.socket) -> list[str]:
+    return ears.recv(4096).decode().split("\n")
+
+
+def test_ready_comes_with_a_status_and_starts_the_watchdog(
+    ears: socket.socket, systemd: Systemd
+) -> None:
+    systemd.ready("ready: spi, cnn1")
+    assert heard(ears) == [
+        "READY=1",
+        "STATUS=ready: spi, cnn1",
+        "WATCHDOG_USEC=2000000",
+        "WATCHDOG=1",
+    ]
+
+
+def test_a_reload_tells_the_time_and_asks_for_patience_until_ready(
+    ears: socket.socket,
+) -> None:
+    manager = Systemd(ears.getsockname(), 2_000_000, Clock(123_456_789_000))
+    manager.reloading()
+    assert heard(ears) == [
+        "RELOADING=1",
+        "MONOTONIC_USEC=123456789",
+        "WATCHDOG_USEC=60000000",
+        "WATCHDOG=1",
+    ]
+    manager.ready("back")
+    assert "WATCHDOG_USEC=2000000" in heard(ears)
+    manager.close()
+
+
+def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) -> None:
+    clock = Clock()
+    manager = Systemd(ears.getsockname(), 2_000_000, clock)
+    ears.setblocking(False)
+    fed_ms = []
+    for elapsed_ms in range(0, 2000, 10):
+        manager.feed()
+        try:
+            assert heard(ears) == ["WATCHDOG=1"]
+        except BlockingIOError:
+            pass
+        else:
+            fed_ms.append(elapsed_ms)
+        clock.now_ns += 10 * MS
+    assert fed_ms == [0, 500, 1000, 1500]
+    manager.close()
+
+
+def test_without_a_watchdog_nothing_is_fed_and_nothing_is_due(ears: socket.socket) -> None:
+    manager = Systemd.of({"NOTIFY_SOCKET": ears.getsockname()})
+    assert manager is not None
+    assert manager.due_ns() is None
+    manager.feed()
+    manager.stopping()
+    assert heard(ears) == ["STOPPING=1", "STATUS=stopping"]
+    manager.close()
+
+
+@pytest.mark.parametrize(
+    ("environment", "watched"),
+    [
+        ({"WATCHDOG_USEC": "1000"}, True),
+        ({"WATCHDOG_USEC": "1000", "WATCHDOG_PID": str(os.getpid())}, True),
+        ({"WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}, False),
+        ({"WATCHDOG_USEC": "0"}, False),
+        ({"WATCHDOG_USEC": "-5"}, False),
+        ({"WATCHDOG_USEC": "soon"}, False),
+    ],
+)
+def test_only_a_sound_watchdog_of_this_process_counts(
+    environment: dict[str, str], watched: bool
+) -> None:
+    manager = Systemd.of({"NOTIFY_SOCKET": "/nowhere", **environment})
+    assert manager is not None
+    assert (manager.due_ns() is not None) is watched
+    manager.close()
+
+
+@pytest.mark.parametrize("address", ["", "relative", "vsock:2:1234"])
+def test_an_address_that_is_no_socket_of_this_kind_is_no_manager(address: str) -> None:
+    assert Systemd.of({"NOTIFY_SOCKET": address}) is None
+
+
+def test_an_abstract_socket_is_found() -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
+        name = f"graspd-test-{os.getpid()}"
+        ears.bind(f"\0{name}")
+        ears.settimeout(5.0)
+        manager = Systemd(f"@{name}")
+        manager.ready("ready")
+        assert heard(ears)[0] == "READY=1"
+        manager.close()
+
+
+def test_a_manager_that_is_gone_costs_one_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    manager = Systemd(str(tmp_path / "gone"))
+    with caplog.at_level(logging.DEBUG):
+        manager.ready("ready")
+        manager.stopping()
+    levels = [record.levelno for record in caplog.records]
+    assert levels == [logging.WARNING, logging.DEBUG]
+    manager.close()
+
+
+def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None:
+    status = decode_status((GOLDEN / "status.json").read_bytes())
+    assert status.state is State.RUNNING
+    assert status.verdicts[Outcome.SLIP] == 1
+    assert status.gate is GateState.IDLE
+    assert status.health["ff_7"] is Reason.SATURATED
+    assert in_a_line(status) == (
+        "running: 100.0 readings/s, 1 stable, 1 slip, 1 unknown, gate idle, 3 late, "
+        "ff_7 saturated, mf not-tared"
+    )

@@ -1,0 +1,503 @@
+"""A session's calibration: taken in, kept, restored, dropped with the sensor."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.calibration import SessionCalibration
+from daemon.judge.decision import Limits
+from daemon.judge.grip import GripLimits
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.session.file import SessionFile, SessionFileError, exchanged, load
+from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
+from models import zoo
+from models.contract import Finger, SessionInput, Sharpness
+from models.inputs import SessionBuilder, raw_features
+from models.runtime import TactileModel
+from models.training.data.datasets import read_table
+from tests.daemon.fakes import Clock, FakeDriver
+
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
+SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
+
+
+def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
+    return np.random.default_rng(seed).integers(500, 3500, (number, 3, 24), dtype=np.uint16)
+
+
+def calibration(builder: SessionBuilder | None = None) -> SessionCalibration:
+    wanted = SessionInput((0.0,) * 78, (1.0,) * 78, 3.0, 1.0, 20.0, SHARPNESS)
+    return SessionCalibration(
+        wanted, builder or SessionBuilder(3, 3.0), np.full((3, 24), 2000.0), np.full((3, 24), 300.0)
+    )
+
+
+def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
+    for reading in counts(number, seed):
+        session.observe(reading)
+
+
+def test_the_input_follows_the_session() -> None:
+    builder = SessionBuilder(3, 3.0)
+    session = calibration(builder)
+    observe(session, 200)
+    raw = raw_features(counts(200))
+    # The prior weighs one grasp in two hundred: the session's own statistics, nearly.
+    fresh = counts(10, seed=1)
+    expected = np.clip((raw_features(fresh) - raw.mean(axis=0)) / raw.std(axis=0), -3.0, 3.0)
+    np.testing.assert_allclose(builder.build_batch(fresh)[0], expected, atol=0.5)
+    np.testing.assert_allclose(session.counts_mean, counts(200).mean(axis=0), rtol=0.02)
+    np.testing.assert_allclose(session.counts_spread, counts(200).std(axis=0), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("grasps", "temperature", "calibrated"),
+    [(0, 3.0, False), (4, 3.0, False), (5, 2.0, False), (19, 2.0, False), (20, 1.0, True)],
+)
+def test_a_young_session_is_less_sure(grasps: int, temperature: float, calibrated: bool) -> None:
+    session = calibration()
+    observe(session, grasps)
+    assert session.grasps == grasps
+    assert session.temperature == temperature
+    assert session.calibrated is calibrated
+
+
+class SensorDriver(FakeDriver):
+    """A driver that knows its sensors."""
+
+    known: dict[str, str] = {}  # noqa: RUF012 - set by the test
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return self.known
+
+
+def sensors(**serials: str) -> SensorDriver:
+    driver = SensorDriver([], Clock())
+    driver.known = serials
+    return driver
+
+
+def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
+    clock, first = Clock(), calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(first, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        observe(first, 30)
+        keeper.mind()
+        assert load(file.path) is None  # not every second
+        clock.now_ns += SAVE_PERIOD_NS
+        keeper.mind()
+        keeper.wait()
+    second = calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        SessionKeeper(second, FINGERS, sensors(), file, clock)
+    assert second.state() == first.state()
+    assert second.calibrated
+
+
+def test_an_exchanged_sensor_ends_the_session(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock, session = Clock(), calibration()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper.mind()
+        observe(session, 30)
+        keeper.save()
+    again = calibration()
+    driver = sensors()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
+        keeper.mind()
+        assert again.grasps == 30  # nothing is known of the sensors yet
+        driver.known = {"ff": "A", "mf": "B", "th": "C"}
+        keeper.mind()
+        assert again.grasps == 30
+        driver.known = {"ff": "A", "mf": "X", "th": "C"}
+        keeper.mind()
+        keeper.wait()
+        assert again.grasps == 0
+        assert "new sensor on mf" in caplog.text
+        kept = file.load()
+    assert kept is not None
+    assert kept.statistics.grasps == 0
+    assert kept.serials["mf"] == "X"
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "fingers"),
+    [
+        ({}, {}, []),
+        ({}, {"ff": "A"}, []),
+        ({"ff": "A"}, {}, []),
+        ({"ff": "A"}, {"ff": "A"}, []),
+        ({"ff": "A", "th": "B"}, {"ff": "C", "th": "B"}, ["ff"]),
+    ],
+)
+def test_only_a_sensor_that_is_known_to_differ_is_another(
+    before: dict[str, str], now: dict[str, str], fingers: list[str]
+) -> None:
+    assert exchanged(before, now) == fingers
+
+
+def test_two_daemons_do_not_keep_one_session(tmp_path: Path) -> None:
+    in_use = pytest.raises(SessionFileError, match="in use by another graspd")
+    with SessionFile(tmp_path / "right.json"), in_use:
+        SessionFile(tmp_path / "right.json")
+    SessionFile(tmp_path / "right.json").close()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b"[]", b"\xff\xfe", b'{"version":2}', b"null", b"{}" * 1000, b"x" * (2 << 20)],
+)
+def test_what_is_no_session_is_one_line_and_a_new_session(
+    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "right.json"
+    path.write_bytes(content)
+    with pytest.raises(SessionFileError) as error:
+        load(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert "\n" not in str(error.value)
+    session = calibration()
+    with SessionFile(path) as file:
+        SessionKeeper(session, FINGERS, sensors(), file)
+    assert session.grasps == 0
+    assert "a new session begins" in caplog.text
+
+
+def test_a_session_of_other_fingers_begins_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    other, session = calibration(), calibration()
+    observe(other, 9)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(other.state(), ("ff", "mf"), {})
+        SessionKeeper(session, FINGERS, sensors(), file)
+    assert "is of the fingers ff, mf, the hand has" in caplog.text
+    assert session.grasps == 0
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    state = calibration().state()
+    data = {"version": 1, "fingers": FINGERS, "serials": {}, "saved_at": 0.0}
+    path = tmp_path / "right.json"
+    statistics = msgspec.to_builtins(state)
+    text = msgspec.json.encode(data | {"statistics": statistics}).decode()
+    path.write_text(text.replace('"squares":[0.0', '"squares":[-1.0', 1))
+    with pytest.raises(SessionFileError, match="not a session"):
+        load(path)
+
+
+def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(SessionFileError, match="No such file or directory"):
+        SessionFile(tmp_path / "no" / "right.json")
+
+
+def test_a_full_disk_is_one_warning_and_no_crash(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, clock = calibration(), Clock()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+
+        def full(descriptor: int) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", full)
+        for seed in range(3):
+            observe(session, 3, seed)
+            clock.now_ns += SAVE_PERIOD_NS
+            keeper.mind()
+            keeper.wait()
+        assert caplog.text.count("No space left on device") == 1
+        monkeypatch.undo()
+        keeper.save()
+        kept = file.load()
+    assert kept is not None
+    assert kept.statistics.grasps == 9
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["right.json", "right.json.lock"]
+
+
+def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session, clock = calibration(), Clock()
+    hangs, asked = threading.Event(), []
+
+    def slow(_descriptor: int) -> None:
+        asked.append(True)
+        hangs.wait()
+
+    monkeypatch.setattr(os, "fsync", slow)
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+        for seed in range(3):
+            observe(session, 3, seed)
+            clock.now_ns += SAVE_PERIOD_NS
+            keeper.mind()  # comes back, though nothing is on the disk yet
+        assert file.load() is None
+        hangs.set()
+        keeper.save()
+        kept = file.load()
+    assert kept is not None
+    assert kept.statistics.grasps == 9
+    assert len(asked) == 2
+
+
+KILLED = """
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from daemon.session.file import SessionFile
+from tests.daemon.session.test_session import FINGERS, calibration, observe
+session = calibration()
+with SessionFile(Path(sys.argv[1])) as file:
+    while True:
+        observe(session, 1, session.grasps)
+        file.save(session.state(), FINGERS, {})
+        print(session.grasps, flush=True)
+"""
+
+
+def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None:
+    path = tmp_path / "right.json"
+    for _ in range(3):
+        with subprocess.Popen(
+            [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
+        ) as process:
+            if process.stdout is None:
+                raise RuntimeError("no pipe")
+            for _ in range(20):
+                process.stdout.readline()
+            process.send_signal(signal.SIGKILL)
+        kept = load(path)
+        assert kept is not None
+        assert kept.statistics.grasps >= 20
+
+
+def session_pipeline(*, learns: bool = True) -> Pipeline:
+    model = TactileModel(zoo.find("small-session"))
+    limits = Limits(max_age_ns=10**18)
+    return Pipeline(model, FINGERS, limits, lambda: 0, learns=learns)
+
+
+def judge(pipeline: Pipeline, rows: NDArray[np.generic], fault: int = 0) -> list[Judgement]:
+    faults = np.full((3, 24), fault, dtype=np.uint8)
+    return [
+        pipeline.judge(TactileReading(0, number, row.astype(np.uint16), faults))
+        for number, row in enumerate(rows)
+    ]
+
+
+def test_a_grasp_is_judged_by_what_came_before_it(bts3_dir: Path) -> None:
+    rows = read_table(bts3_dir / "palm_down.csv").counts[:30]
+    judgements = judge(session_pipeline(), rows)
+    (first,) = judge(session_pipeline(), rows[:1])
+    assert judgements[0].p_slip == first.p_slip
+    calibrated = [judgement.session_calibrated for judgement in judgements]
+    assert calibrated == sorted(calibrated, key=bool)
+    assert not calibrated[19]
+
+
+def test_a_session_that_does_not_learn_stays_what_it_is(bts3_dir: Path) -> None:
+    pipeline = session_pipeline(learns=False)
+    judge(pipeline, read_table(bts3_dir / "palm_down.csv").counts[:30])
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 0
+
+
+@pytest.mark.parametrize("fault", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF, 128])
+def test_a_session_learns_nothing_from_what_is_not_of_now(bts3_dir: Path, fault: int) -> None:
+    pipeline = session_pipeline()
+    judge(pipeline, read_table(bts3_dir / "palm_down.csv").counts[:30], fault)
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 0
+
+
+GARBAGE: dict[str, Callable[[np.random.Generator], NDArray[np.generic]]] = {
+    "any counts": lambda random: random.integers(1, 4095, (300, 3, 24)),
+    "an open hand": lambda random: 3000 + random.normal(0.0, 5.0, (300, 3, 24)),
+    "one level": lambda random: random.integers(1900, 2100, (300, 3, 24)),
+    "noise": lambda random: 2048 + random.normal(0.0, 150.0, (300, 3, 24)),
+}
+
+
+@pytest.mark.parametrize("what", GARBAGE)
+@pytest.mark.parametrize("grasps", [0, 100])
+def test_garbage_never_becomes_its_own_standard(bts3_dir: Path, what: str, grasps: int) -> None:
+    """Neither after real grasps nor from the start: nothing of it is ever called stable."""
+    pipeline = session_pipeline()
+    random = np.random.default_rng(1)
+    rows = read_table(bts3_dir / "palm_down.csv").counts
+    judge(pipeline, rows[random.permutation(len(rows))[:grasps]])
+    judgements = judge(pipeline, GARBAGE[what](random))
+    assert {judgement.outcome for judgement in judgements} == {Outcome.UNKNOWN}
+
+
+def test_a_drifted_session_is_refused_at_first_and_then_learned(bts3_dir: Path) -> None:
+    rows = read_table(bts3_dir / "palm_down.csv").counts.astype(np.int64)
+    rows = rows[np.random.default_rng(2).permutation(len(rows))[:300]]
+    rows[:, 0, :6] -= 400
+    rows = np.clip(rows, 1, 4094)
+    judgements = judge(session_pipeline(), rows)
+    judged = [judgement.outcome is not Outcome.UNKNOWN for judgement in judgements]
+    assert np.mean(judged[100:]) > 0.85
+
+
+@pytest.mark.parametrize("grasps", [0, 200])
+def test_a_finger_that_dies_is_never_judged_by_the_others(bts3_dir: Path, grasps: int) -> None:
+    random = np.random.default_rng(3)
+    rows = read_table(bts3_dir / "palm_down.csv").counts
+    rows = rows[random.permutation(len(rows))].astype(np.int64)
+    pipeline = session_pipeline()
+    judge(pipeline, rows[:grasps])
+    dead = rows[200:600].copy()
+    dead[:, 2] = 2048 + np.rint(random.normal(0.0, 3.5, dead[:, 2].shape)).astype(np.int64)
+    assert {judgement.outcome for judgement in judge(pipeline, dead)} == {Outcome.UNKNOWN}
+
+
+def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
+    random = np.random.default_rng(4)
+    rows = read_table(bts3_dir / "palm_down.csv").counts
+    rows = rows[random.permutation(len(rows))]
+    pipeline = session_pipeline()
+    judge(pipeline, rows[:200])
+    judgements = judge(pipeline, rows[200:600, [1, 2, 0]])
+    assert np.mean([judgement.outcome is Outcome.UNKNOWN for judgement in judgements]) > 0.95
+
+
+@pytest.mark.parametrize("name", ["cnn1", "small-session"])
+def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
+    model = TactileModel(zoo.find(name))
+    random = np.random.default_rng(5)
+    centre = np.array(model.contract.seen.centre)
+    pipeline = Pipeline(model, FINGERS, Limits(max_age_ns=10**18), lambda: 0, learns=False)
+    judgements = judge(pipeline, centre + random.normal(0.0, 2.0, (50, 3, 24)))
+    assert {judgement.outcome for judgement in judgements} == {Outcome.UNKNOWN}
+
+
+def test_a_session_learns_nothing_from_what_is_stale(bts3_dir: Path) -> None:
+    model = TactileModel(zoo.find("small-session"))
+    pipeline = Pipeline(model, FINGERS, Limits(max_age_ns=10**8), lambda: 10**10)
+    judgements = judge(pipeline, read_table(bts3_dir / "palm_down.csv").counts[:30])
+    assert {judgement.reasons[-1] for judgement in judgements} == {Reason.STALE}
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 0
+
+
+@pytest.mark.parametrize("threshold", [0.2, 0.5, 0.95])
+def test_a_young_session_is_less_sure_and_on_the_same_side(
+    bts3_dir: Path, threshold: float
+) -> None:
+    rows = read_table(bts3_dir / "palm_down.csv").counts[::20]
+    limits = Limits(max_age_ns=10**18, slip_threshold=threshold)
+    model = TactileModel(zoo.find("small-session"))
+    young = Pipeline(model, FINGERS, limits, lambda: 0, learns=False)
+    for judgement, row in zip(judge(young, rows), rows, strict=True):
+        if judgement.p_slip is None or judgement.repaired:
+            continue
+        model.inputs.build(row, model.input)
+        _, p_slip = model.run()
+        assert (p_slip >= threshold) is (judgement.outcome is Outcome.SLIP)
+        assert abs(judgement.p_slip - threshold) <= abs(p_slip - threshold) + 1e-6
+
+
+def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path) -> None:
+    clock = Clock()
+    seeded = calibration()
+    observe(seeded, 30)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(seeded.state(), FINGERS, {})
+        keeper = SessionKeeper(calibration(), FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper.mind()
+        keeper.save()
+        kept = file.load()
+        assert kept is not None
+        assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
+        later = calibration()
+        keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
+        keeper.mind()
+        keeper.wait()
+    assert later.grasps == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"weight": 0.0}, "30 grasps weigh 0"),
+        ({"grasps": 1000}, "1000 grasps weigh 30"),
+        ({"mean": (0.0,) * 78 + (5000.0,) * 72}, "means that no counts have"),
+        ({"mean": (0.0,) * 77 + (2000.0,) * 72}, "is of 149 values"),
+    ],
+)
+def test_a_session_that_cannot_be_is_not_restored(change: dict[str, Any], says: str) -> None:
+    session, other = calibration(), calibration()
+    observe(other, 30)
+    with pytest.raises(ValueError, match=says):
+        session.restore(msgspec.structs.replace(other.state(), **change))
+    assert session.grasps == 0
+
+
+def settled_verdicts(pipeline: Pipeline, clock: Clock, seconds: float) -> list[Judgement]:
+    """What is said while a synthetic grasp is closed and held."""
+    held = Durations(first_rest_s=(1.5, 1.5), settle_s=(60.0, 60.0))
+    found = []
+    for moment in synthetic_grasps(1, durations=held, seed=1):
+        if moment.t_s > seconds:
+            break
+        clock.now_ns = 10**12 + round(moment.t_s * 1e9)
+        faults = np.zeros((3, 24), dtype=np.uint8)
+        found.append(pipeline.judge(TactileReading(clock.now_ns, 0, moment.counts, faults)))
+    return found
+
+
+def test_a_scene_that_requires_a_session_judges_nothing_without_one(bts3_dir: Path) -> None:
+    model, clock = TactileModel(zoo.find("cnn1-session")), Clock()
+    pipeline = Pipeline(
+        model, FINGERS, Limits(10**12), clock, grip=GripLimits(), needs_session=True, learns=False
+    )
+    assert pipeline.session is not None
+    for row in read_table(bts3_dir / "palm_down.csv").counts[:100]:
+        pipeline.session.observe(row)
+    assert settled_verdicts(pipeline, clock, 4.0)[-1].outcome is not Outcome.UNKNOWN
+    pipeline.session.reset()
+    after = pipeline.judge(reading_of(clock))
+    assert after.outcome is Outcome.UNKNOWN
+    assert Reason.NOT_CALIBRATED in after.reasons
+    assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
+
+
+def test_an_exchanged_sensor_ends_the_verdict_that_stands(bts3_dir: Path) -> None:
+    model, clock = TactileModel(zoo.find("cnn1")), Clock()
+    pipeline = Pipeline(model, FINGERS, Limits(10**12), clock, grip=GripLimits())
+    assert settled_verdicts(pipeline, clock, 4.0)[-1].gate is GateState.JUDGED
+    pipeline.sensors_exchanged()
+    after = pipeline.judge(reading_of(clock))
+    assert after.outcome is Outcome.UNKNOWN
+    assert Reason.NOT_TARED in after.reasons
+    assert after.contact == ()
+
+
+def reading_of(clock: Clock) -> TactileReading:
+    """One more reading of the same grasp."""
+    held = Durations(first_rest_s=(1.5, 1.5), settle_s=(60.0, 60.0))
+    stream = synthetic_grasps(1, durations=held, seed=1)
+    counts = next(moment.counts for moment in stream if moment.t_s > 4.0)
+    clock.now_ns += 10_000_000
+    return TactileReading(clock.now_ns, 0, counts, np.zeros((3, 24), dtype=np.uint8))

@@ -1,0 +1,396 @@
+"""What is seen of a hand: by its messages, by their absence, and as text in a terminal."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import random
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from rich.console import Console
+
+from daemon.judge.reasons import ADVICE, GateState, Outcome, Reason
+from daemon.publish.messages import OutcomeMessage, encode
+from daemon.watch.fingers import FULL, HEIGHT, WIDTH, Rest, image
+from daemon.watch.letters import big
+from daemon.watch.pixels import Canvas
+from daemon.watch.snapshot import Line, Snapshot, Tone
+from daemon.watch.terminal import draw
+from daemon.watch.view import HISTORY, View
+from models.layout import D1
+from tests.daemon.watch.watch_fakes import BOOT, MS, status, tactile, verdict
+
+GOLDEN = sorted((Path(__file__).parents[1] / "publish" / "golden").glob("*.json"))
+ODD: tuple[object, ...] = (
+    0,
+    -1,
+    2**63,
+    1e308,
+    1e-320,
+    "",
+    "x" * 5000,
+    "\x1b[2J",
+    [],
+    [[]],
+    {},
+    {"": 0},
+    None,
+    True,
+)
+"""Values where others belong."""
+ENDPOINT = "ipc:///tmp/any"
+RESTING = [3000] * 24
+SOUND = np.ones(24, dtype=np.bool_)
+
+
+def a_view(hand: str | None = None) -> View:
+    return View(ENDPOINT, hand, wall=lambda: 1790000000.0)
+
+
+def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
+    seen = a_view()
+    for topic, payload in messages:
+        seen.take(topic, payload, at_ns)
+    return seen
+
+
+def rested(view: View, readings: int = 30) -> None:
+    """Let it see an open hand at rest."""
+    view.take(b"status.right", status(0), 0)
+    for seq in range(readings):
+        view.take(b"verdict.right", verdict(seq), 0)
+        view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
+
+
+def text_of(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[str]:
+    file = io.StringIO()
+    console = Console(file=file, width=width, height=height, color_system=None)
+    console.print(draw(seen, width, height, canvas))
+    return file.getvalue().splitlines()
+
+
+def test_before_the_first_message_it_is_unknown_and_says_what_may_be_wrong() -> None:
+    seen = a_view().snapshot(0)
+    assert (seen.tone, seen.verdict) == (Tone.SILENT, "unknown")
+    assert "is graspd running" in seen.why[0].advice
+    assert seen.why[1] == Line("link", "connecting")
+
+
+@pytest.mark.parametrize(
+    ("outcome", "tone", "p_slip"),
+    [(Outcome.STABLE, Tone.STABLE, 0.25), (Outcome.SLIP, Tone.SLIP, 0.75)],
+)
+def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
+    outcome: Outcome, tone: Tone, p_slip: float
+) -> None:
+    view = after((b"verdict.right", verdict(0, outcome)))
+    seen = view.snapshot(100 * MS)
+    assert (seen.tone, seen.verdict, seen.p_slip) == (tone, outcome.value, p_slip)
+    seen = view.snapshot(101 * MS)
+    assert (seen.tone, seen.verdict, seen.p_slip) == (Tone.SILENT, "unknown", None)
+    assert seen.why[0] == Line("unknown", "no message for 101 ms")
+    assert (seen.gate, seen.contact, seen.fingers, seen.state) == (None, None, [], None)
+
+
+def test_a_message_that_is_repeated_for_somebody_else_is_no_sign_of_life() -> None:
+    view = after((b"verdict.right", verdict(5, Outcome.STABLE)))
+    view.take(b"verdict.right", verdict(5, Outcome.STABLE), 90 * MS)
+    assert view.snapshot(101 * MS).tone is Tone.SILENT
+
+
+def test_gaps_are_counted_as_lost_but_not_over_a_restart() -> None:
+    view = after(*[(b"verdict.right", verdict(seq)) for seq in (3, 4, 9)])
+    assert view.snapshot(0).timing.lost == 4
+    view.take(b"verdict.right", verdict(0, Outcome.SLIP, boot_id="another"), 0)
+    seen = view.snapshot(0)
+    assert (seen.timing.lost, seen.verdict) == (4, "slip")
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"{", b"\xff\xfe", b"[]", verdict(1, Outcome.STABLE).replace(b'"v":1', b'"v":2')],
+)
+def test_what_is_not_understood_is_counted_and_is_no_sign_of_life(payload: bytes) -> None:
+    view = after((b"verdict.right", verdict(0, Outcome.STABLE)))
+    view.take(b"verdict.right", payload, 90 * MS)
+    seen = view.snapshot(101 * MS)
+    assert seen.timing.not_understood == 1
+    assert seen.tone is Tone.SILENT
+
+
+def test_other_hands_and_other_topics_are_not_looked_at() -> None:
+    view = a_view("right")
+    for topic in (b"verdict.right2", b"verdict.left", b"verdict", b"other.right", b"\xff"):
+        view.take(topic, verdict(0, Outcome.STABLE), 0)
+    seen = view.snapshot(0)
+    assert (seen.verdict, seen.timing.not_understood) == ("unknown", 0)
+
+
+@pytest.mark.parametrize(
+    ("reasons", "tone"),
+    [
+        ([Reason.NO_CONTACT], Tone.WAITING),
+        ([Reason.MOVING, Reason.SETTLING], Tone.WAITING),
+        ([Reason.NEVER_SEEN], Tone.TROUBLE),
+        ([Reason.MOVING, Reason.STALE], Tone.TROUBLE),
+    ],
+)
+def test_unknown_is_told_apart_by_whether_something_is_wrong(
+    reasons: list[Reason], tone: Tone
+) -> None:
+    seen = after((b"verdict.right", verdict(0, reasons=reasons))).snapshot(0)
+    assert seen.tone is tone
+    assert seen.why == [Line(reason.value, ADVICE[reason]) for reason in reasons]
+
+
+def test_a_verdict_without_a_calibrated_session_is_said_to_be_less_sure() -> None:
+    message = verdict(0, Outcome.STABLE, session_calibrated=False)
+    why = after((b"verdict.right", message)).snapshot(0).why
+    assert [line.what for line in why] == ["lift", "less sure"]
+
+
+def test_the_last_judgement_stays_and_gets_how_its_lift_ended() -> None:
+    view = after((b"verdict.right", verdict(0, Outcome.SLIP, grasp=42)))
+    view.take(b"verdict.right", verdict(1, grasp=42), 2_000 * MS)
+    for grasp, ended in ((41, None), (42, "slip")):
+        told = OutcomeMessage(boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome="slip")
+        view.take(b"outcome.right", encode(told), 2_000 * MS)
+        last = view.snapshot(2_000 * MS).judged
+        assert last is not None
+        assert (last.verdict, last.p_slip, last.grasp, last.ago_s) == ("slip", 0.75, 42, 2.0)
+        assert last.ended == ended
+
+
+def test_rates_and_the_last_half_minute_are_of_what_arrived() -> None:
+    view = a_view()
+    for moment in range(400):
+        now_ns = moment * 100 * MS
+        for part in range(5):
+            view.take(b"verdict.right", verdict(moment * 5 + part, Outcome.STABLE), now_ns)
+        seen = view.snapshot(now_ns)
+    assert seen.timing.verdicts_hz == pytest.approx(50.0)
+    assert HISTORY == 300
+    assert seen.history == "s" * 300
+    assert seen.history_p == [25] * 300
+
+
+@pytest.mark.parametrize(("fall", "level"), [(0, 0), (16, 10), (400, 50), (1600, 100), (3000, 100)])
+def test_a_pixel_shows_the_root_of_the_fall_below_the_rest(fall: int, level: int) -> None:
+    """Root of the share of 1600 counts, in %: 16 / 1600 = 0.1 squared."""
+    view = a_view()
+    rested(view)
+    view.take(b"verdict.right", verdict(98, gate=GateState.CLOSING), 0)
+    view.take(b"tactile.right", tactile(99, [3000 - fall] * 24, RESTING), 0)
+    first, second = view.snapshot(0).fingers
+    assert (first.name, first.from_rest, first.deepest) == ("ff", True, fall)
+    assert first.levels == [level] * 132
+    assert second.levels == [0] * 132
+
+
+def test_an_electrode_that_rises_is_below_zero() -> None:
+    counts = np.array([3000.0 + 400] * 24)
+    shown = image("ff", counts, SOUND, np.array(RESTING, dtype=float), touches=False)
+    assert shown.levels == [-50] * 132
+
+
+def test_an_electrode_is_where_the_layout_has_it() -> None:
+    """E7 stands in row 8, column 1 of D1 (the paper's table)."""
+    counts = np.array(RESTING, dtype=float)
+    counts[6] -= 1600
+    shown = image("ff", counts, SOUND, np.array(RESTING, dtype=float), touches=True)
+    assert (D1.rows[6], D1.columns[6]) == (8, 1)
+    assert (HEIGHT, WIDTH, len(shown.levels)) == (12, 11, 132)
+    assert shown.levels[8 * WIDTH + 1] == FULL
+
+
+def test_a_rest_is_learned_only_while_nothing_touches_and_the_finger_is_tared() -> None:
+    view = a_view()
+    rested(view, 24)
+    view.take(b"status.right", status(1, tared=["th"]), 0)
+    for seq in range(50, 80):
+        view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
+    assert [finger.from_rest for finger in view.snapshot(0).fingers] == [False, True]
+    view.take(b"verdict.right", verdict(90, gate=GateState.CLOSING, contact=["th"]), 0)
+    for seq in range(90, 200):
+        view.take(b"tactile.right", tactile(seq, RESTING, [1400] * 24), 0)
+    assert view.snapshot(0).fingers[1].levels == [100] * 132
+
+
+def test_the_rest_follows_a_slow_drift() -> None:
+    rest = Rest()
+    for _ in range(25):
+        rest.learn(np.full(24, 3000.0), SOUND)
+    assert rest.counts is not None
+    assert rest.counts == pytest.approx(np.full(24, 3000.0))
+    for _ in range(500):  # ten times the fifty readings that a share of 2 % goes back
+        rest.learn(np.full(24, 3010.0), SOUND)
+    assert rest.counts == pytest.approx(np.full(24, 3010.0), abs=0.01)
+
+
+def test_a_touch_that_the_gate_has_not_seen_yet_hardly_moves_the_rest() -> None:
+    rest = Rest()
+    for _ in range(100):
+        rest.learn(np.full(24, 3000.0), SOUND)
+    for _ in range(3):
+        rest.learn(np.full(24, 1400.0), SOUND)
+    assert rest.counts is not None
+    assert rest.counts.min() == pytest.approx(2998.8)  # three times 2 % of 20 counts
+
+
+def test_without_a_rest_an_image_shows_how_the_electrodes_differ() -> None:
+    counts = np.array([3000.0] * 12 + [2000.0] * 12)
+    shown = image("ff", counts, SOUND, None, touches=None)
+    # The median is 2500, and 500 counts are one standard deviation, of two and a half.
+    assert not shown.from_rest
+    assert (min(shown.levels), max(shown.levels)) == (-40, 40)
+    flat = image("ff", np.full(24, 3000.0), SOUND, None, touches=None)
+    assert flat.levels == [0] * 132
+
+
+def test_a_faulty_electrode_is_marked_and_not_taken_for_a_touch() -> None:
+    view = a_view()
+    rested(view)
+    counts = [3000] * 24
+    counts[6] = 0
+    view.take(b"tactile.right", tactile(99, counts, RESTING, faulty=(6,)), 0)
+    view.take(b"verdict.right", verdict(99, Outcome.STABLE, repaired=["ff_1", "th_24"]), 0)
+    first, second = view.snapshot(0).fingers
+    assert first.levels == [0] * 132
+    assert first.marked == [1, 8 * WIDTH + 1]  # E1 stands in row 0, column 1
+    assert second.marked == [5 * WIDTH + 5]  # E24 in row 5, column 5
+    nothing = image("ff", np.zeros(24), ~SOUND, None, touches=None)
+    assert (nothing.levels, len(nothing.marked)) == ([0] * 132, 24)
+
+
+@pytest.mark.parametrize("counts", [[], [1] * 23])
+def test_a_finger_of_fewer_electrodes_is_left_out(counts: list[int]) -> None:
+    seen = after((b"verdict.right", verdict(0)), (b"tactile.right", tactile(0, counts, RESTING)))
+    assert [finger.name for finger in seen.snapshot(0).fingers] == ["th"]
+
+
+def test_images_go_when_readings_no_longer_come() -> None:
+    view = after((b"tactile.right", tactile(0, RESTING, RESTING)))
+    view.take(b"verdict.right", verdict(0), 1001 * MS)
+    assert view.snapshot(1001 * MS).fingers == []
+
+
+def a_grasp() -> Snapshot:
+    view = a_view()
+    rested(view)
+    pressed = [3000 - 60 * electrode for electrode in range(24)]
+    view.take(b"tactile.right", tactile(99, pressed, RESTING, faulty=(6,)), 0)
+    view.take(b"verdict.right", verdict(99, Outcome.SLIP), 0)
+    return view.snapshot(0)
+
+
+@pytest.mark.parametrize("canvas", [Canvas(), Canvas(colour=False), Canvas(False, True)], ids=str)
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 34), (120, 40), (200, 60)])
+def test_the_view_fits_the_terminal(width: int, height: int, canvas: Canvas) -> None:
+    lines = text_of(a_grasp(), width, height, canvas)
+    assert len(lines) <= height
+    assert max(map(len, lines)) <= width
+    text = "\n".join(lines)
+    for what in ("slip probability 75 %", "ff touches", "FFJ3   28.6", "gate judged", "q ends"):
+        assert what in text
+    assert f"ff_7 electrode-dead: {ADVICE[Reason.ELECTRODE_DEAD]}" in text
+    assert math.degrees(0.5) == pytest.approx(28.6, abs=0.05)
+
+
+def test_a_terminal_of_ascii_gets_ascii() -> None:
+    for line in text_of(a_grasp(), 80, 24, Canvas(colour=False, ascii_only=True)):
+        assert line.replace("°", "").isascii()
+
+
+def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "CET-1")
+    time.tzset()
+    seen = after((b"verdict.right", verdict(0, Outcome.STABLE))).snapshot(0)
+    header = text_of(seen, 80, 24, Canvas())[0]
+    monkeypatch.undo()
+    time.tzset()
+    assert header.startswith("graspd right  15:13:20")  # date -u -d @1790000000: 14:13:20
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (10, 3), (40, 12), (79, 23)])
+def test_a_terminal_that_is_too_small_is_no_error(width: int, height: int) -> None:
+    assert text_of(a_grasp(), width, height, Canvas())
+
+
+def test_without_colour_the_pressed_side_of_a_finger_is_darker() -> None:
+    lines = text_of(a_grasp(), 80, 24, Canvas(colour=False))
+    images = "".join(line[:11] for line in lines)
+    assert "█" in images
+    assert "\u00d7" in images
+
+
+def test_more_is_unwell_than_fits_and_the_rest_is_counted() -> None:
+    view = a_view()
+    health = {f"ff_{number}": Reason.ELECTRODE_DEAD for number in range(1, 25)}
+    view.take(b"status.right", status(0, health=health), 0)
+    view.take(b"verdict.right", verdict(0), 0)
+    lines = text_of(view.snapshot(0), 80, 24, Canvas())
+    assert len(lines) == 24
+    assert "and 24 more" in "\n".join(lines)
+
+
+def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
+    evil = "\x1b[2J\x1b]0;owned\x07"
+    view = after(
+        (b"verdict.right", verdict(0, Outcome.SLIP, model=evil, repaired=[evil])),
+        (b"status.right", status(0, health={evil: Reason.HELD}, drivers={evil: {evil: 1}})),
+    )
+    text = "\n".join(text_of(view.snapshot(0), 120, 40, Canvas()))
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert r"\x1b[2J" in text
+
+
+@pytest.mark.parametrize("word", [outcome.value for outcome in Outcome])
+def test_big_letters_say_the_verdict_in_three_lines_or_in_five_of_ascii(word: str) -> None:
+    blocks, ascii_lines = big(word, ascii_only=False), big(word, ascii_only=True)
+    assert (len(blocks), len(ascii_lines)) == (3, 5)
+    assert len({len(line) for line in blocks}) == len({len(line) for line in ascii_lines}) == 1
+    assert set("".join(ascii_lines)) == {"#", " "}
+    ink = {" ": 0, "▀": 1, "▄": 1, "█": 2}
+    assert sum(ink[mark] for mark in "".join(blocks)) == "".join(ascii_lines).count("#")
+
+
+def mutated(rng: random.Random, golden: dict[str, object]) -> bytes:
+    """A message with odd values, odd bytes, or cut off."""
+    content = dict(golden)
+    for key in rng.sample(sorted(content), rng.randrange(3)):
+        if isinstance(content[key], list | dict) and rng.random() < 0.5:
+            content[key] = [rng.choice(ODD) for _ in range(rng.choice((1, 2, 24, 1000)))]
+        else:
+            content[key] = rng.choice(ODD)
+    payload = bytearray(json.dumps(content).encode())
+    if rng.random() < 0.2:
+        payload[rng.randrange(len(payload))] = rng.randrange(256)
+    if rng.random() < 0.1:
+        del payload[rng.randrange(len(payload)) :]
+    return bytes(payload)
+
+
+def test_ten_thousand_malformed_messages_neither_stop_the_view_nor_its_drawing() -> None:
+    seed = 20261121
+    rng = random.Random(seed)
+    goldens = [(path.stem.split("_")[0], json.loads(path.read_text())) for path in GOLDEN]
+    view = a_view()
+    for number in range(10_000):
+        kind, golden = rng.choice(goldens)
+        payload = mutated(rng, golden)
+        try:
+            view.take(f"{kind}.right".encode(), payload, number * MS)
+            seen = view.snapshot(number * MS)
+            if number % 100 == 0:
+                json.loads(msgspec.json.encode(seen))
+                assert len(text_of(seen, 80, 24, Canvas())) <= 24
+        except Exception as error:
+            error.add_note(f"seed {seed}, message {number}: {payload[:500]!r}")
+            raise
+    assert 1000 < seen.timing.not_understood < 9000

@@ -1,0 +1,248 @@
+"""The page in a real Chromium: the verdict is seen, and so is silence."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import pytest
+
+from daemon.judge.reasons import Outcome
+from daemon.watch.feed import Feed
+from daemon.watch.view import View
+from daemon.watch.watching import TICK_S, snapshots
+from daemon.watch.web import Newest, Server
+from tests.daemon.watch.browser import CHROMIUM, Browser
+from tests.daemon.watch.watch_fakes import Talker, verdict
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
+
+COLOURS = {
+    "light": {"stable": "rgb(26, 127, 55)", "slip": "rgb(207, 34, 46)"},
+    "dark": {"stable": "rgb(35, 139, 67)", "slip": "rgb(218, 63, 69)"},
+}
+"""Green and red of both themes, as the page's style has them."""
+BANNER = "document.getElementById('banner')"
+
+
+class Page:
+    """A server of the page that can be stopped and started again at its port."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._endpoint = endpoint
+        self.port = 0
+        self._over = threading.Event()
+
+    def start(self) -> None:
+        self._over.clear()
+        self._server = Server(self.port, Newest())
+        self.port = self._server.server_port
+        self._threads = [
+            threading.Thread(target=self._server.serve_forever, args=(0.02,)),
+            threading.Thread(target=self._publish),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _publish(self) -> None:
+        with Feed(self._endpoint) as feed:
+            view = View(self._endpoint)
+            for seen in snapshots(feed, view, lambda: self._over.wait(TICK_S)):
+                self._server.newest.put(msgspec.json.encode(seen))
+
+    def stop(self) -> None:
+        self._over.set()
+        self._server.shutdown()
+        for thread in self._threads:
+            thread.join()
+        self._server.server_close()
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    made = Page(f"ipc://{tmp_path}/v")
+    made.start()
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def talker(tmp_path: Path) -> Iterator[Talker]:
+    with Talker(f"ipc://{tmp_path}/v") as made:
+        yield made
+
+
+@pytest.fixture
+def browser(tmp_path: Path) -> Iterator[Browser]:
+    with Browser(tmp_path / "profile") as made:
+        yield made
+
+
+def see(browser: Browser, tone: str) -> None:
+    browser.wait_for(f"{BANNER}.dataset.tone == '{tone}'")
+
+
+def text(browser: Browser, element: str) -> str:
+    return str(browser.value(f"document.getElementById('{element}').innerText"))
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_the_page_shows_verdict_images_and_advice_in_both_themes(
+    tmp_path: Path,
+    page: Page,
+    talker: Talker,
+    browser: Browser,
+    theme: Literal["light", "dark"],
+    width: int,
+    height: int,
+) -> None:
+    browser.look(width, height, theme)
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    for outcome, share in ((Outcome.STABLE, "25 %"), (Outcome.SLIP, "75 %")):
+        talker.outcome = outcome
+        see(browser, outcome.value)
+        assert text(browser, "verdict") == outcome.value.upper()
+        assert share in text(browser, "p")
+        colour = browser.value(f"getComputedStyle({BANNER}).backgroundColor")
+        assert colour == COLOURS[theme][outcome.value]
+    browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
+    assert text(browser, "who") == "graspd right"
+    assert "FFJ3" in text(browser, "joints")
+    assert "28.6°" in text(browser, "joints")
+    assert "ff_7 electrode-dead: " in text(browser, "health")
+    # Nothing is wider than the window, and the images are drawn: not all of one colour.
+    assert browser.value("document.documentElement.scrollWidth <= innerWidth")
+    assert (
+        browser.value(
+            "(c => new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
+            "(document.querySelector('figure canvas'))"
+        )
+        > 8
+    )
+    browser.picture(tmp_path / "page.png")
+    assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
+    assert browser.complaints == []
+
+
+def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.outcome = Outcome.STABLE
+    browser.look(1280, 800)
+    browser.go(f"http://localhost:{page.port}/")
+    see(browser, "stable")
+    talker.outcome = None
+    see(browser, "silent")
+    assert text(browser, "verdict") == "UNKNOWN"
+    assert "unknown: no message for " in text(browser, "why")
+    talker.outcome = Outcome.SLIP
+    see(browser, "slip")
+    page.stop()
+    see(browser, "silent")
+    why = text(browser, "why")
+    assert why.startswith("no connection: graspd watch does not answer; no message from graspd ")
+    page.start()
+    see(browser, "slip")
+
+
+def note_tones(browser: Browser) -> None:
+    """From now on, or from when it is frozen, the page keeps in `tones` what was to be seen."""
+    browser.value(
+        "tones = []; document.addEventListener('freeze', () => { tones = []; });"
+        f" new MutationObserver(() => {{ const tone = {BANNER}.dataset.tone;"
+        " if (tones.at(-1) !== tone) tones.push(tone); })"
+        f".observe({BANNER}, {{attributes: true}})"
+    )
+
+
+def hide(browser: Browser, hidden: str) -> None:
+    """Have the page believe that it is hidden, `true`, or is not."""
+    value = f"{{value: {hidden}, configurable: true}}"
+    browser.value(f"Object.defineProperty(document, 'hidden', {value})")
+
+
+def test_a_page_that_was_frozen_shows_unknown_and_nothing_of_what_waited(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.outcome = Outcome.STABLE
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "stable")
+    hide(browser, "false")  # as far as the page knows
+    note_tones(browser)
+    browser.ask("Page.setWebLifecycleState", state="frozen")
+    time.sleep(1.0)  # of which stable verdicts wait
+    talker.outcome = Outcome.SLIP
+    time.sleep(1.0)
+    browser.ask("Page.setWebLifecycleState", state="active")
+    see(browser, "slip")
+    assert browser.value("tones") == ["silent", "slip"]
+    assert browser.complaints == []
+
+
+def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    """Only the wall clock has gone on meanwhile."""
+    talker.outcome = Outcome.STABLE
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "stable")
+    note_tones(browser)
+    browser.value("(real => { tones = []; Date.now = () => real() + 3600000; })(Date.now)")
+    browser.wait_for("tones.length >= 2")
+    assert browser.value("tones") == ["silent", "stable"]
+
+
+def test_a_page_in_the_background_shows_no_verdict(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.outcome = Outcome.STABLE
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "stable")
+    for hidden, tone in (("true", "silent"), ("false", "stable")):
+        hide(browser, hidden)
+        browser.value("document.dispatchEvent(new Event('visibilitychange'))")
+        see(browser, tone)
+        assert browser.value("document.title") == f"{text(browser, 'verdict').lower()} - graspd"
+
+
+def test_the_page_has_a_clock_that_goes_on(page: Page, talker: Talker, browser: Browser) -> None:
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "waiting")
+    first = text(browser, "clock")
+    assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
+    browser.wait_for(f"document.getElementById('clock').innerText > '{first}'")
+
+
+def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
+    """The way gets five seconds longer, as through a tunnel that hung."""
+    server, late_s, over = Server(0, Newest()), 0.0, threading.Event()
+    view = View("ipc:///tmp/any", wall=lambda: time.time() - late_s)
+
+    def put() -> None:
+        seq = 0
+        while not over.wait(0.05):
+            view.take(b"verdict.right", verdict(seq, Outcome.STABLE), 0)
+            server.newest.put(msgspec.json.encode(view.snapshot(0)))
+            seq += 1
+
+    threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]
+    for thread in threads:
+        thread.start()
+    try:
+        browser.go(f"http://127.0.0.1:{server.server_port}/")
+        see(browser, "stable")
+        note_tones(browser)
+        late_s = 5.0
+        browser.wait_for("tones.includes('silent')")
+    finally:
+        over.set()
+        server.shutdown()
+        for thread in threads:
+            thread.join()
+        server.server_close()

@@ -1,0 +1,413 @@
+"""`graspd watch` as a process: in a terminal of its own, on a port, with keys, and used wrongly."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import pty
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Self
+
+import pytest
+
+from daemon import scene
+from daemon.judge.reasons import Outcome
+from daemon.publish.keys import KeysError, make
+from daemon.publish.messages import decode_verdict
+from daemon.publish.publisher import Publisher
+from daemon.publish.sockets import Sockets
+from daemon.watch.feed import Feed, load_keys
+from daemon.watch.view import View
+from tests.daemon.fakes import Clock
+from tests.daemon.processes import GRASPD, graspd, start
+from tests.daemon.watch.watch_fakes import MS, Talker, verdict
+
+PATIENCE_S = 30.0
+PORT = 25941
+TCP = f"tcp://127.0.0.1:{PORT + 1}"
+ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
+"""Of the alternate screen (xterm)."""
+
+
+class Terminal:
+    """A pseudo-terminal with a command in it."""
+
+    def __init__(self, *arguments: str, columns: int = 80, lines: int = 24) -> None:
+        self.kind = "xterm-256color"
+        self.shell: tuple[str, ...] = ()
+        """What runs the command; alone in its session, Ctrl-C is for it."""
+        self._arguments = arguments
+        self._size = struct.pack("HHHH", lines, columns, 0, 0)
+        self.output = b""
+
+    def __enter__(self) -> Self:
+        self._ours, theirs = pty.openpty()
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, self._size)
+        self.former = termios.tcgetattr(self._ours)
+        self.process = subprocess.Popen(
+            ["setsid", "--ctty", *self.shell, *GRASPD, "watch", *self._arguments],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            env={**os.environ, "TERM": self.kind},
+        )
+        os.close(theirs)
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._ours)
+
+    def read_until(self, pattern: bytes) -> None:
+        """Wait until the command has written something since the last time."""
+        self.output = b""
+        os.set_blocking(self._ours, False)
+        deadline_s = time.monotonic() + PATIENCE_S
+        while not re.search(pattern, self.output, re.DOTALL):
+            assert time.monotonic() < deadline_s, self.output[-3000:]
+            time.sleep(0.02)
+            self.read()
+
+    def read(self) -> None:
+        with contextlib.suppress(BlockingIOError, OSError):
+            while part := os.read(self._ours, 1 << 16):
+                self.output += part
+
+    def type(self, keys: bytes) -> None:
+        os.write(self._ours, keys)
+
+    def resize(self, columns: int, lines: int) -> None:
+        fcntl.ioctl(self._ours, termios.TIOCSWINSZ, struct.pack("HHHH", lines, columns, 0, 0))
+
+    def end(self) -> int:
+        """Wait for the command; its exit code."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while self.process.poll() is None:
+            assert time.monotonic() < deadline_s
+            self.read()
+            time.sleep(0.02)
+        self.read()
+        return self.process.returncode
+
+    def settings(self) -> list[object]:
+        return termios.tcgetattr(self._ours)
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/v"
+
+
+def press_q(terminal: Terminal) -> None:
+    terminal.type(b"q")
+
+
+def press_ctrl_c(terminal: Terminal) -> None:
+    terminal.type(b"\x03")
+
+
+def send_sigterm(terminal: Terminal) -> None:
+    terminal.process.send_signal(signal.SIGTERM)
+
+
+@pytest.mark.parametrize("end", [press_q, press_ctrl_c, send_sigterm])
+def test_it_ends_cleanly_and_leaves_the_terminal_as_it_was(
+    endpoint: str, end: Callable[[Terminal], None]
+) -> None:
+    with Talker(endpoint), Terminal("--connect", endpoint) as terminal:
+        terminal.read_until(rb"readings[^\n]*100")
+        terminal.output = b""
+        end(terminal)
+        assert terminal.end() == 0
+        assert LEAVE in terminal.output
+        assert b"Traceback" not in terminal.output
+        assert terminal.settings() == terminal.former
+
+
+def test_it_shows_verdicts_then_silence_and_verdicts_again(endpoint: str) -> None:
+    with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
+        terminal.read_until(re.escape(ENTER))
+        talker.outcome = Outcome.SLIP
+        terminal.read_until(rb"do not lift")
+        assert b"75 %" in terminal.output
+        talker.outcome = None
+        terminal.read_until(rb"no message for [0-9]+ ms")
+        talker.outcome = Outcome.STABLE
+        terminal.read_until(rb"judged to hold")
+        terminal.resize(200, 60)
+        terminal.read_until(rb"pressed, below ")
+        terminal.resize(20, 5)
+        terminal.read_until(rb"graspd")
+        press_q(terminal)
+        assert terminal.end() == 0
+
+
+SHELL = ("bash", "-c", 'set -m; "$@"; echo "[stopped]"; read -r; fg', "bash")
+"""Runs a command as an interactive shell does, and goes on with it after a line is typed."""
+
+
+def test_stopped_by_ctrl_z_it_shows_no_verdict_and_comes_back_with_new_ones(endpoint: str) -> None:
+    terminal = Terminal("--connect", endpoint)
+    terminal.shell = SHELL
+    with Talker(endpoint) as talker, terminal:
+        talker.outcome = Outcome.STABLE
+        terminal.read_until(rb"judged to hold")
+        terminal.type(b"\x1a")
+        terminal.read_until(
+            re.escape(LEAVE) + rb".*stopped at \d\d:\d\d:\d\d: unknown.*\[stopped\]"
+        )
+        assert ENTER not in terminal.output
+        talker.outcome = Outcome.SLIP
+        time.sleep(1.2)  # longer than it may be without looking
+        terminal.type(b"\n")
+        terminal.read_until(re.escape(ENTER) + rb".*do not lift")
+        assert b"judged to hold" not in terminal.output
+        press_q(terminal)
+        assert terminal.end() == 0
+        assert LEAVE in terminal.output
+
+
+def test_ctrl_z_where_no_shell_could_continue_it_is_no_end(endpoint: str) -> None:
+    """The kernel stops nobody then (POSIX, orphaned process groups)."""
+    with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
+        talker.outcome = Outcome.STABLE
+        terminal.read_until(rb"judged to hold")
+        terminal.type(b"\x1a")
+        terminal.read_until(re.escape(ENTER) + rb".*judged to hold")
+        press_q(terminal)
+        assert terminal.end() == 0
+
+
+def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
+    clock = Clock()
+    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+
+        def came(outcome: Outcome, seq: int) -> list[bytes]:
+            deadline_s = time.monotonic() + PATIENCE_S
+            while not (found := [payload for _, payload in feed.take()]):
+                assert time.monotonic() < deadline_s
+                publisher.take()
+                publisher.send(b"verdict.right", verdict(seq, outcome))
+                time.sleep(0.01)
+            return found
+
+        came(Outcome.STABLE, 0)
+        for seq in range(1, 50):
+            publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+        time.sleep(0.1)
+        publisher.forget()
+        clock.now_ns += 1001 * MS
+        assert list(feed.take()) == []
+        for payload in came(Outcome.SLIP, 50):
+            assert decode_verdict(payload).seq == 50
+
+
+def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoint: str) -> None:
+    clock = Clock()
+    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+        deadline_s, seq = time.monotonic() + PATIENCE_S, 0
+        while not list(feed.take()):
+            assert time.monotonic() < deadline_s
+            publisher.take()
+            publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+            seq += 1
+            time.sleep(0.01)
+        while list(feed.take()):
+            pass
+        looked_ns = clock.now_ns
+        publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+        time.sleep(0.2)
+        clock.now_ns += 900 * MS
+        view = View(endpoint)
+        for topic, payload in feed.take():
+            view.take(topic, payload, feed.empty_ns)
+        assert view.snapshot(clock.now_ns).verdict == "unknown"
+        assert view.snapshot(looked_ns).verdict == "stable"
+
+
+def test_it_waits_for_a_daemon_that_is_not_there_yet(endpoint: str) -> None:
+    with Terminal("--connect", endpoint) as terminal:
+        terminal.read_until(rb"no message has come yet")
+        with Talker(endpoint) as talker:
+            talker.outcome = Outcome.STABLE
+            terminal.read_until(rb"judged to hold")
+        press_q(terminal)
+        assert terminal.end() == 0
+
+
+def test_a_terminal_that_cannot_be_drawn_on_is_said(endpoint: str) -> None:
+    terminal = Terminal("--connect", endpoint)
+    terminal.kind = "dumb"
+    with terminal:
+        assert terminal.end() == 2
+        assert b"watch cannot draw on this terminal" in terminal.output
+
+
+def test_a_scene_says_where_and_which_hand(tmp_path: Path, endpoint: str) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[hand]\nname = "right"\n[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
+        f'[publish]\nendpoint = "{endpoint}"\n'
+    )
+    with Talker(endpoint) as talker, Terminal(str(path)) as terminal:
+        talker.outcome = Outcome.STABLE
+        terminal.read_until(rb"judged to hold")
+        press_q(terminal)
+        assert terminal.end() == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--connect", "ipc:///tmp/x"], "watch draws on a terminal"),
+        (["--connect", "nonsense"], "nonsense: cannot connect there"),
+        (["--connect", "tcp://127.0.0.1:1", "--keys", "x"], "--keys needs --server-key"),
+        (["--connect", "ipc:///tmp/x", "--port", "0", "--web"], "not a port of 1 to 65535"),
+        (["--connect", "ipc:///tmp/x", "scene.toml"], "not allowed with argument"),
+        (["no-such-scene.toml"], "cannot read the scene"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(arguments: list[str], said: str) -> None:
+    result = graspd("watch", *arguments)
+    assert result.returncode == 2
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str) -> None:
+    code = (
+        "import sys; sys.modules['rich'] = None; sys.stdout.isatty = lambda: True; "
+        "from daemon.cli import main; sys.exit(main())"
+    )
+    command = [sys.executable, "-c", code, "watch", "--connect", endpoint]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False)
+    assert result.returncode == 2
+    assert result.stderr == (
+        "graspd: watch needs the package 'rich': run pip install '.[watch]' in the folder of "
+        "graspd's source; or watch --web, which needs none\n"
+    )
+    with subprocess.Popen(
+        [*command, "--web", "--port", str(PORT)], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == f"http://127.0.0.1:{PORT}/ (Ctrl-C ends)\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE_S) == 0
+
+
+def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        result = graspd("watch", "--connect", endpoint, "--web", "--port", port)
+    assert result.returncode == 1
+    assert f"cannot serve a page on port {port}: Address already in use" in result.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_page_ends_on_a_signal_with_pages_open(endpoint: str, number: int) -> None:
+    with Talker(endpoint), start("watch", "--web", "--connect", endpoint, "--port", PORT) as page:
+        assert page.stdout is not None
+        assert page.stdout.readline() == f"http://127.0.0.1:{PORT}/ (Ctrl-C ends)\n"
+        with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as link:
+            link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            with link.makefile("rb") as lines:
+                assert any(b'"hand":"right"' in line for line in lines)
+            page.send_signal(number)
+            assert page.wait(PATIENCE_S) == 0
+        assert page.stderr is not None
+        assert page.stderr.read() == ""
+
+
+@pytest.fixture
+def door(tmp_path: Path) -> Iterator[Sockets]:
+    """A daemon's sockets that admit the key `known`."""
+    make(tmp_path, "daemon")
+    make(tmp_path / "clients", "known")
+    for name in ("known.key", "known.key_secret"):
+        (tmp_path / name).write_bytes((tmp_path / "clients" / name).read_bytes())
+        (tmp_path / name).chmod(0o600)
+    make(tmp_path, "stranger")
+    content = {
+        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        "publish": {"endpoint": TCP},
+        "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
+    }
+    with Sockets(scene.parse(content, tmp_path / "scene.toml")) as made:
+        yield made
+
+
+def hears(door: Sockets, feed: Feed, until: Callable[[bool], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    heard = False
+    while not until(heard):
+        assert time.monotonic() < deadline_s, feed.link
+        door.take()
+        door.send(b"verdict.right", verdict(0))
+        time.sleep(0.01)
+        heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())
+
+
+def test_a_known_key_is_let_in(tmp_path: Path, door: Sockets) -> None:
+    keys = load_keys(tmp_path / "known.key_secret", tmp_path / "daemon.key")
+    with Feed(TCP, keys) as feed:
+        hears(door, feed, lambda heard: heard)
+        assert feed.link == "connected"
+
+
+@pytest.mark.parametrize(
+    ("own", "server", "said"),
+    [
+        ("stranger", "daemon", "the daemon does not know this key"),
+        ("known", "stranger", "is the daemon's key right?"),
+        (None, None, "the daemon wants a key"),
+    ],
+)
+def test_whoever_is_turned_away_is_told_why(
+    tmp_path: Path, door: Sockets, own: str | None, server: str | None, said: str
+) -> None:
+    keys = own and load_keys(tmp_path / f"{own}.key_secret", tmp_path / f"{server}.key")
+    with Feed(TCP, keys or None) as feed:
+        hears(door, feed, lambda heard: heard or feed.link.startswith("turned away"))
+        assert said in feed.link
+        later_s = time.monotonic() + 0.5  # whatever is tried again says the same
+        hears(door, feed, lambda heard: heard or time.monotonic() > later_s)
+        assert said in feed.link
+
+
+def test_who_was_turned_away_is_let_in_when_its_key_is_known(tmp_path: Path, door: Sockets) -> None:
+    clock = Clock()
+    keys = load_keys(tmp_path / "stranger.key_secret", tmp_path / "daemon.key")
+    with Feed(TCP, keys, clock) as feed:
+        hears(door, feed, lambda _: feed.is_turned_away)
+        (tmp_path / "stranger.key").rename(tmp_path / "clients" / "stranger.key")
+        door.mind_keys()
+        for _ in range(6):  # looks, and is not paused
+            clock.now_ns += 900 * MS
+            list(feed.take())
+        hears(door, feed, lambda heard: heard)
+        assert feed.link == "connected"
+
+
+def test_keys_that_are_wrong_are_said(tmp_path: Path) -> None:
+    make(tmp_path, "own")
+    own = tmp_path / "own.key_secret"
+    empty = tmp_path / "empty.key"
+    empty.write_text("")
+    with pytest.raises(KeysError, match=r"no\.key: cannot read the daemon's key"):
+        load_keys(own, tmp_path / "no.key")
+    with pytest.raises(KeysError, match="has no public key"):
+        load_keys(own, empty)
+    own.chmod(0o644)
+    with pytest.raises(KeysError, match="chmod 600"):
+        load_keys(own, tmp_path / "own.key")

@@ -1,0 +1,209 @@
+"""What the tests of the CAN bridge share: stand-ins for buses, and what is sent over them."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+from collections.abc import Callable, Sequence
+from typing import Any, Self
+
+import can
+import pytest
+
+from drivers.base import Reading, TactileReading
+from drivers.can.driver import CanBridgeDriver
+from drivers.can.formats import encode_sample
+from drivers.can.frames import CanFrame, pack_frame
+from drivers.kernel_stamps import SO_TIMESTAMPNS
+from drivers.twins.can import SAMPLE_ID, CanTwin
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps.grasps import Counts, GeneratedContact
+from tests.drivers.can.can_words import Clock, samples
+
+MS = 1_000_000
+CHANNELS = itertools.count()
+LOOPBACK = "lo"
+"""The driver looks for the interface before python-can does; this one is always there."""
+
+
+class SocketBus:
+    """What python-can's `socketcan` bus is to the driver: something with a raw socket.
+
+    The socket is one end of a pair of Unix datagram sockets, stamped like a CAN socket.
+    """
+
+    def __init__(self) -> None:
+        self.socket, self.far_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.far_end.setblocking(False)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.shutdown()
+        self.far_end.close()
+
+    def send(self, frame: CanFrame) -> None:
+        self.far_end.send(pack_frame(frame))
+
+    def fileno(self) -> int:
+        return self.socket.fileno()
+
+    def shutdown(self) -> None:
+        self.socket.close()
+
+
+class ScriptedBus:
+    """A bus without a descriptor whose `recv` follows a script of messages and exceptions."""
+
+    def __init__(self, script: Sequence[can.Message | BaseException | None] = ()) -> None:
+        self.script = list(script)
+        self.shut_down = 0
+        self.shutdown_error: BaseException | None = None
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        assert timeout == 0, "the driver waits"
+        if not self.script:
+            return None
+        step = self.script.pop(0)
+        if isinstance(step, BaseException):
+            raise step
+        return step
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        self.shut_down += 1
+        if self.shutdown_error is not None:
+            raise self.shutdown_error
+
+
+class FailingBus:
+    """A bus whose `recv` fails once `failure` is set, as when an adapter is unplugged."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self.bus = bus
+        self.failure: BaseException | None = None
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        received = self.bus.recv(timeout)
+        if received is None and self.failure is not None:
+            failure, self.failure = self.failure, None
+            raise failure
+        return received
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def shutdown(self) -> None:
+        self.bus.shutdown()
+
+
+Opener = Callable[[], object]
+
+
+def stand_in(monkeypatch: pytest.MonkeyPatch, opener: Opener) -> None:
+    """Have python-can open what `opener` returns or raises."""
+
+    def open_bus(**_: object) -> object:
+        return opener()
+
+    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
+
+
+def channel() -> str:
+    """A virtual channel that no other test uses."""
+    return f"test-{next(CHANNELS)}"
+
+
+def bridge(where: str, frame_format: str = "syntouch", **options: Any) -> CanBridgeDriver:  # noqa: ANN401
+    """A driver on a virtual bus, without the samples that it does not use."""
+    if frame_format == "syntouch":
+        options.setdefault("arbitration_id", SAMPLE_ID)
+        options.setdefault("sequence", "electrodes")
+    return CanBridgeDriver("virtual", where, format=frame_format, **options)
+
+
+def tactile(readings: Sequence[Reading]) -> list[TactileReading]:
+    assert all(isinstance(reading, TactileReading) for reading in readings)
+    return [reading for reading in readings if isinstance(reading, TactileReading)]
+
+
+def contact(sweeps: int, seed: int = 0) -> list[Counts]:
+    return list(itertools.islice(GeneratedContact(seed=seed), sweeps))
+
+
+def message(data: bytes = b"", identifier: int = SAMPLE_ID, **options: bool) -> can.Message:
+    options.setdefault("is_extended_id", False)
+    return can.Message(arbitration_id=identifier, data=data, **options)
+
+
+def sweep_messages(sweep: int = 0) -> list[can.Message]:
+    return [message(encode_sample(channel, words)) for channel, words, _ in samples(sweep)]
+
+
+def sweep_of_frames(sweep: int) -> list[CanFrame]:
+    return [
+        CanFrame(SAMPLE_ID, encode_sample(channel, words)) for channel, words, _ in samples(sweep)
+    ]
+
+
+class TwinLink:
+    """Driver and twins on one virtual bus and one clock that tests move, sweep by sweep."""
+
+    def __init__(self, frame_format: str, sequence: str = "electrodes") -> None:
+        self.clock = Clock()
+        self.where, self.format, self.sequence = channel(), frame_format, sequence
+        self.driver = bridge(
+            self.where, frame_format, sequence=sequence, clock=self.clock, wall_clock=self.clock
+        )
+        self.readings: list[TactileReading] = []
+        self.sweeps_sent = 65_500
+        """The number of sweep frames wraps in the middle of the longer tests."""
+
+    def send(self, counts: Sequence[Counts], faults: LinkFaults = LinkFaults()) -> CanTwin:  # noqa: B008
+        """Send sweeps at 100 Hz; the frames of each arrive at once."""
+        twin = CanTwin(
+            "virtual",
+            self.where,
+            iter(counts),
+            format=self.format,
+            sequence=self.sequence,
+            first_sweep=self.sweeps_sent,
+            faults=faults,
+            bus_options={"preserve_timestamps": True},
+            clock=self.clock,
+        )
+        self.sweeps_sent += len(counts)
+        with twin:
+            for _ in counts:
+                self.clock.now_ns += 10 * MS
+                twin.send_sweep()
+                self.readings += tactile(self.driver.read_ready())
+            twin.flush()
+            self.readings += tactile(self.driver.read_ready())
+        assert twin.unsent == 0
+        return twin
+
+    def half(self, counts: Counts) -> int:
+        """Send the first half of a sweep; its frames."""
+        options = {"preserve_timestamps": True}
+        twin = CanTwin(
+            "virtual",
+            self.where,
+            iter([counts]),
+            format=self.format,
+            sequence=self.sequence,
+            first_sweep=self.sweeps_sent,
+            bus_options=options,
+            clock=self.clock,
+        )
+        self.clock.now_ns += 10 * MS
+        self.sweeps_sent += 1
+        with twin:
+            frames = twin.next_frames()
+            for frame in frames[: len(frames) // 2]:
+                twin._put(frame)
+        return len(frames) // 2

@@ -1,0 +1,270 @@
+"""Every fault of a CAN bus in both formats: counted one by one, and nothing is invented."""
+
+from __future__ import annotations
+
+import errno
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.can.formats import CanFormat, SweepFrame
+from drivers.can.frames import CanFrame, FrameFlag
+from drivers.link import LinkState
+from drivers.twins.can import SAMPLE_ID
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps.grasps import Counts
+from tests.drivers.can.can_fuzz import decoder
+from tests.drivers.can.can_standin import (
+    FailingBus,
+    TwinLink,
+    contact,
+    tactile,
+)
+from tests.drivers.can.can_words import truth, word
+
+MS = 1_000_000
+
+
+FORMATS = list(CanFormat)
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+@pytest.mark.parametrize(
+    "faults",
+    [
+        LinkFaults(drop_probability=0.02),
+        LinkFaults(duplicate_probability=0.05),
+        LinkFaults(reorder_probability=0.05),
+        LinkFaults(burst_frames=6),
+        LinkFaults(disconnect_every_frames=50),
+    ],
+    ids=["drop", "duplicate", "reorder", "burst", "disconnect"],
+)
+def test_link_faults_are_counted_one_by_one_and_invent_nothing(
+    frame_format: str, faults: LinkFaults
+) -> None:
+    link = TwinLink(frame_format)
+    before, during, after = contact(2, 1), contact(200, 2), contact(2, 3)
+    with link.driver:
+        link.send(before)
+        twin = link.send(during, faults)
+        link.send(after)
+    injected, counters = twin.injected, link.driver.counters
+    sent = [*before, *during, *after]
+    assert_only_what_was_sent(link.readings, sent)
+    assert [reading.seq for reading in link.readings] == list(range(len(sent)))
+    late = counters.late_frames
+    assert counters.duplicate_frames == injected["duplicate"]
+    assert counters.lost_frames == injected["drop"] + injected["disconnect"] + late
+    assert counters.reordered_frames + late == injected["reorder"]
+    assert counters.faulty_readings == sum(bool(r.faults.any()) for r in link.readings)
+    assert injected.total() > 10
+    assert_same_tail(link.readings, after)
+
+
+FAILURES = [
+    can.CanOperationError("adapter says no"),
+    OSError(errno.ENODEV, "No such device"),
+    struct.error("unpack requires a buffer of 4 bytes"),
+    IndexError("string index out of range"),
+]
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
+def test_a_driver_that_loses_its_bus_again_and_again_invents_nothing(
+    monkeypatch: pytest.MonkeyPatch, frame_format: str, failure: Exception
+) -> None:
+    """The bus breaks in the middle of every tenth sweep; what is sent until it is back is lost."""
+    real, opened = can.Bus, []
+    link = TwinLink(frame_format)
+
+    def open_bus(**options: Any) -> object:  # noqa: ANN401
+        if options.get("preserve_timestamps"):
+            return real(**options)  # the twin's
+        opened.append(FailingBus(real(**options)))
+        return opened[-1]
+
+    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
+    sent, losses = contact(120), 0
+    with link.driver:
+        for sweep, counts in enumerate(sent):
+            if sweep % 10 == 9:
+                losses += 1
+                half = link.half(counts)
+                opened[-1].failure = failure
+                link.readings += tactile(link.driver.read_ready())
+                assert half > 0
+                assert link.driver.link_state is LinkState.WAITING
+                link.clock.now_ns += 10 * MS
+            else:
+                link.send([counts])
+        counters = link.driver.counters
+    assert (counters.bus_faults, counters.link_losses, counters.interrupted_sweeps) == (
+        losses,
+        losses,
+        losses,
+    )
+    assert losses == 12
+    for reading in link.readings:
+        sound = reading.faults == 0
+        assert any((reading.counts[sound] == counts[sound]).all() for counts in sent)
+    assert counters.faulty_readings == counters.lost_frames == 0
+
+
+def truth_frames(sweep: int) -> list[CanFrame]:
+    """Sweep frames of the tagged counts, at 100 Hz by the board's clock."""
+    return [
+        CanFrame(
+            SAMPLE_ID + finger,
+            SweepFrame(
+                finger,
+                sweep,
+                10_000 * sweep,
+                b"".join(word(int(count)) for count in truth(sweep)[row]),
+            ).to_bytes(),
+            FrameFlag.FD,
+        )
+        for row, finger in enumerate((0, 1, 4))
+    ]
+
+
+@pytest.mark.parametrize("spoiled_row", [0, 1, 2])
+def test_every_single_flipped_bit_of_a_sweep_frame_shows_and_invents_nothing(
+    spoiled_row: int,
+) -> None:
+    for bit in range(512):
+        made, counters = decoder(CanFormat.SWEEP_FD)
+        readings: list[TactileReading] = []
+        for sweep in range(100, 130):
+            for row, frame in enumerate(truth_frames(sweep)):
+                data = bytearray(frame.data)
+                if (sweep, row) == (110, spoiled_row):
+                    data[bit // 8] ^= 1 << bit % 8
+                readings += made.push(frame._replace(data=bytes(data)), sweep * 10 * MS)
+        told = counters.as_dict()
+        harmless = {"readings", "accepted_frames", "lost_frames"}
+        assert any(count for name, count in told.items() if name not in harmless), f"bit {bit}"
+        for reading in readings:
+            sound = reading.faults == 0
+            matches = [(truth(n)[sound] == reading.counts[sound]).all() for n in range(100, 130)]
+            assert any(matches), f"bit {bit}"
+        faulty = [int(np.count_nonzero(reading.faults)) for reading in readings]
+        assert faulty[-3:] == [0, 0, 0], f"bit {bit}"
+        assert sum(count > 0 for count in faulty) <= 4, f"bit {bit}"
+
+
+def assert_only_what_was_sent(readings: Sequence[TactileReading], sent: Sequence[Counts]) -> None:
+    """Every sound electrode holds the count of its own sweep."""
+    for reading in readings:
+        sound = reading.faults == 0
+        assert (reading.counts[sound] == sent[reading.seq][sound]).all()
+
+
+def assert_same_tail(readings: Sequence[TactileReading], counts: Sequence[Counts]) -> None:
+    for reading, expected in zip(readings[-len(counts) :], counts, strict=True):
+        assert not reading.faults.any()
+        assert (reading.counts == expected).all()
+
+
+def test_flipped_bits_are_counted_and_never_become_counts() -> None:
+    link = TwinLink("syntouch")
+    sent = contact(300)
+    with link.driver:
+        link.send(sent[:2])
+        twin = link.send(sent[2:298], LinkFaults(bit_flip_probability=0.05))
+        link.send(sent[298:])
+    counters = link.driver.counters
+    words = counters.parity_words + counters.error_words + counters.unplugged_words
+    assert words + counters.unknown_commands == twin.injected["bit_flip"] > 100
+    assert counters.lost_frames == counters.unknown_commands
+    assert_only_what_was_sent(link.readings, sent)
+    assert_same_tail(link.readings, sent[298:])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_flipped_bits_in_sweep_frames_are_recovered_from(seed: int) -> None:
+    link = TwinLink("sweep_fd")
+    after = contact(20, 5)
+    with link.driver:
+        link.send(contact(2))
+        link.send(contact(200), LinkFaults(bit_flip_probability=0.05, seed=seed))
+        link.clock.now_ns += 3_000 * MS
+        link.send(after)
+    assert_same_tail(link.readings, after[1:])
+    counters = link.driver.counters
+    assert counters.accepted_frames + counters.unknown_versions + counters.malformed_frames == (
+        counters.frames
+    )
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+def test_an_unplugged_sensor_is_missing_and_the_others_are_not(frame_format: str) -> None:
+    link = TwinLink(frame_format)
+    with link.driver:
+        link.send(contact(20), LinkFaults(unplugged_fingers=(1,)))
+    assert len(link.readings) == 20
+    for reading, expected in zip(link.readings, contact(20), strict=True):
+        assert (reading.faults[1] != 0).all()
+        assert not reading.counts[1].any()
+        assert not reading.faults[[0, 2]].any()
+        assert (reading.counts[[0, 2]] == expected[[0, 2]]).all()
+    assert link.driver.counters.unplugged_words == 20 * 24
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+def test_a_dead_electrode_reads_zero(frame_format: str) -> None:
+    link = TwinLink(frame_format)
+    with link.driver:
+        link.send(contact(5), LinkFaults(dead_electrodes=((2, 17),)))
+    for reading in link.readings:
+        assert reading.counts[2, 17] == 0
+        assert np.count_nonzero(reading.counts) == 3 * 24 - 1
+        assert not reading.faults.any()
+
+
+def test_another_version_of_the_layout_gives_no_reading() -> None:
+    link = TwinLink("sweep_fd")
+    with link.driver:
+        link.send(contact(5), LinkFaults(wrong_version=True))
+        assert link.readings == []
+        assert link.driver.counters.unknown_versions == 15
+        assert link.driver.link_state is LinkState.GREETING
+
+
+def test_a_stuck_clock_is_counted() -> None:
+    link = TwinLink("sweep_fd")
+    with link.driver:
+        link.send(contact(5), LinkFaults(stuck_clock=True))
+    assert link.driver.counters.stuck_ticks == 3 * 4
+    assert not link.readings[0].faults.any()
+    assert len(link.readings) == 5
+    assert all((reading.faults == ElectrodeFault.HELD).all() for reading in link.readings[1:])
+
+
+@pytest.mark.parametrize("frame_format", FORMATS)
+def test_sweeps_that_nobody_sent_in_between_are_missed(frame_format: str) -> None:
+    link = TwinLink(frame_format)
+    with link.driver:
+        link.send(contact(20))
+        link.clock.now_ns += 30 * MS
+        link.send(contact(1))
+    counters = link.driver.counters
+    missed = 3 if frame_format == "syntouch" else 0  # sweep frames say that none was made
+    assert counters.missed_readings == missed
+    assert link.readings[-1].seq == 20 + missed
+
+
+def test_sweep_frames_that_start_anew_are_followed() -> None:
+    link = TwinLink("sweep_fd")
+    with link.driver:
+        link.send(contact(20))
+        link.sweeps_sent = 5_000
+        link.send(contact(3))
+    assert len(link.readings) == 23
+    assert link.driver.counters.restarts == 1

@@ -1,0 +1,299 @@
+"""The bytes of CAN frames: golden vectors, the DBC file, what is refused, and fuzzing."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import cantools.database
+import numpy as np
+import pytest
+from cantools.database.can.database import Database
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.base import FINGERS, TactileReading
+from drivers.biotac import decode_words
+from drivers.can.formats import (
+    SWEEP_BASE_ID,
+    CanFormat,
+    Reject,
+    SweepFrame,
+    SweepStatus,
+    encode_sample,
+    parse_sample,
+    parse_sweep,
+)
+from drivers.can.frames import (
+    CanFrame,
+    FrameFlag,
+    describe_error,
+    is_bus_off,
+    is_overflow,
+    pack_frame,
+    unpack_frame,
+)
+from tests.conftest import ROOT
+from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder, fuzz
+from tests.drivers.can.can_words import samples, truth, word
+
+E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
+"""Electrode 1 of three sensors: 2602, 2713, 2391."""
+SWEEP_EXAMPLE = bytes.fromhex("01 04 3412 40420F00" + "A251" * 24 + "0000 000000000000")
+"""The example in deploy/can/PROTOCOL.md."""
+DAMAGED_FRAMES = 100_000
+
+
+@pytest.fixture(scope="module")
+def dbc() -> Database:
+    loaded = cantools.database.load_file(ROOT / "deploy" / "can" / "graspd.dbc")
+    assert isinstance(loaded, Database)
+    return loaded
+
+
+def test_the_real_formats_sample_is_read() -> None:
+    sample = parse_sample(E1_SAMPLE, 3, 7)
+    assert not isinstance(sample, Reject)
+    counts, faults = decode_words(np.frombuffer(sample.words, dtype=">u2").astype(np.uint16))
+    assert sample.channel == 17
+    assert counts.tolist() == [2602, 2713, 2391]
+    assert not faults.any()
+
+
+def test_the_real_formats_sample_is_written() -> None:
+    words = word(2602) + word(2713) + word(2391)
+    assert encode_sample(17, words) == E1_SAMPLE
+
+
+@pytest.mark.parametrize(
+    ("data", "reject"),
+    [
+        ("", Reject.LENGTH),
+        ("A2 A251 A8C8", Reject.LENGTH),
+        ("A2 A251 A8C8 94B9 00", Reject.LENGTH),
+        ("A3 A251 A8C8 94B9", Reject.COMMAND),
+        ("A1 A251 A8C8 94B9", Reject.COMMAND),  # the old protocol's streaming command
+        ("61 A251 A8C8 94B9", Reject.COMMAND),  # reads a parameter, samples nothing
+        ("00 0000 0000 0000", Reject.COMMAND),
+        ("88 A251 A8C8 94B9", Reject.COMMAND),  # even parity
+    ],
+)
+def test_what_is_no_sample_is_refused(data: str, reject: Reject) -> None:
+    assert parse_sample(bytes.fromhex(data), 3, 7) == reject
+
+
+@pytest.mark.parametrize(
+    ("channel", "words"),
+    [(17, b""), (17, b"\xa2"), (17, bytes(8)), (16, bytes(6)), (41, bytes(6)), (-1, bytes(6))],
+)
+def test_samples_that_cannot_be_sent_are_our_mistake(channel: int, words: bytes) -> None:
+    with pytest.raises(ValueError, match=r"sensors|channel"):
+        encode_sample(channel, words)
+
+
+def test_the_protocols_example_of_a_sweep_frame_is_read_and_written() -> None:
+    sweep = SweepFrame(4, 0x1234, 1_000_000, bytes.fromhex("A251") * 24)
+    assert len(SWEEP_EXAMPLE) == 64
+    assert parse_sweep(SWEEP_EXAMPLE) == sweep
+    assert sweep.to_bytes() == SWEEP_EXAMPLE
+
+
+def test_the_protocols_example_stands_in_the_protocol() -> None:
+    text = (ROOT / "deploy" / "can" / "PROTOCOL.md").read_text()
+    assert "01 04 3412 40420F00 A251 (24 times) 0000 000000000000" in text
+    assert "`A2 A251 A8C8 94B9`" in text
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "reject"),
+    [
+        (0, 0, Reject.VERSION),
+        (0, 2, Reject.VERSION),
+        (1, 5, Reject.CONTENT),
+        (56, 8, Reject.CONTENT),
+        (57, 1, Reject.CONTENT),
+        (58, 1, Reject.CONTENT),
+        (63, 0x80, Reject.CONTENT),
+    ],
+)
+def test_what_is_no_sweep_frame_is_refused(at: int, value: int, reject: Reject) -> None:
+    data = bytearray(SWEEP_EXAMPLE)
+    data[at] = value
+    assert parse_sweep(bytes(data)) == reject
+
+
+@pytest.mark.parametrize("length", [0, 1, 8, 48, 63])
+def test_a_short_sweep_frame_is_refused(length: int) -> None:
+    assert parse_sweep(SWEEP_EXAMPLE[:length]) == Reject.LENGTH
+
+
+@pytest.mark.parametrize(
+    "sweep",
+    [
+        SweepFrame(5, 0, 0, bytes(48)),
+        SweepFrame(-1, 0, 0, bytes(48)),
+        SweepFrame(0, 1 << 16, 0, bytes(48)),
+        SweepFrame(0, -1, 0, bytes(48)),
+        SweepFrame(0, 0, 1 << 32, bytes(48)),
+        SweepFrame(0, 0, 0, bytes(47)),
+        SweepFrame(0, 0, 0, bytes(48), 8),
+    ],
+)
+def test_sweep_frames_that_cannot_be_sent_are_our_mistake(sweep: SweepFrame) -> None:
+    with pytest.raises(ValueError, match=r"finger|sequence|tick_us|words|status"):
+        sweep.to_bytes()
+
+
+@given(
+    st.integers(0, 4),
+    st.integers(0, 65535),
+    st.integers(0, (1 << 32) - 1),
+    st.binary(min_size=48, max_size=48),
+    st.integers(0, 7),
+)
+def test_every_sweep_frame_comes_back_as_it_went(
+    finger: int, sequence: int, tick_us: int, words: bytes, status: int
+) -> None:
+    sweep = SweepFrame(finger, sequence, tick_us, words, status)
+    assert parse_sweep(sweep.to_bytes()) == sweep
+
+
+def test_the_dbc_file_reads_the_real_formats_sample(dbc: Database) -> None:
+    values = dbc.get_message_by_name("SynTouchSample").decode(E1_SAMPLE)
+    assert values == {"Command": "E1", "E1_S1": 0xA251, "E1_S2": 0xA8C8, "E1_S3": 0x94B9}
+
+
+def test_the_dbc_file_knows_every_channel_of_the_manual(dbc: Database) -> None:
+    commands = "80 83 85 86 A2 A4 A7 A8 AB AD AE B0 B3 B5 B6 B9 BA BC BF C1 C2 C4 C7 C8 CB CD CE D0"
+    names = ["PAC", "PDC", "TAC", "TDC", *(f"E{electrode}" for electrode in range(1, 25))]
+    message = dbc.get_message_by_name("SynTouchSample")
+    for command, name in zip(bytes.fromhex(commands), names, strict=True):
+        values = message.decode(bytes((command,)) + E1_SAMPLE[1:])
+        assert isinstance(values, dict)
+        assert values["Command"] == name
+        assert values[f"{name}_S2"] == 0xA8C8
+
+
+@pytest.mark.parametrize("finger", FINGERS)
+def test_the_dbc_file_reads_a_sweep_frame_field_by_field(dbc: Database, finger: str) -> None:
+    message = dbc.get_message_by_name(f"Sweep_{finger}")
+    words = b"".join(word(100 * electrode) for electrode in range(24))
+    number = FINGERS.index(finger)
+    status = int(SweepStatus.ABSENT | SweepStatus.OVERRUN)
+    values = message.decode(SweepFrame(number, 513, 70_000, words, status).to_bytes())
+    assert (message.frame_id, message.length, message.is_fd) == (SWEEP_BASE_ID + number, 64, True)
+    assert values == {
+        "Version": 1,
+        "Finger": finger,
+        "Sequence": 513,
+        "Tick": 70_000,
+        "Absent": 1,
+        "Repeated": 0,
+        "Overrun": 1,
+        **{
+            f"E{electrode + 1}": int.from_bytes(word(100 * electrode), "big")
+            for electrode in range(24)
+        },
+    }
+
+
+@pytest.mark.parametrize(
+    ("raw", "frame"),
+    [
+        ("00010000 07 000000 A2A251A8C894B9 00", CanFrame(0x100, E1_SAMPLE)),
+        ("34120080 02 000000 0102 000000000000", CanFrame(0x1234, b"\1\2", FrameFlag.EXTENDED)),
+        ("00010040 07 000000 0000000000000000", CanFrame(0x100, b"", FrameFlag.REMOTE)),
+        (
+            "40000020 08 000000 0000000000000000",
+            CanFrame(0x40, bytes(8), FrameFlag.ERROR),
+        ),
+        ("B0050000 40 01 0000" + "55" * 64, CanFrame(0x5B0, b"\x55" * 64, FrameFlag.FD)),
+    ],
+)
+def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
+    """Layout by linux/can.h, on a little-endian machine."""
+    assert unpack_frame(bytes.fromhex(raw)) == frame
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        *(bytes(length) for length in (0, 15, 17, 71, 73)),
+        bytes.fromhex("00010000 09") + bytes(11),
+        bytes.fromhex("00010000 41") + bytes(67),
+    ],
+)
+def test_what_is_no_struct_of_the_kernel_is_no_frame(raw: bytes) -> None:
+    assert unpack_frame(raw) is None
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        CanFrame(0x800, b""),
+        CanFrame(-1, b""),
+        CanFrame(1 << 29, b"", FrameFlag.EXTENDED),
+        CanFrame(1, bytes(9)),
+        CanFrame(1, bytes(65), FrameFlag.FD),
+    ],
+)
+def test_frames_that_no_bus_has_are_our_mistake(frame: CanFrame) -> None:
+    with pytest.raises(ValueError, match=r"out of range|do not fit"):
+        pack_frame(frame)
+
+
+@given(
+    st.integers(0, 0x1FFFFFFF),
+    st.binary(max_size=64),
+    st.sampled_from([0, 1, 4, 8, 9]),
+)
+def test_frames_come_back_as_they_went(identifier: int, data: bytes, flags: int) -> None:
+    identifier &= 0x1FFFFFFF if flags & (FrameFlag.EXTENDED | FrameFlag.ERROR) else 0x7FF
+    data = data if flags & FrameFlag.FD else data[:8]
+    frame = CanFrame(identifier, data, flags)
+    assert unpack_frame(pack_frame(frame)) == frame
+
+
+def test_error_frames_say_what_happened() -> None:
+    """Classes and bits of linux/can/error.h."""
+    bus_off = CanFrame(0x040, bytes(8), FrameFlag.ERROR)
+    overflow = CanFrame(0x004, bytes.fromhex("0001000000000000"), FrameFlag.ERROR)
+    passive = CanFrame(0x204, bytes.fromhex("0010000000008000"), FrameFlag.ERROR)
+    assert is_bus_off(bus_off)
+    assert not is_bus_off(CanFrame(0x040, bytes(8)))
+    assert is_overflow(overflow)
+    assert not is_overflow(passive)
+    assert not is_overflow(CanFrame(0x004, b"", FrameFlag.ERROR))
+    assert describe_error(bus_off) == "bus-off"
+    assert describe_error(passive) == "controller problem, error counters"
+    assert describe_error(CanFrame(0, b"", FrameFlag.ERROR)) == "unknown error class"
+
+
+@pytest.mark.parametrize("frame_format", list(CanFormat))
+def test_damaged_frames_raise_nothing_and_are_recovered_from(frame_format: CanFormat) -> None:
+    assert fuzz(frame_format, DAMAGED_FRAMES, random.SystemRandom().randrange(1 << 32)) > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flipped_bit_in_a_sample_never_becomes_a_count(seed: int) -> None:
+    chance = random.Random(seed)
+    made, counters = decoder(CanFormat.SYNTOUCH)
+    readings: list[TactileReading] = []
+    flips = 0
+    for sweep in range(200):
+        for channel, words, t_ns in samples(sweep):
+            data = bytearray(encode_sample(channel, words))
+            if sweep and chance.random() < 0.05:
+                data[chance.randrange(7)] ^= 1 << chance.randrange(8)
+                flips += 1
+            readings += made.push(CanFrame(SAMPLE_ID, bytes(data)), t_ns)
+    for reading in readings:
+        sound = reading.faults == 0
+        assert (reading.counts[sound] == truth(reading.seq)[sound]).all(), f"seed {seed}"
+    bad_words = counters.parity_words + counters.error_words + counters.unplugged_words
+    assert bad_words + counters.unknown_commands == flips, f"seed {seed}"
+
+
+def test_the_dbc_file_needs_nothing_but_itself() -> None:
+    text = Path(ROOT / "deploy" / "can" / "graspd.dbc").read_text()
+    assert text.isascii()

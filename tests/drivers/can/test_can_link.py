@@ -1,0 +1,245 @@
+"""Buses that fail, come back, have a socket, a terminal or nothing: the CAN bridge keeps up."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import struct
+import time
+
+import can
+import pytest
+
+from drivers.base import Reading
+from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
+from drivers.can.driver import POLL_NS, SILENCE_MIN_NS, SILENCE_PERIODS, CanBridgeDriver
+from drivers.link import BACKOFF_MAX_S, LinkState
+from drivers.twins.can import SAMPLE_ID
+from tests.drivers.can.can_standin import (
+    LOOPBACK,
+    ScriptedBus,
+    SocketBus,
+    TwinLink,
+    bridge,
+    channel,
+    contact,
+    message,
+    stand_in,
+    sweep_messages,
+    sweep_of_frames,
+    tactile,
+)
+from tests.drivers.can.can_words import Clock, truth
+
+MS = 1_000_000
+
+
+def test_an_absent_socketcan_interface_is_waited_for(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    clock = Clock()
+    with CanBridgeDriver("socketcan", "nocan77", clock=clock) as driver:
+        for _ in range(20):
+            assert driver.link_state is LinkState.WAITING
+            due_ns = driver.due_ns()
+            assert due_ns is not None
+            assert 0 < due_ns - clock.now_ns <= BACKOFF_MAX_S * 1e9
+            clock.now_ns = due_ns
+            assert driver.read_ready() == ()
+        assert driver.counters.bus_faults == 21
+        assert driver.last_error is not None
+        assert "nocan77" in driver.last_error
+    noisy = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(noisy) == 1, "one warning per outage, and none of python-can's"
+
+
+FAILURES = [
+    can.CanOperationError("adapter says no"),
+    can.CanTimeoutError("too late"),
+    can.CanInitializationError("gone"),
+    OSError(errno.ENETDOWN, "Network is down"),
+    OSError(errno.ENODEV, "No such device"),
+    struct.error("unpack requires a buffer of 4 bytes"),
+    ValueError("invalid literal for int() with base 16"),
+    TypeError("ord() expected a character"),
+    IndexError("string index out of range"),
+    AssertionError("only requested a single extra field"),
+    RuntimeError("whatever"),
+]
+
+
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
+@pytest.mark.parametrize("shutdown_fails", [False, True])
+def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception, shutdown_fails: bool
+) -> None:
+    first = ScriptedBus([*sweep_messages(0), *sweep_messages(1)[:10], failure])
+    second = ScriptedBus([*sweep_messages(2)[10:], *sweep_messages(3)])
+    first.shutdown_error = can.CanOperationError("cannot close") if shutdown_fails else None
+    buses: list[object] = [first, second]
+    stand_in(monkeypatch, lambda: buses.pop(0))
+    clock = Clock()
+    driver = CanBridgeDriver("pcan", "x", arbitration_id=SAMPLE_ID, clock=clock)
+    with driver:
+        (reading,) = tactile(driver.read_ready())
+        assert (reading.counts == truth(0)).all()
+        assert driver.describe()["link"] == "waiting"
+        assert driver.fileno() is None
+        assert str(failure) in driver.describe()["last error"]
+        assert first.shut_down == 1
+        assert driver.read_ready() == ()
+        due_ns = driver.due_ns()
+        assert due_ns is not None
+        clock.now_ns = due_ns
+        (reading,) = tactile(driver.read_ready())
+        assert (reading.counts == truth(3)).all()
+        assert not reading.faults.any()
+        assert driver.describe()["link"] == "up"
+        counters = driver.counters
+        assert (counters.bus_faults, counters.link_losses, counters.interrupted_sweeps) == (1, 1, 1)
+    assert second.shut_down == 1
+
+
+@pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
+def test_whatever_opening_raises_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch, failure: Exception
+) -> None:
+    outcomes: list[Exception | ScriptedBus] = [failure, failure, ScriptedBus(sweep_messages())]
+
+    def open_bus() -> object:
+        outcome = outcomes.pop(0)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    stand_in(monkeypatch, open_bus)
+    clock = Clock()
+    with CanBridgeDriver("pcan", "x", arbitration_id=SAMPLE_ID, clock=clock) as driver:
+        readings: list[Reading] = []
+        while not readings:
+            due_ns = driver.due_ns()
+            assert due_ns is not None
+            clock.now_ns = max(clock.now_ns, due_ns)
+            readings += driver.read_ready()
+        assert driver.counters.bus_faults == 2
+        assert driver.counters.link_losses == 0
+
+
+def test_a_keyboard_interrupt_is_no_link_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(monkeypatch, lambda: ScriptedBus([KeyboardInterrupt()]))
+    with CanBridgeDriver("pcan", "x") as driver, pytest.raises(KeyboardInterrupt):
+        driver.read_ready()
+
+
+def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    bus = ScriptedBus([message(b"\0", 0x7FF)] * (2 * FRAMES_PER_DRAIN + 5))
+    stand_in(monkeypatch, lambda: bus)
+    with CanBridgeDriver("pcan", "x", clock=clock) as driver:
+        for expected in (FRAMES_PER_DRAIN, 2 * FRAMES_PER_DRAIN):
+            driver.read_ready()
+            assert driver.counters.frames == expected
+            assert driver.due_ns() == clock.now_ns
+        driver.read_ready()
+        assert driver.counters.frames == 2 * FRAMES_PER_DRAIN + 5
+        assert driver.due_ns() == clock.now_ns + POLL_NS
+
+
+def test_a_bus_without_a_descriptor_is_polled_every_millisecond() -> None:
+    clock = Clock()
+    with bridge(channel(), clock=clock) as driver:
+        assert driver.fileno() is None
+        assert driver.due_ns() == clock.now_ns
+        driver.read_ready()
+        assert driver.due_ns() == clock.now_ns + POLL_NS
+
+
+def test_frames_per_second_are_told_until_there_are_none() -> None:
+    clock = Clock()
+    where = channel()
+    with bridge(where, clock=clock) as driver:
+        with can.Bus(interface="virtual", channel=where, ignore_config=True) as bus:
+            for _ in range(11):
+                for sent in sweep_messages():
+                    bus.send(sent)
+                clock.now_ns += 100 * MS
+                driver.read_ready()
+        assert driver.frames_per_s == pytest.approx(240, rel=0.05)
+        clock.now_ns += 10_000 * MS
+        assert driver.frames_per_s == 0.0
+
+
+def test_bus_options_reach_python_can_over_our_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, object] = {}
+    monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **options: seen.update(options))
+    options = {"rx_queue_size": 7}
+    CanBridgeDriver("virtual", "x", bitrate=500_000, bus_options=options).open()
+    assert seen["rx_queue_size"] == 7
+    assert seen["bitrate"] == 500_000
+    assert seen["ignore_config"] is True
+
+
+def test_a_bus_that_was_never_opened_drains_nothing() -> None:
+    bus = CanBus("virtual", "x", {}, time.monotonic_ns, time.time_ns)
+    assert bus.drain() == []
+    assert bus.fileno() is None
+    bus.close()
+
+
+def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
+    """No error tells of it: the bus is there, others even talk on it."""
+    link = TwinLink("syntouch")
+    driver, clock = link.driver, link.clock
+    with driver:
+        link.send(contact(8))
+        assert driver.link_state is LinkState.UP
+        assert SILENCE_PERIODS * 10 * MS == SILENCE_MIN_NS == 100 * MS
+        with can.Bus(interface="virtual", channel=link.where, ignore_config=True) as bus:
+            for _ in range(10):
+                clock.now_ns += 10 * MS - 1
+                bus.send(message(bytes(7), 0x7FF))
+                assert driver.read_ready() == []
+                assert driver.link_state is LinkState.UP
+            clock.now_ns += 10
+            bus.send(message(bytes(7), 0x7FF))
+            assert driver.read_ready() == []
+        assert str(driver.link_state) == "greeting"
+        assert driver.describe()["last error"] == "nothing from the board for 100 ms"
+        assert (driver.counters.link_losses, driver.counters.bus_faults) == (1, 0)
+        before = len(link.readings)
+        link.send(contact(3))
+        assert driver.link_state is LinkState.UP
+        assert len(link.readings) == before + 3
+        assert not any(reading.faults.any() for reading in link.readings)
+        assert driver.counters.link_losses == 1
+
+
+def test_slow_boards_have_ten_periods() -> None:
+    link = TwinLink("sweep_fd")
+    with link.driver:
+        for sweep in contact(12):
+            link.clock.now_ns += 40 * MS
+            link.send([sweep])
+        link.clock.now_ns += 499 * MS
+        link.driver.read_ready()
+        assert link.driver.link_state is LinkState.UP
+        link.clock.now_ns += 2 * MS
+        link.driver.read_ready()
+        assert str(link.driver.link_state) == "greeting"
+
+
+def test_a_bus_with_a_descriptor_is_looked_at_when_silence_is_due(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = Clock()
+    with SocketBus() as bus:
+        stand_in(monkeypatch, lambda: bus)
+        driver = CanBridgeDriver("socketcan", LOOPBACK, sequence="electrodes", clock=clock)
+        with driver:
+            for frame in sweep_of_frames(0):
+                bus.send(frame)
+            driver.read_ready()
+            assert driver.due_ns() == clock.now_ns + SILENCE_MIN_NS
+            clock.now_ns += SILENCE_MIN_NS
+            driver.read_ready()
+            assert str(driver.link_state) == "greeting"
+            assert driver.due_ns() is None

@@ -1,0 +1,274 @@
+"""SocketCAN: frames from the kernel, their age, and what the kernel says is lost."""
+
+from __future__ import annotations
+
+import errno
+import socket
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import pytest
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.can.driver import (
+    REST_MAX_NS,
+    CanBridgeDriver,
+)
+from drivers.can.formats import CanFormat
+from drivers.can.frames import CanFrame, FrameFlag, pack_frame
+from drivers.kernel_stamps import SO_RXQ_OVFL
+from drivers.link import LinkState
+from drivers.twins.can import SAMPLE_ID, CanTwin
+from tests.drivers.can.can_standin import (
+    LOOPBACK,
+    ScriptedBus,
+    SocketBus,
+    contact,
+    stand_in,
+    sweep_of_frames,
+    tactile,
+)
+from tests.drivers.can.can_words import SLOT_NS, Clock, truth
+
+MS = 1_000_000
+
+
+@pytest.fixture
+def socket_bus(monkeypatch: pytest.MonkeyPatch) -> Iterator[SocketBus]:
+    with SocketBus() as bus:
+        stand_in(monkeypatch, lambda: bus)
+        yield bus
+
+
+def over_socket(**options: Any) -> CanBridgeDriver:  # noqa: ANN401
+    options.setdefault("arbitration_id", SAMPLE_ID)
+    return CanBridgeDriver("socketcan", LOOPBACK, sequence="electrodes", **options)
+
+
+def test_a_socketcan_bus_is_read_from_its_socket(socket_bus: SocketBus) -> None:
+    with over_socket() as driver:
+        assert driver.fileno() == socket_bus.socket.fileno()
+        assert socket_bus.socket.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) >= 212_992
+        assert driver.due_ns() is None
+        for frame in sweep_of_frames(0):
+            socket_bus.send(frame)
+        (reading,) = tactile(driver.read_ready())
+        assert (reading.counts == truth(0)).all()
+        assert driver.read_ready() == []
+
+
+def test_a_frame_is_as_old_as_its_stay_in_the_kernel(socket_bus: SocketBus) -> None:
+    with over_socket() as driver:
+        for frame in sweep_of_frames(0):
+            socket_bus.send(frame)
+        time.sleep(0.05)
+        (reading,) = tactile(driver.read_ready())
+        assert 50 * MS <= time.monotonic_ns() - reading.t_ns < 5_000 * MS
+
+
+@pytest.mark.parametrize(
+    ("step_ns", "age_ns"), [(3_600_000 * MS, 3_600_000 * MS), (-5_000 * MS, 0)]
+)
+def test_a_step_of_the_wall_clock_makes_frames_old_and_never_of_the_future(
+    socket_bus: SocketBus, step_ns: int, age_ns: int
+) -> None:
+    with over_socket(wall_clock=lambda: time.time_ns() + step_ns) as driver:
+        for frame in sweep_of_frames(0):
+            socket_bus.send(frame)
+        (reading,) = tactile(driver.read_ready())
+        assert 0 <= time.monotonic_ns() - reading.t_ns - age_ns < 5_000 * MS
+
+
+def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = Clock()
+    with SocketBus() as first, SocketBus() as second:
+        buses = [first, second]
+        stand_in(monkeypatch, lambda: buses.pop(0))
+        with over_socket(clock=clock) as driver:
+            for frame in sweep_of_frames(0) + sweep_of_frames(1)[:9]:
+                first.send(frame)
+            first.send(CanFrame(0x040, bytes(8), FrameFlag.ERROR))
+            assert len(driver.read_ready()) == 1
+            assert driver.link_state is LinkState.WAITING
+            assert driver.last_error == "bus-off"
+            due_ns = driver.due_ns()
+            assert due_ns is not None
+            clock.now_ns = due_ns
+            for frame in sweep_of_frames(2)[9:] + sweep_of_frames(3):
+                second.send(frame)
+            (reading,) = tactile(driver.read_ready())
+            assert (reading.counts == truth(3)).all()
+            counters = driver.counters
+            assert (counters.bus_off, counters.link_losses, counters.error_frames) == (1, 1, 1)
+
+
+def test_other_error_frames_are_counted_only(socket_bus: SocketBus) -> None:
+    with over_socket() as driver:
+        frames = sweep_of_frames(0)
+        frames.insert(9, CanFrame(0x080, bytes(8), FrameFlag.ERROR))
+        for frame in frames:
+            socket_bus.send(frame)
+        (reading,) = tactile(driver.read_ready())
+        assert not reading.faults.any()
+        assert (driver.counters.error_frames, driver.counters.controller_overflows) == (1, 0)
+        assert driver.link_state is LinkState.UP
+
+
+def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBus) -> None:
+    with over_socket() as driver:
+        frames = sweep_of_frames(0)
+        frames[3:5] = [CanFrame(0x004, bytes.fromhex("0001000000000000"), FrameFlag.ERROR)]
+        for frame in [*frames, *sweep_of_frames(1)]:
+            socket_bus.send(frame)
+        cut, whole = tactile(driver.read_ready())
+        assert (cut.counts[:, :3] == truth(0)[:, :3]).all()
+        assert (cut.faults[:, 3:] == ElectrodeFault.MISSING).all()
+        assert (whole.counts == truth(1)).all()
+        assert (driver.counters.controller_overflows, driver.counters.cut_sweeps) == (1, 1)
+        assert driver.counters.unsynchronised_frames == 19
+
+
+def test_records_that_are_no_frames_are_counted(socket_bus: SocketBus) -> None:
+    with over_socket() as driver:
+        for record in (b"\1", bytes(15), bytes(71), pack_frame(CanFrame(1, b"")) + b"\0"):
+            socket_bus.far_end.send(record)
+        for frame in sweep_of_frames(0):
+            socket_bus.send(frame)
+        assert len(driver.read_ready()) == 1
+        assert driver.counters.malformed_frames == 4
+
+
+class DownSocket(socket.socket):
+    """A socket of an interface that was taken down."""
+
+    def recvmsg(self, *_: object) -> Any:  # noqa: ANN401
+        raise OSError(errno.ENETDOWN, "Network is down")
+
+
+def test_an_interface_that_goes_down_is_a_link_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = ScriptedBus()
+    with DownSocket(socket.AF_UNIX, socket.SOCK_DGRAM) as down:
+        bus.socket = down  # type: ignore[attr-defined]
+        stand_in(monkeypatch, lambda: bus)
+        with over_socket() as driver:
+            assert driver.read_ready() == []
+            assert driver.link_state is LinkState.WAITING
+            assert driver.last_error is not None
+            assert "Network is down" in driver.last_error
+
+
+def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """UDP stands in: its sockets report drops in the same way as CAN sockets."""
+    bus = ScriptedBus()
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far,
+    ):
+        near.bind(("127.0.0.1", 0))
+        far.connect(near.getsockname())
+        bus.socket = near  # type: ignore[attr-defined]
+        stand_in(monkeypatch, lambda: bus)
+        with over_socket() as driver:
+            assert near.getsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL) == 1
+            near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+            record = pack_frame(CanFrame(0x7FF, b""))
+            for _ in range(200):
+                far.send(record)
+            driver.read_ready()
+            far.send(record)
+            driver.read_ready()
+            counters = driver.counters
+            assert counters.kernel_drops > 0
+            assert counters.frames + counters.kernel_drops == 201
+
+
+def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A board whose samples bear one id; exactly whole sweeps may be lost, so time is no help."""
+    clock = Clock()
+    bus = ScriptedBus()
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far,
+    ):
+        near.bind(("127.0.0.1", 0))
+        far.connect(near.getsockname())
+        bus.socket = near  # type: ignore[attr-defined]
+        stand_in(monkeypatch, lambda: bus)
+        with over_socket(clock=clock, wall_clock=clock) as driver:
+            near.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+            for sweep in range(20):
+                for frame in sweep_of_frames(sweep):
+                    far.send(pack_frame(frame))
+            readings = tactile(driver.read_ready())
+            for frame in [*sweep_of_frames(20), *sweep_of_frames(21)]:
+                far.send(pack_frame(frame))
+                readings += tactile(driver.read_ready())
+        assert driver.counters.kernel_drops > 0
+        assert driver.counters.cut_sweeps <= 1
+        for reading in readings:
+            sound = reading.faults == 0
+            assert any((reading.counts[sound] == truth(n)[sound]).all() for n in range(22))
+        assert (readings[-1].counts == truth(21)).all()
+
+
+def send_on_time(bus: SocketBus, frames: Sequence[CanFrame], start_s: float) -> None:
+    for at, frame in enumerate(frames):
+        time.sleep(max(start_s + at * SLOT_NS / 1e9 - time.monotonic(), 0.0))
+        bus.send(frame)
+
+
+def test_the_loop_rests_while_no_reading_is_near(socket_bus: SocketBus) -> None:
+    """Descriptor or time: at any moment the loop has one of them to wait for."""
+    with over_socket() as driver:
+        start_s = time.monotonic()
+        rests, readings = 0, 0
+        for sweep in range(20):
+            for part in (sweep_of_frames(sweep)[:12], sweep_of_frames(sweep)[12:]):
+                send_on_time(socket_bus, part, start_s)
+                start_s += 12 * SLOT_NS / 1e9
+                readings += len(driver.read_ready())
+                due_ns = driver.due_ns()
+                assert due_ns is not None
+                if driver.fileno() is None:
+                    rests += 1
+                    assert due_ns - time.monotonic_ns() <= REST_MAX_NS
+        assert readings >= 20  # more where the host stalls, which cuts a sweep in two
+        assert rests > 0
+        driver.close()
+        assert driver.due_ns() is driver.fileno() is None
+
+
+def test_real_socketcan_plays_count_for_count() -> None:
+    """Needs a kernel with CAN: `ip link add dev vcan0 type vcan; ip link set vcan0 mtu 72 up`."""
+    if not hasattr(socket, "AF_CAN"):
+        pytest.skip("this Python knows no CAN sockets")
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as error:
+        pytest.skip(f"this kernel has no PF_CAN: {error}")
+    try:
+        socket.if_nametoindex("vcan0")
+    except OSError:
+        pytest.skip("there is no interface vcan0")
+    counts = contact(200)
+    for frame_format in CanFormat:
+        driver = CanBridgeDriver(
+            "socketcan", "vcan0", format=frame_format, arbitration_id=SAMPLE_ID
+        )
+        twin = CanTwin(
+            "socketcan", "vcan0", iter(counts), format=frame_format, arbitration_id=SAMPLE_ID
+        )
+        readings: list[TactileReading] = []
+        with driver, twin:
+            assert driver.fileno() is not None
+            while twin.send_sweep():
+                readings += tactile(driver.read_ready())
+            assert driver.counters.kernel_drops == 0
+        assert len(readings) == len(counts)
+        for reading, expected in zip(readings, counts, strict=True):
+            assert (reading.counts == expected).all()

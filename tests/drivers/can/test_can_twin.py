@@ -1,0 +1,131 @@
+"""The CAN twin: what it refuses, how it paces, and how it says that it cannot work here."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from drivers.base import DriverError, LinkError, TactileReading
+from drivers.can.driver import CanBridgeDriver
+from drivers.twins.can import CanTwin
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps.grasps import GeneratedContact
+from tests.drivers.can.can_standin import (
+    bridge,
+    channel,
+    contact,
+    tactile,
+)
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"format": "brand_new"},
+        {"sequence": "backwards"},
+        {"rate_hz": 0.0},
+        {"rate_hz": 1e6},
+        {"faults": LinkFaults(one_byte_at_a_time=True)},
+        {"faults": LinkFaults(stuck_clock=True)},
+        {"faults": LinkFaults(wrong_version=True)},
+    ],
+)
+def test_a_twin_refuses_what_its_format_cannot_show(options: Mapping[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        CanTwin("virtual", "x", iter(()), **options)
+
+
+def test_a_twin_serves_at_its_rate_until_stopped() -> None:
+    where, stop = channel(), threading.Event()
+    twin = CanTwin("virtual", where, GeneratedContact(), rate_hz=100.0, sequence="electrodes")
+    readings: list[TactileReading] = []
+    with bridge(where) as driver, twin:
+        server = threading.Thread(target=twin.serve, args=(stop,))
+        server.start()
+        try:
+            deadline_s = time.monotonic() + 10.0
+            while len(readings) < 30 and time.monotonic() < deadline_s:
+                time.sleep(0.001)
+                readings += tactile(driver.read_ready())
+        finally:
+            stop.set()
+            server.join()
+        period_ns = driver.period_ns
+    assert len(readings) >= 30
+    assert period_ns == pytest.approx(10 * MS, rel=0.2)
+    elapsed_ns = readings[29].t_ns - readings[0].t_ns
+    assert elapsed_ns == pytest.approx(290 * MS, rel=0.2)
+
+
+def test_a_twin_ends_with_its_counts_and_mends_its_link() -> None:
+    faults = LinkFaults(disconnect_every_frames=30)
+    where = channel()
+    twin = CanTwin(
+        "virtual", where, iter(contact(2)), sequence="electrodes", faults=faults, rate_hz=25.0
+    )
+    with bridge(where) as driver, twin:
+        twin.serve(threading.Event())
+        readings = tactile(driver.read_ready())
+    assert twin.injected["disconnect"] == 1
+    assert twin.frames_sent == 47
+    came = Counter(e for r in readings for e in np.flatnonzero(r.faults[0] == 0).tolist())
+    assert came == {electrode: 2 - (electrode == 5) for electrode in range(24)}
+    before = [reading for reading in readings if reading.faults[0, 4] == 0][-1]
+    assert before.faults[0, 5:].all()
+    assert readings[-1].faults[0, :6].all()
+
+
+@pytest.mark.parametrize("make", [CanTwin, CanBridgeDriver], ids=["twin", "driver"])
+def test_a_package_that_is_missing_is_named(
+    monkeypatch: pytest.MonkeyPatch, make: Callable[..., CanTwin | CanBridgeDriver]
+) -> None:
+    monkeypatch.setattr("can.interfaces.udp_multicast.utils.msgpack", None)
+    arguments = (iter(()),) if make is CanTwin else ()
+    with pytest.raises(
+        DriverError, match=r"needs the package msgpack: pip install msgpack"
+    ) as raised:
+        make("udp_multicast", "239.74.163.2", *arguments).open()
+    assert "\n" not in str(raised.value)
+    assert not isinstance(raised.value, NotImplementedError)
+
+
+@pytest.mark.parametrize(
+    ("says", "package"),
+    [
+        ("Cannot import module x for CAN interface 'x': No module named 'nican'", "nican"),
+        ("The serial module is not installed", "pyserial"),
+        ("No module named 'gs_usb.gs_usb'", "gs_usb"),
+    ],
+)
+def test_packages_are_named_as_they_are_installed(
+    monkeypatch: pytest.MonkeyPatch, says: str, package: str
+) -> None:
+    def refuse(**_: object) -> object:
+        raise can.CanInterfaceNotImplementedError(says)
+
+    monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
+    with pytest.raises(LinkError, match=f"pip install {package}$"):
+        CanTwin("slcan", "/dev/null", iter(())).open()
+
+
+def test_a_library_that_does_not_work_here_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_: object) -> object:
+        raise can.CanInterfaceNotImplementedError("Windows only")
+
+    monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
+    with pytest.raises(LinkError, match="does not work here: Windows only"):
+        CanTwin("vector", "0", iter(())).open()
+
+
+def test_an_interface_that_nobody_has_is_refused_at_once() -> None:
+    with pytest.raises(ValueError, match="no interface 'nonsense'"):
+        CanTwin("nonsense", "x", iter(()))

@@ -1,0 +1,250 @@
+"""Samples lost by whole sweeps, stalls, and frames without a time: no reading holds two sweeps."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from itertools import accumulate
+
+import numpy as np
+import pytest
+
+from drivers.base import TactileReading
+from drivers.biotac import SEQUENCES
+from drivers.can.samples import NEXT_SWEEP_PERIODS, SampleSweeps
+from tests.drivers.can.can_words import (
+    FINGERS,
+    SLOT_NS,
+    Sample,
+    assembler,
+    assert_true,
+    concatenated,
+    samples,
+    truth,
+)
+
+MS = 1_000_000
+
+
+def feed(sweeps: SampleSweeps, stream: Sequence[Sample]) -> list[TactileReading]:
+    return [reading for sample in stream for reading in sweeps.push(*sample)]
+
+
+def assert_of_one_sweep(reading: TactileReading) -> int:
+    """The sweep of all counts of a reading that are not flagged; each sweep has its own counts."""
+    sound = reading.faults == 0
+    base = (reading.counts.astype(int) - truth(0).astype(int)) % 4096
+    tags = set(base[sound].tolist())
+    assert len(tags) == 1, f"the reading has counts of the sweeps {tags}"
+    assert not reading.counts[~sound].any()
+    return int(tags.pop()) // 7
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("where", [0.0, 0.04, 0.13, 0.5, 0.75, 0.97])
+@pytest.mark.parametrize("begun", [1, 3, 8], ids=lambda begun: f"after {begun}")
+def test_samples_lost_by_whole_sweeps_never_mix_two(
+    sequence: str, where: float, begun: int
+) -> None:
+    """Also while the period is not yet known."""
+    for lost in (24, 28, 48, 54, 56, 72, 108, 144, 162, 168, 324):
+        try:
+            check_losing(sequence, lost, where, begun)
+        except AssertionError as error:
+            error.add_note(f"{lost} samples lost")
+            raise
+
+
+def check_losing(sequence: str, lost: int, where: float, begun: int) -> None:
+    """Lose samples in the middle of sweep `begun`."""
+    sweeps, counters = assembler(sequence)
+    length = len(SEQUENCES[sequence])
+    stream = concatenated([samples(n, sequence) for n in range(30)])
+    start = begun * length + round(where * length)
+    readings = feed(sweeps, stream[:start] + stream[start + lost :])
+    tags = [assert_of_one_sweep(reading) for reading in readings]
+    assert tags == sorted(tags)
+    assert set(range(begun)) | set(range(begun + lost // length + 2, 30)) <= set(tags)
+    if begun < 8:
+        return  # a sweep may be told in two parts: the fastest board would have made more
+    assert tags == sorted(set(tags)), "no sweep is told twice"
+    cut_through = {begun, (start + lost) // length}
+    for reading, tag in zip(readings, tags, strict=True):
+        assert tag in cut_through or not reading.faults.any()
+    electrodes = sum(channel >= 17 for channel, _, _ in stream[start : start + lost])
+    told = sum(np.count_nonzero(reading.faults[0]) for reading in readings)
+    untold = set(range(30)) - set(tags)
+    assert told + 24 * len(untold) == electrodes
+    assert (counters.lost_frames, counters.missed_readings) == (told, len(untold))
+    assert [reading.seq for reading in readings] == tags
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_losses_of_any_length_never_mix_two_sweeps(seed: int) -> None:
+    chance = random.Random(seed)
+    sweeps, _ = assembler("interleaved")
+    stream = concatenated([samples(n, "interleaved") for n in range(400)])
+    at = chance.randrange(54, 400)
+    while at < len(stream):
+        del stream[
+            at : at + chance.choice([1, 2, 53, 54, 55, 107, 108, 109, chance.randrange(300)])
+        ]
+        at += chance.randrange(1, 600)
+    jittered = [
+        (channel, words, t_ns + chance.randrange(1_000_000)) for channel, words, t_ns in stream
+    ]
+    for reading in feed(sweeps, jittered):
+        assert_of_one_sweep(reading)
+
+
+@pytest.mark.parametrize("lost", [22, 23, 24, 25, 46, 47, 48])
+def test_untouched_sensors_that_repeat_themselves_make_no_copies_of_lost_samples(lost: int) -> None:
+    """The words of all sweeps are the same, so only time tells that a sample is no copy."""
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(20)])
+    stream = [(channel, samples(0)[channel - 17][1], t_ns) for channel, _, t_ns in stream]
+    start = 9 * 24 + 12
+    feed(sweeps, stream[:start] + stream[start + lost :])
+    assert counters.lost_frames + 24 * counters.missed_readings == lost
+    assert counters.duplicate_frames == counters.reordered_frames == 0
+
+
+@pytest.mark.parametrize("at", [1, 5, 12, 23])
+def test_a_sender_that_stalls_looks_like_a_loss(at: int) -> None:
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(10)])
+    here = 8 * 24 + at
+    stream[here:] = [(channel, words, t_ns + 15 * MS) for channel, words, t_ns in stream[here:]]
+    readings = feed(sweeps, stream)
+    assert [assert_of_one_sweep(reading) for reading in readings] == [*range(9), 8, 9]
+    assert [int(np.count_nonzero(r.faults[0])) for r in readings[8:]] == [24 - at, at, 0]
+    assert counters.missed_readings == 2
+
+
+@pytest.mark.parametrize("periods", [0.1, 0.5, NEXT_SWEEP_PERIODS - 0.01])
+def test_a_short_stall_breaks_nothing(periods: float) -> None:
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(10)])
+    stall_ns = round(periods * 24 * SLOT_NS)
+    here = 8 * 24 + 5
+    stream[here:] = [(channel, words, t_ns + stall_ns) for channel, words, t_ns in stream[here:]]
+    assert len(feed(sweeps, stream)) == 10
+    assert counters.faulty_readings == counters.missed_readings == 0
+
+
+@pytest.mark.parametrize("cut_at", [0, 1, 12, 23])
+def test_a_known_loss_ends_the_sweep_at_hand(cut_at: int) -> None:
+    """So few are lost that neither order nor time would show where."""
+    sweeps, counters = assembler()
+    readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:cut_at])
+    readings += sweeps.cut()
+    readings += feed(sweeps, samples(8)[cut_at:] + samples(9) + samples(10))
+    tags = [assert_of_one_sweep(reading) for reading in readings]
+    assert tags == [*range(11)]
+    assert [reading.seq for reading in readings] == tags
+    assert np.count_nonzero(readings[8].faults[0]) == (24 - cut_at if cut_at else 0)
+    assert counters.cut_sweeps == (cut_at > 0)
+    assert counters.unsynchronised_frames == (24 - cut_at if cut_at else 0)
+
+
+def test_samples_that_may_have_come_within_a_long_time_make_no_reading() -> None:
+    sweeps, counters = assembler()
+    readings = feed(sweeps, concatenated([samples(n) for n in range(8)]) + samples(8)[:12])
+    until_ns = samples(10)[12][2]
+    since_ns = samples(8)[12][2]
+    stalled = [*samples(8)[12:], *samples(9), *samples(10)[:12]]
+    for channel, words, _ in stalled:
+        readings += sweeps.push(channel, words, since_ns, until_ns)
+    readings += feed(sweeps, samples(10)[12:] + samples(11))
+    assert [assert_of_one_sweep(reading) for reading in readings] == [*range(9), 10, 11]
+    assert [int(np.count_nonzero(r.faults[0])) for r in readings[8:]] == [12, 12, 0]
+    assert counters.untimed_frames == len(stalled)
+    assert [reading.seq for reading in readings] == [*range(9), 10, 11]
+
+
+def test_the_period_is_learned_from_samples_whose_time_is_vague() -> None:
+    sweeps, counters = assembler()
+    for n in range(20):
+        for channel, words, t_ns in samples(n):
+            sweeps.push(channel, words, t_ns - 3 * MS, t_ns)
+    assert sweeps.period_ns == 24 * SLOT_NS
+    assert 0 < counters.untimed_frames < 10 * 24
+    assert counters.readings >= 10
+
+
+def test_losses_within_the_doubt_about_time_mix_no_sweeps() -> None:
+    """Samples are stamped too early by up to half a period, as if nothing had been lost."""
+    sweeps, _ = assembler()
+    stream = concatenated([samples(n) for n in range(20)])
+    start = 8 * 24 + 12
+    readings = feed(sweeps, stream[:start])
+    for channel, words, t_ns in stream[start + 24 :]:
+        readings += sweeps.push(channel, words, t_ns - 12 * SLOT_NS, t_ns)
+    for reading in readings:
+        assert_of_one_sweep(reading)
+
+
+def test_the_assembler_has_as_many_fingers_as_the_truth() -> None:
+    (reading,) = feed(assembler()[0], samples(3))
+    assert_true(reading, assert_of_one_sweep(reading))
+    assert reading.counts.shape == (FINGERS, 24)
+
+
+def retimed(stream: Sequence[Sample], times_ns: Sequence[int]) -> list[Sample]:
+    return [(sample[0], sample[1], t) for sample, t in zip(stream, times_ns, strict=True)]
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("mean_ms", [2, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_host_that_stalls_leaves_no_wrong_period_behind(
+    sequence: str, mean_ms: float, seed: int
+) -> None:
+    """Half a second of samples that come late and in heaps, as from a computer without a break."""
+    chance = random.Random(seed)
+    sweeps, _ = assembler(sequence)
+    count = 5000 // len(SEQUENCES[sequence])
+    stream = concatenated([samples(n, sequence) for n in range(count)])
+    times = [t_ns for _, _, t_ns in stream]
+    for at, sent_ns in enumerate(times):
+        if 150 * MS <= sent_ns < 650 * MS:
+            times[at] = sent_ns + round(chance.expovariate(1 / mean_ms) * MS)
+    readings = feed(sweeps, retimed(stream, list(accumulate(times, max))))  # the order stays
+    for reading in readings:
+        assert_of_one_sweep(reading)
+    assert sweeps.period_ns == len(SEQUENCES[sequence]) * SLOT_NS
+    assert not any(reading.faults.any() for reading in readings[-20:])
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("rate_hz", [1, 5, 20, 60, 400])
+def test_slow_and_fast_boards_are_understood(sequence: str, rate_hz: int) -> None:
+    """Nothing is known of the rate when the driver opens."""
+    sweeps, _ = assembler(sequence)
+    slot_ns = round(1e9 / rate_hz / len(SEQUENCES[sequence]))
+    stream = concatenated([samples(n, sequence) for n in range(40)])
+    readings = feed(sweeps, retimed(stream, [slot_ns * at for at in range(len(stream))]))
+    for reading in readings:
+        assert_of_one_sweep(reading)
+    assert [r.faults.any() for r in readings[-30:]] == [False] * 30
+    assert sweeps.period_ns == slot_ns * len(SEQUENCES[sequence])
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("lost", [-1, 0, 1])
+def test_losses_of_a_sweep_in_a_rhythm_are_not_taken_for_a_longer_period(
+    sequence: str, lost: int
+) -> None:
+    """The order looks as if nothing were missing."""
+    sweeps, _ = assembler(sequence)
+    length = len(SEQUENCES[sequence])
+    stream = concatenated([samples(n, sequence) for n in range(200)])
+    rhythm = 5 * length // 2 + 1
+    kept = [
+        sample
+        for at, sample in enumerate(stream)
+        if at < 20 * length or at % rhythm >= length + lost
+    ]
+    for reading in feed(sweeps, kept):
+        assert_of_one_sweep(reading)
+    assert sweeps.period_ns == length * SLOT_NS

@@ -1,0 +1,259 @@
+"""Samples become readings: nothing shifts, nothing is invented, what is missing is flagged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.biotac import PAC, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE, SEQUENCES
+from drivers.can.decoders import CanCounters
+from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED, SampleSweeps
+from tests.drivers.can.can_words import (
+    FINGERS,
+    SLOT_NS,
+    Sample,
+    assembler,
+    assert_true,
+    concatenated,
+    samples,
+    truth,
+    word,
+)
+
+MISSING = ElectrodeFault.MISSING
+SWEEP_NS = 24 * SLOT_NS
+
+
+def feed(sweeps: SampleSweeps, stream: Iterable[Sample]) -> list[TactileReading]:
+    readings: list[TactileReading] = []
+    for channel, words, t_ns in stream:
+        readings += sweeps.push(channel, words, t_ns)
+    return readings
+
+
+def missing_electrodes(reading: TactileReading) -> list[int]:
+    """Electrodes, from 1, that are missing, the same for all fingers."""
+    flagged = reading.faults == MISSING
+    assert (flagged == flagged[0]).all()
+    return [int(electrode) + 1 for electrode in np.flatnonzero(flagged[0])]
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+def test_a_sweep_is_complete_with_its_last_electrode(sequence: str) -> None:
+    sweeps, counters = assembler(sequence)
+    stream = samples(0, sequence)
+    last = max(at for at, (channel, _, _) in enumerate(stream) if channel == 40)
+    assert feed(sweeps, stream[:last]) == []
+    (reading,) = feed(sweeps, stream[last:])
+    assert reading.t_ns == stream[last][2]
+    assert (reading.counts == truth(0)).all()
+    assert not reading.faults.any()
+    assert counters.readings == 1
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+def test_sweeps_follow_each_other_and_their_period_is_learned(sequence: str) -> None:
+    sweeps, counters = assembler(sequence)
+    stream = concatenated([samples(sweep, sequence) for sweep in range(30)])
+    readings = feed(sweeps, stream)
+    assert [reading.seq for reading in readings] == list(range(30))
+    for sweep, reading in enumerate(readings):
+        assert_true(reading, sweep)
+    assert sweeps.period_ns == len(SEQUENCES[sequence]) * SLOT_NS
+    assert counters.missed_readings == counters.lost_frames == counters.faulty_readings == 0
+
+
+@pytest.mark.parametrize("lost", range(24))
+@pytest.mark.parametrize("timed", [False, True], ids=["at once", "on time"])
+def test_a_lost_sample_flags_its_electrode_and_shifts_no_other(lost: int, timed: bool) -> None:
+    sweeps, counters = assembler()
+    spoiled = samples(5)
+    del spoiled[lost]
+    stream = concatenated([*(samples(n) for n in range(5)), spoiled, samples(6), samples(7)])
+    if not timed:
+        stream = [(channel, words, 0) for channel, words, _ in stream]
+    readings = feed(sweeps, stream)
+    assert len(readings) == 8
+    for sweep, reading in enumerate(readings):
+        assert missing_electrodes(reading) == ([lost + 1] if sweep == 5 else [])
+        assert_true(reading, sweep)
+    assert counters.lost_frames == counters.faulty_readings == 1
+    assert counters.missed_readings == 0
+
+
+@pytest.mark.parametrize("burst", range(2, 24))
+@pytest.mark.parametrize("first", [0, 1, 11, 20])
+def test_a_burst_of_lost_samples_never_mixes_two_sweeps(first: int, burst: int) -> None:
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(10)])
+    start = 7 * 24 + first
+    readings = feed(sweeps, stream[:start] + stream[start + burst :])
+    assert len(readings) == 10
+    for sweep, reading in enumerate(readings):
+        assert_true(reading, sweep)
+    assert counters.lost_frames == burst
+    assert [reading.seq for reading in readings] == list(range(10))
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+@pytest.mark.parametrize("lost", [1, 2, 7])
+def test_sweeps_lost_as_a_whole_are_found_by_time(sequence: str, lost: int) -> None:
+    sweeps, counters = assembler(sequence)
+    before = [samples(n, sequence) for n in range(10)]
+    after = [samples(n, sequence) for n in range(10 + lost, 20 + lost)]
+    readings = feed(sweeps, concatenated(before + after))
+    assert len(readings) == 20
+    assert readings[10].seq == readings[9].seq + 1 + lost
+    assert counters.missed_readings == lost
+    assert counters.faulty_readings == 0
+
+
+@pytest.mark.parametrize("at", range(24))
+def test_a_duplicated_sample_is_dropped(at: int) -> None:
+    sweeps, counters = assembler()
+    spoiled = samples(3)
+    spoiled.insert(at, spoiled[at])
+    readings = feed(sweeps, concatenated([samples(0), samples(1), samples(2), spoiled, samples(4)]))
+    assert len(readings) == 5
+    for sweep, reading in enumerate(readings):
+        assert not reading.faults.any()
+        assert_true(reading, sweep)
+    assert counters.duplicate_frames == 1
+
+
+@pytest.mark.parametrize("distance", [1, 2, 3])
+@pytest.mark.parametrize("at", range(24))
+def test_a_late_sample_is_put_in_its_place_or_flagged(at: int, distance: int) -> None:
+    """A sample comes up to three after its place; behind the last electrode it is too late."""
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(9)])
+    here = 6 * 24 + at
+    stream.insert(here + distance, stream.pop(here))
+    readings = feed(sweeps, stream)
+    assert len(readings) == 9
+    for sweep, reading in enumerate(readings):
+        assert_true(reading, sweep)
+    in_time = at + distance < 23
+    assert missing_electrodes(readings[6]) == ([] if in_time else [at + 1])
+    assert counters.reordered_frames == in_time
+    assert counters.late_frames == (not in_time)
+    assert all(not reading.faults.any() for n, reading in enumerate(readings) if n != 6)
+
+
+def test_joining_in_the_middle_waits_for_a_sweep_to_begin() -> None:
+    sweeps, counters = assembler()
+    readings = feed(sweeps, concatenated([samples(0)[10:], samples(1), samples(2)]))
+    assert len(readings) == 2
+    assert counters.unsynchronised_frames == 14
+    for sweep, reading in enumerate(readings, start=1):
+        assert not reading.faults.any()
+        assert_true(reading, sweep)
+
+
+def test_joining_where_the_first_electrode_is_lost_still_begins() -> None:
+    sweeps, _ = assembler()
+    readings = feed(sweeps, concatenated([samples(0)[10:], samples(1)[1:], samples(2)]))
+    assert [missing_electrodes(reading) for reading in readings] == [[1], []]
+
+
+def test_an_interrupted_sweep_is_dropped_and_not_mended() -> None:
+    sweeps, counters = assembler()
+    readings = feed(sweeps, samples(0) + samples(1)[:12])
+    sweeps.interrupt()
+    readings += feed(sweeps, samples(2)[12:] + samples(3))
+    assert [reading.t_ns for reading in readings] == [samples(0)[-1][2], samples(3)[-1][2]]
+    assert_true(readings[1], 3)
+    assert counters.interrupted_sweeps == 1
+
+
+@pytest.mark.parametrize("known", [False, True], ids=["period unknown", "period known"])
+def test_a_sweep_cut_by_silence_is_not_filled_up_later(known: bool) -> None:
+    sweeps, counters = assembler()
+    before = PERIODS_NEEDED + 3 if known else 2
+    readings = feed(sweeps, concatenated([samples(n) for n in range(before)]))
+    readings += feed(sweeps, samples(before)[:12])
+    late = [(channel, words, t_ns + OUTAGE_NS) for channel, words, t_ns in samples(before + 1)]
+    readings += feed(sweeps, late[12:])
+    assert missing_electrodes(readings[-2]) == list(range(13, 25))
+    assert missing_electrodes(readings[-1]) == list(range(1, 13))
+    assert_true(readings[-2], before)
+    assert_true(readings[-1], before + 1)
+    assert counters.lost_frames == 24
+
+
+def test_an_outage_counts_as_one_missed_reading() -> None:
+    sweeps, counters = assembler()
+    stream = concatenated([samples(n) for n in range(10)])
+    later = [(channel, words, t_ns + 60 * OUTAGE_NS) for channel, words, t_ns in samples(10)]
+    readings = feed(sweeps, stream + later)
+    assert readings[-1].seq == readings[-2].seq + 2
+    assert counters.missed_readings == 1
+
+
+def test_frames_that_come_in_bursts_make_the_same_readings() -> None:
+    sweeps, counters = assembler("interleaved")
+    stream = concatenated([samples(n, "interleaved") for n in range(40)])
+    bursts = [stream[at : at + 7] for at in range(0, len(stream), 7)]
+    stream = [(channel, words, burst[-1][2]) for burst in bursts for channel, words, _ in burst]
+    readings = feed(sweeps, stream)
+    assert [reading.seq for reading in readings] == list(range(40))
+    for sweep, reading in enumerate(readings):
+        assert_true(reading, sweep)
+    assert counters.faulty_readings == counters.missed_readings == 0
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "fault", "counter"),
+    [
+        ("A52D", ElectrodeFault.ERROR_WORD, "error_words"),
+        ("A558", ElectrodeFault.ERROR_WORD, "error_words"),
+        ("0000", ElectrodeFault.MISSING, "unplugged_words"),
+        ("FFFF", ElectrodeFault.MISSING, "unplugged_words"),
+        ("A250", ElectrodeFault.PARITY, "parity_words"),
+        ("A351", ElectrodeFault.PARITY, "parity_words"),
+        ("A257", ElectrodeFault.PARITY, "parity_words"),
+    ],
+)
+def test_a_bad_word_flags_its_electrode_only(
+    spoiled: str, fault: ElectrodeFault, counter: str
+) -> None:
+    sweeps, counters = assembler()
+    stream = samples(0)
+    channel, words, t_ns = stream[8]
+    stream[8] = (channel, words[:2] + bytes.fromhex(spoiled) + words[4:], t_ns)
+    (reading,) = feed(sweeps, stream)
+    assert reading.faults[1, 8] == fault
+    assert np.count_nonzero(reading.faults) == 1
+    assert reading.counts[1, 8] == 0
+    assert_true(reading, 0)
+    assert getattr(counters, counter) == 1
+
+
+def test_channels_that_the_sequence_lacks_are_counted() -> None:
+    sweeps, counters = assembler("electrodes")
+    stream = samples(0)
+    stream.insert(5, (PAC, word(2050) * FINGERS, stream[5][2]))
+    (reading,) = feed(sweeps, stream)
+    assert not reading.faults.any()
+    assert counters.unexpected_channels == 1
+
+
+@pytest.mark.parametrize(
+    "sequence", [SEQUENCE_PRESSURE, SEQUENCE_ELECTRODES[1:], (*SEQUENCE_ELECTRODES, 17)]
+)
+def test_a_sequence_must_have_every_electrode_once(sequence: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="exactly once"):
+        SampleSweeps(FINGERS, sequence, CanCounters())
+
+
+def test_the_next_reading_is_expected_when_its_last_electrode_is() -> None:
+    sweeps, _ = assembler()
+    assert sweeps.expected_ns is None
+    feed(sweeps, concatenated([samples(n) for n in range(8)]))
+    ends = [samples(n)[-1][2] for n in range(10)]
+    assert sweeps.expected_ns == ends[8]
+    feed(sweeps, samples(8)[:12])
+    assert sweeps.expected_ns == pytest.approx(ends[8], abs=10)

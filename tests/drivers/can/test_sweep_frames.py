@@ -1,0 +1,214 @@
+"""Per-finger frames become readings: nothing is mixed, what is missing is flagged."""
+
+from __future__ import annotations
+
+import pytest
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.can.decoders import CanCounters
+from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED
+from drivers.can.sweep_frames import LATE_FRAMES_MAX, SEQUENCE_JUMP_MAX, FrameSweeps
+from tests.drivers.can.can_words import FINGERS, assert_true, truth, word
+
+MISSING = ElectrodeFault.MISSING
+
+
+TICK_US = 10_000
+
+
+def push(
+    sweeps: FrameSweeps, row: int, sweep: int, t_ns: int = 0, tick_us: int | None = None
+) -> list[TactileReading]:
+    words = b"".join(word(int(count)) for count in truth(sweep)[row])
+    tick_us = sweep * TICK_US if tick_us is None else tick_us
+    return list(sweeps.push(row, sweep % (1 << 16), tick_us % (1 << 32), words, 0, t_ns))
+
+
+def frame_sweeps() -> tuple[FrameSweeps, CanCounters]:
+    counters = CanCounters()
+    return FrameSweeps(FINGERS, counters), counters
+
+
+def whole(
+    sweeps: FrameSweeps, sweep: int, t_ns: int = 0, tick_us: int | None = None
+) -> list[TactileReading]:
+    pushed = [push(sweeps, row, sweep, t_ns, tick_us) for row in range(FINGERS)]
+    return [reading for readings in pushed for reading in readings]
+
+
+def test_frames_of_all_fingers_make_a_reading_in_any_order() -> None:
+    sweeps, _ = frame_sweeps()
+    assert push(sweeps, 2, 0, 5) == push(sweeps, 0, 0, 9) == []
+    (reading,) = push(sweeps, 1, 0, 7)
+    assert_true(reading, 0)
+    assert not reading.faults.any()
+    assert reading.t_ns == 9
+
+
+def test_a_lost_frame_flags_its_finger_when_the_next_sweep_begins() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 0)
+    assert push(sweeps, 0, 1, 20) == push(sweeps, 2, 1, 21) == []
+    (reading,) = push(sweeps, 0, 2, 30)
+    assert (reading.faults[1] == MISSING).all()
+    assert not reading.faults[[0, 2]].any()
+    assert_true(reading, 1)
+    assert (reading.t_ns, counters.lost_frames) == (21, 1)
+
+
+def test_a_first_sweep_that_was_joined_in_the_middle_is_no_reading() -> None:
+    sweeps, counters = frame_sweeps()
+    assert push(sweeps, 2, 7) == []
+    (reading,) = whole(sweeps, 8)
+    assert_true(reading, 8)
+    assert counters.unsynchronised_frames == 1
+
+
+def test_gaps_in_the_sequence_are_missed_readings_across_its_wrap() -> None:
+    sweeps, counters = frame_sweeps()
+    (first,) = whole(sweeps, (1 << 16) - 2)
+    (second,) = whole(sweeps, (1 << 16) + 3)
+    assert second.seq == first.seq + 5
+    assert counters.missed_readings == 4
+    assert counters.restarts == 0
+
+
+def test_duplicated_and_late_frames_change_nothing() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 10)
+    assert push(sweeps, 1, 10) == push(sweeps, 1, 9) == push(sweeps, 1, 10 - LATE_FRAMES_MAX) == []
+    (reading,) = whole(sweeps, 11)
+    assert not reading.faults.any()
+    assert (counters.duplicate_frames, counters.late_frames) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("sequence", "t_ns"),
+    [(5000 - LATE_FRAMES_MAX - 1, 0), (5000 + SEQUENCE_JUMP_MAX + 1, 0), (0, 0)],
+)
+def test_a_sequence_that_starts_anew_is_followed(sequence: int, t_ns: int) -> None:
+    sweeps, counters = frame_sweeps()
+    (before,) = whole(sweeps, 5000)
+    (after,) = whole(sweeps, sequence, t_ns)
+    assert_true(after, sequence)
+    assert counters.restarts == 1
+    assert after.seq == before.seq + 2
+
+
+def test_a_device_that_says_the_same_sweep_again_after_an_outage_has_started_anew() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 0)
+    (reading,) = whole(sweeps, 0, OUTAGE_NS + 1, tick_us=77)
+    assert reading.t_ns == OUTAGE_NS + 1
+    assert counters.restarts == 1
+
+
+def test_a_copy_is_a_copy_however_late_it_comes() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 0)
+    assert whole(sweeps, 0, OUTAGE_NS + 1) == []
+    assert (counters.duplicate_frames, counters.restarts) == (FINGERS, 0)
+
+
+PERIOD_NS = 10_000_000
+
+
+def running(sweeps: FrameSweeps, sweep: int) -> int:
+    """Sweeps up to before `sweep`, on time; when that is due, ns."""
+    for before in range(sweep - 8, sweep):
+        whole(sweeps, before, before * PERIOD_NS)
+    return sweep * PERIOD_NS
+
+
+@pytest.mark.parametrize("is_known", [True, False], ids=["period known", "period unknown"])
+@pytest.mark.parametrize("tick_stuck", [False, True], ids=["tick", "stuck tick"])
+@pytest.mark.parametrize("down_ns", [PERIOD_NS, 3 * PERIOD_NS, 300_000_000])
+def test_a_board_that_was_reset_never_completes_the_sweep_at_hand(
+    *, is_known: bool, tick_stuck: bool, down_ns: int
+) -> None:
+    """One finger of sweep 8 comes before the reset, then the numbers begin again at 0."""
+    sweeps, counters = frame_sweeps()
+    now_ns = running(sweeps, 8) if is_known else 8 * PERIOD_NS
+    if not is_known:
+        whole(sweeps, 7, 7 * PERIOD_NS)
+    readings = push(sweeps, 0, 8, now_ns, tick_us=80_000)
+    now_ns += down_ns
+    for again in range(20):
+        tick_us = 80_000 if tick_stuck else 1_000 + 10_000 * again
+        counts = again + 100
+        for row in range(FINGERS):
+            words = b"".join(word(int(count)) for count in truth(counts)[row])
+            faults = ElectrodeFault.HELD if tick_stuck else 0  # as the decoder says
+            readings += sweeps.push(row, again, tick_us, words, faults, now_ns)
+        now_ns += PERIOD_NS
+    for reading in readings:
+        sound = reading.faults == 0
+        fits = [n for n in range(130) if (truth(n)[sound] == reading.counts[sound]).all()]
+        assert fits, "a reading has fingers of two sweeps"
+    assert tick_stuck or not readings[-1].faults.any()
+    assert tick_stuck or counters.restarts + counters.contradicting_frames > 0
+
+
+def test_a_finger_that_was_lacking_for_two_periods_is_of_another_sweep() -> None:
+    sweeps, counters = frame_sweeps()
+    due_ns = running(sweeps, 9)
+    push(sweeps, 0, 9, due_ns)
+    push(sweeps, 1, 9, due_ns)
+    (before,) = push(sweeps, 2, 9, due_ns + 2 * PERIOD_NS + 1)
+    assert (before.faults[2] == MISSING).all()
+    assert not before.faults[:2].any()
+    (after,) = push(sweeps, 0, 10, due_ns + 3 * PERIOD_NS)
+    assert (after.faults[:2] == MISSING).all()
+    assert counters.restarts == 1
+
+
+def test_a_frame_with_the_number_at_hand_and_another_tick_is_dropped() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 2)
+    push(sweeps, 0, 3)
+    assert push(sweeps, 1, 3, tick_us=31_000) == push(sweeps, 1, 3, tick_us=29_000) == []
+    assert push(sweeps, 2, 3) == []
+    (reading,) = push(sweeps, 0, 4)
+    assert (reading.faults[1] == MISSING).all()
+    assert counters.contradicting_frames == 2
+
+
+def test_a_tick_that_runs_backwards_is_a_new_start_and_its_wrap_is_none() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 10, tick_us=(1 << 32) - 5)
+    whole(sweeps, 11, tick_us=(1 << 32) + 9_995)
+    assert counters.restarts == 0
+    (reading,) = whole(sweeps, 14, tick_us=17)
+    assert not reading.faults.any()
+    assert (counters.restarts, counters.missed_readings) == (1, 1)
+
+
+def test_finger_faults_hold_for_all_its_electrodes() -> None:
+    sweeps, counters = frame_sweeps()
+    words = word(2602) * 24
+    sweeps.push(0, 0, 0, words, ElectrodeFault.MISSING, 0)
+    sweeps.push(1, 0, 0, words, ElectrodeFault.HELD, 0)
+    (reading,) = sweeps.push(2, 0, 0, words, 0, 0)
+    assert (reading.faults[0] == ElectrodeFault.MISSING).all()
+    assert not reading.counts[0].any()
+    assert (reading.faults[1] == ElectrodeFault.HELD).all()
+    assert not reading.faults[2].any()
+    assert (counters.faulty_readings, counters.unplugged_words) == (1, 24)
+
+
+def test_an_interrupted_frame_sweep_is_missed() -> None:
+    sweeps, counters = frame_sweeps()
+    (before,) = whole(sweeps, 0)
+    push(sweeps, 0, 1)
+    sweeps.interrupt()
+    assert push(sweeps, 2, 1) == push(sweeps, 1, 1) == []
+    (after,) = whole(sweeps, 2)
+    assert after.seq == before.seq + 2
+    assert (counters.interrupted_sweeps, counters.missed_readings) == (1, 1)
+
+
+def test_the_frame_period_is_learned() -> None:
+    sweeps, _ = frame_sweeps()
+    for sweep in range(PERIODS_NEEDED + 1):
+        whole(sweeps, sweep, sweep * 10_000_000)
+    assert sweeps.period_ns == 10_000_000

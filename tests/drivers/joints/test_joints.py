@@ -1,0 +1,309 @@
+"""The plain joint stream: what is a message, what an angle, in which order, from whom."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.base import Driver, JointReading, LinkError
+from drivers.joints.driver import JointStreamDriver
+from drivers.joints.message import (
+    DATAGRAM_BYTES_MAX,
+    JointCounters,
+    JointMessage,
+    JointParser,
+)
+from drivers.link import LinkState
+from drivers.twins.faults import LinkFaults
+from drivers.twins.joints import JointTwin
+from tests.drivers.palm.palm_stream import MS, Clock, Sender, joints, listen
+
+LOOPBACK = "udp://127.0.0.1:0"
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def driver(clock: Clock) -> Iterator[JointStreamDriver]:
+    with JointStreamDriver(LOOPBACK, clock=clock) as driver:
+        yield driver
+
+
+def parse(data: bytes | str) -> tuple[JointMessage | None, JointCounters]:
+    counters = JointCounters()
+    text = data.encode() if isinstance(data, str) else data
+    return JointParser(counters).parse(text), counters
+
+
+def message(seq: int | None = None, t_s: float | None = None, **angles: float) -> bytes:
+    fields: dict[str, object] = {"joints": angles or {"FFJ3": 0.5}}
+    fields |= {} if seq is None else {"seq": seq}
+    fields |= {} if t_s is None else {"t": t_s}
+    return json.dumps(fields).encode()
+
+
+def state(driver: JointStreamDriver) -> LinkState:
+    return driver.link_state
+
+
+def test_the_example_of_the_documentation_is_read() -> None:
+    found, counters = parse(
+        '{"seq": 1041, "t": 12.31, "joints": {"FFJ3": 0.51, "FFJ4": -0.02, "THJ5": 0.3}}'
+    )
+    assert found is not None
+    assert (found.seq, found.t_s) == (1041, 12.31)
+    assert found.names == ("FFJ3", "FFJ4", "THJ5")
+    assert found.position_rad.tolist() == [0.51, -0.02, 0.3]
+    assert not any(counters.as_dict().values())
+
+
+def test_a_hand_prefix_and_other_fields_do_no_harm() -> None:
+    found, counters = parse('{"v": 3, "joints": {"rh_WRJ1": 0, "lh_LFJ5": 1}, "note": [1, {}]}')
+    assert found is not None
+    assert found.names == ("WRJ1", "LFJ5")
+    assert not any(counters.as_dict().values())
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"\xff\xfe\x00",
+        b"null",
+        b"[]",
+        b'"joints"',
+        b"NaN",
+        b"{}",
+        b'{"joints": []}',
+        b'{"joints": null}',
+        b'{"joints": {"FFJ3": 0.5}',
+        b'{"joints": {"FFJ3": 0.5}} x',
+        b'{"joints": {"FFJ3": 0.5, "FFJ3": 0.6}}',
+        b'{"joints": {}, "joints": {"FFJ3": 0.5}}',
+        b'{"joints": {"FFJ3": 0.5}, "seq": -1}',
+        b'{"joints": {"FFJ3": 0.5}, "seq": 1.5}',
+        b'{"joints": {"FFJ3": 0.5}, "seq": true}',
+        b'{"joints": {"FFJ3": 0.5}, "seq": "7"}',
+        b'{"joints": {"FFJ3": 0.5}, "seq": 9223372036854775808}',
+        b'{"joints": {"FFJ3": 0.5}, "seq": NaN}',
+        b'{"joints": {"FFJ3": 0.5}, "t": "now"}',
+        b'{"joints": {"FFJ3": 0.5}, "t": 1e999}',
+        b'{"joints": {"FFJ3": 0.5}, "t": NaN}',
+        b'{"joints": {"FFJ3": 0.5}}'.decode().encode("utf-16"),
+        b"[" * DATAGRAM_BYTES_MAX,
+        b'{"joints":' * 400,
+        b'{"joints": {"FFJ3": 0.5}}' + b" " * DATAGRAM_BYTES_MAX,
+        b'{"seq": ' + b"9" * 4080 + b"}",
+    ],
+)
+def test_what_is_no_message_is_counted_and_dropped(data: bytes) -> None:
+    found, counters = parse(data)
+    assert found is None
+    assert counters.bad_messages == 1
+
+
+@pytest.mark.parametrize(
+    "angle",
+    ["NaN", "Infinity", "-Infinity", "1e999", "true", "false", "null", '"0.5"', "[0.5]", "{}",
+     "3.6", "-3.6", "90", "1" + "0" * 400],
+)  # fmt: skip
+def test_what_is_no_angle_in_radians_is_nan_and_costs_no_other(angle: str) -> None:
+    found, counters = parse('{"joints": {"FFJ3": 0.5, "FFJ4": ' + angle + ', "THJ5": 0}}')
+    assert found is not None
+    assert found.names == ("FFJ3", "FFJ4", "THJ5")
+    assert found.position_rad[[0, 2]].tolist() == [0.5, 0.0]
+    assert math.isnan(found.position_rad[1])
+    assert counters.bad_angles == 1
+
+
+@pytest.mark.parametrize("name", ["FFJ5", "ffj3", "xx_FFJ3", "rh_rh_FFJ3", "", "THJ0", "elbow"])
+def test_an_unknown_name_is_left_out_and_counted(name: str) -> None:
+    found, counters = parse(json.dumps({"joints": {name: 0.1, "FFJ3": 0.5}}))
+    assert found is not None
+    assert found.names == ("FFJ3",)
+    assert counters.unknown_names == 1
+
+
+def test_one_joint_under_two_names_has_no_angle() -> None:
+    found, counters = parse('{"joints": {"FFJ3": 0.5, "rh_FFJ3": 0.6}}')
+    assert found is not None
+    assert found.names == ("FFJ3",)
+    assert math.isnan(found.position_rad[0])
+    assert counters.bad_angles == 1
+
+
+def test_names_are_remembered_up_to_a_limit() -> None:
+    counters = JointCounters()
+    parser = JointParser(counters)
+    for number in range(500):
+        parser.parse(json.dumps({"joints": {f"X{number}": 0.1, "FFJ3": 0.5}}).encode())
+    assert parser.names_kept <= 64
+    assert counters.unknown_names == 500
+
+
+@given(st.binary(max_size=300) | st.text(max_size=200).map(str.encode))
+def test_whatever_is_fed_nothing_is_raised(data: bytes) -> None:
+    found, counters = parse(data)
+    assert (found is None) == counters.bad_messages
+
+
+def test_a_message_is_written_as_it_is_read() -> None:
+    sent = JointMessage(7, 1.5, ("FFJ3", "WRJ2"), np.array([0.1, -0.2]))
+    found, _ = parse(sent.to_bytes())
+    assert found is not None
+    assert (found.seq, found.t_s, found.names) == (7, 1.5, ("FFJ3", "WRJ2"))
+    assert np.array_equal(found.position_rad, sent.position_rad)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        JointMessage(7, 1.5, ("FFJ3",), np.array([math.nan])).to_bytes()
+
+
+def test_the_joint_stream_is_a_driver() -> None:
+    driver: Driver = JointStreamDriver(LOOPBACK)
+    assert (driver.name, driver.period_ns, driver.exhausted) == ("joints", None, False)
+    assert driver.fileno() is driver.due_ns() is None
+    assert driver.describe() == {"source": LOOPBACK}
+    with pytest.raises(RuntimeError, match="not open"):
+        driver.read_ready()
+    driver.close()
+    driver.close()
+
+
+@pytest.mark.parametrize("source", ["127.0.0.1:5", "udp://localhost:5", "tcp://127.0.0.1:5"])
+def test_a_source_that_is_no_udp_address_is_refused(source: str) -> None:
+    with pytest.raises(ValueError, match="is not"):
+        JointStreamDriver(source)
+
+
+@pytest.mark.parametrize("silence_s", [0.0, 61.0, math.nan])
+def test_a_silence_out_of_range_is_refused(silence_s: float) -> None:
+    with pytest.raises(ValueError, match="silence_s"):
+        JointStreamDriver(LOOPBACK, silence_s=silence_s)
+
+
+def test_a_port_that_is_taken_is_a_link_error(driver: JointStreamDriver) -> None:
+    with pytest.raises(LinkError, match="cannot listen"):
+        JointStreamDriver(f"udp://127.0.0.1:{driver.port}").open()
+
+
+def taken(driver: JointStreamDriver, *data: bytes) -> list[JointReading]:
+    with Sender(driver) as sender:
+        sender.send(*data)
+        return joints(driver.read_ready())
+
+
+def test_each_message_is_a_reading_and_a_gap_is_a_loss(driver: JointStreamDriver) -> None:
+    readings = taken(driver, *(message(seq, FFJ3=seq / 100) for seq in (3, 4, 7, 8)))
+    assert [reading.seq for reading in readings] == [0, 1, 4, 5]
+    assert [reading.position_rad[0] for reading in readings] == [0.03, 0.04, 0.07, 0.08]
+    assert driver.counters.readings == 4
+    assert driver.counters.missed_readings == 2
+
+
+@pytest.mark.parametrize("by", ["seq", "t_s"])
+def test_late_and_doubled_messages_are_dropped(driver: JointStreamDriver, by: str) -> None:
+    stream = [message(**{by: number}, FFJ3=number / 100) for number in (1, 2, 2, 4, 3, 5)]
+    angles = [reading.position_rad[0] for reading in taken(driver, *stream)]
+    assert angles == [0.01, 0.02, 0.04, 0.05]
+    assert driver.counters.old_messages == 2
+
+
+def test_without_number_and_time_every_message_counts(driver: JointStreamDriver) -> None:
+    assert len(taken(driver, *[message()] * 5)) == 5
+
+
+def test_a_sender_that_begins_anew_is_taken_at_its_eleventh_message(
+    driver: JointStreamDriver,
+) -> None:
+    stream = [message(seq) for seq in (*range(500, 510), *range(20))]
+    assert len(taken(driver, *stream)) == 10 + 10
+    assert driver.counters.old_messages == 10
+    assert driver.counters.restarts == 1
+
+
+def test_a_sender_that_repeats_itself_is_never_taken(driver: JointStreamDriver) -> None:
+    assert len(taken(driver, *[message(5)] * 100)) == 1
+    assert driver.counters.old_messages == 99
+
+
+def test_a_wild_jump_ahead_is_no_loss_of_millions(driver: JointStreamDriver) -> None:
+    readings = taken(driver, message(1), message(1 << 60), *(message(seq) for seq in range(2, 20)))
+    assert driver.counters.missed_readings == 0
+    assert driver.counters.restarts == 2
+    assert [reading.seq for reading in readings] == list(range(2 + 8))
+
+
+def test_silence_loses_the_link_and_a_message_brings_it_back(
+    driver: JointStreamDriver, clock: Clock
+) -> None:
+    assert state(driver) is LinkState.GREETING
+    with Sender(driver) as sender:
+        sender.send(message(100))
+        driver.read_ready()
+        assert state(driver) is LinkState.UP
+        clock.now_ns += 499 * MS
+        driver.read_ready()
+        assert state(driver) is LinkState.UP
+        due_ns = driver.due_ns()
+        assert due_ns is not None
+        clock.now_ns = due_ns
+        driver.read_ready()
+        assert state(driver) is LinkState.GREETING
+        assert driver.counters.link_losses == 1
+        assert driver.describe()["why"] == "nothing good for 500 ms"
+    assert len(taken(driver, message(1))) == 1  # another sender, counting from the start
+    assert state(driver) is LinkState.UP
+
+
+def test_another_sender_is_not_mixed_in(driver: JointStreamDriver) -> None:
+    with Sender(driver) as sender, Sender(driver) as stranger:
+        sender.send(message(1))
+        stranger.send(message(2, FFJ3=-0.1))
+        sender.send(message(2))
+        angles = [reading.position_rad[0] for reading in joints(driver.read_ready())]
+    assert angles == [0.5, 0.5]
+    assert driver.counters.foreign_datagrams == 1
+
+
+def test_a_message_without_a_known_joint_is_no_reading(driver: JointStreamDriver) -> None:
+    assert taken(driver, message(1, elbow=0.1), b'{"joints": {}}') == []
+    assert state(driver) is LinkState.UP
+
+
+def test_the_faults_of_a_twin_are_counted() -> None:
+    twin = JointTwin(
+        rate_hz=1000.0,
+        faults=LinkFaults(drop_probability=0.1, duplicate_probability=0.1, seed=2),
+    )
+    stop = threading.Event()
+    with JointStreamDriver(LOOPBACK) as driver:
+        target = f"udp://127.0.0.1:{driver.port}"
+        thread = threading.Thread(target=twin.serve, args=(target, stop))
+        thread.start()
+        try:
+            listen(driver, lambda readings: len(readings) >= 500)
+        finally:
+            stop.set()
+            thread.join()
+        driver.read_ready()
+        counters = driver.counters
+    # The last message sent may have been followed by losses that nobody can know of.
+    assert counters.missed_readings == pytest.approx(twin.injected["drop"], abs=3)
+    assert counters.old_messages == twin.injected["duplicate"] > 20
+    assert counters.bad_messages == counters.bad_angles == 0
+
+
+def test_a_twin_with_nonsense_settings_is_refused() -> None:
+    with pytest.raises(ValueError, match="rate_hz"):
+        JointTwin(rate_hz=0.0)
+    with pytest.raises(ValueError, match="bursts"):
+        JointTwin(faults=LinkFaults(burst_frames=2))

@@ -1,0 +1,291 @@
+"""Raw Hall values to joint angles, and the mistakes that a calibration file may not have."""
+
+from __future__ import annotations
+
+import math
+import re
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
+from drivers.palm.hall import JOINTS, Calibration, CoupledTable, Table, impossible_angles
+
+EXAMPLE = Path(__file__).parents[3] / "deploy" / "calibration" / "example_hand.toml"
+FFJ1 = [[3109, 0.0], [2673, 22.5], [1942, 45.0], [1247, 67.5], [649, 90.0]]
+# One record of a real hand's `sensors`, from Shadow's documentation.
+SNAPSHOT = [
+    *(1303, 1574, 3205, 1780, 1382, 1523, 3164, 1938, 904, 1332, 2977, 1706, 1730, 1434, 3060),
+    *(1853, 1955, 1814, 2132, 2294, 2496, 4029, 1668, 2931, 1768, 1377, *range(26, 37)),
+]
+FILE = Path("hand.toml")
+
+
+def degrees(calibration: Calibration, **raws: int | tuple[int, ...]) -> dict[str, float]:
+    """Angles, degrees, with the words of the given joints; THJ5 and WRJ1 take two."""
+    words = {"FFJ1": 0, "FFJ2": 1, "FFJ3": 2, "FFJ4": 3, "LFJ5": 16, "THJ1": 17, "THJ2": 18,
+             "THJ4": 20, "THJ5": 21, "WRJ1": 23, "WRJ2": 25}  # fmt: skip
+    sensors = [1] * 37
+    for joint, raw in raws.items():
+        values = raw if isinstance(raw, tuple) else (raw,)
+        sensors[words[joint] : words[joint] + len(values)] = values
+    return dict(zip(JOINTS, np.degrees(calibration.angles_rad(sensors)), strict=True))
+
+
+def calibration(**joints: list[list[float]]) -> Calibration:
+    return parse_calibration({"version": 1, "joints": joints}, FILE)
+
+
+def problems(data: dict[str, object]) -> tuple[str, ...]:
+    with pytest.raises(CalibrationError) as caught:
+        parse_calibration(data, FILE)
+    for line in str(caught.value).splitlines():
+        assert line.startswith("hand.toml: ")
+    return caught.value.problems
+
+
+@pytest.mark.parametrize(
+    ("joint", "raw", "expected_deg"),
+    [
+        *(("FFJ1", raw, angle) for raw, angle in FFJ1),
+        ("FFJ1", 2891, 11.25),  # half way from 3109 to 2673
+        ("FFJ1", 1595, 45 + 22.5 * (1942 - 1595) / (1942 - 1247)),
+        ("FFJ3", 2487, 0),
+        ("FFJ3", 946, 90),
+        ("FFJ4", 591, -20),
+        ("FFJ4", 1884, 0),
+        ("FFJ4", 2092, 20),
+        ("THJ4", 1403, 0),
+        ("THJ4", 2260, 67.5),
+        ("THJ5", (3633, 3633), -60),
+        ("THJ5", (1063, 1063), 60),
+        ("THJ5", (4029, 1668), -60 + 120 * (3633 - 2848.5) / 2570),
+    ],
+)
+def test_the_values_of_a_real_hand_are_met(
+    joint: str, raw: int | tuple[int, int], expected_deg: float
+) -> None:
+    assert degrees(load_calibration(EXAMPLE), **{joint: raw})[joint] == pytest.approx(expected_deg)
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected_deg"),
+    [
+        (4095, 0 - 22.5 * (4095 - 3109) / (3109 - 2673)),  # by the first segment
+        (100, 90 + 22.5 * (649 - 100) / (1247 - 649)),  # by the last one
+    ],
+)
+def test_beyond_the_table_the_line_goes_on_without_clamping(raw: int, expected_deg: float) -> None:
+    assert degrees(load_calibration(EXAMPLE), FFJ1=raw)["FFJ1"] == pytest.approx(expected_deg)
+
+
+def test_two_sensors_are_averaged_before_the_table_not_after() -> None:
+    bent: list[list[float]] = [[1000, -40], [2000, 0], [3000, 20]]
+    angle = degrees(calibration(WRJ1=bent), WRJ1=(1000, 2500))["WRJ1"]
+    assert angle == pytest.approx(-10.0)  # at 1750; the mean of -40 and 10 would be -15
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    for rows in (FFJ1, FFJ1[::-1], FFJ1[2:] + FFJ1[:2]):
+        assert degrees(calibration(FFJ1=rows), FFJ1=2000)["FFJ1"] == pytest.approx(
+            22.5 + 22.5 * (2673 - 2000) / (2673 - 1942)
+        )
+
+
+def test_j0_is_the_sum_of_j1_and_j2() -> None:
+    both = calibration(FFJ1=FFJ1, FFJ2=[[3000, 0.0], [1000, 90.0]])
+    angles = degrees(both, FFJ1=1942, FFJ2=2000)
+    assert [angles["FFJ1"], angles["FFJ2"], angles["FFJ0"]] == pytest.approx([45, 45, 90])
+
+
+def test_a_joint_without_a_table_has_no_angle() -> None:
+    angles = dict(zip(JOINTS, load_calibration(EXAMPLE).angles_rad(SNAPSHOT), strict=True))
+    known = {joint for joint, angle in angles.items() if not math.isnan(angle)}
+    assert known == {"FFJ1", "FFJ3", "FFJ4", "THJ4", "THJ5"}
+    assert len(angles) == 28
+
+
+@pytest.mark.parametrize("raw", [(4096, 2000), (2000, 65535)])
+def test_a_raw_value_over_12_bits_gives_no_angle(raw: tuple[int, int]) -> None:
+    assert math.isnan(degrees(load_calibration(EXAMPLE), THJ5=raw)["THJ5"])
+    both = calibration(FFJ1=FFJ1, FFJ2=FFJ1)
+    assert math.isnan(degrees(both, FFJ1=4096, FFJ2=2000)["FFJ0"])
+
+
+def test_impossible_angles_are_counted_and_not_changed() -> None:
+    angles = load_calibration(EXAMPLE).angles_rad(SNAPSHOT)  # another hand's snapshot
+    by_name = dict(zip(JOINTS, np.degrees(angles), strict=True))
+    assert by_name["FFJ3"] == pytest.approx(-90 * (3205 - 2487) / (2487 - 946))  # -41.9
+    assert by_name["THJ4"] == pytest.approx(67.5 * (2496 - 1403) / (2260 - 1403))  # 86.1
+    assert impossible_angles(angles) == 2
+
+
+# THJ1 and THJ2: five by five raw pairs, as a hand is calibrated.
+RAW_PAIRS = [(900 + 420 * i + 60 * j, 800 + 380 * j - 45 * i) for i in range(5) for j in range(5)]
+ANGLES = [(-15 + 26 * i, -40 + 20 * j) for i in range(5) for j in range(5)]
+COUPLED = [[*raws, *angles] for raws, angles in zip(RAW_PAIRS, ANGLES, strict=True)]
+
+
+def coupled(rows: Sequence[Sequence[float]]) -> dict[str, object]:
+    return {"version": 1, "coupled": {"THJ1_THJ2": [list(row) for row in rows]}}
+
+
+def test_the_coupled_table_is_met_at_each_of_its_points() -> None:
+    thumb = parse_calibration(coupled(COUPLED), FILE)
+    for (raw_1, raw_2), (first, second) in zip(RAW_PAIRS, ANGLES, strict=True):
+        angles = degrees(thumb, THJ1=raw_1, THJ2=raw_2)
+        assert angles["THJ1"] == pytest.approx(first)
+        assert angles["THJ2"] == pytest.approx(second)
+
+
+def test_a_flat_coupled_table_is_a_plane_inside_and_outside() -> None:
+    raws = np.random.default_rng(3).uniform(500, 3500, (25, 2))
+    rows = [(a, b, 0.01 * a - 0.002 * b + 1, 0.004 * a + 0.006 * b - 30) for a, b in raws]
+    table = CoupledTable(rows)
+    for a, b in np.random.default_rng(4).uniform(0, 4095, (200, 2)):
+        first, second = table.angles_rad(a, b)
+        assert math.degrees(first) == pytest.approx(0.01 * a - 0.002 * b + 1)
+        assert math.degrees(second) == pytest.approx(0.004 * a + 0.006 * b - 30)
+
+
+def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:
+    interpolate = pytest.importorskip("scipy.interpolate", reason="scipy is not installed")
+    raws = np.random.default_rng(5).uniform(500, 3500, (25, 2))
+    angles = np.random.default_rng(6).uniform(-15, 40, (25, 2))
+    rows = [(float(a), float(b), float(c), float(d)) for (a, b), (c, d) in zip(raws, angles)]  # noqa: B905
+    table, reference = CoupledTable(rows), interpolate.LinearNDInterpolator(raws, angles)
+    inside = 0
+    for pair in np.random.default_rng(7).uniform(500, 3500, (300, 2)):
+        expected = reference(*pair)
+        if not np.isnan(expected).any():
+            inside += 1
+            assert np.degrees(table.angles_rad(*pair)) == pytest.approx(expected, abs=1e-6)
+    assert inside > 150
+
+
+def test_without_the_coupled_table_the_thumb_tip_has_no_angles() -> None:
+    angles = degrees(load_calibration(EXAMPLE), THJ1=2000, THJ2=2000)
+    assert math.isnan(angles["THJ1"])
+    assert math.isnan(angles["THJ2"])
+
+
+@pytest.mark.parametrize(
+    ("joint", "rows", "reason"),
+    [
+        # As shipped with three hands: a digit too many.
+        ("LFJ1", [[22361, 0.0], [1942, 45.0], [649, 90.0]], "raw 22361 is not in 1..4095"),
+        ("FFJ1", [[18589, 0.0], [1942, 45.0], [649, 90.0]], "raw 18589 is not in 1..4095"),
+        ("THJ5", [[3633, -60.0], [10397, 60.0]], "raw 10397 is not in 1..4095"),
+        ("RFJ2", [[0, 0.0], [0, 22.5], [0, 45.0]], "raw 0 is a placeholder"),
+        ("RFJ2", [[3000, 0.0], [0, 45.0]], "raw 0 is a placeholder"),
+        ("RFJ2", [[-5, 0.0], [900, 45.0]], "raw -5 is not in 1..4095"),
+        ("LFJ3", [[2500, 0.0], [1800, 45.0], [1200, 40.0], [700, 90.0]], "is not monotone"),
+        ("THJ3", [[2500, 0.0], [1800, 0.0]], "is not monotone"),
+        ("WRJ1", [[2500, 0.0]], "has 1 points, must have 2 to 64"),
+        ("WRJ1", [], "has 0 points"),
+        ("WRJ1", [[1000 + row, row / 10] for row in range(65)], "has 65 points"),
+        ("WRJ2", [[2500, 0.0], [2500, 10.0]], "raw 2500 stands twice"),
+        ("FFJ3", [[2500, 0.0], [2510, 45.0]], "4.50 degrees per count from raw 2500 to 2510"),
+        ("FFJ3", [[2500, 0.0], [900, 900.0]], "900.0 degrees is out of reach"),
+        ("FFJ5", FFJ1, "no such joint"),
+        ("ffj1", FFJ1, "no such joint"),
+        ("FFJ0", FFJ1, "is the sum of FFJ1 and FFJ2"),
+        ("THJ1", FFJ1, "stand in [coupled]"),
+        ("FFJ1", [[1000, 0.0, 1], [2000, 45.0]], "must be a list of points of 2 numbers"),
+        ("FFJ1", [[1000, True], [2000, 45.0]], "must be a list of points"),
+        ("FFJ1", [[1000, "0"], [2000, 45.0]], "must be a list of points"),
+        ("FFJ1", [[1000, math.nan], [2000, 45.0]], "must be a list of points"),
+        ("FFJ1", [[10**400, 0.0], [2000, 45.0]], "must be a list of points"),
+        ("FFJ1", 7, "must be a list of points"),
+    ],
+)
+def test_a_wrong_table_is_refused_by_name(joint: str, rows: object, reason: str) -> None:
+    found = problems({"version": 1, "joints": {joint: rows, "FFJ4": [[591, -20], [1884, 0]]}})
+    assert any(line.startswith(f"{joint}: ") and reason in line for line in found), found
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        ({"joints": {"FFJ1": FFJ1}}, "version is None, must be 1"),
+        ({"version": 2, "joints": {"FFJ1": FFJ1}}, "version is 2"),
+        ({"version": True, "joints": {"FFJ1": FFJ1}}, "version is True"),
+        ({"version": 1}, "joints: is empty"),
+        ({"version": 1, "joints": 3}, "joints: must be a table"),
+        ({"version": 1, "joint": {}, "joints": {"FFJ1": FFJ1}}, "joint: no such key"),
+        ({"version": 1, "coupled": {"THJ1": COUPLED}}, "THJ1: no such key; there is: THJ1_THJ2"),
+        (coupled(COUPLED[:2]), "THJ1_THJ2: has 2 points, must have 3 to 49"),
+        (coupled([[0, 0, 0, 0]] * 25), "THJ1_THJ2: raw 0 is a placeholder"),
+        (coupled([*COUPLED, COUPLED[0]]), "stands twice"),
+        (coupled([*COUPLED, [901, 800, 0, -40]]), "is steeper than 0.5"),
+        (coupled([*COUPLED, [4096, 800, 0, -40]]), "raw 4096 is not in 1..4095"),
+        (coupled([*COUPLED, [3500, 300, 120, -40]]), "THJ1: 120 degrees is out of reach"),
+        (coupled([[1000 + 90 * i, 2000 + 90 * i, i, i] for i in range(9)]), "span a triangle"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_the_reason(data: dict[str, object], reason: str) -> None:
+    assert any(reason in line for line in problems(data)), problems(data)
+
+
+def test_every_mistake_of_a_file_has_its_line() -> None:
+    joints = {"LFJ1": [[22361, 0.0], [649, 90.0]], "THJ5": [[3633, 60.0]], "XXJ1": FFJ1}
+    found = problems({"version": 1, "joints": joints})
+    assert [line.partition(":")[0] for line in found] == ["LFJ1", "THJ5", "XXJ1"]
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"version = ", "is not TOML"),
+        (b"\xff\xfe", "is not TOML"),
+        (b"#" * 300_000, "is longer than"),
+        (b"x = " + b"[" * 5000, "is not TOML"),
+        (None, "cannot be read"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_refused_by_its_path(
+    tmp_path: Path, content: bytes | None, reason: str
+) -> None:
+    path = tmp_path / "hand.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(CalibrationError, match=re.escape(f"{path}: {reason}")):
+        load_calibration(path)
+
+
+def test_the_example_says_what_is_missing() -> None:
+    text = EXAMPLE.read_text()
+    listed = set(tomllib.loads(text)["joints"])
+    assert listed == {"FFJ1", "FFJ3", "FFJ4", "THJ4", "THJ5"}
+    for missing in ("FFJ2", "MFJ1", "RFJ4", "LFJ5", "THJ3", "WRJ1", "WRJ2", "THJ1 and THJ2"):
+        assert missing in text
+
+
+def test_a_table_needs_two_different_points() -> None:
+    for points in ([], [(5.0, 1.0)], [(5.0, 1.0), (5.0, 2.0)]):
+        with pytest.raises(ValueError, match="two points"):
+            Table(points)
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.sampled_from(["FFJ1", "THJ1_THJ2", "x"]), inner, max_size=3)
+    ),
+    max_leaves=20,
+)
+
+
+@given(st.fixed_dictionaries({}, optional=dict.fromkeys(("version", "joints", "coupled"), values)))
+def test_whatever_a_file_holds_it_is_taken_or_refused(data: dict[str, object]) -> None:
+    try:
+        found = parse_calibration({"version": 1} | data, FILE)
+    except CalibrationError:
+        return
+    assert len(found.angles_rad(SNAPSHOT)) == 28

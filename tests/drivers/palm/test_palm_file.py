@@ -1,0 +1,77 @@
+"""Files of palm packets as recordings: every count, one packet per millisecond, what is none."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.base import RecordingError
+from drivers.palm.driver import PalmDriver
+from drivers.palm.packet import Palm
+from drivers.twins.palm import PalmTwin
+from tests.drivers.palm.palm_stream import MS, Clock, datagrams, rows, tactile
+
+
+@pytest.mark.parametrize("palm", list(Palm))
+@pytest.mark.parametrize("can_record", [False, True])
+def test_a_file_of_packets_plays_count_for_count(
+    tmp_path: Path, palm: Palm, can_record: bool
+) -> None:
+    twin = PalmTwin(rows(40), palm=palm, can_record=can_record)
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(packet.to_bytes() for packet in twin.packets()) + bytes(5))
+    readings = []
+    with PalmDriver(path, realtime=False) as driver:
+        while not driver.exhausted:
+            readings += tactile(driver.read_ready())
+        assert driver.counters.bad_lengths == 1  # the file ends in the middle of a packet
+        assert driver.due_ns() is None
+    assert np.array_equal([reading.counts for reading in readings], rows(40))
+
+
+def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
+    clock = Clock()
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(datagrams(10)))
+    times = []
+    with PalmDriver(path, clock=clock) as driver:
+        start_ns = clock.now_ns
+        while (due_ns := driver.due_ns()) is not None:
+            clock.now_ns = due_ns
+            times += [reading.t_ns - start_ns for reading in driver.read_ready()]
+    assert times == [(14 * number + 13) * MS for number in range(10)]
+
+
+def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "hand.palm"
+    os.mkfifo(path)
+    with pytest.raises(RecordingError, match="is not a file"):
+        PalmDriver(path).open()
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])
+def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "hand.palm"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"hand\.palm"):
+        PalmDriver(path).open()
+    with pytest.raises(RecordingError, match=r"is not a file|cannot be opened"):
+        PalmDriver(tmp_path).open()
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_file_that_is_read_late_has_lost_no_packet(tmp_path: Path, realtime: bool) -> None:
+    clock = Clock()
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(datagrams(40)))
+    readings = []
+    with PalmDriver(path, realtime=realtime, clock=clock) as driver:
+        while not driver.exhausted:
+            readings += tactile(driver.read_ready())
+            clock.now_ns += 500 * MS
+        assert driver.counters.lost_packets == 0
+    assert np.array_equal([reading.counts for reading in readings], rows(40))

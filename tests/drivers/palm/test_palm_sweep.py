@@ -1,0 +1,262 @@
+"""Rounds of palm packets: what is lost, held, doubled, late or damaged, and what is made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.base import ElectrodeFault
+from drivers.palm.packet import PalmPacket
+from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps.grasps import recorded_counts
+from drivers.twins.palm import PalmTwin
+from tests.conftest import data_dir
+from tests.drivers.palm.palm_stream import (
+    FINGERS,
+    MS,
+    ROUND,
+    Played,
+    flags,
+    packets,
+    play,
+    play_packets,
+    row_of,
+    rows,
+)
+
+MISSING, HELD, NOT_A_COUNT = (
+    ElectrodeFault.MISSING,
+    ElectrodeFault.HELD,
+    ElectrodeFault.NOT_A_COUNT,
+)
+# Electrodes, from 0, of each request of a round (tactile_data_type 0x0001, 0x0003 ... 0x001B).
+PAIRS = [[], [0], *([first, first + 1] for first in range(1, 22, 2)), [23]]
+
+
+def everywhere(electrodes: list[int]) -> list[list[int]]:
+    return [[finger, electrode] for finger in range(3) for electrode in electrodes]
+
+
+def change(packet: PalmPacket, finger: str, values: dict[str, int], **fields: int) -> PalmPacket:
+    """A packet with other values in one finger's slot and other fields."""
+    slot = ("ff", "mf", "rf", "lf", "th").index(finger)
+    slots = list(packet.tactile)
+    slots[slot] = slots[slot]._replace(**values)
+    changed: dict[str, Any] = {"tactile": tuple(slots), **fields}
+    return dataclasses.replace(packet, **changed)
+
+
+def expect_no_invention(played: Played, number: int) -> None:
+    """Each reading's unflagged counts are of one row, and rows never go back."""
+    truth = rows(number)
+    found = [row_of(reading, truth) for reading in played.readings]
+    assert None not in found
+    assert found == sorted(set(found), key=lambda row: -1 if row is None else row)
+
+
+def test_fourteen_packets_make_one_reading_of_their_counts() -> None:
+    played = play_packets(packets(5))
+    assert [reading.seq for reading in played.readings] == [0, 1, 2, 3, 4]
+    for reading, row in zip(played.readings, rows(5), strict=True):
+        assert np.array_equal(reading.counts, row)
+        assert not reading.faults.any()
+    assert [reading.t_ns for reading in played.readings] == [13 * MS, 27 * MS, 41 * MS, 55 * MS,
+                                                             69 * MS]  # fmt: skip
+    assert played.counters.lost_packets == played.counters.faulty_readings == 0
+
+
+@pytest.mark.parametrize("order", [("th", "ff"), ("mf",), ("ff", "mf", "rf", "lf", "th")])
+def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
+    made = list(PalmTwin(rows(2)).packets())
+    readings = play(([packet.to_bytes()] for packet in made), order).readings
+    for reading, row in zip(readings, rows(2), strict=True):
+        for place, finger in enumerate(order):
+            if finger in FINGERS:
+                assert np.array_equal(reading.counts[place], row[FINGERS.index(finger)])
+                assert not reading.faults[place].any()
+            else:
+                assert (reading.faults[place] == MISSING).all()
+
+
+@pytest.mark.parametrize("fingers", [(), ("ff", "ff"), ("ff", "xx")])
+def test_other_fingers_are_refused(fingers: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="different ones"):
+        PalmSweeps(fingers, RoundCounters())
+
+
+@pytest.mark.parametrize("position", range(ROUND))
+def test_a_lost_packet_takes_its_electrodes_and_moves_no_other(position: int) -> None:
+    stream: list[PalmPacket | None] = [*packets(3)]
+    stream[ROUND + position] = None
+    played = play_packets(stream)
+    assert [reading.seq for reading in played.readings] == [0, 1, 2]
+    damaged = played.readings[1]
+    assert flags(damaged, MISSING) == everywhere(PAIRS[position])
+    assert row_of(damaged, rows(3)) == 1
+    assert (damaged.counts[damaged.faults != 0] == 0).all()
+    assert [reading.faults.any() for reading in played.readings[::2]] == [False, False]
+    assert played.counters.lost_packets == 1
+
+
+@pytest.mark.parametrize("lost", [2, 6, 7, 13, 14, 15, 28, 33, 60])
+def test_losses_in_a_row_are_counted_and_the_round_is_found_again(lost: int) -> None:
+    stream: list[PalmPacket | None] = [*packets(10)]
+    stream[20 : 20 + lost] = [None] * lost
+    played = play_packets(stream)
+    expect_no_invention(played, 10)
+    assert played.counters.lost_packets == lost
+    for reading in played.readings:
+        assert row_of(reading, rows(10)) == reading.seq
+    assert played.readings[-1].seq == 9
+    assert played.counters.missed_readings == 10 - len(played.readings)
+
+
+def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
+    stream = packets(3)
+    for index in (2, ROUND + 2):  # E2 and E3 of rounds 0 and 1, without the bit of other_sensor_1
+        stream[index] = change(stream[index], "mf", {"valid": 0b0111})
+    first, second, third = play_packets(stream[ROUND:] + stream[:ROUND]).readings
+    assert flags(first, MISSING) == [[1, 2]]  # nothing older is known
+    assert not second.faults.any()
+    assert flags(third, HELD) == [[1, 2]]
+    assert third.counts[1, 2] == rows(3)[2][1, 2]  # that of the round before
+    assert flags(third, MISSING) == []
+
+
+def test_a_value_over_12_bits_is_not_a_count() -> None:
+    stream = packets(2)
+    stream[3] = change(stream[3], "th", {"other_0": 4096, "other_1": 65535})
+    stream[4] = change(stream[4], "th", {"other_0": 4095})
+    played = play_packets(stream)
+    assert flags(played.readings[0], NOT_A_COUNT) == [[2, 3], [2, 4]]
+    assert played.readings[0].counts[2, 3:6].tolist() == [0, 0, 4095]
+    assert played.counters.not_counts == 2
+
+
+def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
+    stream = packets(2)
+    for index in range(5, ROUND):
+        stream[index] = change(stream[index], "ff", {}, tactile_valid=0b10010)
+    reading = play_packets(stream).readings[0]
+    assert flags(reading, MISSING) == [[0, electrode] for electrode in range(7, 24)]
+    sweeps = PalmSweeps(FINGERS, RoundCounters(), heed_finger_bits=False)
+    heedless = [reading for packet in stream for reading in sweeps.push(packet, 0)]
+    assert not heedless[0].faults.any()
+
+
+def test_the_garbage_of_an_absent_sensor_is_no_reading() -> None:
+    twin = PalmTwin(rows(20), faults=LinkFaults(unplugged_fingers=(1,)))
+    first = struct.unpack_from("<HHHBxH", next(iter(twin.packets())).to_bytes(), 138 + 16)
+    assert first[2] == -22072 & 0xFFFF  # as recorded from a hand without this sensor
+    assert first[3:] == (0b1111, 32570)  # even with all valid bits set
+    played = play(PalmTwin(rows(20), faults=LinkFaults(unplugged_fingers=(1,))).cycles())
+    assert len(played.readings) == 20
+    for reading, row in zip(played.readings, rows(20), strict=True):
+        assert flags(reading, MISSING) == [[1, electrode] for electrode in range(24)]
+        assert np.array_equal(reading.counts[::2], row[::2])
+    assert played.counters.absent_fingers == 20
+
+
+def test_a_damaged_type_never_puts_a_value_in_another_place_unseen() -> None:
+    stream = packets(4)
+    for position, wrong in itertools.product(range(ROUND), range(1, 29, 2)):
+        damaged = list(stream)
+        index = ROUND + position
+        damaged[index] = change(stream[index], "ff", {}, tactile_type=wrong)
+        played = play_packets(damaged)
+        expect_no_invention(played, 4)
+        assert not played.readings[-1].faults.any()
+        if position != 0 and wrong != 2 * position + 1:  # the first packet has no electrode
+            assert any(reading.faults.any() for reading in played.readings)
+
+
+@pytest.mark.parametrize(
+    ("tactile_type", "counter"),
+    [
+        *((kind, "metadata_packets") for kind in (0xFFF9, 0xFFFC, 0xFFFF)),
+        *((kind, "unknown_types") for kind in (0, 2, 0x1A, 0x1D, 0xFFF8, 0x10000, 0x10001)),
+    ],
+)
+def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str) -> None:
+    stream = packets(3)
+    other = change(stream[0], "ff", {}, tactile_type=tactile_type)
+    played = play_packets([*stream[:20], other, *stream[20:]])
+    assert getattr(played.counters, counter) == 1
+    assert not any(reading.faults.any() for reading in played.readings)
+
+
+def test_a_request_that_stands_still_gives_no_reading() -> None:
+    played = play(PalmTwin(rows(50), faults=LinkFaults(stuck_clock=True)).cycles())
+    assert played.readings == []
+    assert played.counters.conflicting_packets == 50 * ROUND - 1
+
+
+def test_a_packet_that_comes_again_and_again_gives_no_reading() -> None:
+    stream = packets(2)
+    played = play_packets([*stream[:ROUND], *stream[:ROUND] * 20])
+    assert len(played.readings) == 1
+    assert played.counters.duplicate_packets == 20 * ROUND
+
+
+def test_after_an_interruption_a_reading_begins_with_a_round() -> None:
+    counters = RoundCounters()
+    sweeps = PalmSweeps(FINGERS, counters)
+    stream = packets(60)
+    readings = [reading for at in range(20) for reading in sweeps.push(stream[at], at * MS)]
+    sweeps.interrupt()
+    for at in range(20 + 500, len(stream)):
+        readings += sweeps.push(stream[at], at * MS)
+    assert [row_of(reading, rows(60)) for reading in readings] == [0, *range(38, 60)]
+    assert not any(reading.faults.any() for reading in readings)
+    assert counters.interrupted_rounds == 1
+    assert counters.unsynchronised_packets == 38 * ROUND - 520
+    assert readings[1].seq - readings[0].seq == pytest.approx(38, abs=1)
+
+
+@pytest.mark.parametrize("late_ms", range(1, 10))
+def test_a_relay_that_hesitates_loses_nothing(late_ms: int) -> None:
+    cycles = [[packet.to_bytes()] for packet in packets(6)]
+    held = [data for cycle in cycles[30 : 30 + late_ms] for data in cycle]
+    cycles[30 : 30 + late_ms] = [[]] * late_ms
+    cycles[30 + late_ms] = [*held, *cycles[30 + late_ms]]
+    played = play(cycles)
+    assert len(played.sound()) == len(played.readings) == 6
+
+
+def test_a_hand_sampled_at_100_hz_repeats_two_of_seven_and_the_driver_none() -> None:
+    """Each electrode is fresh at 1000 / 14 = 71.43 Hz, so 1 - 71.43 / 100 of the rows are stale."""
+    made = [packet.to_bytes() for packet in PalmTwin(rows(700)).packets()]
+    held: dict[int, int] = {}  # as the ROS driver does: what does not come keeps its old value
+    samples = []
+    for index, data in enumerate(made):
+        (kind,) = struct.unpack_from("<I", data, 132)
+        first, second = (
+            struct.unpack_from("<H", data, 142)[0],
+            struct.unpack_from("<H", data, 146)[0],
+        )
+        held[kind - 3], held[kind - 2] = first, second  # E1 is the second of 0x0003
+        if index % 10 == 9:
+            samples.append([held.get(electrode, 0) for electrode in range(1, 25)])
+    table = np.array(samples[2:])
+    repeats = (table[1:] == table[:-1]).mean(axis=0)
+    assert repeats == pytest.approx(2 / 7, abs=0.002)
+    played = play([data] for data in made)
+    assert len(played.sound()) / (len(made) / 1000) == pytest.approx(71.43, abs=0.01)
+    counts = np.array([reading.counts for reading in played.readings])
+    assert (counts[1:] == counts[:-1]).mean() < 0.01
+
+
+def test_the_real_hand_has_the_same_signature() -> None:
+    folder = data_dir()
+    if folder is None:
+        pytest.skip("the real recordings are not there: set $GRASPD_DATA")
+    counts = np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
+    for pair in PAIRS[2:-1]:
+        stale = (counts[1:, :, pair] == counts[:-1, :, pair]).all(axis=(1, 2))
+        assert stale.mean() == pytest.approx(2 / 7, abs=0.003)

@@ -1,0 +1,234 @@
+"""Faults on demand: each does what it says, and the counters equal what was injected."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.recordings.csv_player import DEMO_TABLE, Pace, ReplayDriver
+from drivers.recordings.faults import ReplayFaults
+from tests.drivers.recordings.tables import stream, table, write
+
+MS = 1_000_000
+ROWS = 200
+
+
+def run(faults: ReplayFaults, path: Path = DEMO_TABLE) -> tuple[ReplayDriver, list[TactileReading]]:
+    driver = ReplayDriver([path], pace=Pace.FAST, faults=faults)
+    readings: list[TactileReading] = []
+    with driver:
+        while not driver.exhausted:
+            readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
+    return driver, readings
+
+
+@pytest.fixture(scope="module")
+def clean() -> list[TactileReading]:
+    return run(ReplayFaults())[1]
+
+
+def test_without_faults_nothing_is_injected() -> None:
+    driver, readings = run(ReplayFaults())
+    assert len(readings) == ROWS
+    injected = [n for name, n in driver.counters.as_dict().items() if name.startswith("injected")]
+    assert len(injected) == 7
+    assert not any(injected)
+
+
+def test_off_is_silent_from_that_reading_on() -> None:
+    driver, readings = run(ReplayFaults(off_from=150))
+    assert [reading.seq for reading in readings] == list(range(150))
+    assert driver.counters.injected_off == 50
+    assert driver.counters.missed_readings == 0
+
+
+def test_stuck_repeats_the_reading_before(clean: list[TactileReading]) -> None:
+    driver, readings = run(ReplayFaults(stuck_from=20))
+    for index, reading in enumerate(readings):
+        expected = clean[min(index, 19)].counts
+        np.testing.assert_array_equal(reading.counts, expected)
+        assert not reading.faults.any()
+    assert driver.counters.injected_stuck == ROWS - 20
+    assert readings[30].annotation != readings[19].annotation
+
+
+def test_stuck_repeats_faults_as_well(tmp_path: Path) -> None:
+    path = write(tmp_path, table(4, {1: {"ff_biotac_2": "nan"}}))
+    _, readings = run(ReplayFaults(stuck_from=2), path)
+    flags = [int(reading.faults[0, 1]) for reading in readings]
+    assert flags == [0, *[ElectrodeFault.NOT_A_COUNT] * 3]
+
+
+@pytest.mark.parametrize("offset", [300, -300, 4095, -4095])
+def test_wrong_shifts_and_clips(clean: list[TactileReading], offset: int) -> None:
+    driver, readings = run(ReplayFaults(wrong_counts=offset))
+    for reading, before in zip(readings, clean, strict=True):
+        shifted = np.clip(before.counts.astype(int) + offset, 0, 4095)
+        np.testing.assert_array_equal(reading.counts, shifted)
+    assert driver.counters.injected_wrong == ROWS
+    assert driver.counters.faulty_readings == 0
+
+
+def test_wrong_leaves_what_is_no_count_alone(tmp_path: Path) -> None:
+    path = write(tmp_path, table(1, {0: {"ff_biotac_2": "nan"}}))
+    _, (reading,) = run(ReplayFaults(wrong_counts=100), path)
+    assert reading.counts[0, 1] == 0
+    assert reading.faults[0, 1] == ElectrodeFault.NOT_A_COUNT
+
+
+def test_garbage_is_16_bit_and_what_has_more_than_12_is_no_count(
+    clean: list[TactileReading],
+) -> None:
+    driver, readings = run(ReplayFaults(garbage_probability=0.4, seed=3))
+    changed = [
+        (reading.counts != before.counts).any()
+        for reading, before in zip(readings, clean, strict=True)
+    ]
+    assert sum(changed) == driver.counters.injected_garbage
+    # Binomial, 200 x 0.4: within 5 standard deviations of 7.
+    assert 45 <= sum(changed) <= 115
+    flagged = np.array([r.faults for r, bad in zip(readings, changed, strict=True) if bad]) > 0
+    # 4096 of 65536 words are counts: 93.75 % of thousands of electrodes are not.
+    assert 0.92 < flagged.mean() < 0.955
+    assert driver.counters.not_counts == flagged.sum()
+    assert driver.counters.faulty_readings == driver.counters.injected_garbage
+    assert all(not reading.counts[reading.faults > 0].any() for reading in readings)
+
+
+def test_value_faults_keep_to_the_chosen_electrodes(clean: list[TactileReading]) -> None:
+    faults = ReplayFaults(
+        stuck_from=1,
+        wrong_counts=50,
+        garbage_probability=0.5,
+        fingers=("mf",),
+        electrodes=(1, 24),
+    )
+    _, readings = run(faults)
+    changed = np.zeros((3, 24), dtype=bool)
+    for reading, before in zip(readings, clean, strict=True):
+        changed |= reading.counts != before.counts
+    assert np.argwhere(changed).tolist() == [[1, 0], [1, 23]]
+
+
+@pytest.mark.parametrize("every", [1, 2, 7])
+def test_slow_makes_every_nth_reading_and_leaves_no_gap(every: int) -> None:
+    driver, readings = run(ReplayFaults(slow_every=every))
+    lines = [reading.annotation.line - 2 for reading in readings if reading.annotation]
+    assert lines == list(range(0, ROWS, every))
+    assert [reading.seq for reading in readings] == list(range(len(lines)))
+    assert driver.counters.injected_slow == ROWS - len(lines)
+
+
+def test_intermittent_leaves_a_gap_in_seq() -> None:
+    driver, readings = run(ReplayFaults(intermittent_probability=0.3, seed=11))
+    lost = ROWS - len(readings)
+    assert 25 <= lost <= 95
+    assert driver.counters.injected_intermittent == driver.counters.missed_readings == lost
+    for reading in readings:
+        assert reading.annotation is not None
+        assert reading.seq == reading.annotation.line - 2
+
+
+def test_delayed_comes_late_and_says_when_it_should_have_come(tmp_path: Path) -> None:
+    now_ns = 5_000 * MS
+    path = write(tmp_path, table(3))
+    driver = ReplayDriver([path], faults=ReplayFaults(delayed_s=0.25), clock=lambda: now_ns)
+    with driver:
+        assert driver.read_ready() == ()
+        for index in range(3):
+            due_ns = driver.due_ns()
+            assert due_ns == (5_250 + 10 * index) * MS
+            now_ns = due_ns
+            (reading,) = driver.read_ready()
+            assert reading.t_ns == (5_000 + 10 * index) * MS
+        assert driver.counters.injected_delayed == 3
+        assert driver.counters.late == 0
+
+
+def test_delayed_does_not_wait_when_there_is_no_schedule(tmp_path: Path) -> None:
+    driver = ReplayDriver(
+        [write(tmp_path, table(1))],
+        pace=Pace.FAST,
+        faults=ReplayFaults(delayed_s=0.25),
+        clock=lambda: 5_000 * MS,
+    )
+    with driver:
+        (reading,) = driver.read_ready()
+    assert reading.t_ns == 4_750 * MS
+
+
+def test_joints_still_come_while_the_sensor_is_off(tmp_path: Path) -> None:
+    path = write(tmp_path, stream(["0", "1", "2"], {"FFJ3": ["0", "0.1", "0.2"]}))
+    with ReplayDriver([path], pace=Pace.FAST, faults=ReplayFaults(off_from=1)) as driver:
+        assert [len(driver.read_ready()) for _ in range(3)] == [2, 1, 1]
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another() -> None:
+    def trace(seed: int) -> list[tuple[int, int]]:
+        faults = ReplayFaults(garbage_probability=0.3, intermittent_probability=0.2, seed=seed)
+        return [(reading.seq, int(reading.counts.sum())) for reading in run(faults)[1]]
+
+    assert trace(1) == trace(1)
+    assert trace(1) != trace(2)
+
+
+@settings(max_examples=25)
+@given(
+    off_from=st.none() | st.integers(0, ROWS + 10),
+    stuck_from=st.none() | st.integers(1, ROWS + 10),
+    garbage_probability=st.floats(0, 1),
+    wrong_counts=st.integers(-4095, 4095),
+    slow_every=st.integers(1, 20),
+    intermittent_probability=st.floats(0, 1),
+    seed=st.integers(0, 2**32),
+)
+def test_under_any_mix_every_row_is_accounted_for(**fields: Any) -> None:  # noqa: ANN401
+    driver, readings = run(ReplayFaults(**fields))
+    counters = driver.counters
+    kept_back = counters.injected_off + counters.injected_slow + counters.injected_intermittent
+    assert counters.readings == len(readings) == ROWS - kept_back
+    assert counters.injected_wrong == (len(readings) if fields["wrong_counts"] else 0)
+    made = counters.readings + counters.missed_readings
+    assert all(reading.seq < made for reading in readings)
+    seqs = [reading.seq for reading in readings]
+    assert seqs == sorted(set(seqs))
+    assert all(reading.counts.max() <= 4095 for reading in readings)
+    flagged = sum(int((reading.faults > 0).sum()) for reading in readings)
+    assert counters.not_counts == flagged
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"off_from": -1}, "off_from is -1, must be at least 0"),
+        ({"stuck_from": 0}, "stuck_from is 0, must be at least 1"),
+        ({"slow_every": 0}, "slow_every is 0, must be at least 1"),
+        ({"seed": -1}, "seed is -1"),
+        ({"garbage_probability": 1.1}, r"garbage_probability is 1.1, must be in 0..1"),
+        ({"garbage_probability": math.nan}, "garbage_probability is nan"),
+        ({"intermittent_probability": -0.1}, "intermittent_probability is -0.1"),
+        ({"wrong_counts": 4096}, "wrong_counts is 4096"),
+        ({"delayed_s": -1.0}, "delayed_s is -1.0"),
+        ({"delayed_s": math.inf}, "delayed_s is inf"),
+        ({"delayed_s": math.nan}, "delayed_s is nan"),
+        ({"fingers": ()}, "fingers is empty"),
+        ({"fingers": ("toe",)}, "fingers has 'toe', which is none of ff, mf, rf, lf, th"),
+        ({"electrodes": (0,)}, "electrodes has 0"),
+        ({"electrodes": (1, 25)}, "electrodes has 25"),
+    ],
+)
+def test_a_fault_out_of_range_is_refused(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ReplayFaults(**fields)
+
+
+def test_a_fault_of_a_finger_that_does_not_play_is_refused() -> None:
+    with pytest.raises(ValueError, match="faults name finger rf, the run has ff, mf"):
+        ReplayDriver([DEMO_TABLE], ("ff", "mf"), faults=ReplayFaults(fingers=("rf",)))

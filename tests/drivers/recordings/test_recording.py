@@ -1,0 +1,335 @@
+"""Reading recordings: what is a row, what is a faulty value, and what is refused, and how."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.base import ElectrodeFault, RecordingError
+from drivers.recordings.csv_rows import (
+    LINE_BYTES_MAX,
+    Recording,
+    open_recording,
+    read_lines,
+)
+from tests.drivers.recordings.tables import (
+    ELECTRODES,
+    FINGERS,
+    PATH,
+    TABLE_HEADER,
+    cells,
+    count,
+    line,
+    rows_of,
+    rows_or_message,
+    stream,
+    table,
+)
+
+
+def test_a_table_gives_its_counts_and_annotations() -> None:
+    rows = rows_of(table(3))
+    for index, row in enumerate(rows):
+        expected = np.array([count(index, electrode) for electrode in range(72)]).reshape(3, 24)
+        np.testing.assert_array_equal(row.counts, expected)
+        assert row.counts.dtype == np.uint16
+        assert not row.faults.any()
+        assert row.t_s is None
+        assert row.position_rad is None
+        assert row.annotation.source == PATH
+        assert row.annotation.line == index + 2
+        assert row.annotation.object_name == f"thing_{index}"
+        assert row.annotation.slipped == bool(index % 2)
+
+
+def test_columns_may_stand_in_any_order_and_only_those_asked_for_are_read() -> None:
+    columns = [*reversed(ELECTRODES), "slipped"]
+    (row,) = rows_of(table(1, columns=columns), ("th", "ff"))
+    expected = [[count(0, 48 + k) for k in range(24)], [count(0, k) for k in range(24)]]
+    np.testing.assert_array_equal(row.counts, expected)
+    assert row.annotation.object_name is None
+
+
+def test_a_table_of_one_finger_needs_no_other_columns() -> None:
+    (row,) = rows_of(table(1, columns=ELECTRODES[24:48]), ("mf",))
+    np.testing.assert_array_equal(row.counts, [[count(0, 24 + k) for k in range(24)]])
+    assert row.annotation.slipped is None
+
+
+def test_unknown_columns_are_listed_and_columns_of_other_fingers_are_not() -> None:
+    header = [*TABLE_HEADER, "force", "", "force", "FFJ3"]
+    content = ",".join(header).encode() + b"\n" + b"0," * 77 + b"0\n"
+    recording = Recording(PATH, io.BytesIO(content), ("mf",))
+    assert recording.columns.ignored == ("force", "", "force", "FFJ3")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xef\xbb\xbf" + table(3),
+        table(3, end="\r\n"),
+        b"\xef\xbb\xbf" + table(3, end="\r\n"),
+        b"\n\r\n" + table(3).replace(b"\n", b"\n \t\n\n"),
+        table(3).replace(b",", b" , "),
+        table(3).replace(b",", b"\t,"),
+        table(3).replace(b"thing_0", b'"thing_0"').replace(b"slipped", b'"slipped"'),
+    ],
+    ids=["BOM", "CRLF", "BOM and CRLF", "blank lines", "spaces", "tabs", "quotes"],
+)
+def test_the_dialects_of_spreadsheets_read_the_same(content: bytes) -> None:
+    plain, same = rows_of(table(3), strict=True), rows_of(content, strict=True)
+    assert len(same) == 3
+    for one, other in zip(plain, same, strict=True):
+        np.testing.assert_array_equal(one.counts, other.counts)
+        assert one.annotation.object_name == other.annotation.object_name
+        assert one.annotation.slipped == other.annotation.slipped
+
+
+def test_a_quoted_object_name_may_hold_commas_and_quotes() -> None:
+    (row,) = rows_of(table(1, {0: {"object": '"a ""red"" pen, long"'}}))
+    assert row.annotation.object_name == 'a "red" pen, long'
+
+
+def test_an_empty_object_name_is_none() -> None:
+    (row,) = rows_of(table(1, {0: {"object": "  "}}))
+    assert row.annotation.object_name is None
+
+
+GOOD = table(2)
+BAD_FILES = {
+    "empty": (b"", "grasps.csv: the file is empty"),
+    "only a BOM": (b"\xef\xbb\xbf", "grasps.csv: the file is empty"),
+    "only blank lines": (b"\n \r\n\t\n", "grasps.csv: the file is empty"),
+    "header only": (table(0), "grasps.csv: the file has a header and no rows"),
+    "header only, no line end": (table(0).strip(), "grasps.csv: the file has a header and no rows"),
+    "NUL in the header": (b"\x7fELF\0\0", "line 1: a NUL byte: this is a binary file, not CSV"),
+    "NUL in a row": (GOOD + b"a,0\0\n", "line 4: a NUL byte: this is a binary file, not CSV"),
+    "Latin-1": (table(2, {1: {"object": "x"}}).replace(b"x", b"\xe9"), "line 3: not UTF-8"),
+    "UTF-16": (GOOD.decode().encode("utf-16"), "line 1: a NUL byte"),
+    "gzip": (b"\x1f\x8b\x08\x08rest\n", "line 1: not UTF-8"),
+    "one column missing": (
+        table(2, columns=[name for name in TABLE_HEADER if name != "mf_biotac_7"]),
+        "line 1, column mf_biotac_7: this column is missing",
+    ),
+    "a finger missing": (
+        table(2, columns=TABLE_HEADER[:-24]),
+        "line 1, column th_biotac_1: this column is missing, the first of 24 that are",
+    ),
+    "no header": (GOOD.partition(b"\n")[2], "column ff_biotac_1: this column is missing, the fir"),
+    "semicolons": (GOOD.replace(b",", b";"), "column ff_biotac_1: this column is missing, the f"),
+    "electrode twice": (
+        table(2, columns=[*TABLE_HEADER, "ff_biotac_3"]),
+        "line 1, column ff_biotac_3: this column stands twice",
+    ),
+    "label twice": (
+        table(2, columns=[*TABLE_HEADER, "slipped"]),
+        "line 1, column slipped: this column stands twice",
+    ),
+    "short row": (
+        GOOD + b"apple,0,12,13\n",
+        "line 4: the row has 4 cells, the header 74",
+    ),
+    "long row": (
+        GOOD.replace(b"thing_1", b"thing,1"),
+        "line 3: the row has 75 cells, the header 74",
+    ),
+    "short row at the end": (
+        GOOD + b"apple,0,12",
+        "line 4: the row has 3 cells, the header 74; the file ends here without a line end",
+    ),
+    "long line": (
+        GOOD + b"7" * (LINE_BYTES_MAX + 1) + b"\n",
+        "line 4: the line is longer than 65536 bytes",
+    ),
+    "no line ends": (b"7," * LINE_BYTES_MAX, "line 1: the line is longer than 65536 bytes"),
+    "old Mac line ends": (GOOD.replace(b"\n", b"\r"), "line 1: a carriage return inside the line"),
+    "open quote": (GOOD.replace(b"thing_1", b'"thing_1'), "line 3: wrong quotes: they do not pai"),
+    "text after a quote": (GOOD.replace(b"thing_1", b'"thing"_1'), "line 3: wrong quotes: ',' ex"),
+    "open quote in the header": (b'"' + GOOD, "line 1: wrong quotes"),
+    "time not a number": (
+        stream(["0", "later"]),
+        "line 3, column t: 'later' is not a finite number of seconds",
+    ),
+    "time backwards": (
+        stream(["5", "5.01", "5.0"]),
+        "line 4, column t: time goes backwards, from 5.01 s to 5.0 s",
+    ),
+    "time in ns": (
+        stream(["1700000000000000000"]),
+        "line 2, column t: '1700000000000000000' is no time in seconds: another unit?",
+    ),
+    "joint twice": (
+        stream(["0"], {"rh_FFJ3": ["0"], "FFJ3": ["0"]}),
+        "line 1, column FFJ3: this column is the same joint as rh_FFJ3",
+    ),
+    "time twice": (
+        stream(["0"], columns=["t", *ELECTRODES, "t"]),
+        "line 1, column t: this column stands twice",
+    ),
+}
+
+
+@pytest.mark.parametrize(("content", "message"), BAD_FILES.values(), ids=BAD_FILES)
+def test_what_is_no_recording_is_refused_with_file_line_and_column(
+    content: bytes, message: str
+) -> None:
+    with pytest.raises(RecordingError) as caught:
+        rows_of(content)
+    assert message in str(caught.value)
+    assert str(caught.value).startswith("grasps.csv")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("label", ["", "2", "-1", "true", "yes", "0.0", "01", "\u0661", "nan"])
+def test_a_label_is_0_or_1(label: str) -> None:
+    with pytest.raises(RecordingError, match=r"line 3, column slipped: .* is not a label") as error:
+        rows_of(table(2, {1: {"slipped": label}}))
+    assert repr(label) in str(error.value)
+    assert (error.value.line, error.value.column) == (3, "slipped")
+
+
+@pytest.mark.parametrize("t", ["nan", "inf", "-inf", "", "1e999", "1_0", "0x1", "\u0661"])
+def test_a_time_is_a_finite_number(t: str) -> None:
+    with pytest.raises(RecordingError, match=r"line 2, column t: .* is not a finite number"):
+        rows_of(stream([t, "1"]))
+
+
+@pytest.mark.parametrize("t", ["0", "-3.5", "1700000000.123456", "+1e3", ".5", "7."])
+def test_a_time_may_have_any_offset(t: str) -> None:
+    first, second = rows_of(stream([t, t]))
+    assert first.t_s == second.t_s == float(t)
+
+
+def test_a_line_of_exactly_the_limit_is_read() -> None:
+    room = LINE_BYTES_MAX - len(line(TABLE_HEADER, cells(0, {"object": ""}))) - 1
+    assert len(rows_of(table(1, {0: {"object": "x" * room}}))) == 1
+    with pytest.raises(RecordingError, match="line 2: the line is longer than 65536 bytes"):
+        rows_of(table(1, {0: {"object": "x" * (room + 1)}}))
+
+
+def test_a_long_cell_is_shortened_in_the_message() -> None:
+    with pytest.raises(RecordingError) as caught:
+        rows_of(table(1, {0: {"ff_biotac_1": "9" * 5000}}), strict=True)
+    assert len(str(caught.value)) < 200
+
+
+def test_a_last_row_without_line_end_is_cut_off() -> None:
+    *whole, last = rows_of(table(3).rstrip(b"\n"))
+    assert all(not row.faults.any() for row in whole)
+    assert (last.faults == ElectrodeFault.CUT_OFF).all()
+    with pytest.raises(RecordingError, match=r"line 4: the last row has no line end; .* cut off"):
+        rows_of(table(3).rstrip(b"\n"), strict=True)
+
+
+def test_a_value_can_be_no_count_and_cut_off_at_once() -> None:
+    *_, last = rows_of(table(1, {0: {"th_biotac_24": "26x"}}).rstrip(b"\n"))
+    both = ElectrodeFault.CUT_OFF | ElectrodeFault.NOT_A_COUNT
+    assert last.faults[2, 23] == both
+    assert (last.faults.ravel()[:-1] == ElectrodeFault.CUT_OFF).all()
+
+
+@pytest.mark.parametrize("cut", [*range(1, 20), 100, 200, len(line(TABLE_HEADER, cells(1)))])
+def test_a_file_cut_anywhere_in_its_last_row_never_gives_a_whole_reading(cut: int) -> None:
+    outcome = rows_or_message(table(2)[:-cut])
+    if isinstance(outcome, str):
+        assert "may be cut off" in outcome
+    else:
+        assert (outcome[-1].faults & np.uint8(ElectrodeFault.CUT_OFF)).all()
+
+
+def test_a_stream_gives_times_and_joints_without_hand_prefix() -> None:
+    joints = {"rh_FFJ3": ["0.25", "1e-3"], "rh_WRJ1": ["-0.5", " 0.5 "]}
+    content = stream(["10.0", "10.5"], joints)
+    recording = Recording(PATH, io.BytesIO(content), FINGERS)
+    assert recording.columns.joint_names == ("FFJ3", "WRJ1")
+    first, second = list(recording)
+    assert (first.t_s, second.t_s) == (10.0, 10.5)
+    assert first.position_rad is not None
+    assert second.position_rad is not None
+    assert first.position_rad.tolist() == [0.25, -0.5]
+    assert second.position_rad.tolist() == [1e-3, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("column", "known"),
+    [
+        ("FFJ0", True), ("MFJ4", True), ("RFJ2", True), ("LFJ5", True), ("THJ5", True),
+        ("WRJ2", True), ("lh_THJ1", True), ("FFJ5", False), ("THJ0", False), ("WRJ3", False),
+        ("rh_lh_FFJ3", False), ("ffj3", False),
+    ],
+)  # fmt: skip
+def test_joints_are_those_of_the_shadow_hand(column: str, known: bool) -> None:
+    recording = Recording(PATH, io.BytesIO(stream(["0"], {column: ["0"]})), FINGERS)
+    assert (recording.columns.ignored == ()) is known
+    assert len(recording.columns.joints) == known
+
+
+@pytest.mark.parametrize("cell", ["nan", "inf", "", "text", "1_0", "1e999"])
+def test_an_angle_that_is_no_number_is_nan(cell: str) -> None:
+    content = stream(["0"], {"FFJ1": ["0.5"], "FFJ2": [cell]})
+    (row,) = rows_of(content)
+    assert row.position_rad is not None
+    np.testing.assert_array_equal(row.position_rad, [0.5, math.nan])
+    with pytest.raises(RecordingError, match=r"line 2, column FFJ2: .* is not an angle in radians"):
+        rows_of(content, strict=True)
+
+
+def test_angles_of_a_cut_off_row_are_nan() -> None:
+    (row,) = rows_of(stream(["0"], {"FFJ1": ["0.5"]}).rstrip(b"\n"))
+    assert row.position_rad is not None
+    assert np.isnan(row.position_rad).all()
+
+
+def test_a_missing_file_a_directory_and_a_device_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"nowhere.csv: no such file or directory"):
+        open_recording(tmp_path / "nowhere.csv")
+    with pytest.raises(RecordingError, match="is a directory"):
+        open_recording(tmp_path)
+    with pytest.raises(RecordingError, match="/dev/zero: is not a regular file"):
+        open_recording(Path("/dev/zero"))
+    with pytest.raises(RecordingError, match="null byte"):
+        open_recording(Path("a\0b"))
+
+
+def test_an_error_while_reading_is_a_recording_error() -> None:
+    class Broken(io.BytesIO):
+        def readline(self, size: int | None = -1, /) -> bytes:
+            raise OSError(5, "Input/output error")
+
+    with pytest.raises(RecordingError, match=r"grasps.csv: input/output error"):
+        list(read_lines(PATH, Broken()))
+
+
+def test_a_sparse_file_of_many_gigabytes_without_a_line_end_is_refused_at_once(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "disk.csv"
+    with path.open("wb") as file:
+        file.truncate(1 << 36)
+    with (
+        open_recording(path) as opened,
+        pytest.raises(RecordingError, match="line 1: the line is longer than 65536 bytes"),
+    ):
+        Recording(path, read_lines(path, opened), FINGERS)
+
+
+@pytest.mark.parametrize("name", ["palm_down.csv", "palm_side.csv", "palm_45.csv"])
+def test_the_stability_set_is_read_count_for_count(bts3_dir: Path, name: str) -> None:
+    path = bts3_dir / name
+    with path.open(newline="") as file:
+        expected = list(csv.DictReader(file))
+    with open_recording(path) as opened:
+        lines = read_lines(path, opened)
+        rows = list(Recording(path, lines, ("th", "ff", "mf"), strict=True))
+    assert len(rows) == len(expected)
+    for row, cells_by_name in zip(rows, expected, strict=True):
+        for finger, counts in zip(("th", "ff", "mf"), row.counts, strict=True):
+            wanted = [int(cells_by_name[f"{finger}_biotac_{k}"]) for k in range(1, 25)]
+            assert counts.tolist() == wanted
+        assert row.annotation.object_name == cells_by_name["object"]
+        assert row.annotation.slipped is (cells_by_name["slipped"] == "1")

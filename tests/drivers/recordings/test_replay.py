@@ -1,0 +1,397 @@
+"""The replay driver: pace, order, time stamps, and what it counts."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.base import (
+    Driver,
+    ElectrodeFault,
+    JointReading,
+    Reading,
+    RecordingError,
+    TactileReading,
+)
+from drivers.recordings.csv_player import DEMO_TABLE, Pace, ReplayDriver
+from tests.drivers.recordings.tables import (
+    ELECTRODES,
+    FINGERS,
+    TABLE_HEADER,
+    count,
+    stream,
+    table,
+    write,
+)
+
+MS = 1_000_000
+
+
+class Clock:
+    """A clock that only moves when told to."""
+
+    def __init__(self, now_ns: int = 1_000 * MS) -> None:
+        self.now_ns = now_ns
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def play(driver: ReplayDriver, clock: Clock | None = None) -> list[Reading]:
+    """Open the driver and take all it has, moving the clock to whatever is due."""
+    readings: list[Reading] = []
+    with driver:
+        while not driver.exhausted:
+            due_ns = driver.due_ns()
+            assert due_ns is not None
+            if clock is not None:
+                clock.now_ns = max(clock.now_ns, due_ns)
+            readings.extend(driver.read_ready())
+    return readings
+
+
+def tactile(readings: list[Reading]) -> list[TactileReading]:
+    return [reading for reading in readings if isinstance(reading, TactileReading)]
+
+
+def times_ms(readings: list[Reading], start_ns: int = 1_000 * MS) -> list[float]:
+    return [(reading.t_ns - start_ns) / MS for reading in tactile(readings)]
+
+
+def test_the_replay_is_a_driver(tmp_path: Path) -> None:
+    driver: Driver = ReplayDriver([write(tmp_path, table())])
+    assert driver.name == "replay"
+    assert driver.fileno() is None
+    assert driver.due_ns() is None
+    assert not driver.exhausted
+    driver.close()
+    driver.close()
+
+
+def test_every_reading_comes_once_in_order(tmp_path: Path) -> None:
+    driver = ReplayDriver([write(tmp_path, table(5))], pace=Pace.FAST)
+    readings = tactile(play(driver))
+    assert [reading.seq for reading in readings] == [0, 1, 2, 3, 4]
+    for index, reading in enumerate(readings):
+        expected = [count(index, electrode) for electrode in range(72)]
+        assert reading.counts.ravel().tolist() == expected
+        assert reading.annotation is not None
+        assert reading.annotation.object_name == f"thing_{index}"
+    assert driver.counters.readings == 5
+    assert driver.counters.as_dict()["faulty_readings"] == 0
+    assert driver.exhausted
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "speed", "period_ms"), [(100, 1, 10), (50, 1, 20), (100, 4, 2.5), (10, 0.5, 200)]
+)
+def test_a_table_plays_at_its_rate_times_speed(
+    tmp_path: Path, rate_hz: float, speed: float, period_ms: float
+) -> None:
+    clock = Clock()
+    path = write(tmp_path, table(4))
+    driver = ReplayDriver([path], rate_hz=rate_hz, speed=speed, clock=clock)
+    assert times_ms(play(driver, clock)) == [k * period_ms for k in range(4)]
+    assert driver.period_ns == period_ms * MS
+    assert driver.counters.late == 0
+
+
+def test_a_stream_plays_at_its_own_times_whatever_their_offset(tmp_path: Path) -> None:
+    clock = Clock()
+    path = write(tmp_path, stream(["100.5", "100.51", "100.51", "100.75"]))
+    assert times_ms(play(ReplayDriver([path], speed=2, clock=clock), clock)) == [0, 5, 5, 125]
+
+
+def test_the_period_of_a_stream_is_the_shortest_step_so_far(tmp_path: Path) -> None:
+    clock = Clock()
+    path = write(tmp_path, stream(["5", "5.02", "5.03", "35.0"]))
+    with ReplayDriver([path], speed=2, clock=clock) as driver:
+        periods_ms = [None if driver.period_ns is None else driver.period_ns / MS]
+        while not driver.exhausted:
+            clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
+            driver.read_ready()
+            periods_ms.append((driver.period_ns or 0) / MS)
+    assert periods_ms == [None, 0, 10, 5, 5]
+
+
+def test_a_late_reading_is_an_old_one(tmp_path: Path) -> None:
+    clock = Clock()
+    with ReplayDriver([write(tmp_path, table(3))], clock=clock) as driver:
+        started_ns = clock.now_ns
+        driver.read_ready()
+        clock.now_ns += 4000 * MS
+        late = tactile([*driver.read_ready(), *driver.read_ready()])
+    assert [reading.t_ns - started_ns for reading in late] == [10 * MS, 20 * MS]
+
+
+def test_nothing_comes_before_it_is_due(tmp_path: Path) -> None:
+    clock = Clock()
+    with ReplayDriver([write(tmp_path, table(2))], clock=clock) as driver:
+        clock.now_ns += 500 * MS
+        started_ns = clock.now_ns
+        assert len(driver.read_ready()) == 1, "the first call starts the run, not open()"
+        assert driver.due_ns() == started_ns + 10 * MS
+        clock.now_ns += 10 * MS - 1
+        assert driver.read_ready() == ()
+        clock.now_ns += 1
+        (reading,) = driver.read_ready()
+        assert reading.t_ns == clock.now_ns
+
+
+def test_a_lag_is_counted_and_nothing_is_skipped(tmp_path: Path) -> None:
+    clock = Clock()
+    with ReplayDriver([write(tmp_path, table(6))], clock=clock) as driver:
+        driver.read_ready()
+        clock.now_ns += 35 * MS
+        seqs: list[int] = []
+        while readings := driver.read_ready():
+            seqs.extend(reading.seq for reading in readings)
+        assert seqs == [1, 2, 3]
+        # Due at 10, 20 and 30 ms, taken at 35 ms: late are those more than 10 ms behind.
+        assert driver.counters.late == 2
+        assert driver.due_ns() == 1_000 * MS + 40 * MS
+
+
+def test_fast_is_never_waiting_and_never_late(tmp_path: Path) -> None:
+    clock = Clock()
+    driver = ReplayDriver([write(tmp_path, table(50))], pace=Pace.FAST, clock=clock)
+    assert times_ms(play(driver)) == [0] * 50
+    assert driver.counters.late == 0
+
+
+def test_stepped_gives_as_many_readings_as_were_released(tmp_path: Path) -> None:
+    with ReplayDriver([write(tmp_path, table(4))], pace=Pace.STEPPED, clock=Clock()) as driver:
+        assert driver.due_ns() is None
+        assert driver.read_ready() == ()
+        driver.step()
+        assert driver.due_ns() is not None
+        assert [reading.seq for reading in driver.read_ready()] == [0]
+        assert driver.read_ready() == ()
+        driver.step(10)
+        assert [r.seq for _ in range(5) for r in driver.read_ready()] == [1, 2, 3]
+        assert driver.exhausted
+        assert driver.due_ns() is None
+
+
+def test_only_a_stepped_replay_can_be_stepped(tmp_path: Path) -> None:
+    path = write(tmp_path, table())
+    with pytest.raises(ValueError, match="the pace is fast, only a stepped replay"):
+        ReplayDriver([path], pace=Pace.FAST).step()
+    with pytest.raises(ValueError, match="cannot step by 0"):
+        ReplayDriver([path], pace=Pace.STEPPED).step(0)
+
+
+def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:
+    clock = Clock()
+    paths = [
+        write(tmp_path, table(2), "a.csv"),
+        write(tmp_path, stream(["7", "7.03", "7.04"]), "b.csv"),
+        write(tmp_path, stream(["-1"]), "c.csv"),
+        write(tmp_path, table(2), "d.csv"),
+    ]
+    readings = play(ReplayDriver(paths, clock=clock), clock)
+    # A stream goes on for its shortest step, 10 ms; one of a single row for that of tables.
+    assert times_ms(readings) == [0, 10, 20, 50, 60, 70, 80, 90]
+    assert [reading.seq for reading in readings] == list(range(8))
+    sources = [
+        reading.annotation.source.name for reading in tactile(readings) if reading.annotation
+    ]
+    assert sources == ["a.csv"] * 2 + ["b.csv"] * 3 + ["c.csv"] + ["d.csv"] * 2
+
+
+def test_a_loop_starts_again_with_the_first_file_and_time_goes_on(tmp_path: Path) -> None:
+    clock = Clock()
+    paths = [
+        write(tmp_path, table(2), "a.csv"),
+        write(tmp_path, stream(["1", "1.02"]), "b.csv"),
+    ]
+    readings: list[Reading] = []
+    with ReplayDriver(paths, loop=True, clock=clock) as driver:
+        while len(readings) < 9:
+            clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
+            readings.extend(driver.read_ready())
+        assert not driver.exhausted
+    assert times_ms(readings) == [0, 10, 20, 40, 60, 70, 80, 100, 120]
+    assert [reading.seq for reading in readings] == list(range(9))
+
+
+def test_a_schedule_does_not_drift_by_rounding(tmp_path: Path) -> None:
+    clock = Clock(0)
+    driver = ReplayDriver([write(tmp_path, table(301))], rate_hz=300, clock=clock)
+    assert play(driver, clock)[300].t_ns == 1_000_000_000
+
+
+def test_a_stream_with_joints_gives_the_joints_before_the_counts(tmp_path: Path) -> None:
+    angles = {"rh_THJ5": ["0.1", "0.2"], "rh_FFJ0": ["1.5", "nan"]}
+    path = write(tmp_path, stream(["0", "0.01"], angles))
+    clock = Clock()
+    with ReplayDriver([path], clock=clock) as driver:
+        joints, counts = driver.read_ready()
+        assert isinstance(joints, JointReading)
+        assert isinstance(counts, TactileReading)
+        assert joints.names == ("THJ5", "FFJ0")
+        assert joints.position_rad.tolist() == [0.1, 1.5]
+        assert joints.t_ns == counts.t_ns == clock.now_ns
+        clock.now_ns += 10 * MS
+        joints, _ = driver.read_ready()
+        assert isinstance(joints, JointReading)
+        np.testing.assert_array_equal(joints.position_rad, [0.2, np.nan])
+        assert joints.seq == 1
+        assert driver.counters.bad_angles == 1
+        assert driver.counters.readings == 2
+
+
+def test_open_checks_the_header_of_every_file(tmp_path: Path) -> None:
+    good = write(tmp_path, table(), "good.csv")
+    bad = write(tmp_path, table(columns=TABLE_HEADER[:-1]), "bad.csv")
+    driver = ReplayDriver([good, good, bad])
+    with pytest.raises(RecordingError, match=r"bad.csv, line 1, column th_biotac_24") as caught:
+        driver.open()
+    assert caught.value.path == bad
+    with pytest.raises(RecordingError, match=r"gone.csv: no such file or directory"):
+        ReplayDriver([good, tmp_path / "gone.csv"]).open()
+    with pytest.raises(RecordingError, match=r"empty.csv: the file has a header and no rows"):
+        ReplayDriver([good, write(tmp_path, table(0), "empty.csv")]).open()
+
+
+def test_unknown_columns_are_listed_and_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    extra = [*TABLE_HEADER, "force", *(f"x{k}" for k in range(20))]
+    content = ",".join(extra).encode() + b"\no,0" + b",5" * 93 + b"\n"
+    paths = [write(tmp_path, table(), "a.csv"), write(tmp_path, content, "b.csv")] * 2
+    with caplog.at_level(logging.INFO), ReplayDriver(paths, pace=Pace.FAST) as driver:
+        assert driver.ignored_columns == tuple(extra[74:])
+    (record,) = caplog.records
+    assert record.levelname == "INFO"
+    assert record.getMessage().startswith("replay: unknown columns ignored: 21, such as 'force'")
+    assert "x9" not in record.getMessage()
+
+
+def test_a_bad_row_is_raised_after_the_readings_before_it(tmp_path: Path) -> None:
+    path = write(tmp_path, table(2) + b"apple,0,1\n" + table(1))
+    clock = Clock()
+    with ReplayDriver([path], clock=clock) as driver:
+        assert len(driver.read_ready()) == 1
+        clock.now_ns += 10 * MS
+        assert len(driver.read_ready()) == 1
+        assert not driver.exhausted
+        due_ns = driver.due_ns()
+        assert due_ns is not None
+        assert due_ns <= clock.now_ns, "an error does not wait"
+        with pytest.raises(RecordingError, match="line 4: the row has 3 cells, the header 74"):
+            driver.read_ready()
+        assert driver.exhausted
+        assert driver.read_ready() == ()
+
+
+def test_bad_values_are_counted_and_strict_refuses_them(tmp_path: Path) -> None:
+    changes = {1: {"ff_biotac_1": "nan", "th_biotac_9": "4096"}, 2: {"mf_biotac_3": "2.5"}}
+    path = write(tmp_path, table(4, changes).rstrip(b"\n"))
+    driver = ReplayDriver([path], pace=Pace.FAST)
+    faulty = [bool(reading.faults.any()) for reading in tactile(play(driver))]
+    assert faulty == [False, True, True, True]
+    counters = driver.counters
+    assert (counters.readings, counters.faulty_readings) == (4, 3)
+    assert (counters.not_counts, counters.cut_off) == (3, 1)
+    with pytest.raises(RecordingError, match=r"line 3, column ff_biotac_1: 'nan' is not a count"):
+        play(ReplayDriver([path], pace=Pace.FAST, strict=True))
+
+
+def test_opening_again_starts_over(tmp_path: Path) -> None:
+    driver = ReplayDriver([write(tmp_path, table(3))], pace=Pace.FAST)
+    first, second = play(driver), play(driver)
+    assert [reading.seq for reading in second] == [reading.seq for reading in first] == [0, 1, 2]
+    assert driver.counters.readings == 3
+    driver.open()
+    driver.read_ready()
+    driver.open()
+    assert len(driver.read_ready()) == 1
+    driver.close()
+    assert driver.due_ns() is None
+    with pytest.raises(RuntimeError, match="not open"):
+        driver.read_ready()
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda path: ReplayDriver([]), "no recording"),
+        (lambda path: ReplayDriver([path], ()), "fingers"),
+        (lambda path: ReplayDriver([path], ("ff", "ff")), "fingers"),
+        (lambda path: ReplayDriver([path], ("ff", "toe")), "toe"),
+        (lambda path: ReplayDriver([path], rate_hz=0), "rate_hz is 0"),
+        (lambda path: ReplayDriver([path], rate_hz=float("nan")), "rate_hz is nan"),
+        (lambda path: ReplayDriver([path], speed=-1), "speed is -1"),
+        (lambda path: ReplayDriver([path], speed=float("inf")), "speed is inf"),
+    ],
+)
+def test_an_argument_out_of_range_is_refused(
+    build: Callable[[Path], ReplayDriver], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        build(Path("grasps.csv"))
+
+
+def test_fingers_come_in_the_order_asked_for(tmp_path: Path) -> None:
+    path = write(tmp_path, table(1))
+    (reading,) = tactile(play(ReplayDriver([path], ("th", "mf"), pace=Pace.FAST)))
+    assert reading.counts[:, 0].tolist() == [count(0, 48), count(0, 24)]
+
+
+def peak_bytes(path: Path) -> int:
+    tracemalloc.start()
+    with ReplayDriver([path], pace=Pace.FAST) as driver:
+        while not driver.exhausted:
+            driver.read_ready()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return peak
+
+
+def test_a_file_of_any_length_plays_in_constant_memory(tmp_path: Path) -> None:
+    short = write(tmp_path, table(2_000), "short.csv")
+    header, _, body = short.read_bytes().partition(b"\n")
+    long = write(tmp_path, header + b"\n" + body * 20, "long.csv")
+    peak_bytes(short)
+    assert abs(peak_bytes(long) - peak_bytes(short)) < 20_000
+
+
+def test_the_whole_stability_set_plays_count_for_count(bts3_dir: Path) -> None:
+    paths = [bts3_dir / f"palm_{pose}.csv" for pose in ("down", "side", "45")]
+    expected = [row for path in paths for row in csv_rows(path)]
+    driver = ReplayDriver(paths, FINGERS, pace=Pace.FAST, strict=True)
+    readings = tactile(play(driver))
+    assert len(readings) == len(expected) == 1276 + 1273 + 2133
+    assert driver.ignored_columns == ()
+    for index, (reading, wanted) in enumerate(zip(readings, expected, strict=True)):
+        assert reading.seq == index
+        assert reading.counts.ravel().tolist() == [int(wanted[name]) for name in ELECTRODES]
+        assert reading.annotation is not None
+        assert reading.annotation.slipped is (wanted["slipped"] == "1")
+    assert driver.counters.faulty_readings == 0
+
+
+def csv_rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_demo_recording_plays_without_a_fault() -> None:
+    driver = ReplayDriver([DEMO_TABLE], pace=Pace.FAST, strict=True)
+    readings = tactile(play(driver))
+    assert len(readings) == 200
+    assert not any(reading.faults.any() for reading in readings)
+
+
+def test_a_reading_without_line_end_is_marked_once_per_file(tmp_path: Path) -> None:
+    path = write(tmp_path, table(2).rstrip(b"\n"))
+    readings = tactile(play(ReplayDriver([path, path], pace=Pace.FAST)))
+    cut_off = [bool((reading.faults == ElectrodeFault.CUT_OFF).all()) for reading in readings]
+    assert cut_off == [False, True, False, True]

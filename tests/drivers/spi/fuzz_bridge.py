@@ -1,0 +1,95 @@
+"""The serial bridge's frames and messages as targets of `tests.bench.fuzz`."""
+
+from __future__ import annotations
+
+import random
+
+import numpy as np
+
+from drivers.spi.framing import DELIMITER, ENCODED_MAX_BYTES, encode_frame
+from drivers.spi.messages import (
+    DIGEST,
+    UNSEEDED,
+    Hello,
+    Message,
+    Ping,
+    Start,
+    Status,
+    Stop,
+    Sweep,
+    decode,
+    frame_parser,
+)
+from tests.bench.fuzz import Target
+
+Value = tuple[int, bytes]
+
+
+def _message(rng: random.Random) -> Message:
+    kind = rng.randrange(8)
+    if kind < 4:
+        return _sweep(rng)
+    if kind == 4:
+        return _hello(rng)
+    if kind == 5:
+        errors = tuple(rng.getrandbits(8) for _ in range(rng.randint(1, 5)))
+        return Status(rng.getrandbits(40), rng.getrandbits(32), 1, 2, rng.getrandbits(8), errors)
+    host: list[Message] = [Ping(rng.getrandbits(32)), Start(), Stop()]
+    return rng.choice(host)
+
+
+def _sweep(rng: random.Random) -> Sweep:
+    slots, sensors = rng.choice([(24, 3), (54, 3), (2, 1), (64, 5)])
+    words = np.frombuffer(rng.randbytes(2 * slots * sensors), np.uint16).reshape(slots, sensors)
+    tick = rng.getrandbits(40)
+    return Sweep(rng.getrandbits(32), tick, tick + 1900, rng.getrandbits(sensors), words)
+
+
+def _hello(rng: random.Random) -> Hello:
+    serials = tuple(rng.choice(["BTSP-0001", ""]) for _ in range(rng.randint(1, 5)))
+    commands = bytes(rng.choice(b"\x80\x83\xa2\xd0") for _ in range(rng.randint(1, 64)))
+    return Hello(
+        rng.getrandbits(32), rng.getrandbits(40), 1_000_000, 10_000, serials, tuple(commands)
+    )
+
+
+def _frame(rng: random.Random) -> tuple[bytes, Value]:
+    """Half of them real messages, half of any type and length, full of zeros and ones."""
+    if rng.random() < 0.5:
+        message = _message(rng)
+        kind, payload = message.TYPE, message.to_bytes()
+    else:
+        kind = rng.getrandbits(8)
+        length = rng.choice([0, 1, 8, 249, 250, 254, rng.randrange(300)])
+        payload = rng.choice([bytes(length), b"\xff" * length, rng.randbytes(length)])
+    return encode_frame(kind, payload, 0 if kind in UNSEEDED else DIGEST), (kind, payload)
+
+
+FRAMING = Target(
+    name="framing",
+    frame=_frame,
+    parser=frame_parser,
+    held_max=ENCODED_MAX_BYTES,
+    delimiter=DELIMITER,
+)
+
+
+class _Messages:
+    """Payloads that passed the checksum, for what a faulty bridge may say."""
+
+    held_bytes = 0
+
+    def feed(self, chunk: bytes) -> list[Value]:
+        message = decode(chunk[0], chunk[1:]) if chunk else None
+        return [] if message is None else [(message.TYPE, message.to_bytes())]
+
+
+def _payload(rng: random.Random) -> tuple[bytes, Value]:
+    message = _message(rng)
+    payload = message.to_bytes()
+    return bytes([message.TYPE]) + payload, (message.TYPE, payload)
+
+
+MESSAGES = Target(
+    name="messages", frame=_payload, parser=_Messages, held_max=0, detects_damage=False
+)

@@ -1,0 +1,279 @@
+"""The bridge's firmware, in C: against the manual and against Python's own tools."""
+
+from __future__ import annotations
+
+import random
+import re
+import shutil
+import struct
+import subprocess
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cobs import cobs
+
+from drivers.biotac import ERROR_WORDS
+from tests.drivers.spi.bridge_c import (
+    BRIDGE,
+    DIGEST,
+    ELECTRODE_COMMANDS,
+    HELLO,
+    HOST_PAYLOADS,
+    PAC,
+    PDC,
+    PING,
+    START,
+    STATUS,
+    STOP,
+    SWEEP,
+    TAC,
+    TDC,
+    ask,
+    build_program,
+    frame,
+    hexed,
+    judged,
+)
+
+
+def test_the_firmware_passes_its_own_tests(bridge_folder: Path) -> None:
+    sources = ("test/test_bridge.c", "host/sim_sensor.c", "src/*.c")
+    done = subprocess.run(
+        [build_program(bridge_folder, "test_bridge", *sources)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    names = re.findall(r"TEST\((\w+)\),", (BRIDGE / "test" / "test_bridge.c").read_text())
+    assert done.stdout.splitlines() == [f"ok {name}" for name in names]
+
+
+def test_the_digest_is_that_of_the_documented_schema() -> None:
+    schema = (BRIDGE / "PROTOCOL.md").read_text().split("-" * 72 + "\n")[1]
+    assert zlib.crc32(schema.encode("ascii")) == DIGEST
+    header = (BRIDGE / "src" / "protocol.h").read_text()
+    assert re.findall(r"PROTOCOL_DIGEST 0x(\w+)u", header) == [f"{DIGEST:08X}"]
+
+
+def test_the_core_needs_no_heap_and_no_floating_point() -> None:
+    for source in sorted((BRIDGE / "src").glob("*.[ch]")):
+        code = re.sub(r"/\*.*?\*/", "", source.read_text(), flags=re.DOTALL)
+        assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|float|double)\b", code), source
+
+
+STAND_INS = {
+    "Arduino.h": """
+        #include <stddef.h>
+        #include <stdint.h>
+        enum { LOW, HIGH };
+        enum { INPUT, OUTPUT };
+        void pinMode(uint8_t pin, int mode);
+        void digitalWrite(uint8_t pin, int value);
+        struct Port {
+            void begin(unsigned long baud);
+            int available(), read(), availableForWrite();
+            size_t write(const uint8_t *data, size_t size);
+        };
+        extern Port Serial;
+        """,
+    "SPI.h": """
+        #include <stdint.h>
+        enum { LSBFIRST, MSBFIRST };
+        enum { SPI_MODE0 };
+        struct SPISettings { SPISettings(uint32_t hz, int order, int mode); };
+        struct Spi {
+            bool setRX(uint8_t pin), setTX(uint8_t pin), setSCK(uint8_t pin);
+            void begin(bool hardware_select);
+            void beginTransaction(SPISettings settings);
+            uint8_t transfer(uint8_t data);
+        };
+        extern Spi SPI;
+        """,
+    "hardware/gpio.h": """
+        #include <stdint.h>
+        void gpio_pull_up(unsigned pin);
+        void gpio_put_masked(uint32_t mask, uint32_t value);
+        """,
+    "hardware/timer.h": """
+        #include <stdint.h>
+        uint64_t time_us_64();
+        void busy_wait_us_32(uint32_t us);
+        """,
+    "pico/unique_id.h": """
+        #include <stdint.h>
+        struct pico_unique_board_id_t { uint8_t id[8]; };
+        void pico_get_unique_board_id(pico_unique_board_id_t *id);
+        """,
+}
+"""As much of the headers of the RP2040's Arduino core as the sketch uses."""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler (c++)")
+def test_the_sketch_compiles_against_stand_ins(tmp_path: Path) -> None:
+    for name, text in STAND_INS.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("#pragma once\n" + text)
+    sketch = BRIDGE / "rp2040" / "graspd_bridge" / "graspd_bridge.ino"
+    flags = ["-std=gnu++17", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c++"]
+    includes = [f"-I{BRIDGE}/src", f"-I{tmp_path}", "-include", "Arduino.h"]
+    done = subprocess.run(
+        ["c++", *flags, *includes, str(sketch)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_commands_are_those_of_the_manual(bridge_probe: Path) -> None:
+    commands = bytes.fromhex(ask(bridge_probe, ["tables"])[0].split()[0])
+    expected = bytes([PAC, PDC, TAC, TDC]) + bytes(13) + ELECTRODE_COMMANDS + bytes(256 - 41)
+    assert commands == expected
+    assert 0xA1 not in commands
+
+
+def test_sequences_are_those_of_the_manual(bridge_probe: Path) -> None:
+    electrodes, every, interleaved = map(
+        bytes.fromhex, ask(bridge_probe, ["sequence 0", "sequence 1", "sequence 2"])
+    )
+    assert electrodes == ELECTRODE_COMMANDS
+    assert every == bytes([PAC, PDC, TAC, TDC]) + ELECTRODE_COMMANDS
+    others = ELECTRODE_COMMANDS + bytes([PDC, TAC, TDC])
+    assert interleaved == b"".join(bytes([other, PAC]) for other in others)
+
+
+def test_exactly_the_4096_response_words_are_sound(bridge_probe: Path) -> None:
+    told = ask(bridge_probe, ["tables"])[0].split()[1]
+    sound = {word for word in range(1 << 16) if told[word] == "1"}
+    expected = set()
+    for count in range(4096):
+        high, low = count >> 5 << 1, (count & 31) << 3
+        high += bin(high).count("1") % 2 == 0
+        low += bin(low).count("1") % 2 == 0
+        expected.add(high << 8 | low)
+    assert sound == expected
+    golden = "0101 0108 01F8 0201 4C91 7FF8 8001 A251 AEF8 C1D9 FEF8"
+    assert {int(word, 16) for word in golden.split()} <= sound
+    assert not sound & {*ERROR_WORDS, 0x0000, 0xFFFF}
+
+
+SIZES = (0, 1, 2, 252, 253, 254, 255, 256, 507, 508, 509, 510, 668, 762, 763)
+
+
+def blobs(rng: random.Random) -> Iterator[bytes]:
+    """Data of every awkward size, with no, few and many zeros."""
+    for size in (*SIZES, *(rng.randrange(700) for _ in range(300))):
+        for zeros in (0.0, 0.01, 0.5):
+            data = (0 if rng.random() < zeros else rng.randrange(1, 256) for _ in range(size))
+            yield bytes(data)
+
+
+def test_checksums_and_stuffing_agree_with_zlib_and_cobs(bridge_probe: Path) -> None:
+    data = list(blobs(random.Random(1)))
+    assert list(map(int, ask(bridge_probe, [f"crc {DIGEST} {hexed(d)}" for d in data]))) == [
+        zlib.crc32(d, DIGEST) for d in data
+    ]
+    encoded = [cobs.encode(d) for d in data]
+    assert ask(bridge_probe, [f"encode {hexed(d)}" for d in data]) == [hexed(e) for e in encoded]
+    assert ask(bridge_probe, [f"decode {hexed(e)}" for e in encoded]) == [hexed(d) for d in data]
+
+
+def test_damaged_stuffing_is_judged_as_cobs_does(bridge_probe: Path) -> None:
+    rng = random.Random(2)
+    damaged = []
+    for data in blobs(rng):
+        encoded = bytearray(cobs.encode(data))
+        encoded[rng.randrange(len(encoded))] = rng.randrange(256)
+        damaged.append(bytes(encoded[: rng.randrange(1, len(encoded) + 1)]))
+    expected = []
+    for one in damaged:
+        try:
+            expected.append(hexed(cobs.decode(one)))
+        except cobs.DecodeError:
+            expected.append("bad")
+    assert ask(bridge_probe, [f"decode {hexed(one)}" for one in damaged]) == expected
+    assert 100 < expected.count("bad") < len(expected) - 100
+
+
+def test_every_frame_agrees_with_an_independent_computation(bridge_probe: Path) -> None:
+    rng = random.Random(3)
+    requests, expected = [], []
+    for _ in range(200):
+        sensors, slots = rng.randint(1, 5), rng.choice((1, 24, 28, 54, 64))
+        nonce, period, seq = (rng.choice((0, 1, rng.getrandbits(32))) for _ in range(3))
+        start, end = rng.choice((0, rng.getrandbits(64))), rng.getrandbits(64)
+        firmware, present = rng.getrandbits(16), rng.getrandbits(sensors)
+        board, serials = rng.randbytes(16), rng.randbytes(16 * sensors)
+        commands, words = rng.randbytes(slots), rng.randbytes(2 * slots * sensors)
+        counters = [rng.getrandbits(32) for _ in range(4 + sensors)]
+        requests += [
+            f"hello {nonce} {start} 1000000 {firmware} {board.hex()} {period} {sensors} {slots} "
+            f"{serials.hex()} {commands.hex()}",
+            f"sweep {seq} {start} {end} {present} {sensors} {slots} {words.hex()}",
+            f"status {end} {' '.join(map(str, counters[:4]))} {sensors} "
+            f"{' '.join(map(str, counters[4:]))}",
+        ]
+        hello = struct.pack("<BIIQIH", 1, DIGEST, nonce, start, 1000000, firmware) + board
+        hello += struct.pack("<IBB", period, sensors, slots) + serials + commands
+        sweep = struct.pack("<IQQBBB", seq, start, end, present, sensors, slots) + words
+        status = struct.pack(f"<QIIIIB{sensors}I", end, *counters[:4], sensors, *counters[4:])
+        expected += [frame(HELLO, hello), frame(SWEEP, sweep), frame(STATUS, status)]
+    assert ask(bridge_probe, requests) == [one.hex() for one in expected]
+    assert max(map(len, expected)) <= 672
+
+
+@pytest.mark.parametrize(
+    ("slots", "sensors", "payload", "line"),
+    [(24, 3, 167, 174), (54, 3, 347, 355), (64, 5, 663, 672)],
+)
+def test_a_sweep_takes_the_documented_bytes(
+    bridge_probe: Path, slots: int, sensors: int, payload: int, line: int
+) -> None:
+    words = bytes.fromhex("A251") * (slots * sensors)
+    assert 23 + len(words) == payload
+    answer = ask(bridge_probe, [f"sweep 1 2 3 1 {sensors} {slots} {words.hex()}"])[0]
+    assert len(bytes.fromhex(answer)) == line
+
+
+def damaged(rng: random.Random) -> bytes:
+    """A frame of a host that something happened to, with its zero."""
+    kind = rng.choice((PING, START, STOP, rng.randrange(256)))
+    size = HOST_PAYLOADS.get(kind, rng.randrange(8))
+    whole = bytearray(frame(kind, rng.randbytes(size), rng.choice((DIGEST, DIGEST, 0))))
+    match rng.randrange(7):
+        case 0:
+            whole[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        case 1:
+            del whole[rng.randrange(len(whole))]
+        case 2:
+            whole.insert(rng.randrange(len(whole)), rng.randrange(256))
+        case 3:
+            del whole[rng.randrange(len(whole)) : -1]
+        case 4:
+            whole[:] = rng.randbytes(rng.randrange(1, 40)) + b"\0"
+        case 5:
+            whole[:] = bytes(rng.randrange(1, 256) for _ in range(rng.choice((32, 33, 1025))))
+        case _:
+            whole[:] = frame(kind, rng.randbytes(size + rng.choice((-1, 1, 30)) % 40))
+    return bytes(whole)
+
+
+def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(
+    bridge_probe: Path,
+) -> None:
+    seed = 20251121
+    rng = random.Random(seed)
+    stream, nonces = bytearray(), []
+    for nonce in range(1000):
+        for _ in range(100):
+            stream += damaged(rng)
+        stream += b"\0" + frame(PING, struct.pack("<I", 0xA0000000 + nonce))
+        nonces.append(f"81 {0xA0000000 + nonce}")
+    done = subprocess.run([bridge_probe, "receive"], input=stream, capture_output=True, check=False)
+    assert done.returncode == 0, (seed, done.stderr.decode())
+    *lines, last = done.stdout.decode().splitlines()
+    found, errors = judged(bytes(stream))
+    assert lines == found, seed
+    assert last == f"errors {errors}", seed
+    assert [line for line in lines if line in set(nonces)] == nonces, seed
+    assert errors > 50_000

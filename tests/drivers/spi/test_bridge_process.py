@@ -1,0 +1,310 @@
+"""The bridge's firmware as a process: what a host sees, and what the driver makes of it."""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import signal
+import struct
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.twins.grasps.grasps import recorded_counts
+from tests.drivers.spi.bridge_c import (
+    DIGEST,
+    ELECTRODE_COMMANDS,
+    HELLO,
+    PING,
+    START,
+    STATUS,
+    STOP,
+    SWEEP,
+    StartBridge,
+    counts_of,
+    frame,
+    judged,
+    pattern,
+    seq_of,
+    words_of,
+)
+
+FINGERS = ("ff", "mf", "th")
+
+
+def test_a_hello_says_what_the_bridge_is(start_bridge: StartBridge) -> None:
+    host = start_bridge(
+        "--sensors", 2, "--period-us", 12345, "--board", "left hand", "--serial", "1:XX"
+    )
+    hello = host.hello(0xCAFE)
+    assert struct.unpack_from("<BII", hello) == (1, DIGEST, 0xCAFE)
+    tick, tick_hz, firmware, board, *numbers = struct.unpack_from("<QIH16sIBB", hello, 9)
+    assert numbers == [12345, 2, 24]
+    assert (tick_hz, firmware) == (1_000_000, 0x0001)
+    assert tick < 60_000_000
+    assert board == b"left hand".ljust(16, b"\0")
+    assert hello[45:61] == b"BTSP000000000001"
+    assert hello[61:77] == bytes(16)
+    assert hello[77:] == ELECTRODE_COMMANDS
+
+
+def test_sweeps_carry_what_the_sensors_feel(start_bridge: StartBridge) -> None:
+    host = start_bridge("--period-us", 3000)
+    host.hello()
+    host.send(frame(START))
+    sweeps = host.next_of(SWEEP, 100)
+    assert [seq_of(sweep) for sweep in sweeps] == list(range(100))
+    for row, sweep in enumerate(sweeps):
+        np.testing.assert_array_equal(counts_of(sweep), pattern(row))
+    starts, ends = np.array([struct.unpack_from("<QQ", sweep, 4) for sweep in sweeps]).T
+    assert (ends - starts >= 1900).all()
+    assert 0.99 < np.median(np.diff(starts)) / 3000 < 1.01
+    host.send(frame(STOP), frame(START))
+    while seq_of(again := host.next_of(SWEEP)[0]) != 0:
+        pass
+    np.testing.assert_array_equal(counts_of(again), pattern(0))
+
+
+def test_a_file_of_counts_is_played_again_at_its_end(
+    start_bridge: StartBridge, tmp_path: Path
+) -> None:
+    rows = np.random.default_rng(4).integers(0, 4096, (7, 5, 24))
+    text = "# five sensors\n" + "\n".join(", ".join(map(str, row.ravel())) for row in rows)
+    (tmp_path / "counts").write_text(text)
+    host = start_bridge("--counts", tmp_path / "counts", "--sensors", 5, "--period-us", 4000)
+    host.hello()
+    host.send(frame(START))
+    for row, sweep in enumerate(host.next_of(SWEEP, 20)):
+        np.testing.assert_array_equal(counts_of(sweep), rows[row % 7])
+
+
+def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBridge) -> None:
+    rows = np.random.default_rng(5).integers(0, 4096, (10, 1, 24))
+    lines = "".join(" ".join(map(str, row.ravel())) + "\n" for row in rows)
+    host = start_bridge("--counts", "-", "--sensors", 1, "--period-us", 2000, stdin=lines.encode())
+    host.hello()
+    host.send(frame(START))
+    for row, sweep in enumerate(host.next_of(SWEEP, 10)):
+        np.testing.assert_array_equal(counts_of(sweep), rows[row])
+    assert host.process.wait(10) == 0
+
+
+def test_faults_look_as_on_the_real_sensor(start_bridge: StartBridge) -> None:
+    host = start_bridge(
+        *("--unplug", 1, "--dead", "0:8", "--answer", "2:5:A558", "--answer", "2:24:A259"),
+        *("--settle-us", "0:50", "--period-us", 3000),
+    )
+    hello = host.hello()
+    assert hello[61:77] == bytes(16)
+    host.send(frame(START))
+    words = words_of(host.next_of(SWEEP)[0])
+    assert (words[:, 1] == 0xFFFF).all()
+    assert words[7, 0] == 0x0101
+    assert words[4, 2] == 0xA558
+    assert words[23, 2] == 0xA259
+
+
+def test_a_sensor_that_needs_longer_answers_the_error_word(start_bridge: StartBridge) -> None:
+    host = start_bridge("--settle-us", "2:80", "--period-us", 3000)
+    assert host.hello()[77:93] == bytes(16)
+    host.send(frame(START))
+    sweep = host.next_of(SWEEP)[0]
+    assert (words_of(sweep)[:, 2] == 0xA52D).all()
+    assert sweep[20] == 0b011
+
+
+def test_a_sensor_that_is_plugged_in_again_comes_back(start_bridge: StartBridge) -> None:
+    host = start_bridge("--unplug", "1:50:600", "--period-us", 3000)
+    host.hello()
+    host.send(frame(START))
+    present = [sweep[20] for sweep in host.next_of(SWEEP, 1200)]
+    changes = [now for before, now in zip([0, *present], present, strict=False) if now != before]
+    assert changes == [0b111, 0b101, 0b111]
+    assert 50 < present.index(0b101) < 600 < len(present) - present[::-1].index(0b101)
+
+
+def test_garbage_from_the_host_is_counted_and_survived(start_bridge: StartBridge) -> None:
+    host = start_bridge("--period-us", 4000)
+    host.hello()
+    host.send(frame(START))
+    rng = random.Random(6)
+    errors = 0
+    for _ in range(20):
+        pieces = (bytes(rng.randrange(1, 256) for _ in range(size)) for size in (3, 9, 90))
+        garbage = b"".join(piece + b"\0" for piece in pieces)
+        found, bad = judged(garbage)
+        assert found == []
+        errors += bad
+        host.send(garbage)
+    host.send(frame(0x01, bytes(50)), frame(START, digest=0))
+    status = host.next_of(STATUS)[0]
+    _, sweeps, _, dropped, rx_errors, sensors, *spi_errors = struct.unpack("<QIIIIB3I", status)
+    assert (rx_errors, dropped, sensors, spi_errors) == (errors + 2, 0, 3, [0, 0, 0])
+    assert sweeps > 0
+    host.send(frame(PING, struct.pack("<I", 5)))
+    assert struct.unpack_from("<I", host.next_of(HELLO)[0], 5)[0] == 5
+
+
+def test_a_host_that_does_not_read_costs_whole_frames(start_bridge: StartBridge) -> None:
+    host = start_bridge("--period-us", 5000, "--sequence", "interleaved", "--spi-hz", 10_000_000)
+    host.hello()
+    host.send(frame(START))
+    time.sleep(2.0)  # 400 sweeps of 355 bytes; a terminal holds 64 KiB and a little
+    host.send(frame(PING, struct.pack("<I", 5)))
+    sweeps = []
+    for kind, payload in host.frames():
+        if kind == SWEEP:
+            sweeps.append(seq_of(payload))
+        elif kind == HELLO and struct.unpack_from("<I", payload, 5)[0] == 5:
+            break
+    sweeps += [seq_of(sweep) for sweep in host.next_of(SWEEP, 10)]
+    lost = sweeps[-1] + 1 - len(sweeps)
+    dropped = struct.unpack_from("<I", host.next_of(STATUS)[0], 16)[0]
+    assert sweeps == sorted(set(sweeps))
+    assert 50 < lost <= dropped <= lost + 3  # a STATUS now and then was dropped too
+
+
+def test_a_link_leads_to_the_terminal_and_goes_with_the_process(
+    start_bridge: StartBridge, tmp_path: Path
+) -> None:
+    link = tmp_path / "bridge"
+    host = start_bridge("--link", link)
+    assert os.readlink(link) == host.path
+    host.process.send_signal(signal.SIGINT)
+    assert host.process.wait(10) == 0
+    assert not link.is_symlink()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--sensors", "6"), "--sensors: 6 is not a number in 1..5"),
+        (("--dead", "0:25"), "--dead: 25 is not a number in 1..24"),
+        (("--sequence", "16"), "does not run"),
+        (("--sequence", ""), "does not run"),
+        (("--period-us", "-1"), "--period-us: -1 is not a number"),
+        (("--counts",), "--counts needs a value"),
+        (("--colour", "red"), "no such option: --colour"),
+    ],
+)
+def test_a_wrong_option_is_refused(
+    bridge_program: Path, options: Sequence[str], message: str
+) -> None:
+    done = subprocess.run([bridge_program, *options], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+Readings = list[TactileReading]
+
+
+def drive(
+    driver: SpiBridgeDriver, enough: Callable[[Readings], bool], timeout_s: float
+) -> Readings:
+    """Serve a driver as the daemon does until its readings are enough."""
+    readings: Readings = []
+    end_s = time.monotonic() + timeout_s
+    while not enough(readings):
+        assert time.monotonic() < end_s, f"{len(readings)} readings, {driver.counters}"
+        due_ns, descriptor = driver.due_ns(), driver.fileno()
+        wait_s = 0.1 if due_ns is None else (due_ns - time.monotonic_ns()) / 1e9
+        descriptors = [] if descriptor is None else [descriptor]
+        select.select(descriptors, [], [], min(max(wait_s, 0.0), 0.1))
+        for reading in driver.read_ready():
+            assert isinstance(reading, TactileReading)
+            readings.append(reading)
+    return readings
+
+
+def read(port: object, count: int, timeout_s: float = 20.0) -> Readings:
+    """The first readings of three fingers."""
+    with SpiBridgeDriver(str(port), FINGERS) as driver:
+        readings = drive(driver, lambda readings: len(readings) >= count, timeout_s)
+        assert driver.counters.missed_readings == 0
+        assert driver.counters.bad_crc + driver.counters.bad_cobs == 0
+        return readings[:count]
+
+
+def write_counts(path: Path, rows: NDArray[np.uint16]) -> Path:
+    path.write_text("".join(" ".join(map(str, row.ravel())) + "\n" for row in rows))
+    return path
+
+
+def check_count_for_count(readings: Readings, rows: NDArray[np.uint16]) -> None:
+    assert [reading.seq for reading in readings] == list(range(len(rows)))
+    assert not np.any([reading.faults for reading in readings])
+    np.testing.assert_array_equal([reading.counts for reading in readings], rows)
+
+
+def test_the_driver_reads_random_counts_count_for_count(
+    start_bridge: StartBridge, tmp_path: Path
+) -> None:
+    rows = np.random.default_rng(7).integers(0, 4096, (300, 3, 24), dtype=np.uint16)
+    file = write_counts(tmp_path / "counts", rows)
+    host = start_bridge("--counts", file, "--period-us", 5000)
+    began_ns = time.monotonic_ns()
+    readings = read(host.path, len(rows))
+    check_count_for_count(readings, rows)
+    t_ns = np.array([reading.t_ns for reading in readings])
+    assert began_ns < t_ns[0] < t_ns[-1] < time.monotonic_ns()
+    assert np.median(np.diff(t_ns)) == pytest.approx(5_000_000, rel=0.01)
+
+
+def test_the_driver_reads_a_real_recording_count_for_count(
+    start_bridge: StartBridge, tmp_path: Path, bts3_dir: Path
+) -> None:
+    recording = bts3_dir.parent / "untouched" / "untouched.csv"
+    if not recording.is_file():
+        pytest.skip("the recording of an untouched hand is not there")
+    rows = np.array(list(islice(recorded_counts(recording, FINGERS), 400)))
+    file = write_counts(tmp_path / "counts", rows)
+    host = start_bridge("--counts", file, "--period-us", 6000, "--sequence", "interleaved")
+    check_count_for_count(read(host.path, len(rows)), rows)
+
+
+def test_the_driver_flags_what_is_wrong_with_a_sensor(start_bridge: StartBridge) -> None:
+    host = start_bridge(
+        *("--unplug", 1, "--dead", "0:8", "--period-us", 4000),
+        *("--answer", "2:5:A52D", "--answer", "2:6:A558", "--answer", "2:24:A259"),
+    )
+    expected = np.zeros((3, 24), dtype=np.uint8)
+    expected[1] = ElectrodeFault.MISSING
+    expected[2, [4, 5]] = ElectrodeFault.ERROR_WORD
+    expected[2, 23] = ElectrodeFault.PARITY
+    for row, reading in enumerate(read(host.path, 20)):
+        np.testing.assert_array_equal(reading.faults, expected)
+        assert reading.counts[0, 7] == 0
+        sound = expected == 0
+        sound[0, 7] = False
+        np.testing.assert_array_equal(reading.counts[sound], pattern(row)[sound])
+
+
+def test_the_driver_reads_no_finger_that_is_read_too_early(start_bridge: StartBridge) -> None:
+    host = start_bridge("--settle-us", "2:80", "--period-us", 4000)
+    for reading in read(host.path, 5):
+        assert (reading.faults[:2] == 0).all()
+        assert (reading.faults[2] != 0).all()
+
+
+def test_the_driver_finds_a_bridge_that_was_replaced(
+    start_bridge: StartBridge, tmp_path: Path
+) -> None:
+    link = tmp_path / "bridge"
+    first = start_bridge("--link", link, "--period-us", 4000)
+    with SpiBridgeDriver(str(link), FINGERS) as driver:
+        before = drive(driver, lambda readings: len(readings) >= 20, 10.0)
+        first.stop()
+        start_bridge("--link", link, "--period-us", 4000)
+        after = drive(driver, lambda readings: len(readings) >= 100, 20.0)
+    assert driver.counters.link_losses == 1
+    assert after[-1].seq > before[-1].seq
+    assert not after[-1].faults.any()

@@ -1,0 +1,185 @@
+"""Device ticks on the host's clock: how well, and what happens when the device's clock fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.spi.clock import AGE_MAX_NS, UNKNOWN_DELAY_NS, DeviceClock
+from tests.drivers.spi.clock_error import (
+    MS,
+    START_NS,
+    TICK_HZ,
+    S,
+    Way,
+    errors_ms,
+    tick_of,
+)
+
+
+def synchronised(way: Way | None = None, pings: int = 5) -> tuple[DeviceClock, int]:
+    """A clock after some PINGs of 1 ms, and the host time of the last, ns."""
+    clock = DeviceClock(TICK_HZ)
+    now_ns = START_NS
+    for _ in range(pings):
+        now_ns += S
+        ping(clock, now_ns, way)
+    return clock, now_ns
+
+
+def ping(clock: DeviceClock, now_ns: int, way: Way | None = None, lead_ticks: int = 0) -> None:
+    tick = tick_of(now_ns, way or Way()) + lead_ticks
+    clock.round_trip(tick, now_ns - MS // 2, now_ns + MS // 2)
+
+
+@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 37.0, 100.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_times_are_right_within_two_milliseconds_and_never_too_fresh(
+    drift_ppm: float, seed: int
+) -> None:
+    clock = DeviceClock(TICK_HZ)
+    errors = errors_ms(Way(drift_ppm=drift_ppm, seed=seed), 120.0, clock)
+    assert len(errors) > 11_900
+    assert errors.max() <= 0.01
+    assert errors.min() > -5.0  # in the first second
+    settled = errors[len(errors) // 4 :]
+    assert settled.min() > -2.5
+    assert -0.5 < np.median(settled) < 0.0
+    assert clock.faults == clock.fallbacks == 0
+
+
+def test_the_drift_is_found() -> None:
+    clock = DeviceClock(TICK_HZ)
+    errors_ms(Way(drift_ppm=80.0), 300.0, clock)
+    assert clock.drift_ppm == pytest.approx(80.0, abs=10.0)
+    assert clock.round_trip_ns is not None
+    assert clock.round_trip_ns < 16 * MS
+
+
+def test_one_answered_ping_is_enough() -> None:
+    clock, now_ns = synchronised(pings=1)
+    assert clock.trusted
+    assert clock.drift_ppm is None
+    made_ns = now_ns + 10 * MS
+    mapped_ns = clock.host_ns(tick_of(made_ns, Way()), made_ns + 3 * MS, now_ns)
+    assert made_ns - MS <= mapped_ns <= made_ns
+
+
+def test_before_any_ping_a_time_is_older_than_the_last_idle_moment() -> None:
+    clock = DeviceClock(TICK_HZ)
+    assert not clock.trusted
+    mapped_ns = clock.host_ns(123, START_NS, START_NS - 10 * MS)
+    assert mapped_ns == START_NS - 10 * MS - UNKNOWN_DELAY_NS
+    assert clock.fallbacks == 1
+
+
+def test_a_host_that_stalls_gets_old_times_for_old_readings() -> None:
+    clock, now_ns = synchronised()
+    woke_ns = now_ns + 3 * S
+    for k in range(1, 300):
+        made_ns = now_ns + k * 10 * MS
+        mapped_ns = clock.host_ns(tick_of(made_ns, Way()), woke_ns, now_ns)
+        assert made_ns - 2 * MS <= mapped_ns <= made_ns
+    assert clock.faults == 0
+
+
+def test_a_ping_that_took_long_does_no_harm() -> None:
+    clock, now_ns = synchronised(pings=30)
+    made_ns = now_ns + 400 * MS
+    clock.round_trip(tick_of(made_ns, Way()), now_ns + 100 * MS, now_ns + 700 * MS)
+    later_ns = now_ns + 900 * MS
+    mapped_ns = clock.host_ns(tick_of(later_ns, Way()), later_ns + MS, later_ns)
+    assert later_ns - MS <= mapped_ns <= later_ns
+    assert clock.trusted
+
+
+def test_a_clock_that_stands_is_not_believed() -> None:
+    clock, now_ns = synchronised()
+    tick = tick_of(now_ns + 10 * MS, Way())
+    clock.host_ns(tick, now_ns + 11 * MS, now_ns)
+    for k in range(2, 500):
+        arrival_ns = now_ns + k * 10 * MS
+        mapped_ns = clock.host_ns(tick, arrival_ns, arrival_ns - 10 * MS)
+        assert mapped_ns == arrival_ns - 10 * MS - UNKNOWN_DELAY_NS
+        if k % 100 == 0:
+            clock.round_trip(tick, arrival_ns - MS, arrival_ns)
+    assert not clock.trusted
+    assert (clock.faults, clock.fallbacks) == (1, 498)
+
+
+def test_a_clock_that_stands_is_noticed_by_pings_alone() -> None:
+    clock, now_ns = synchronised()
+    clock.round_trip(tick_of(now_ns, Way()), now_ns + S, now_ns + S + MS)
+    assert not clock.trusted
+    assert clock.faults == 1
+
+
+def test_a_clock_that_falls_back_is_believed_again_after_two_pings_that_agree() -> None:
+    clock, now_ns = synchronised()
+    clock.host_ns(tick_of(now_ns, Way()), now_ns + MS, now_ns)
+    clock.host_ns(500, now_ns + 20 * MS, now_ns + 10 * MS)
+    assert not clock.trusted
+    reset = -tick_of(now_ns, Way())
+    for seconds, trusted in ((1, False), (2, True)):
+        ping(clock, now_ns + seconds * S, lead_ticks=reset)
+        assert clock.trusted is trusted
+    made_ns = now_ns + 2 * S + 10 * MS
+    mapped_ns = clock.host_ns(tick_of(made_ns, Way()) + reset, made_ns + MS, made_ns)
+    assert made_ns - 2 * MS <= mapped_ns <= made_ns
+    assert clock.faults == 1
+
+
+def test_a_clock_that_jumps_ahead_is_not_believed() -> None:
+    clock, now_ns = synchronised()
+    arrival_ns = now_ns + 20 * MS
+    tick = tick_of(arrival_ns, Way()) + 5 * TICK_HZ
+    assert clock.host_ns(tick, arrival_ns, now_ns) == now_ns - UNKNOWN_DELAY_NS
+    assert not clock.trusted
+    assert clock.faults == 1
+
+
+@pytest.mark.parametrize("drift_ppm", [-10_000.0, 10_000.0])
+def test_a_clock_of_a_wrong_rate_is_found_out_and_then_never_too_fresh(drift_ppm: float) -> None:
+    clock = DeviceClock(TICK_HZ)
+    errors = errors_ms(Way(drift_ppm=drift_ppm), 120.0, clock)
+    assert 1 <= clock.faults <= 5
+    assert not clock.trusted
+    assert len(errors) < 2_000, "trusted for a small part of the time"
+
+
+def test_a_time_is_never_later_than_its_arrival_nor_older_than_the_limit() -> None:
+    rng = np.random.default_rng(5)
+    clock, now_ns = synchronised()
+    for _ in range(20_000):
+        now_ns += int(rng.integers(0, 50 * MS))
+        tick = int(rng.integers(0, 1 << int(rng.integers(1, 63)))) << int(rng.integers(0, 2))
+        if rng.random() < 0.1:
+            clock.round_trip(tick, now_ns - int(rng.integers(0, S)), now_ns)
+        mapped_ns = clock.host_ns(tick, now_ns, now_ns - int(rng.integers(0, 60 * S)))
+        assert now_ns - AGE_MAX_NS <= mapped_ns <= now_ns
+
+
+def test_times_do_not_go_back_while_the_clock_is_trusted() -> None:
+    clock = DeviceClock(TICK_HZ)
+    rng = np.random.default_rng(6)
+    now_ns, last_ns = START_NS, 0
+    for k in range(5_000):
+        now_ns += 10 * MS
+        if k % 100 == 0:
+            tick = tick_of(now_ns, Way())
+            clock.round_trip(tick, now_ns - int(rng.exponential(MS)), now_ns + MS)
+        mapped_ns = clock.host_ns(tick_of(now_ns, Way()), now_ns + MS, now_ns)
+        assert mapped_ns >= last_ns
+        last_ns = mapped_ns
+    assert clock.faults == 0
+
+
+def test_a_slow_clock_of_a_kilohertz_is_no_fault() -> None:
+    clock = DeviceClock(1000)
+    for k in range(1, 100):
+        now_ns = START_NS + k * 10 * MS
+        if k % 5 == 1:
+            clock.round_trip(k * 10, now_ns - MS // 10, now_ns + MS // 10)
+        mapped_ns = clock.host_ns(k * 10, now_ns + MS, now_ns)
+        assert now_ns - 3 * MS <= mapped_ns <= now_ns
+    assert clock.faults == 0

@@ -1,0 +1,320 @@
+"""The link to the serial bridge: greeting, refusals, losses, and the way back."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.base import Driver, DriverError
+from drivers.biotac import SEQUENCE_ALL
+from drivers.link import LinkState
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.framing import encode_frame
+from drivers.spi.line import SerialLine
+from drivers.spi.messages import DIGEST, Ping, Start, Stop, encode
+from tests.drivers.spi.bridge_bench import (
+    FINGERS,
+    MS,
+    Clock,
+    Rig,
+    ScriptedBridge,
+    hello,
+    sweep,
+    take,
+)
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    clock = Clock()
+    with ScriptedBridge() as bridge:
+        driver = SpiBridgeDriver(bridge.port, FINGERS, clock=clock)
+        yield Rig(bridge, driver, clock)
+        driver.close()
+
+
+def test_the_bridge_is_a_driver() -> None:
+    driver: Driver = SpiBridgeDriver("/dev/serial/by-id/none", FINGERS)
+    assert driver.name == "spi"
+    assert driver.fileno() is None
+    assert driver.due_ns() is None
+    assert driver.period_ns is None
+    assert not driver.exhausted
+    with pytest.raises(RuntimeError, match="not open"):
+        driver.read_ready()
+    driver.close()
+    driver.close()
+
+
+@pytest.mark.parametrize("fingers", [(), ("ff", "ff"), ("ff", "thumb"), ("ff",) * 6])
+def test_fingers_that_are_none_are_refused(fingers: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match="fingers"):
+        SpiBridgeDriver("/dev/null", fingers)
+
+
+def test_a_port_that_can_never_be_is_said_at_once() -> None:
+    driver = SpiBridgeDriver("nonsense://1", FINGERS)
+    with pytest.raises(DriverError, match="nonsense"):
+        driver.open()
+    driver.close()
+
+
+def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
+    said = rig.greet()
+    assert [type(message) for message in said] == [Stop, Ping]
+    assert [type(message) for message in rig.bridge.heard(Start)] == [Start]
+    assert rig.driver.link_state is LinkState.GREETING
+    assert rig.driver.hello is not None
+    assert rig.driver.hello.board == "b"
+    assert rig.driver.period_ns == 10 * MS
+
+
+def test_closing_tells_the_bridge_to_stop(rig: Rig) -> None:
+    rig.greet()
+    rig.bridge.heard(Start)
+    rig.driver.close()
+    assert [type(message) for message in rig.bridge.heard(Stop)] == [Stop]
+    assert rig.driver.link_state is LinkState.CLOSED
+
+
+REFUSALS = [
+    (
+        encode_frame(0x01, struct.pack("<BII", 2, 0xCAFEF00D, 0) + b"later things"),
+        "the bridge speaks version 2, this is version 1",
+    ),
+    (
+        encode(dataclasses.replace(hello(0), digest=0xCAFEF00D)),
+        f"the bridge has layout 0xCAFEF00D of version 1, this is 0x{DIGEST:08X}",
+    ),
+]
+
+
+@pytest.mark.parametrize(("answer", "why"), REFUSALS, ids=["version", "layout"])
+def test_a_bridge_of_another_version_is_refused_in_one_line(
+    rig: Rig, caplog: pytest.LogCaptureFixture, answer: bytes, why: str
+) -> None:
+    rig.driver.open()
+    rig.bridge.heard(Ping)
+    with caplog.at_level(logging.WARNING):
+        rig.bridge.send(answer, encode(sweep(0, 0)))
+        assert take(rig.driver, rig.bridge) == []
+    assert rig.driver.failure == f"{rig.bridge.port}: {why}"
+    assert rig.driver.link_state is LinkState.WAITING
+    assert rig.driver.counters.refused_bridges == 1
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert rig.bridge.says_nothing_more(), "not even START"
+
+
+def test_a_bridge_with_too_few_sensors_is_refused(rig: Rig) -> None:
+    rig.greet(hello(0, sensors=2))
+    assert rig.driver.failure is not None
+    assert "the bridge has 2 sensors, the scene needs 3" in rig.driver.failure
+    assert rig.driver.counters.refused_bridges == 1
+
+
+def test_a_bridge_that_hardly_ever_sweeps_is_refused(rig: Rig) -> None:
+    rig.greet(dataclasses.replace(hello(0), period_ticks=1_000_001))
+    assert rig.driver.failure is not None
+    assert "the bridge sweeps once in 1 s only" in rig.driver.failure
+    assert rig.driver.counters.refused_bridges == 1
+    assert rig.bridge.says_nothing_more(), "not even START"
+
+
+def test_a_silent_device_is_asked_again_and_then_given_up(rig: Rig) -> None:
+    rig.driver.open()
+    for _ in range(4):
+        assert [type(message) for message in rig.bridge.heard(Ping)] == [Stop, Ping]
+        assert rig.driver.link_state is LinkState.GREETING
+        rig.wait(499)
+        assert rig.bridge.says_nothing_more()
+        rig.wait(1)
+    assert rig.driver.link_state is LinkState.WAITING
+    assert rig.driver.failure == f"no answer from {rig.bridge.port}"
+    assert rig.driver.counters.unanswered_pings == 4
+
+
+def test_a_hello_that_was_damaged_is_asked_for_again(rig: Rig) -> None:
+    rig.driver.open()
+    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
+    damaged = bytearray(encode(hello(ping.nonce)))
+    damaged[20] ^= 0x40
+    rig.bridge.send(bytes(damaged))
+    take(rig.driver, rig.bridge)
+    rig.wait(500)
+    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
+    rig.bridge.send(hello(ping.nonce), sweep(0, 100))
+    assert len(take(rig.driver, rig.bridge)) == 1
+
+
+def test_a_hello_that_answers_nothing_begins_nothing(rig: Rig) -> None:
+    rig.driver.open()
+    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
+    rig.bridge.send(hello(ping.nonce ^ 1), sweep(0, 100))
+    assert take(rig.driver, rig.bridge) == []
+    assert rig.bridge.says_nothing_more()
+    assert rig.driver.counters.stale_sweeps == 1
+
+
+def test_a_board_that_was_reset_by_opening_it_is_asked_again_at_once(rig: Rig) -> None:
+    rig.driver.open()
+    rig.bridge.heard(Ping)
+    rig.bridge.send(hello(0))
+    take(rig.driver, rig.bridge)
+    assert [type(message) for message in rig.bridge.heard(Ping)] == [Stop, Ping]
+
+
+def test_ten_missing_sweeps_are_a_lost_link(rig: Rig) -> None:
+    rig.greet()
+    rig.bridge.send(sweep(0, 10_000))
+    assert len(take(rig.driver, rig.bridge)) == 1
+    rig.wait(99)
+    assert str(rig.driver.link_state) == "up"
+    rig.wait(1)
+    assert str(rig.driver.link_state) == "waiting"
+    assert rig.driver.failure == "no sweep for 100 ms"
+    assert rig.driver.counters.link_losses == 1
+    assert rig.driver.fileno() is None
+
+
+def test_a_bridge_that_never_begins_is_not_called_up(rig: Rig) -> None:
+    rig.greet()
+    rig.wait(100)
+    assert rig.driver.link_state is LinkState.WAITING
+    assert rig.driver.counters.link_losses == 0
+    assert rig.driver.counters.link_failures == 1
+
+
+def test_sweeps_that_waited_while_the_host_slept_are_no_silence(rig: Rig) -> None:
+    rig.greet()
+    for seq in range(50):
+        rig.bridge.send(sweep(seq, 10_000 * seq + 100))
+    rig.clock.now_ns += 500 * MS
+    readings = take(rig.driver, rig.bridge)
+    assert len(readings) == 50
+    assert rig.driver.link_state is LinkState.UP
+    # The first is half a second old and the times between them are those of the bridge.
+    ages_ms = [(rig.clock.now_ns - reading.t_ns) / MS for reading in readings]
+    assert ages_ms[0] == pytest.approx(498, abs=0.5)
+    assert ages_ms[0] - ages_ms[-1] == pytest.approx(490, abs=0.5)
+
+
+def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again(rig: Rig) -> None:
+    rig.greet()
+    rig.bridge.send(sweep(0, 10_000), hello(0), sweep(1, 20_000))
+    assert len(take(rig.driver, rig.bridge)) == 1
+    assert rig.driver.failure == "the bridge was reset"
+    assert rig.driver.counters.restarts == 1
+
+
+def test_a_bridge_that_changes_its_sampling_is_greeted_again(rig: Rig) -> None:
+    rig.greet()
+    rig.bridge.send(sweep(0, 10_000))
+    take(rig.driver, rig.bridge)
+    rig.wait(50)
+    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
+    rig.bridge.send(hello(ping.nonce, 60_000, channels=SEQUENCE_ALL))
+    take(rig.driver, rig.bridge)
+    assert rig.driver.failure == "the bridge changed what it samples"
+
+
+def test_pings_come_quickly_at_first_and_then_once_a_second(rig: Rig) -> None:
+    rig.greet()
+    times_ms = []
+    rig.bridge.heard(Start)
+    for seq, now_ms in enumerate(range(50, 4000, 50)):
+        rig.wait(50)
+        rig.bridge.send(sweep(seq, 50_000 * seq))
+        take(rig.driver, rig.bridge)
+        if not rig.bridge.says_nothing_more():
+            (ping,) = rig.bridge.heard(Ping)
+            times_ms.append(now_ms)
+            assert isinstance(ping, Ping)
+            rig.bridge.send(hello(ping.nonce, now_ms * 1000))
+    assert times_ms == [50, 100, 150, 200, 250, 300, 350, 1350, 2350, 3350]
+    assert rig.driver.bridge_clock is not None
+    assert rig.driver.bridge_clock.trusted
+    assert rig.driver.counters.unanswered_pings == 0
+
+
+def test_a_device_that_is_not_there_is_tried_again_with_growing_patience(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = Clock()
+    port = str(tmp_path / "gone")
+    with caplog.at_level(logging.DEBUG), SpiBridgeDriver(port, FINGERS, clock=clock) as driver:
+        waits_ms = []
+        for _ in range(9):
+            due_ns = driver.due_ns()
+            assert due_ns is not None
+            waits_ms.append((due_ns - clock.now_ns) / MS)
+            clock.now_ns = due_ns
+            assert driver.read_ready() == ()
+        assert driver.failure == f"{port}: no such file or directory"
+    assert waits_ms == sorted(waits_ms)
+    assert (waits_ms[0], waits_ms[-1]) == (50, 1000)
+    assert [r.levelname for r in caplog.records].count("WARNING") == 1
+
+
+def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:
+    rig.greet()
+    with SpiBridgeDriver(rig.bridge.port, FINGERS) as second:
+        assert second.failure == f"{rig.bridge.port}: another program has it open"
+    assert rig.driver.link_state is LinkState.GREETING
+
+
+def test_unplugging_is_noticed_at_once(rig: Rig) -> None:
+    rig.greet()
+    rig.bridge.send(sweep(0, 10_000))
+    take(rig.driver, rig.bridge)
+    rig.bridge.unplug()
+    assert rig.driver.read_ready() == ()
+    assert rig.driver.link_state is LinkState.WAITING
+    assert rig.driver.failure == f"{rig.bridge.port}: the device went away"
+    assert rig.driver.counters.link_losses == 1
+
+
+def test_a_port_without_descriptor_is_polled(rig: Rig) -> None:
+    clock = Clock()
+    with SpiBridgeDriver("loop://", FINGERS, clock=clock) as driver:
+        assert driver.fileno() is None
+        assert driver.link_state is LinkState.GREETING
+        clock.now_ns += 5 * MS
+        assert driver.read_ready() == []
+        assert driver.due_ns() == clock.now_ns + 2 * MS
+        # What comes back is what was said: STOP and PING, which no bridge says.
+        assert driver.counters.unknown_frames == 2
+
+
+def test_a_socket_has_a_descriptor_and_its_end_is_a_lost_link() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        clock = Clock()
+        with SpiBridgeDriver(port, FINGERS, clock=clock) as driver:
+            peer, _ = server.accept()
+            with peer:
+                assert driver.fileno() is not None
+                assert len(peer.recv(1)) == 1
+            for _ in range(100):
+                if driver.link_state is LinkState.WAITING:
+                    break
+                driver.read_ready()
+            assert driver.link_state is LinkState.WAITING
+
+
+def test_a_bridge_that_does_not_read_never_blocks_the_host(rig: Rig) -> None:
+    line = SerialLine(rig.bridge.port, 921_600)
+    line.open()
+    began_s = time.monotonic()
+    writes = 0
+    while line.write(b"x" * 1000):
+        writes += 1
+        assert writes < 10_000
+    line.close()
+    assert time.monotonic() - began_s < 2.0

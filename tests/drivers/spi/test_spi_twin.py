@@ -1,0 +1,262 @@
+"""Driver and twin over a real pseudo-terminal: count for count, fault by fault, plug by plug."""
+
+from __future__ import annotations
+
+import itertools
+import random
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cobs import cobs
+
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.biotac import SEQUENCE_INTERLEAVED
+from drivers.spi.clock import UNKNOWN_DELAY_NS
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.messages import DIGEST
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps.grasps import Counts, GeneratedContact, recorded_counts
+from drivers.twins.spi import SpiTwin
+from tests.conftest import data_dir
+from tests.drivers.spi.bridge_bench import FINGERS, MS, replug_times_s, run
+
+SWEEPS = 600
+REPLUGS = 50
+BACK_WITHIN_S = 2.0
+
+
+def generated(sweeps: int = SWEEPS, seed: int = 3) -> list[Counts]:
+    return list(itertools.islice(GeneratedContact(len(FINGERS), seed=seed), sweeps))
+
+
+def together(
+    folder: Path, rows: list[Counts], faults: LinkFaults
+) -> tuple[SpiTwin, SpiBridgeDriver, list[TactileReading], bytes]:
+    """All rows through twin and driver as fast as they are read, and what was on the wire."""
+    wire = bytearray()
+    twin = SpiTwin(folder / "bridge", rows, rate_hz=None, faults=faults, tap=wire.extend)
+    driver = SpiBridgeDriver(str(folder / "bridge"), FINGERS)
+    with twin:
+        wire.clear()  # what is on the line before it is opened is thrown away
+        with driver:
+
+            def done(readings: list[TactileReading]) -> bool:
+                return twin.exhausted and driver.counters.bytes >= len(wire)
+
+            readings = run(twin, driver, done)
+            driver.read_ready()
+    return twin, driver, readings, bytes(wire)
+
+
+@pytest.fixture
+def untouched() -> Path:
+    folder = data_dir()
+    if folder is None or not (folder / "untouched" / "untouched.csv").is_file():
+        pytest.skip("the real recording of an untouched hand is not there")
+    return folder / "untouched" / "untouched.csv"
+
+
+def test_a_real_recording_comes_out_count_for_count(tmp_path: Path, untouched: Path) -> None:
+    rows = list(recorded_counts(untouched))
+    assert len(rows) == 977
+    _, driver, readings, _ = together(tmp_path, rows, LinkFaults())
+    assert np.array_equal([reading.counts for reading in readings], rows)
+    assert not any(reading.faults.any() for reading in readings)
+    assert [reading.seq for reading in readings] == list(range(977))
+    counters = driver.counters
+    assert (counters.readings, counters.missed_readings, counters.faulty_readings) == (977, 0, 0)
+    assert counters.bad_cobs == counters.bad_crc == counters.too_long == 0
+    assert counters.clock_faults == counters.clock_fallbacks == 0
+
+
+def test_the_interleaved_sequence_gives_the_same_counts(tmp_path: Path) -> None:
+    rows = generated(50)
+    twin = SpiTwin(tmp_path / "b", rows, rate_hz=None, channels=SEQUENCE_INTERLEAVED)
+    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
+        readings = run(twin, driver, lambda readings: len(readings) == 50)
+    assert np.array_equal([reading.counts for reading in readings], rows)
+
+
+def test_at_its_rate_readings_come_in_time_and_are_young(tmp_path: Path) -> None:
+    twin = SpiTwin(tmp_path / "b", GeneratedContact(3), rate_hz=100.0, drift_ppm=80.0)
+    ages_ms: list[float] = []
+    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
+        seen = 0
+
+        def done(readings: list[TactileReading]) -> bool:
+            nonlocal seen
+            now_ns = time.monotonic_ns()
+            ages_ms.extend((now_ns - reading.t_ns) / MS for reading in readings[seen:])
+            seen = len(readings)
+            return seen == 100
+
+        readings = run(twin, driver, done)
+        assert driver.period_ns == 10 * MS
+    periods_ms = np.diff([reading.t_ns for reading in readings]) / MS
+    assert periods_ms.mean() == pytest.approx(10.0, abs=0.3)
+    assert min(ages_ms) >= 0.0
+    assert np.median(ages_ms) < 10.0
+
+
+def damaged_pieces(wire: bytes) -> int:
+    """How many pieces between zeros are no frames, by a decoder of this test's own."""
+    damaged = 0
+    for piece in wire.split(b"\0")[:-1]:
+        if not piece:
+            continue
+        try:
+            decoded = cobs.decode(piece)
+        except cobs.DecodeError:
+            damaged += 1
+            continue
+        seed = 0 if decoded[:1] == b"\x01" else DIGEST
+        crc = zlib.crc32(decoded[:-4], seed).to_bytes(4, "little")
+        damaged += len(decoded) < 5 or crc != decoded[-4:]
+    return damaged
+
+
+LOSING = {"bit_flip_probability", "drop_probability", "reorder_probability"}
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    "faults",
+    [
+        {},
+        {"bit_flip_probability": 0.01},
+        {"bit_flip_probability": 0.3},
+        {"drop_probability": 0.2},
+        {"duplicate_probability": 0.2},
+        {"reorder_probability": 0.2},
+        {"one_byte_at_a_time": True},
+        {"burst_frames": 7},
+        {
+            "bit_flip_probability": 0.05,
+            "drop_probability": 0.1,
+            "duplicate_probability": 0.1,
+            "reorder_probability": 0.1,
+            "burst_frames": 3,
+        },
+    ],
+    ids=lambda faults: "+".join(faults) or "none",
+)
+def test_faults_are_counted_one_by_one_and_no_reading_is_invented(
+    tmp_path: Path, faults: dict[str, float], seed: int
+) -> None:
+    rows = generated()
+    twin, driver, readings, wire = together(tmp_path, rows, LinkFaults(seed=seed, **faults))  # type: ignore[arg-type]
+    counters, injected = driver.counters, twin.injected_in_sweeps
+    for reading in readings:  # the number of a reading is that of the sweep it was made from
+        assert np.array_equal(reading.counts, rows[reading.seq]), reading.seq
+        assert not reading.faults.any()
+    seqs = [reading.seq for reading in readings]
+    assert seqs == sorted(set(seqs))
+    lost_at_end = SWEEPS - 1 - seqs[-1]
+    assert counters.readings + counters.missed_readings + lost_at_end == twin.sweeps_made == SWEEPS
+    assert counters.bad_cobs + counters.bad_crc + counters.too_long == damaged_pieces(wire)
+    lost = counters.missed_readings + lost_at_end
+    if len(faults) == 1:
+        flips, drops = injected["bit_flip"], injected["drop"]
+        # A flipped delimiter joins two frames: both are lost.
+        assert drops + flips <= lost - counters.reordered <= drops + 2 * flips
+        assert counters.duplicates == injected["duplicate"]
+        assert abs(injected["reorder"] - counters.reordered) <= 1  # the last may stay behind
+    if not set(faults) & LOSING:
+        assert lost == 0
+
+
+def test_a_dead_electrode_and_an_unplugged_finger_are_where_they_are(tmp_path: Path) -> None:
+    rows = generated(100)
+    faults = LinkFaults(dead_electrodes=((0, 7), (2, 17)), unplugged_fingers=(1,))
+    _, driver, readings, _ = together(tmp_path, rows, faults)
+    assert len(readings) == 100
+    for reading, row in zip(readings, rows, strict=True):
+        assert reading.counts[0, 7] == reading.counts[2, 17] == 0
+        assert (reading.faults[1] == ElectrodeFault.MISSING).all()
+        assert not reading.faults[[0, 2]].any()
+        same = reading.counts == row
+        same[0, 7] = same[2, 17] = True
+        assert same[[0, 2]].all()
+    assert driver.counters.absent_sensors == 100
+    assert driver.hello is not None
+    assert driver.hello.serials[1] == ""
+
+
+def test_a_stuck_clock_gives_old_times_and_the_same_counts(tmp_path: Path) -> None:
+    rows = generated(100)
+    began_ns = time.monotonic_ns()
+    _, driver, readings, _ = together(tmp_path, rows, LinkFaults(stuck_clock=True))
+    assert np.array_equal([reading.counts for reading in readings], rows)
+    assert driver.counters.clock_fallbacks >= 99
+    assert driver.counters.clock_faults == 1
+    now_ns = time.monotonic_ns()
+    for reading in readings[1:]:
+        assert began_ns - UNKNOWN_DELAY_NS <= reading.t_ns <= now_ns - UNKNOWN_DELAY_NS
+
+
+def test_a_twin_of_a_wrong_version_gives_no_reading(tmp_path: Path) -> None:
+    twin = SpiTwin(tmp_path / "b", generated(5), faults=LinkFaults(wrong_version=True))
+    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
+        readings = run(twin, driver, lambda _: driver.counters.refused_bridges >= 3)
+        assert readings == []
+        assert driver.failure is not None
+        assert "speaks version 2, this is version 1" in driver.failure
+        assert twin.sweeps_made == 0
+
+
+def test_a_link_that_breaks_in_the_middle_of_a_frame_comes_back(tmp_path: Path) -> None:
+    faults = LinkFaults(disconnect_every_frames=40)
+    rows = generated(100_000 // 24)
+    twin = SpiTwin(tmp_path / "b", rows, rate_hz=1000.0, faults=faults)
+    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
+        readings = run(twin, driver, lambda _: driver.counters.link_losses >= 6)
+        assert driver.counters.link_losses == twin.injected["disconnect"] == 6
+    made = {row.tobytes() for row in rows[: twin.sweeps_made]}
+    assert len(readings) > 150
+    assert all(reading.counts.tobytes() in made for reading in readings)
+    seqs = [reading.seq for reading in readings]
+    assert seqs == sorted(set(seqs))
+
+
+def test_a_bridge_that_is_plugged_in_again_is_back_soon(tmp_path: Path) -> None:
+    seed = random.SystemRandom().randrange(1 << 32)
+    twin = SpiTwin(tmp_path / "b", GeneratedContact(3))
+    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
+        times_s = replug_times_s(twin, driver, REPLUGS, random.Random(seed))
+        assert driver.counters.link_losses == REPLUGS, seed
+    assert max(times_s) < BACK_WITHIN_S, (seed, times_s)
+
+
+def test_a_file_in_the_way_of_the_link_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "bridge"
+    path.write_text("precious")
+    twin = SpiTwin(path, generated(1))
+    with pytest.raises(FileExistsError, match="in the way"):
+        twin.open()
+    twin.close()
+    assert path.read_text() == "precious"
+
+
+def test_a_source_without_counts_and_a_rate_of_nothing_are_refused(tmp_path: Path) -> None:
+    empty: Iterator[Counts] = iter(())
+    with pytest.raises(ValueError, match="no counts"):
+        SpiTwin(tmp_path / "b", empty)
+    with pytest.raises(ValueError, match="rate_hz"):
+        SpiTwin(tmp_path / "b", generated(1), rate_hz=0.0)
+
+
+def test_a_host_that_does_not_read_loses_whole_frames_and_is_told(tmp_path: Path) -> None:
+    rows = generated(5000)
+    twin = SpiTwin(tmp_path / "b", rows, rate_hz=20_000.0)
+    with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
+        run(twin, driver, lambda readings: len(readings) >= 3)
+        while twin.tx_dropped < 100:
+            twin.run_once()
+        readings = run(twin, driver, lambda _: driver.counters.missed_readings > 0)
+        for reading in readings:
+            assert np.array_equal(reading.counts, rows[reading.seq])
+        assert driver.counters.bad_cobs == driver.counters.bad_crc == 0

@@ -1,0 +1,379 @@
+"""`graspd train` from its arguments to its files."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("rich", reason="the train extra is not installed")
+
+from models.contract import Dataset, SessionInput
+from models.runtime import TactileModel
+from models.training.commands import train
+from models.training.data.datasets import Grasps
+from models.training.evaluating import jobs
+from models.training.making.export import ExportError
+from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
+from tests.models.training.training_samples import separable_counts, write_table
+
+SYSTEM = "svm-session"
+GRASPS = 80
+"""Of each of the three tables."""
+
+
+def graspd_train(*arguments: str, system: str = SYSTEM) -> int:
+    parser = argparse.ArgumentParser()
+    train.add_arguments(parser)
+    return train.run(parser.parse_args([system, *arguments]))
+
+
+def smallest() -> Grasps:
+    """20 grasps of two objects, of each of which five slipped."""
+    counts, slipped = separable_counts(20)
+    objects = tuple("ball" if grasp < 10 else "box" for grasp in range(20))
+    return Grasps(counts, slipped, objects, (Dataset("lab", "", 20),))
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    folder = tmp_path / "data"
+    write_sessions(folder, GRASPS)
+    return folder
+
+
+def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out" / SYSTEM
+    options = ["--data", str(data), "--out", str(out), "--folds", "2", "--seed", "3"]
+    assert graspd_train(*options) == 0
+    files = sorted(path.name for path in out.iterdir())
+    assert files == [f"{SYSTEM}.json", f"{SYSTEM}.onnx", "trainings"]
+    model = TactileModel(out / f"{SYSTEM}.onnx")
+    card = json.loads((out / f"{SYSTEM}.json").read_text())
+    assert card["contract"] == json.loads(model.contract.to_json())
+    assert card["file"]["sha256"] == model.sha256
+    assert card["command"] == f"graspd train {SYSTEM} --data DIR --seed 3 --folds 2"
+    assert card["file"]["parity"]["grasps"] == 2 * GRASPS
+    assert card["same_seed_same_margins"] is True
+    assert list(card["protocols"]) == ["cv", "objects-whole", "session"]
+    assert [m["protocol"] for m in card["contract"]["measured"]] == list(card["protocols"])
+    assert [file["rows"] for file in card["contract"]["datasets"]] == [GRASPS, GRASPS]
+    digest = hashlib.sha256((data / "palm_side.csv").read_bytes()).hexdigest()
+    assert card["contract"]["datasets"][1]["sha256"] == digest
+    assert card["data"]["not_published"] == ["palm_down", "palm_side", "palm_45"]
+    assert set(card["protocols"]["objects-whole"]["objects"]) == set(OBJECTS)
+    assert "running" in card["protocols"]["session"]["calibrated_by"]
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"{out / SYSTEM}.onnx: cv F1 ")
+    assert printed.out.count("\n") == 1
+    assert printed.err.splitlines() == [
+        f"graspd train: warning: {name}.csv is not the published table; "
+        "the figures are of this data only"
+        for name in ("palm_down", "palm_side", "palm_45")
+    ]
+
+
+def test_the_contract_holds_the_statistics_that_the_session_starts_from(
+    data: Path, tmp_path: Path
+) -> None:
+    options = ["--data", str(data), "--out", str(tmp_path), "--folds", "2", "--quiet"]
+    assert graspd_train(*options) == 0
+    session = TactileModel(tmp_path / f"{SYSTEM}.onnx").contract.input
+    assert isinstance(session, SessionInput)
+    tables = [
+        np.loadtxt(data / f"{name}.csv", delimiter=",", skiprows=1, usecols=range(2, 74))
+        for name in ("palm_down", "palm_side")
+    ]
+    means = [table.reshape(-1, 3, 24).mean(axis=2) for table in tables]
+    # Feature 72 is the mean of the first finger.
+    assert session.mean[72] == pytest.approx(np.concatenate(means)[:, 0].mean())
+    within = np.mean([mean[:, 0].var() for mean in means])
+    assert session.spread[72] == pytest.approx(np.sqrt(within))
+    assert session.sharpness[0].grasps == 0.0
+    sharpness = [step.temperature for step in session.sharpness]
+    assert sharpness == sorted(sharpness, reverse=True)
+    assert sharpness[-1] >= 1.0
+
+
+def test_an_interrupted_training_goes_on_where_it_was(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "2", "--quiet"]
+    ran: list[jobs.Job] = []
+    run = jobs.run
+
+    def counted(job: jobs.Job, grasps: Grasps) -> jobs.JobResult:
+        if len(ran) == 4:
+            raise KeyboardInterrupt
+        ran.append(job)
+        return run(job, grasps)
+
+    monkeypatch.setattr(jobs, "run", counted)
+    assert graspd_train(*options) == 130
+    assert not (tmp_path / "out" / f"{SYSTEM}.onnx").exists()
+    done, ran[:] = len(ran), []
+    assert done == 4
+    assert graspd_train(*options) == 0
+    # Six folds in all, less the four that are kept, and one again to see that it is the same.
+    assert len(ran) == 6 - 4 + 1
+
+
+def test_the_same_seed_makes_the_same_file(data: Path, tmp_path: Path) -> None:
+    for out in ("one", "two"):
+        options = ["--data", str(data), "--out", str(tmp_path / out), "--folds", "2", "--quiet"]
+        assert graspd_train(*options, system="svm") == 0
+    for name in ("svm.onnx", "svm.json"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_a_model_of_the_later_session_needs_its_table(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data / "palm_45.csv").unlink()
+    options = ["--data", str(data), "--out", str(tmp_path / "out")]
+    assert graspd_train(*options, system="small-session") == 2
+    missing = data / "palm_45.csv"
+    assert capsys.readouterr().err == (
+        f"graspd train: {missing}: is missing, small-session needs it\n"
+    )
+
+
+def test_bad_data_is_one_line_and_exit_code_2(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = data / "palm_side.csv"
+    path.write_text(path.read_text().replace("juice,1", "juice,maybe", 1))
+    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"graspd train: {path}, line 3, column slipped: 'maybe' is not 0 or 1\n"
+    assert printed.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "lab 1.csv", table("lab 1", 60, 3))
+    own = ["--own", str(tmp_path / "lab 1.csv")]
+    options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "2"]
+    assert graspd_train(*options, *own, system="svm") == 0
+    card = json.loads((tmp_path / "out" / "svm.json").read_text())
+    assert card["command"] == "graspd train svm --data DIR --own 'lab 1.csv' --seed 0 --folds 2"
+    assert [(file["name"], file["rows"]) for file in card["contract"]["datasets"]] == [
+        ("palm_down", GRASPS),
+        ("palm_side", GRASPS),
+        ("lab 1", 60),
+    ]
+    # Of the 220 grasps of the objects that were left out, 50 are the fewest to tell an accuracy.
+    coverages = [step["coverage"] for step in card["contract"]["confidence"]]
+    assert coverages[0] == 1.0
+    assert all(coverage >= 50 / 220 for coverage in coverages)
+    judged = {name: set(figures["palms"]) for name, figures in card["protocols"].items()}
+    assert judged == {
+        "cv": {"palm_down", "palm_side", "lab 1"},
+        "objects-whole": {"palm_down", "palm_side", "lab 1"},
+        "session": {"palm_45"},
+    }
+    assert card["data"]["licence"].startswith("MIT")
+    assert "lab 1" in card["data"]["not_published"]
+    assert {
+        "The data is of 20 objects in 3 tables, of which lab 1 is not published.",
+        "The figures of another day are of the published tables alone.",
+    } < set(card["weak_points"])
+    assert "lab 1.csv is not" not in capsys.readouterr().err
+
+
+def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "lab.csv", smallest())
+    options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path), "--folds", "2"]
+    assert graspd_train(*options) == 0
+    contract = TactileModel(tmp_path / f"{SYSTEM}.onnx").contract
+    assert [(file.name, file.rows) for file in contract.datasets] == [("lab", 20)]
+    assert isinstance(contract.input, SessionInput)
+    assert contract.confidence == ()  # 20 grasps say nothing of how sure one may be
+    card = json.loads((tmp_path / f"{SYSTEM}.json").read_text())
+    assert card["command"] == f"graspd train {SYSTEM} --own lab.csv --seed 0 --folds 2"
+    assert list(card["protocols"]) == ["cv", "objects"]
+    assert card["calibrated_by"] == "objects"
+    assert card["broken"]["grasps"] > 0
+    assert card["data"] == {
+        "licence": "whatever the owner of the tables says",
+        "repository": None,
+        "cite": [],
+        "not_published": ["lab"],
+    }
+    assert card["weak_points"][1:3] == [
+        "The data is of 2 objects in 1 table, of which lab is not published.",
+        "What it is worth on another day than those of its data was not measured.",
+    ]
+    assert capsys.readouterr().err.startswith("graspd train: warning: 20 grasps are few")
+
+
+@pytest.mark.parametrize(
+    ("name", "rows", "problem"),
+    [
+        ("palm_45", range(80), "has the name of a published table: rename it, or use --data"),
+        ("la\nb", range(80), "has a name that cannot be printed"),
+        ("lab", range(19), "has 19 grasps, 20 are the fewest"),
+        ("lab", range(0, 80, 2), "has no grasp that slipped, a session needs both kinds"),
+        ("lab", range(1, 80, 2), "has no grasp that stayed, a session needs both kinds"),
+        ("lab", (*range(80), 7), "has counts twice: the same grasp counts once"),
+    ],
+)
+def test_a_table_of_ones_own_that_would_mislead_is_one_line_and_exit_code_2(
+    name: str,
+    rows: Sequence[int],
+    problem: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    counts, slipped = separable_counts(GRASPS)
+    path = tmp_path / f"{name}.csv"
+    write_table(path, counts[list(rows)], slipped[list(rows)])
+    assert graspd_train("--own", str(path), "--out", str(tmp_path / "out")) == 2
+    assert capsys.readouterr().err == f"graspd train: {path}: {problem}\n"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("beside", ["palm_45", "monday"])
+def test_a_grasp_that_is_in_two_tables_is_refused(
+    beside: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monday, both = tmp_path / "monday.csv", tmp_path / "both.csv"
+    write(monday, table("monday", 40, 3))
+    first = monday if beside == "monday" else data / "palm_45.csv"
+    both.write_bytes(first.read_bytes())
+    options = ["--data", str(data), "--own", str(monday), "--own", str(both)]
+    assert graspd_train(*options, "--out", str(tmp_path / "out")) == 2
+    assert capsys.readouterr().err == (
+        f"graspd train: {both}: has counts that are in {beside}, too: the same grasp counts once\n"
+    )
+
+
+def test_two_tables_of_ones_own_have_two_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paths = [tmp_path / day / "lab.csv" for day in ("monday", "friday")]
+    for seed, path in enumerate(paths):
+        path.parent.mkdir()
+        write(path, table("lab", 40, seed))
+    assert graspd_train("--own", str(paths[0]), "--own", str(paths[1])) == 2
+    assert capsys.readouterr().err == (
+        f"graspd train: {paths[1]}: has the same name as {paths[0]}: rename one\n"
+    )
+
+
+def test_grasps_of_one_object_measure_known_objects_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
+    options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path / "out"), "--folds", "2"]
+    assert graspd_train(*options) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "graspd train: 2 folds need 2 objects, there are 1 (see --folds and --only)"
+    )
+    assert graspd_train(*options, "--only", "cv") == 0
+    card = json.loads((tmp_path / "out" / f"{SYSTEM}.json").read_text())
+    assert card["never_seen"]["held_out_object"] is None
+    assert card["calibrated_by"] == "cv"
+
+
+def test_a_session_model_needs_several_objects_of_each_session(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
+    options = ["--data", str(data), "--own", str(tmp_path / "lab.csv"), "--folds", "2"]
+    assert graspd_train(*options, "--out", str(tmp_path / "out")) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "leaves out all objects of lab, by whose other grasps" in last
+    assert "put the tables of a session together" in last
+    assert graspd_train(*options, "--out", str(tmp_path / "out"), system="svm") == 0
+
+
+def test_a_fold_that_leaves_one_kind_of_grasps_to_train_on_is_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = smallest()
+    objects = tuple("ball" if slip else "box" for slip in made.slipped)
+    write(tmp_path / "lab.csv", dataclasses.replace(made, objects=objects))
+    options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path / "out"), "--folds", "2"]
+    assert graspd_train(*options) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.match(r"graspd train: objects, fold 0, has 0 grasps that \w+ to train on", last)
+
+
+def test_without_any_data_there_is_nothing_to_train_on(capsys: pytest.CaptureFixture[str]) -> None:
+    assert graspd_train() == 2
+    assert capsys.readouterr().err == "graspd train: needs --data DIR, --own FILE, or both\n"
+
+
+def test_too_few_grasps_for_the_folds_are_exit_code_2(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "25"]
+    assert graspd_train(*options) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == ("graspd train: 25 folds need 25 objects, there are 20 (see --folds and --only)")
+
+
+def test_an_output_folder_that_is_a_file_is_exit_code_2(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = data / "palm_45.csv"
+    assert graspd_train("--data", str(data), "--out", str(out)) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"graspd train: {out}: File exists"
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--folds", "1"), ("--jobs", "0"), ("--seed", "-1"), ("--seed", "1e3"), ("--folds", "")],
+)
+def test_a_number_out_of_range_is_exit_code_2(
+    option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        graspd_train("--data", "anywhere", f"{option}={value}")
+    assert caught.value.code == 2
+    assert f"argument {option}: '{value}' is not a whole number from" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_cleanly_with_130(
+    data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "make", interrupted)
+    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        "graspd train: interrupted; the same command goes on from here"
+    )
+
+
+def test_a_failed_export_is_exit_code_1(
+    data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def failing(*_: object) -> None:
+        raise ExportError("the exported file differs")
+
+    monkeypatch.setattr(train, "make", failing)
+    assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == "graspd train: the exported file differs"

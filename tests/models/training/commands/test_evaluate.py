@@ -1,0 +1,245 @@
+"""`graspd evaluate` from its arguments to its files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("skl2onnx", reason="the train extra is not installed")
+pytest.importorskip("rich", reason="the train extra is not installed")
+
+from models.training.commands import evaluate
+from models.training.estimators.classical import SvmConfig
+from models.training.evaluating import jobs
+from models.training.evaluating.grid import grid_of
+from models.training.systems.systems import SYSTEMS
+from tests.models.training.evaluation_samples import write_sessions
+
+ROOT = Path(__file__).parents[4]
+
+
+def graspd_evaluate(*arguments: str) -> int:
+    parser = argparse.ArgumentParser()
+    evaluate.add_arguments(parser)
+    return evaluate.run(parser.parse_args(arguments))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    write_sessions(folder, 160)
+    return folder
+
+
+def test_a_quick_run_writes_summaries_and_table(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, table = tmp_path / "out", tmp_path / "tables" / "RESULTS.md"
+    options = ["--data", str(data), "--out", str(out), "--table", str(table), "--quick"]
+    assert graspd_evaluate("svm", "svm-session", *options) == 0
+    protocols = ("cv", "unknown", "objects", "objects-whole", "session")
+    assert {path.name for path in out.glob("*.json")} == {
+        f"{name}.{protocol}.json" for name in ("svm", "svm-session") for protocol in protocols
+    }
+    assert len(list((out / "jobs").iterdir())) == 2 * (4 * 2 + 1)  # unknown has one split
+    text = table.read_text()
+    assert "graspd evaluate svm svm-session --data DIR --out DIR --quick --table FILE" in text
+    assert "mean nothing" in text
+    assert str(tmp_path) not in text
+    printed = capsys.readouterr()
+    assert [line.split()[:2] for line in printed.out.splitlines()] == [
+        [name, protocol] for name in ("svm", "svm-session") for protocol in protocols
+    ]
+    assert "svm-session session (n50): F1 " in printed.out
+    assert "palm_45.csv is not the published table" in printed.err
+
+
+def test_a_quick_run_on_the_real_grasps_says_what_it_is(bts3_dir: Path, tmp_path: Path) -> None:
+    table = tmp_path / "RESULTS.md"
+    options = ["--data", str(bts3_dir), "--out", str(tmp_path / "out"), "--table", str(table)]
+    systems = ("cnn0", "rf", "svm", "svm-session")
+    protocols = ("--protocol", "cv", "--protocol", "session")
+    assert graspd_evaluate(*systems, *protocols, *options, "--quick", "--quiet") == 0
+    text = table.read_text()
+    assert "mean nothing" in text
+    for name in systems:
+        assert f"`{name}`" in text
+
+
+def test_what_is_finished_is_not_run_again(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["svm", "--protocol", "cv", "--data", str(data), "--out", str(tmp_path), "--json"]
+    assert graspd_evaluate(*options, "--seeds", "2") == 0
+    first = json.loads(capsys.readouterr().out)
+
+    def fail(*_: object) -> None:
+        pytest.fail("a finished job was run again")
+
+    monkeypatch.setattr(jobs, "run", fail)
+    assert graspd_evaluate(*options, "--seeds", "2") == 0
+    assert json.loads(capsys.readouterr().out) == first
+    (summary,) = first
+    assert (summary["system"], summary["protocol"], summary["seeds"]) == ("svm", "cv", [0, 1])
+    assert len(summary["variants"]["none"]["figures"]["f1"]) == 2
+    assert len(summary["variants"]["none"]["figures"]["f1"][0]) == 10
+    assert json.loads((tmp_path / "svm.cv.json").read_text()) == summary
+
+
+def test_seeds_add_to_what_is_there(data: Path, tmp_path: Path) -> None:
+    options = ["svm", "--protocol", "cv", "--data", str(data), "--out", str(tmp_path)]
+    assert graspd_evaluate(*options, "--seeds", "1") == 0
+    assert len(list((tmp_path / "jobs").iterdir())) == 10
+    assert graspd_evaluate(*options, "--seeds", "2") == 0
+    assert len(list((tmp_path / "jobs").iterdir())) == 20
+
+
+def test_a_grid_names_the_best_of_all_its_points(
+    data: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    points = [SvmConfig(cost, gamma) for cost in (0.01, 3.0) for gamma in (1e-4, 0.01)]
+    monkeypatch.setattr(SvmConfig, "grid", staticmethod(lambda: points))
+    options = ["--grid", "--protocol", "cv", "--quick", "--data", str(data)]
+    assert graspd_evaluate("svm", "cnn1", *options, "--out", str(tmp_path)) == 0
+    report = json.loads((tmp_path / "svm.cv.grid.json").read_text())
+    assert len(report) == 4
+    figures = [point["f1"]["mean"] for point in report]
+    assert figures == sorted(figures, reverse=True)
+    assert capsys.readouterr().out.startswith(f"{report[0]['name']} cv: best of 4, F1 ")
+    assert not (tmp_path / "svm.cv.json").exists()
+
+
+def test_grids_are_the_papers() -> None:
+    machines = [system.estimator for system in grid_of(SYSTEMS["svm"])]
+    costs = [machine.c for machine in machines if isinstance(machine, SvmConfig)]
+    assert (min(costs), max(costs)) == (0.01, 5000.0)
+    names = [system.name for system in grid_of(SYSTEMS["svm"])]
+    assert len(set(names)) == len(names) == len(machines)
+    assert not any("/" in name or " " in name for name in names)
+    assert grid_of(SYSTEMS["cnn1"]) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["svn"], "no system 'svn': there are cnn0, "),
+        (["cnn1", "--grid"], "none of these systems has a grid"),
+        (["svm", "--data", "nowhere"], "nowhere: no such folder"),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(
+    data: Path,
+    tmp_path: Path,
+    arguments: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert graspd_evaluate("--data", str(data), "--out", str(tmp_path / "out"), *arguments) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"graspd evaluate: {message}")
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert not (tmp_path / "out").exists()
+
+
+def test_data_without_a_later_session_have_no_session_protocol(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for name in ("palm_down.csv", "palm_side.csv"):
+        (folder / name).write_bytes((data / name).read_bytes())
+    options = ["svm", "--data", str(folder), "--out", str(tmp_path / "out"), "--quick"]
+    assert graspd_evaluate(*options) == 2
+    assert "graspd evaluate: the data lack palm_45\n" in capsys.readouterr().err
+    assert graspd_evaluate(*options, "--protocol", "objects-whole") == 0
+
+
+def test_an_output_folder_that_is_a_file_is_exit_code_2(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    out.write_text("")
+    assert graspd_evaluate("svm", "--quick", "--data", str(data), "--out", str(out)) == 2
+    assert f"graspd evaluate: {out}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--seeds", "0"), ("--jobs", "0"), ("--jobs", "two"), ("--protocol", "all")],
+)
+def test_a_value_out_of_range_is_exit_code_2(
+    option: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        graspd_evaluate("--data", "anywhere", option, value)
+    assert caught.value.code == 2
+    assert f"argument {option}:" in capsys.readouterr().err
+
+
+def test_no_cluster_is_exit_code_1_and_says_so(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cluster = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 1)
+    options = ["--data", str(data), "--out", str(tmp_path), "--dask", "tcp://127.0.0.1:9"]
+    assert graspd_evaluate("svm", "--quick", *options) == 1
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("graspd evaluate: no Dask scheduler at tcp://127.0.0.1:9")
+
+
+def test_what_is_not_installed_is_said_before_any_training(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(evaluate, "find_spec", lambda _: None)
+    options = ["svm", "--data", str(data), "--out", str(tmp_path)]
+    assert graspd_evaluate(*options, "--plots", str(tmp_path)) == 2
+    assert graspd_evaluate(*options, "--dask", "tcp://127.0.0.1:9") == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "graspd evaluate: needs the package 'matplotlib': pip install '.[report]'",
+        "graspd evaluate: needs the package 'distributed': pip install '.[cluster]'",
+    ]
+
+
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_ctrl_c_ends_with_130_and_leaves_a_folder_to_go_on_from(
+    data: Path, tmp_path: Path, processes: str
+) -> None:
+    command = [sys.executable, "-m", "daemon", "evaluate", "mlp", "--protocol", "cv"]
+    options = ["--data", str(data), "--out", str(tmp_path), "--jobs", processes, "--seeds", "30"]
+    process = subprocess.Popen(
+        [*command, *options],
+        cwd=ROOT,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    try:
+        deadline_s = time.monotonic() + 40.0
+        while len(list(tmp_path.glob("jobs/mlp*.npz"))) < 2 and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers, too
+        _, errors = process.communicate(timeout=20.0)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 130
+    lines = [line for line in errors.splitlines() if "published" not in line]
+    assert lines == ["graspd evaluate: interrupted; the same command goes on from here"]
+    stored = list((tmp_path / "jobs").iterdir())
+    assert 2 <= len(stored) < 300
+    for path in stored:
+        jobs.JobResult.from_bytes(path.read_bytes())

@@ -1,0 +1,213 @@
+"""Grasp tables: the real ones against the facts published of them, broken ones against errors."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.bts3 import TABLES
+from models.training.data.datasets import (
+    DatasetError,
+    concatenate,
+    read_all,
+    read_new_session,
+    read_table,
+    read_whole,
+    unpublished,
+)
+from tests.models.training.training_samples import HEADER, separable_counts, write_table
+
+# Grasps, stable, slip, SHA-256: as recorded when the data was taken in.
+REAL = {
+    "palm_down": (
+        1276, 667, 609, "7abe522411416909f6c71adc37eabc17d3ee62bed5073da1297757bea951715f"
+    ),
+    "palm_side": (
+        1273, 603, 670, "79d8ce7220317f9df4061a2b983eb62bdaae56e2b4428a69a7d3369de2457a87"
+    ),
+    "palm_45": (
+        2133, 1058, 1075, "6e94f40cd6d4e33fd53fb0a3179c948d0144b57d325d7e8761365d6c4c0ae4cb"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_a_published_table_is_read_whole(bts3_dir: Path, name: str) -> None:
+    rows, stable, slip, sha256 = REAL[name]
+    path = bts3_dir / f"{name}.csv"
+    grasps = read_table(path)
+    assert len(grasps) == rows
+    assert (int((~grasps.slipped).sum()), int(grasps.slipped.sum())) == (stable, slip)
+    assert len(set(grasps.objects)) == 41
+    assert grasps.counts.dtype == np.uint16
+    assert [(file.name, file.sha256, file.rows) for file in grasps.files] == [(name, sha256, rows)]
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == sha256
+    assert unpublished(grasps.files) == []
+
+
+def test_counts_stand_by_finger_and_electrode(bts3_dir: Path) -> None:
+    grasps = read_table(bts3_dir / "palm_side.csv")
+    with (bts3_dir / "palm_side.csv").open(newline="") as file:
+        for index, row in enumerate(csv.DictReader(file)):
+            for finger, name in enumerate(("ff", "mf", "th")):
+                expected = [int(row[f"{name}_biotac_{n}"]) for n in range(1, 25)]
+                assert grasps.counts[index, finger].tolist() == expected
+            assert grasps.slipped[index] == (row["slipped"] == "1")
+
+
+def test_whole_is_palm_down_then_palm_side(bts3_dir: Path) -> None:
+    whole = read_whole(bts3_dir)
+    assert (len(whole), int(whole.slipped.sum())) == (2549, 1279)
+    assert 5 <= int(whole.counts.min()) < int(whole.counts.max()) <= 3975
+    assert [file.name for file in whole.files] == ["palm_down", "palm_side"]
+    assert np.array_equal(whole.counts[:1276], read_table(bts3_dir / "palm_down.csv").counts)
+
+
+def test_the_list_of_published_tables_agrees_with_the_record() -> None:
+    listed = {table.name: (table.rows, table.sha256) for table in TABLES}
+    assert listed == {name: (rows, sha256) for name, (rows, _, _, sha256) in REAL.items()}
+    assert [table.upstream_name for table in TABLES] == [
+        "bts3v2_palm_down.csv",
+        "bts3v2_palm_side.csv",
+        "bts3v2_palm_45.csv",
+    ]
+
+
+def _without_column(text: str) -> str:
+    return text.replace("mf_biotac_7,", "", 1)
+
+
+def _twice(text: str) -> str:
+    return text.replace("mf_biotac_7,", "mf_biotac_8,", 1)
+
+
+def _cell(column: int, value: str) -> Callable[[str], str]:
+    def change(text: str) -> str:
+        lines = text.splitlines()
+        cells = lines[2].split(",")
+        cells[column] = value
+        lines[2] = ",".join(cells)
+        return "\n".join(lines) + "\n"
+
+    return change
+
+
+BROKEN: list[tuple[str, Callable[[str], str], str]] = [
+    ("empty file", lambda _: "", "line 1, column object: column is missing"),
+    ("no grasp", lambda text: text.splitlines()[0], "has no grasps"),
+    ("column missing", _without_column, "line 1, column mf_biotac_7: column is missing"),
+    ("column twice", _twice, "line 1, column mf_biotac_7: column is missing"),
+    ("row cut off", lambda text: text[:-40], "line 7: has "),
+    ("value too many", _cell(73, "1,2"), "line 3: has 75 values, not 74"),
+    ("no object", _cell(0, ""), "line 3, column object: object has no name"),
+    ("slip not 0 or 1", _cell(1, "yes"), "line 3, column slipped: 'yes' is not 0 or 1"),
+    ("slip empty", _cell(1, ""), "line 3, column slipped: '' is not 0 or 1"),
+    ("not 12 bit", _cell(2, "4096"), "line 3, column ff_biotac_1: '4096' is not a count (0..4095)"),
+    ("negative", _cell(26, "-1"), "line 3, column mf_biotac_1: '-1' is not a count (0..4095)"),
+    ("missing value", _cell(73, ""), "line 3, column th_biotac_24: '' is not a count (0..4095)"),
+    ("a float", _cell(5, "12.5"), "line 3, column ff_biotac_4: '12.5' is not a count (0..4095)"),
+    ("not a number", _cell(5, "nan"), "line 3, column ff_biotac_4: 'nan' is not a count (0..4095)"),
+    ("python's own", _cell(5, "1_0"), "line 3, column ff_biotac_4: '1_0' is not a count (0..4095)"),
+    ("huge", _cell(5, "9" * 5000), "line 3, column ff_biotac_4: '99999999999999999999' is not a"),
+    ("open quote", _cell(0, '"ball'), "is not a table"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), [case[1:] for case in BROKEN], ids=lambda _: "")
+def test_a_broken_table_is_one_clear_line(
+    tmp_path: Path, change: Callable[[str], str], message: str
+) -> None:
+    path = tmp_path / "palm_down.csv"
+    write_table(path, *separable_counts(6))
+    path.write_text(change(path.read_text()))
+    with pytest.raises(DatasetError) as caught:
+        read_table(path)
+    assert str(caught.value).startswith(f"{path}")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_column_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "palm_down.csv"
+    path.write_text(",".join([*HEADER, "slipped"]) + "\n")
+    with pytest.raises(DatasetError, match="column slipped: column is there more than once"):
+        read_table(path)
+
+
+def test_columns_may_stand_in_another_order(tmp_path: Path) -> None:
+    counts, slipped = separable_counts(6)
+    path = tmp_path / "palm_down.csv"
+    write_table(path, counts, slipped)
+    lines = [",".join(reversed(line.split(","))) for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines) + "\n")
+    grasps = read_table(path)
+    assert np.array_equal(grasps.counts, counts)
+    assert np.array_equal(grasps.slipped, slipped)
+
+
+def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "palm_down.csv"
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DatasetError, match="is not text"):
+        read_table(path)
+
+
+def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="nowhere: no such folder"):
+        read_whole(tmp_path / "nowhere")
+    with pytest.raises(DatasetError, match=r"palm_down\.csv: cannot read: No such file"):
+        read_whole(tmp_path)
+    assert read_new_session(tmp_path) is None
+
+
+def test_a_table_with_other_bytes_is_known_as_not_published(tmp_path: Path) -> None:
+    for name in ("palm_down", "palm_side"):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6))
+    assert unpublished(read_whole(tmp_path).files) == ["palm_down", "palm_side"]
+
+
+def test_all_tables_know_which_grasp_is_theirs(bts3_dir: Path) -> None:
+    grasps = read_all(bts3_dir)
+    assert len(grasps) == 1276 + 1273 + 2133
+    assert np.bincount(grasps.table_of).tolist() == [1276, 1273, 2133]
+    assert [file.name for file in grasps.files] == ["palm_down", "palm_side", "palm_45"]
+
+
+def test_without_a_later_session_all_is_whole(tmp_path: Path) -> None:
+    for name in ("palm_down", "palm_side"):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6))
+    assert len(read_all(tmp_path)) == 12
+
+
+def test_some_rows_keep_counts_labels_objects_and_tables_together(tmp_path: Path) -> None:
+    for seed, name in enumerate(("palm_down", "palm_side")):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
+    whole = read_whole(tmp_path)
+    some = whole.rows(np.array([1, 5, 7]))
+    assert np.array_equal(some.counts, whole.counts[[1, 5, 7]])
+    assert some.slipped.tolist() == [True, True, True]
+    assert some.table_of.tolist() == [0, 0, 1]
+    assert [file.rows for file in some.files] == [2, 1]
+    assert some.digest() != whole.digest()
+    assert whole.rows(np.arange(12)).digest() == whole.digest()
+
+
+def test_the_digest_of_grasps_is_of_counts_labels_objects_and_tables(tmp_path: Path) -> None:
+    for seed, name in enumerate(("palm_down", "palm_side")):
+        write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))
+    down, side = (read_table(tmp_path / f"{name}.csv") for name in ("palm_down", "palm_side"))
+    digests = {
+        concatenate([down, side]).digest(),
+        concatenate([side, down]).digest(),
+        dataclasses.replace(down, slipped=~down.slipped).digest(),
+        dataclasses.replace(down, objects=("cup",) * 6).digest(),
+        dataclasses.replace(down, counts=down.counts + np.uint16(1)).digest(),
+        down.digest(),
+    }
+    assert len(digests) == 6

@@ -1,0 +1,172 @@
+"""Splits: sizes as published, nothing on both sides, every grasp judged once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn", reason="the train extra is not installed")
+
+from models.training.data.datasets import Grasps, concatenate, read_all
+from models.training.data.folds import TooFewGraspsError, fold_seed, object_folds
+from models.training.data.protocols import (
+    ABOUT,
+    PROTOCOLS,
+    UNKNOWN_OBJECTS,
+    Protocol,
+    splits,
+)
+from tests.models.training.evaluation_samples import OBJECTS, sessions, table
+
+GROUPED: tuple[Protocol, ...] = ("objects", "objects-whole", "session")
+# Grasps that each protocol judges, from the paper and the tables' own row counts.
+JUDGED: dict[Protocol, int] = {
+    "cv": 2549,
+    "unknown": 485,
+    "objects": 4682,
+    "objects-whole": 2549,
+    "session": 2133,
+    "cv-palm-down": 1276,
+    "cv-palm-side": 1273,
+}
+
+
+@pytest.fixture(scope="module")
+def real(bts3_dir: Path) -> Grasps:
+    return read_all(bts3_dir)
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+def test_every_grasp_of_a_protocol_is_judged_once_by_who_never_saw_it(
+    real: Grasps, protocol: Protocol
+) -> None:
+    made = splits(protocol, real, seed=3)
+    judged = np.concatenate([split.test for split in made])
+    assert len(judged) == len(set(judged.tolist())) == JUDGED[protocol]
+    for split in made:
+        assert not set(split.test.tolist()) & set(split.train.tolist())
+        assert (np.diff(split.test) > 0).all()
+        assert (np.diff(split.train) > 0).all()
+
+
+def test_known_objects_are_ten_even_stratified_folds_of_whole(real: Grasps) -> None:
+    made = splits("cv", real, seed=0)
+    assert len(made) == 10
+    assert {len(split.test) for split in made} == {254, 255}
+    assert all(split.test.max() < 2549 and split.train.max() < 2549 for split in made)
+    assert all(127 <= real.slipped[split.test].sum() <= 128 for split in made)
+
+
+def test_unknown_objects_are_the_papers_485_of_2549(real: Grasps) -> None:
+    (split,) = splits("unknown", real, seed=0)
+    assert (len(split.train), len(split.test)) == (2064, 485)
+    assert {real.objects[row] for row in split.test} == UNKNOWN_OBJECTS
+    assert not {real.objects[row] for row in split.train} & UNKNOWN_OBJECTS
+    (other,) = splits("unknown", real, seed=7)
+    assert np.array_equal(other.test, split.test)
+
+
+@pytest.mark.parametrize("protocol", GROUPED)
+def test_no_object_is_on_both_sides(real: Grasps, protocol: Protocol) -> None:
+    for split in splits(protocol, real, seed=1):
+        judged = {real.objects[row] for row in split.test}
+        assert 4 <= len(judged) <= 5  # 41 objects in 10 groups
+        assert not judged & {real.objects[row] for row in split.train}
+
+
+def test_a_session_is_judged_by_other_days_and_calibrated_by_other_objects(real: Grasps) -> None:
+    for split in splits("session", real, seed=0):
+        assert set(real.table_of[split.train].tolist()) == {0, 1}
+        assert set(real.table_of[split.test].tolist()) == {2}
+        assert split.calibration is not None
+        assert set(real.table_of[split.calibration].tolist()) == {2}
+        assert len(split.calibration) + len(split.test) == 2133
+        calibrating = {real.objects[row] for row in split.calibration}
+        assert not calibrating & {real.objects[row] for row in split.test}
+
+
+def test_only_a_session_has_grasps_to_calibrate_with(real: Grasps) -> None:
+    for protocol in PROTOCOLS:
+        made = splits(protocol, real, seed=0)
+        assert all((split.calibration is not None) == (protocol == "session") for split in made)
+
+
+@pytest.mark.parametrize("protocol", ["cv", *GROUPED])
+def test_the_seed_alone_decides_the_split(protocol: Protocol) -> None:
+    grasps = sessions(200)
+    first, again, other = (splits(protocol, grasps, seed) for seed in (0, 0, 1))
+    for one, two in zip(first, again, strict=True):
+        assert np.array_equal(one.test, two.test)
+    assert any(
+        not np.array_equal(one.test, two.test) for one, two in zip(first, other, strict=True)
+    )
+
+
+def test_objects_are_dealt_evenly_and_differently_by_each_seed() -> None:
+    names = [name for name in OBJECTS for _ in range(5)]
+    fold_of = object_folds(names, 4, seed=0)
+    assert Counter(fold_of.tolist()) == {0: 25, 1: 25, 2: 25, 3: 25}
+    for name in OBJECTS:
+        assert len(set(fold_of[[other == name for other in names]].tolist())) == 1
+    assert not np.array_equal(fold_of, object_folds(names, 4, seed=1))
+
+
+def test_the_order_of_the_rows_does_not_move_an_object_to_another_fold() -> None:
+    assert np.array_equal(object_folds(OBJECTS, 4, 0)[::-1], object_folds(OBJECTS[::-1], 4, 0))
+
+
+def test_more_folds_than_objects_are_refused() -> None:
+    with pytest.raises(TooFewGraspsError, match="21 folds need 21 objects, there are 20"):
+        splits("objects-whole", sessions(100), seed=0, folds=21)
+
+
+@pytest.mark.parametrize("protocol", ["objects", "session"])
+def test_a_protocol_whose_table_is_missing_is_refused(protocol: Protocol) -> None:
+    with pytest.raises(TooFewGraspsError, match="the data lack palm_side"):
+        splits(protocol, table("palm_down", 40, 0), seed=0)
+
+
+def test_a_table_of_ones_own_is_dealt_out_like_a_published_one() -> None:
+    whole = [table("palm_down", 100, 0), table("palm_side", 100, 1)]
+    published = splits("objects", concatenate([*whole, table("palm_45", 100, 2)]), seed=0)
+    own = splits("objects-whole", concatenate([*whole, table("lab", 100, 2)]), seed=0)
+    for one, other in zip(published, own, strict=True):
+        assert np.array_equal(one.train, other.train)
+        assert np.array_equal(one.test, other.test)
+
+
+@pytest.mark.parametrize("protocol", ["cv", "objects", "objects-whole"])
+def test_tables_of_ones_own_alone_are_all_that_there_is(protocol: Protocol) -> None:
+    grasps = concatenate([table("monday", 100, 0), table("friday", 60, 1)])
+    judged = np.concatenate([split.test for split in splits(protocol, grasps, seed=0)])
+    assert sorted(judged.tolist()) == list(range(160))
+
+
+@pytest.mark.parametrize("protocol", ["unknown", "session", "cv-palm-down", "cv-palm-side"])
+def test_figures_of_published_tables_take_no_other(protocol: Protocol) -> None:
+    alone = splits(protocol, sessions(100), seed=0)
+    beside = splits(protocol, concatenate([sessions(100), table("lab", 100, 3)]), seed=0)
+    for one, other in zip(alone, beside, strict=True):
+        assert np.array_equal(one.train, other.train)
+        assert np.array_equal(one.test, other.test)
+    with pytest.raises(TooFewGraspsError, match="the data lack palm_"):
+        splits(protocol, table("lab", 100, 3), seed=0)
+
+
+def test_data_without_the_papers_unknown_objects_are_refused() -> None:
+    grasps = sessions(100)
+    known = [index for index, name in enumerate(grasps.objects) if name not in UNKNOWN_OBJECTS]
+    with pytest.raises(TooFewGraspsError, match="lack the objects that the paper leaves out"):
+        splits("unknown", grasps.rows(np.array(known)), seed=0)
+
+
+def test_each_fold_of_each_seed_trains_from_another_start() -> None:
+    assert len({fold_seed(seed, fold) for seed in range(10) for fold in range(10)}) == 100
+
+
+def test_every_protocol_is_explained() -> None:
+    assert set(ABOUT) == set(get_args(Protocol)) == set(PROTOCOLS)

@@ -1,0 +1,112 @@
+"""Classifiers of scikit-learn behind one function."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn", reason="the train extra is not installed")
+
+from models.inputs import VectorBuilder
+from models.training.estimators.classical import (
+    BoostingConfig,
+    ClassicalConfig,
+    ForestConfig,
+    MlpConfig,
+    SvmConfig,
+    classical_margins,
+    classical_size,
+    fit_classical,
+)
+from tests.models.training.training_samples import separable_counts
+
+COUNTS, SLIPPED = separable_counts(120)
+VECTORS = VectorBuilder(3).build_batch(COUNTS)[0]
+KINDS: list[ClassicalConfig] = [
+    SvmConfig(3.0, 0.01),
+    SvmConfig(3.0, "auto"),
+    ForestConfig(11, None),
+    ForestConfig(11, 2),
+    MlpConfig((8,), epochs=40),
+    BoostingConfig(iterations=20, leaves=4),
+]
+
+
+@pytest.mark.parametrize("config", KINDS)
+def test_a_positive_margin_says_slip(config: ClassicalConfig) -> None:
+    counts, slipped = separable_counts(60, seed=9)
+    vectors = VectorBuilder(3).build_batch(counts)[0]
+    model = fit_classical(config, VECTORS, SLIPPED, seed=0)
+    margins = classical_margins(model, vectors)
+    assert margins.dtype == np.float64
+    assert ((margins > 0.0) == slipped).all()
+    assert classical_margins(model, vectors[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("config", KINDS)
+def test_the_same_seed_gives_the_same_margins(config: ClassicalConfig) -> None:
+    once, again = (
+        classical_margins(fit_classical(config, VECTORS, SLIPPED, seed=2), VECTORS)
+        for _ in range(2)
+    )
+    assert np.array_equal(once, again)
+
+
+def test_an_svm_decides_by_the_radial_kernel() -> None:
+    model = fit_classical(SvmConfig(3.0, "auto"), VECTORS, SLIPPED, seed=0)
+    vectors = model.support_vectors_  # type: ignore[attr-defined]
+    weights, bias = model.dual_coef_[0], model.intercept_[0]  # type: ignore[attr-defined]
+    for reading, margin in zip(VECTORS[:10], classical_margins(model, VECTORS[:10]), strict=True):
+        distance = ((vectors - reading) ** 2).sum(axis=1)
+        expected = (weights * np.exp(-distance / 72.0)).sum() + bias
+        assert margin == pytest.approx(expected, abs=1e-9)
+    assert classical_size(model) == vectors.size + len(vectors) + 1
+
+
+def test_a_forest_of_one_mind_has_a_finite_margin() -> None:
+    """All trees agree: 0.999 and 0.001, log-odds 6.9068."""
+    model = fit_classical(ForestConfig(11, None), VECTORS, SLIPPED, seed=0)
+    assert np.abs(classical_margins(model, VECTORS)).max() == pytest.approx(6.90675, abs=1e-4)
+
+
+def test_a_perceptron_counts_its_weights_and_keeps_large_margins() -> None:
+    model = fit_classical(MlpConfig((8, 4), epochs=300), VECTORS, SLIPPED, seed=0)
+    assert classical_size(model) == 72 * 8 + 8 + 8 * 4 + 4 + 4 + 1
+    margins = classical_margins(model, 20.0 * VECTORS)
+    assert np.isfinite(margins).all()
+    assert np.abs(margins).max() > 40.0  # where a probability in double precision is 1
+    slip = model.predict_proba(VECTORS)[:, 1]  # type: ignore[attr-defined]
+    expected = np.log(slip / (1.0 - slip))
+    assert classical_margins(model, VECTORS) == pytest.approx(expected, rel=1e-2)
+
+
+def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
+    """Nine in ten grasps slip: a stable grasp may pull nine times as hard."""
+    random = np.random.default_rng(0)
+    inputs = random.normal(size=(400, 72)).astype(np.float32)
+    slipped = np.arange(400) % 10 > 0
+    model = fit_classical(SvmConfig(0.01, 0.0001), inputs, slipped, seed=0)
+    weights = np.abs(model.dual_coef_[0])  # type: ignore[attr-defined]
+    assert weights.max() / weights.min() == pytest.approx(9.0, rel=0.01)
+
+
+def test_grids_cover_what_the_paper_searched() -> None:
+    costs = {config.c for config in SvmConfig.grid()}
+    gammas = {config.gamma for config in SvmConfig.grid()}
+    assert (min(costs), max(costs)) == (0.01, 5000.0)
+    assert "auto" in gammas
+    numbers = [gamma for gamma in gammas if not isinstance(gamma, str)]
+    assert (min(numbers), max(numbers)) == (1e-4, 0.1)
+    depths = {config.depth for config in ForestConfig.grid()}
+    assert {None, 5, 30} <= depths
+    assert all(10 <= config.trees <= 200 for config in ForestConfig.grid())
+    for grid in (SvmConfig.grid(), ForestConfig.grid(), MlpConfig.grid(), BoostingConfig.grid()):
+        assert len(set(grid)) == len(grid) > 5
+
+
+def test_images_and_a_single_class_are_refused() -> None:
+    images, slipped = np.zeros((4, 12, 11, 3), np.float32), np.ones(120, np.bool_)
+    with pytest.raises(ValueError, match="takes vectors"):
+        fit_classical(SvmConfig(1.0, 0.1), images, SLIPPED[:4], seed=0)
+    with pytest.raises(ValueError, match="one class"):
+        fit_classical(SvmConfig(1.0, 0.1), VECTORS, slipped, seed=0)

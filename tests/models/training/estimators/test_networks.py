@@ -1,0 +1,245 @@
+"""The networks: sizes, shapes, order of axes, folding for inference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+
+import torch
+from torch import nn
+
+from models.layout import D1
+from models.tactile_image import TactileImager
+from models.training.estimators.networks import (
+    CNN0,
+    CNN1,
+    CNN2,
+    CNN3,
+    Beside,
+    DenseConfig,
+    NetworkConfig,
+    SecondConvolution,
+    build,
+    for_inference,
+    for_margin,
+    parameter_count,
+)
+from models.training.estimators.recipe import logits, reproducible
+from tests.models.training.training_samples import separable_counts
+
+TINY = NetworkConfig(filters=4, hidden=16)
+DEEP = NetworkConfig(
+    filters=4, hidden=8, pool=True, second=SecondConvolution(5, kernel=3), dropout=0.4
+)
+PLAIN = NetworkConfig(filters=4, hidden=8, batch_norm=False)
+IMAGE, FEATURES, VECTOR = (12, 11, 3), (78,), (72,)
+
+
+@pytest.fixture(scope="module")
+def images() -> NDArray[np.float32]:
+    return TactileImager(3).build_batch(separable_counts(160)[0])[0]
+
+
+def _unsettled(config: NetworkConfig | DenseConfig, shape: tuple[int, ...]) -> nn.Sequential:
+    """A network in evaluation mode, no parameter of which has its neutral value."""
+    with reproducible(seed=3):
+        network = build(config, shape)
+        for layer in network.modules():
+            if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d):
+                nn.init.uniform_(layer.weight, 0.5, 2.0)
+                nn.init.normal_(layer.bias)
+                assert layer.running_mean is not None
+                assert layer.running_var is not None
+                nn.init.normal_(layer.running_mean)
+                nn.init.uniform_(layer.running_var, 0.5, 2.0)
+            elif isinstance(layer, nn.Conv2d | nn.Linear) and layer.bias is not None:
+                nn.init.normal_(layer.bias)
+    return network.eval()
+
+
+@pytest.mark.parametrize(
+    ("config", "shape", "parameters"),
+    [
+        (CNN1, IMAGE, 2_955_170),  # the published network
+        # convolution + its norm + hidden layer + its norm + last layer, by hand
+        (CNN0, IMAGE, 864 + 64 + (2880 * 128 + 128) + 256 + 258),
+        (CNN2, IMAGE, 864 + 64 + (640 * 1024 + 1024) + 2048 + 2050),
+        (CNN3, IMAGE, 864 + 64 + (32 * 64 + 128) + (1280 * 1024 + 1024) + 2048 + 2050),
+        (
+            NetworkConfig(32, 1024, pool=True, second=SecondConvolution(64, kernel=3)),
+            IMAGE,
+            864 + 64 + (32 * 64 * 9 + 128) + (384 * 1024 + 1024) + 2048 + 2050,
+        ),
+        (CNN0, (12, 33, 1), 288 + 64 + (10 * 31 * 32 * 128 + 128) + 256 + 258),
+        (CNN0, (36, 11, 1), 288 + 64 + (34 * 9 * 32 * 128 + 128) + 256 + 258),
+        (CNN0, (6, 5, 3), 864 + 64 + (4 * 3 * 32 * 128 + 128) + 256 + 258),
+        (CNN0, (4, 7, 3), 864 + 64 + (2 * 5 * 32 * 128 + 128) + 256 + 258),
+        (NetworkConfig(16, 64), FEATURES, 432 + 32 + (1446 * 64 + 64) + 128 + 130),
+        (NetworkConfig(8, 32), VECTOR, 216 + 16 + (720 * 32 + 32) + 64 + 66),
+        (NetworkConfig(8, 32, batch_norm=False), IMAGE, 216 + 8 + (720 * 32 + 32) + 66),
+        (DenseConfig((64, 32)), FEATURES, (78 * 64 + 64) + 128 + (64 * 32 + 32) + 64 + 66),
+    ],
+)
+def test_a_network_has_the_parameters_of_its_layers(
+    config: NetworkConfig | DenseConfig, shape: tuple[int, ...], parameters: int
+) -> None:
+    network = build(config, shape).eval()
+    assert parameter_count(network) == parameters
+    assert network(torch.zeros(2, *shape)).shape == (2, 2)
+
+
+@pytest.mark.parametrize(
+    ("config", "shape", "problem"),
+    [
+        (
+            NetworkConfig(4, 8, pool=True, second=SecondConvolution(kernel=3)),
+            (4, 7, 3),
+            "too small",
+        ),
+        (TINY, (2, 5, 3), "too small"),
+        (TINY, (77,), "not those of whole fingers"),
+    ],
+)
+def test_a_network_that_does_not_fit_its_input_is_refused(
+    config: NetworkConfig, shape: tuple[int, ...], problem: str
+) -> None:
+    with pytest.raises(ValueError, match=problem):
+        build(config, shape)
+
+
+def test_weights_start_as_in_keras() -> None:
+    with reproducible(seed=0):
+        network = build(CNN1)
+    fans = {(32, 3, 3, 3): 27 + 288, (1024, 2880): 2880 + 1024, (2, 1024): 1024 + 2}
+    for layer in network:
+        if isinstance(layer, nn.Conv2d | nn.Linear):
+            weight = layer.weight.detach().numpy()
+            limit = (6 / fans[weight.shape]) ** 0.5
+            assert np.abs(weight).max() <= limit
+            assert weight.std() == pytest.approx(limit / 3**0.5, rel=0.05)
+            assert layer.bias is None or not layer.bias.any()
+        if isinstance(layer, nn.BatchNorm2d | nn.BatchNorm1d):
+            assert layer.eps == 1e-3
+
+
+@pytest.mark.parametrize("finger", [0, 1, 2])
+def test_each_finger_is_one_input_channel(finger: int, images: NDArray[np.float32]) -> None:
+    with reproducible(seed=2):
+        network = build(TINY).eval()
+    convolution = network[1]
+    assert isinstance(convolution, nn.Conv2d)
+    with torch.no_grad():
+        convolution.weight[:, [other for other in range(3) if other != finger]] = 0.0
+    before = logits(network, images)
+    for changed in range(3):
+        other = images.copy()
+        other[..., changed] = images[::-1, ..., changed]
+        assert np.array_equal(logits(network, other), before) == (changed != finger)
+
+
+def test_rows_and_columns_are_not_swapped(images: NDArray[np.float32]) -> None:
+    """One filter that passes one pixel on shows where the convolution finds it."""
+    with reproducible(seed=2):
+        network = build(TINY).eval()
+    convolution = network[1]
+    assert isinstance(convolution, nn.Conv2d)
+    with torch.no_grad():
+        convolution.weight.zero_()
+        convolution.weight[0, 2, 0, 1] = 1.0  # thumb, the row above the centre
+        seen = network[:2](torch.from_numpy(images))[:, 0].numpy()
+    assert seen.shape == (160, 10, 9)
+    assert np.array_equal(seen, images[:, 0:10, 1:10, 2])
+
+
+def _convolve(planes: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Valid correlation of (channels, h, w) with (filters, channels, k, k), by loops."""
+    side = weights.shape[-1]
+    height, width = planes.shape[1] - side + 1, planes.shape[2] - side + 1
+    out = np.empty((len(weights), height, width))
+    for row in range(height):
+        for column in range(width):
+            window = planes[:, row : row + side, column : column + side]
+            out[:, row, column] = np.tensordot(weights, window, 3)
+    return out
+
+
+def _normed(
+    values: NDArray[np.float64], tensors: dict[str, NDArray[np.float64]], name: str
+) -> NDArray[np.float64]:
+    """Batch norm, then ReLU."""
+    aside = (-1, *(1,) * (values.ndim - 1))
+    mean, variance = tensors[f"{name}.running_mean"], tensors[f"{name}.running_var"]
+    scale = tensors[f"{name}.weight"] / np.sqrt(variance + 1e-3)
+    shifted = (values - mean.reshape(aside)) * scale.reshape(aside)
+    return np.maximum(shifted + tensors[f"{name}.bias"].reshape(aside), 0.0)
+
+
+def test_a_deep_network_computes_what_its_layers_say(images: NDArray[np.float32]) -> None:
+    """The same in numpy: convolution, norm, ReLU, pooling, convolution, norm, ReLU, dense."""
+    network = _unsettled(DEEP, IMAGE)
+    tensors = {name: tensor.double().numpy() for name, tensor in network.state_dict().items()}
+    expected = []
+    for image in images[:5]:
+        seen = _normed(_convolve(image.transpose(2, 0, 1), tensors["1.weight"]), tensors, "2")
+        assert seen.shape == (4, 10, 9)
+        pooled = seen[:, :10, :8].reshape(4, 5, 2, 4, 2).max(axis=(2, 4))
+        seen = _normed(_convolve(pooled, tensors["5.weight"]), tensors, "6")
+        hidden = tensors["10.weight"] @ seen.ravel() + tensors["10.bias"]
+        hidden = _normed(hidden, tensors, "11")
+        expected.append(tensors["14.weight"] @ hidden + tensors["14.bias"])
+    assert logits(network, images[:5]) == pytest.approx(np.array(expected), rel=1e-4, abs=1e-4)
+
+
+def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
+    """The image is filled here by loops: twice the mean of the known neighbours."""
+    features = np.random.default_rng(5).normal(size=(3, 78)).astype(np.float32)
+    network = _unsettled(NetworkConfig(filters=4, hidden=8), FEATURES)
+    beside = network[0]
+    assert isinstance(beside, Beside)
+    front = beside.look[0](torch.from_numpy(features[:, :72])).numpy()
+    assert front.shape == (3, 3, 12, 11)
+    for finger in range(3):
+        image = np.full((12, 11), np.nan)
+        image[list(D1.rows), list(D1.columns)] = features[1, 24 * finger : 24 * finger + 24]
+        for _ in range(2):
+            known = image.copy()
+            for row, column in np.argwhere(np.isnan(known)):
+                window = known[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+                if not np.isnan(window).all():
+                    image[row, column] = np.nanmean(window)
+        assert front[1, finger] == pytest.approx(image, abs=1e-5)
+    laid = beside(torch.from_numpy(features)).detach().numpy()
+    assert laid.shape == (3, 4 * 90 + 6)
+    assert np.array_equal(laid[:, -6:], features[:, 72:])
+
+
+@pytest.mark.parametrize(
+    ("config", "shape"),
+    [
+        (DEEP, IMAGE),
+        (PLAIN, IMAGE),
+        (NetworkConfig(4, 8, dropout=0.5), FEATURES),
+        (DenseConfig((9, 5), dropout=0.5), VECTOR),
+        (DenseConfig((9,), batch_norm=False), FEATURES),
+    ],
+)
+@pytest.mark.parametrize("temperature", [0.5, 2.5])
+def test_folding_batch_norm_and_temperature_changes_no_probability(
+    config: NetworkConfig | DenseConfig, shape: tuple[int, ...], temperature: float
+) -> None:
+    inputs = np.random.default_rng(6).normal(size=(50, *shape)).astype(np.float32)
+    network = _unsettled(config, shape)
+    layers = len(network)
+    folded = for_inference(network, temperature)
+    assert not any(
+        word in type(layer).__name__ for layer in folded.modules() for word in ("Norm", "Drop")
+    )
+    scaled = np.exp(logits(network, inputs) / temperature)
+    expected = scaled / scaled.sum(axis=1, keepdims=True)
+    assert np.abs(logits(folded, inputs) - expected).max() < 1e-5
+    assert len(network) == layers, "the trained network itself must stay as it is"
+    stable, slip = logits(network, inputs).T
+    assert logits(for_margin(network), inputs)[:, 0] == pytest.approx(slip - stable, abs=1e-4)

@@ -1,0 +1,232 @@
+"""How networks are trained: seeds, schedules, the published recipe against its formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+
+import torch
+from torch import nn
+
+from models.inputs import VectorBuilder
+from models.tactile_image import TactileImager
+from models.training.estimators.networks import DenseConfig, NetworkConfig, build
+from models.training.estimators.recipe import (
+    PublishedRecipe,
+    Recipe,
+    logits,
+    optimization,
+    reproducible,
+    train,
+)
+from tests.models.training.training_samples import separable_counts
+
+TINY = NetworkConfig(filters=4, hidden=16)
+QUICK = Recipe(epochs=4)
+PLAIN = DenseConfig((5,), batch_norm=False)
+
+
+@pytest.fixture(scope="module")
+def images() -> NDArray[np.float32]:
+    return TactileImager(3).build_batch(separable_counts(160)[0])[0]
+
+
+@pytest.fixture(scope="module")
+def vectors() -> NDArray[np.float32]:
+    return VectorBuilder(3).build_batch(separable_counts(160)[0])[0]
+
+
+@pytest.fixture(scope="module")
+def slipped() -> NDArray[np.bool_]:
+    return separable_counts(160)[1]
+
+
+@pytest.fixture(scope="module")
+def trained(images: NDArray[np.float32], slipped: NDArray[np.bool_]) -> nn.Sequential:
+    return train(TINY, images, slipped, QUICK, seed=1)
+
+
+def _weights(network: nn.Sequential) -> list[float]:
+    return [value for tensor in network.state_dict().values() for value in tensor.ravel().tolist()]
+
+
+def test_a_tiny_training_learns_what_can_be_separated(
+    trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    counts, labels = separable_counts(100, seed=8)
+    unseen = TactileImager(3).build_batch(counts)[0]
+    assert ((logits(trained, images).argmax(axis=1) == 1) == slipped).all()
+    assert ((logits(trained, unseen).argmax(axis=1) == 1) == labels).all()
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_gives_others(
+    trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    torch.manual_seed(99)  # the state around a training does not matter
+    assert _weights(train(TINY, images, slipped, QUICK, seed=1)) == _weights(trained)
+    assert _weights(train(TINY, images, slipped, QUICK, seed=2)) != _weights(trained)
+
+
+def test_training_leaves_torch_as_it_was(
+    images: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    threads, state = torch.get_num_threads(), torch.random.get_rng_state()
+    train(TINY, images, slipped, Recipe(epochs=1, threads=threads + 1), seed=1)
+    assert torch.get_num_threads() == threads
+    assert not torch.are_deterministic_algorithms_enabled()
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("recipe", [QUICK, PublishedRecipe(epochs=4)])
+def test_every_epoch_is_reported(
+    images: NDArray[np.float32], slipped: NDArray[np.bool_], recipe: Recipe | PublishedRecipe
+) -> None:
+    epochs: list[None] = []
+    train(TINY, images, slipped, recipe, seed=1, on_epoch=lambda: epochs.append(None))
+    assert len(epochs) == 4
+
+
+@pytest.mark.parametrize("grasps", [0, 1])
+def test_training_on_less_than_two_grasps_is_refused(
+    grasps: int, images: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    with pytest.raises(ValueError, match=f"cannot train on {grasps} grasps"):
+        train(TINY, images[:grasps], slipped[:grasps], QUICK, seed=1)
+
+
+def test_the_published_recipe_updates_as_keras_does(
+    vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    """Forward, backward, L2 loss term, Adam and time decay of Keras 2.0.8, in numpy."""
+    recipe = PublishedRecipe(epochs=6, batch=160, learning_rate=0.01, decay=0.5, l2=0.03)
+    network = train(PLAIN, vectors, slipped, recipe, seed=4)
+    with reproducible(seed=4):
+        start = build(PLAIN, (72,))
+    weights = [tensor.detach().double().numpy().copy() for tensor in start.parameters()]
+    first = [np.zeros_like(weight) for weight in weights]
+    second = [np.zeros_like(weight) for weight in weights]
+    inputs, truth = vectors.astype(np.float64), np.eye(2)[slipped.astype(np.int64)]
+    for update in range(6):
+        w1, b1, w2, b2 = weights
+        before = inputs @ w1.T + b1
+        hidden = np.maximum(before, 0.0)
+        odds = np.exp(hidden @ w2.T + b2)
+        error = (odds / odds.sum(axis=1, keepdims=True) - truth) / len(truth)
+        back = error @ w2 * (before > 0.0)
+        gradients = [
+            back.T @ inputs + 2.0 * 0.03 * w1,  # of 0.03 * sum(w1**2)
+            back.sum(axis=0),
+            error.T @ hidden,
+            error.sum(axis=0),
+        ]
+        rate = 0.01 / (1.0 + 0.5 * update)
+        step = rate * np.sqrt(1.0 - 0.999 ** (update + 1)) / (1.0 - 0.9 ** (update + 1))
+        for place, gradient in enumerate(gradients):
+            first[place] = 0.9 * first[place] + 0.1 * gradient
+            second[place] = 0.999 * second[place] + 0.001 * gradient**2
+            weights[place] = weights[place] - step * first[place] / (np.sqrt(second[place]) + 1e-8)
+    for tensor, expected in zip(network.parameters(), weights, strict=True):
+        assert tensor.detach().numpy() == pytest.approx(expected, abs=2e-4)
+
+
+def test_the_published_recipe_is_the_published_one() -> None:
+    recipe = PublishedRecipe()
+    assert (recipe.epochs, recipe.batch) == (300, 32)
+    assert (recipe.learning_rate, recipe.decay, recipe.l2) == (1e-4, 0.005, 0.01)
+
+
+@pytest.mark.parametrize(("recipe", "momentum"), [(Recipe(), 0.1), (PublishedRecipe(), 0.01)])
+def test_batch_norm_remembers_as_the_recipe_says(
+    recipe: Recipe | PublishedRecipe,
+    momentum: float,
+    vectors: NDArray[np.float32],
+    slipped: NDArray[np.bool_],
+) -> None:
+    once = (
+        Recipe(epochs=1, batch=160)
+        if isinstance(recipe, Recipe)
+        else PublishedRecipe(epochs=1, batch=160)
+    )
+    config = DenseConfig((5,))
+    with reproducible(seed=4):
+        start = next(build(config, (72,)).parameters())
+    first = vectors.astype(np.float64) @ start.detach().double().numpy().T
+    norm = train(config, vectors, slipped, once, seed=4)[1]
+    assert isinstance(norm, nn.BatchNorm1d)
+    assert norm.running_mean is not None
+    assert norm.running_mean.numpy() == pytest.approx(momentum * first.mean(axis=0), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "grasps", "seen"),
+    [
+        (Recipe(epochs=1), 80, 64),  # a remainder would disturb the batch norm
+        (PublishedRecipe(epochs=1), 80, 80),  # as Keras does
+        (PublishedRecipe(epochs=1), 65, 64),  # no batch norm of one grasp
+        (Recipe(epochs=1), 20, 20),
+    ],
+)
+def test_an_epoch_sees_each_grasp_at_most_once(
+    recipe: Recipe | PublishedRecipe,
+    grasps: int,
+    seen: int,
+    vectors: NDArray[np.float32],
+    slipped: NDArray[np.bool_],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    batches: list[torch.Tensor] = []
+    plain = nn.CrossEntropyLoss.forward
+
+    def counting(
+        self: nn.CrossEntropyLoss, given: torch.Tensor, target: torch.Tensor
+    ) -> torch.Tensor:
+        batches.append(target)
+        return plain(self, given, target)
+
+    monkeypatch.setattr(nn.CrossEntropyLoss, "forward", counting)
+    numbers = np.arange(grasps) / grasps
+    train(DenseConfig((3,)), vectors[:grasps], numbers, recipe, seed=0)
+    values = torch.cat(batches)[:, 1].tolist()
+    assert len(values) == len(set(values)) == seen
+
+
+def test_targets_may_be_probabilities(vectors: NDArray[np.float32]) -> None:
+    """Without anything to learn from, a network answers with the mean of its targets."""
+    targets = np.full(160, 0.8)
+    recipe = Recipe(epochs=60, weight_decay=0.0, peak_learning_rate=0.01)
+    values = logits(train(PLAIN, vectors, targets, recipe, seed=0), vectors)
+    assert np.mean(values[:, 1] - values[:, 0]) == pytest.approx(np.log(0.8 / 0.2), abs=0.05)
+
+
+def test_label_smoothing_bounds_the_margin(
+    vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    """Smoothed by 0.2 the targets are 0.9 and 0.1: margins of log(9)."""
+    recipe = Recipe(epochs=60, weight_decay=0.0, peak_learning_rate=0.01, label_smoothing=0.2)
+    values = logits(train(PLAIN, vectors, slipped, recipe, seed=0), vectors)
+    margins = values[:, 1] - values[:, 0]
+    assert margins[slipped].mean() == pytest.approx(np.log(9.0), rel=0.05)
+    assert margins[~slipped].mean() == pytest.approx(-np.log(9.0), rel=0.05)
+
+
+def test_input_noise_is_drawn_from_the_seed(
+    vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
+) -> None:
+    noisy = Recipe(epochs=2, input_noise=0.3)
+    first = _weights(train(PLAIN, vectors, slipped, noisy, seed=1))
+    assert first == _weights(train(PLAIN, vectors, slipped, noisy, seed=1))
+    assert first != _weights(train(PLAIN, vectors, slipped, Recipe(epochs=2), seed=1))
+
+
+def test_weight_decay_spares_biases_and_norms() -> None:
+    network = build(TINY)
+    for recipe in (Recipe(), PublishedRecipe()):
+        optimizer, _ = optimization(network, recipe, 10)
+        decayed, spared = optimizer.param_groups
+        assert all(tensor.ndim > 1 for tensor in decayed["params"])
+        assert spared["weight_decay"] == 0.0
+        # The published regularizer leaves the last layer alone.
+        assert len(decayed["params"]) == (3 if isinstance(recipe, Recipe) else 2)

@@ -1,0 +1,232 @@
+"""Jobs are pure, their files are whole or not there, and a session is calibrated honestly."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("skl2onnx", reason="the train extra is not installed")
+
+from sklearn.neural_network import MLPClassifier
+
+from models.contract import VectorInput
+from models.inputs import SessionBuilder, raw_features
+from models.training.data.protocols import splits
+from models.training.estimators.classical import MlpConfig, SvmConfig
+from models.training.estimators.networks import NetworkConfig
+from models.training.estimators.recipe import Recipe
+from models.training.evaluating import jobs
+from models.training.evaluating.jobs import BrokenResultError, Job, JobResult
+from models.training.fitting.standards import SESSION_VARIANTS, Standards, TrainingStandards, sit
+from models.training.systems.system import SessionFeatures, System
+from tests.models.training.evaluation_samples import sessions
+
+GRASPS = sessions(200)
+SVM = System("svm", "A machine.", VectorInput(), SvmConfig(3.0, 0.01))
+SESSION_SVM = System("svm-s", "A machine, calibrated.", SessionFeatures(), SvmConfig(3.0, 0.003))
+NETWORK = System(
+    "net",
+    "A small network, calibrated.",
+    SessionFeatures(),
+    NetworkConfig(filters=4, hidden=8),
+    Recipe(epochs=2),
+)
+SESSION_JOB = Job(SESSION_SVM, "session", 0, 1, 4)
+
+
+@pytest.fixture(scope="module")
+def judged() -> JobResult:
+    return jobs.run(SESSION_JOB, GRASPS)
+
+
+@pytest.mark.parametrize("system", [SVM, SESSION_SVM, NETWORK])
+def test_a_job_gives_the_same_margins_again(system: System) -> None:
+    job = Job(system, "objects", 2, 1, 4)
+    first, again = jobs.run(job, GRASPS), jobs.run(job, GRASPS)
+    assert np.array_equal(first.test, splits("objects", GRASPS, 2, 4)[1].test)
+    assert list(first.margins) == list(again.margins)
+    assert all(np.array_equal(first.margins[name], again.margins[name]) for name in first.margins)
+
+
+def test_threads_of_a_recipe_change_neither_key_nor_result() -> None:
+    two = dataclasses.replace(NETWORK, recipe=Recipe(epochs=2, threads=2))
+    one_job, two_job = (Job(system, "cv", 0, 0, 4) for system in (NETWORK, two))
+    assert one_job.key("data") == two_job.key("data")
+    ours, theirs = jobs.run(one_job, GRASPS), jobs.run(two_job, GRASPS)
+    assert np.array_equal(ours.margins["training"], theirs.margins["training"])
+
+
+def test_everything_that_changes_the_result_changes_the_key() -> None:
+    job = Job(SVM, "cv", 0, 0)
+    others = [
+        dataclasses.replace(job, system=dataclasses.replace(SVM, estimator=SvmConfig(3.0, 0.02))),
+        dataclasses.replace(job, system=SESSION_SVM),
+        dataclasses.replace(job, protocol="objects"),
+        dataclasses.replace(job, seed=1),
+        dataclasses.replace(job, fold=1),
+        dataclasses.replace(job, folds=5),
+    ]
+    keys = {job.key("data"), job.key("other data"), *(other.key("data") for other in others)}
+    assert len(keys) == len(others) + 2
+    renamed = dataclasses.replace(job, system=dataclasses.replace(SVM, description="Another."))
+    assert renamed.key("data") == job.key("data")
+
+
+def test_the_labels_of_the_test_grasps_are_not_looked_at(judged: JobResult) -> None:
+    slipped = GRASPS.slipped.copy()
+    slipped[GRASPS.table_of == 2] ^= True
+    other = jobs.run(SESSION_JOB, dataclasses.replace(GRASPS, slipped=slipped))
+    for variant, margins in judged.margins.items():
+        assert np.array_equal(margins, other.margins[variant]), variant
+
+
+def test_a_session_system_is_judged_in_every_way_and_others_in_one(judged: JobResult) -> None:
+    assert set(judged.margins) == set(SESSION_VARIANTS)
+    assert set(judged.ages) == {"running", "running-sorted"}
+    assert list(jobs.run(Job(SVM, "session", 0, 1, 4), GRASPS).margins) == ["none"]
+    assert list(jobs.run(Job(SESSION_SVM, "cv", 0, 1, 4), GRASPS).margins) == ["training"]
+
+
+def test_calibration_repairs_a_drifted_session(judged: JobResult) -> None:
+    truth = GRASPS.slipped[judged.test]
+    accuracy = {name: ((m > 0) == truth).mean() for name, m in judged.margins.items()}
+    assert accuracy["n50"] > 0.8  # a tenth of the labels is wrong
+    assert accuracy["all"] > 0.8
+    assert accuracy["running"] > 0.8
+
+
+def test_a_result_comes_back_from_its_bytes(judged: JobResult) -> None:
+    back = JobResult.from_bytes(judged.to_bytes())
+    assert np.array_equal(back.test, judged.test)
+    assert all(np.array_equal(back.margins[name], judged.margins[name]) for name in judged.margins)
+    assert all(np.array_equal(back.ages[name], judged.ages[name]) for name in judged.ages)
+    assert (back.parameters, back.seconds) == (judged.parameters, judged.seconds)
+    assert back.train_grasps == judged.train_grasps
+
+
+def test_no_damage_of_a_file_goes_unseen(judged: JobResult) -> None:
+    data = judged.to_bytes()
+    for cut in range(0, len(data), 997):
+        with pytest.raises(BrokenResultError):
+            JobResult.from_bytes(data[:cut])
+    random = np.random.default_rng(6)
+    for place in random.integers(len(data), size=150):
+        torn = bytearray(data)
+        torn[place] ^= 0x55
+        try:
+            back = JobResult.from_bytes(bytes(torn))
+        except BrokenResultError:
+            continue
+        # What the archive does not protect is its own padding and dates.
+        assert all(np.array_equal(back.margins[n], judged.margins[n]) for n in judged.margins)
+
+
+def test_a_result_with_a_margin_that_is_no_number_is_broken(judged: JobResult) -> None:
+    margins = {"none": np.full(len(judged.test), np.nan)}
+    with pytest.raises(BrokenResultError, match="not finite"):
+        JobResult.from_bytes(dataclasses.replace(judged, margins=margins).to_bytes())
+
+
+def test_a_stored_result_is_found_and_a_broken_one_is_not(
+    judged: JobResult, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert jobs.load(tmp_path, SESSION_JOB, "data") is None
+    jobs.save(tmp_path, SESSION_JOB, "data", judged.to_bytes())
+    found = jobs.load(tmp_path, SESSION_JOB, "data")
+    assert found is not None
+    assert np.array_equal(found.test, judged.test)
+    assert jobs.load(tmp_path, SESSION_JOB, "other data") is None
+    (path,) = tmp_path.iterdir()
+    assert path.name.startswith("svm-s.session.0.1.")
+    path.write_bytes(b"")
+    with caplog.at_level(logging.WARNING):
+        assert jobs.load(tmp_path, SESSION_JOB, "data") is None
+    assert "it is run again" in caplog.text
+
+
+def test_features_are_standardised_as_the_daemon_does() -> None:
+    features = raw_features(GRASPS.counts[:50])
+    standards = Standards.of(features)
+    builder = SessionBuilder(3, clip=3.0)
+    builder.use(standards.mean, standards.spread)
+    expected = builder.build_batch(GRASPS.counts[:50])[0]
+    assert np.array_equal(standards.apply(features, 3.0), expected)
+
+
+def test_a_feature_that_does_not_vary_is_not_divided_by_zero() -> None:
+    standards = Standards.of(np.full((5, 2), 7.0))
+    assert standards.apply(np.full((1, 2), 7.5), 3.0).tolist() == [[0.5, 0.5]]
+
+
+def test_training_rows_are_standardised_by_their_own_table() -> None:
+    features = np.array([[0.0], [2.0], [100.0], [104.0]])
+    table_of = np.array([0, 0, 2, 2])
+    training = TrainingStandards.of(features, table_of)
+    assert training.apply(features, table_of, 3.0).ravel().tolist() == [-1.0, 1.0, -1.0, 1.0]
+    # The prior: mean of all four rows; spread within the tables, sqrt((1 + 1 + 4 + 4) / 4).
+    assert training.prior.mean.tolist() == [51.5]
+    assert training.prior.spread == pytest.approx([np.sqrt(2.5)])
+    with pytest.raises(KeyError):
+        training.apply(features, np.array([1, 1, 1, 1]), 3.0)
+
+
+def test_a_running_session_judges_each_grasp_by_what_came_before_it() -> None:
+    random = np.random.default_rng(1)
+    features = random.normal(50.0, 4.0, (60, 3))
+    training = TrainingStandards.of(features[:20], np.zeros(20, dtype=np.int64))
+    test, pool = np.arange(25, 30), np.setdiff1d(np.arange(20, 60), np.arange(25, 30))
+    sitting = sit(features, test, pool, training, seed=0)
+    assert sitting.ages["running-sorted"].tolist() == [5, 6, 7, 8, 9]
+    by = sitting.standards["running-sorted"]
+    statistics = training.statistics()
+    for row in range(20, 29):
+        statistics.observe(features[row])
+    np.testing.assert_allclose(by.mean[4], statistics.mean)
+    np.testing.assert_allclose(by.spread[4], statistics.spread)
+    mixed = sitting.ages["running"]
+    assert len(set(mixed.tolist())) == 5
+    assert mixed.tolist() != [5, 6, 7, 8, 9]
+
+
+def test_the_pool_alone_calibrates_a_session() -> None:
+    features = np.random.default_rng(1).normal(50.0, 4.0, (60, 3))
+    training = TrainingStandards.of(features[:20], np.zeros(20, dtype=np.int64))
+    test, pool = np.arange(20, 30), np.arange(30, 60)
+    changed = features.copy()
+    changed[test] += 1000.0
+    ours, theirs = (sit(each, test, pool, training, 0).standards for each in (features, changed))
+    for variant in ("none", "n5", "n10", "n20", "n50", "all"):
+        np.testing.assert_array_equal(ours[variant].mean, theirs[variant].mean)
+    np.testing.assert_allclose(ours["all"].mean, features[pool].mean(axis=0))
+
+
+def test_the_result_does_not_depend_on_the_process() -> None:
+    code = (
+        "from tests.models import test_training_jobs as t\n"
+        "result = t.jobs.run(t.Job(t.NETWORK, 'objects', 2, 1, 4), t.GRASPS)\n"
+        "print(result.margins['training'].tobytes().hex())"
+    )
+    root = Path(__file__).parents[4]
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=True
+    )
+    ours = jobs.run(Job(NETWORK, "objects", 2, 1, 4), GRASPS)
+    assert done.stdout.strip() == ours.margins["training"].tobytes().hex()
+
+
+def test_an_interrupted_training_is_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    # What Ctrl-C meets in the middle of a fit; scikit-learn itself would return what it has so far.
+    monkeypatch.setattr(MLPClassifier, "_update_no_improvement_count", interrupted)
+    system = System("mlp", "A perceptron.", VectorInput(), MlpConfig((4,)))
+    with pytest.raises(KeyboardInterrupt):
+        jobs.run(Job(system, "cv", 0, 0, 4), GRASPS)

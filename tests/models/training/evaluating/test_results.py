@@ -1,0 +1,242 @@
+"""Summaries and the table: what is published, what was run, and `-` for what was not."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("skl2onnx", reason="the train extra is not installed")
+
+from models.training.data.protocols import Protocol, splits
+from models.training.evaluating import summary as summaries
+from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.results import Made, difference, table
+from models.training.evaluating.summary import Summary, summarise
+from models.training.fitting.standards import SESSION_VARIANTS
+from models.training.systems.system import digest
+from models.training.systems.systems import SYSTEMS
+from tests.models.training.evaluation_samples import sessions
+
+GRASPS = sessions(200)
+MADE = Made("graspd evaluate --data DIR", 90.0, {"machine": "a desk", "numpy": "2"})
+TRUTH = np.where(GRASPS.slipped, 2.0, -2.0)
+
+
+def summary_of(name: str, protocol: Protocol, wrong: float, seeds: int = 2) -> Summary:
+    """A system that is wrong on this share of the grasps, at random."""
+    flip = np.random.default_rng(len(name)).random(len(GRASPS)) < wrong
+    margins = np.where(flip, -TRUTH, TRUTH)
+
+    def result(test: NDArray[np.int64], train: int) -> JobResult:
+        variants = {"none": margins[test]}
+        if protocol == "session":
+            variants |= {"n50": margins[test], "running": margins[test]}
+        ages = {"running": np.arange(len(test))} if protocol == "session" else {}
+        return JobResult(test, variants, train, 2.0, 1000, ages)
+
+    results = {
+        seed: [result(split.test, len(split.train)) for split in splits(protocol, GRASPS, seed, 4)]
+        for seed in range(seeds)
+    }
+    return summarise(SYSTEMS[name], protocol, results, GRASPS)
+
+
+def test_a_summary_counts_every_grasp() -> None:
+    made = summary_of("cnn1", "cv", wrong=0.1)
+    (stable, false_alarm), (missed, slip) = made.main.confusion
+    assert stable + false_alarm == 2 * int((~GRASPS.slipped[:400]).sum())
+    assert missed + slip == 2 * int(GRASPS.slipped[:400].sum())
+    accuracy = (stable + slip) / 800
+    assert made.main.spreads["accuracy"].mean == pytest.approx(accuracy)
+    assert sum(one.share.grasps for one in made.main.objects.values()) == 400
+    assert {name: palm.grasps for name, palm in made.main.palms.items()} == {
+        "palm_down": 200,
+        "palm_side": 200,
+    }
+    assert sum(number for _, _, number in made.main.bins) == 800
+    assert (made.seeds, made.folds, made.train_grasps) == ((0, 1), 4, 300.0)
+    assert made.seconds == pytest.approx(16.0)
+
+
+def test_probabilities_are_calibrated_by_the_other_folds() -> None:
+    made = summary_of("cnn1", "cv", wrong=0.1)
+    # Margins of +-2, right nine times in ten: log-odds of 0.9 are 2.2, so T is about 2 / 2.2.
+    assert made.main.temperature == pytest.approx(2.0 / np.log(9.0), rel=0.2)
+    assert made.main.spreads["ece"].mean < 0.06
+
+
+def test_a_single_split_is_calibrated_by_its_other_objects() -> None:
+    made = summary_of("cnn1", "unknown", wrong=0.1)
+    assert made.folds == 1
+    assert made.main.spreads["ece"].mean < 0.06
+    assert len(made.main.objects) == 8
+
+
+def test_fifty_grasps_speak_for_a_calibrated_session() -> None:
+    made = summary_of("svm-session", "session", wrong=0.2)
+    assert made.headline == "n50"
+    assert [age.grasps_before for age in made.variants["running"].ages] == [0, 5, 10, 20]
+    assert not made.main.ages
+
+
+def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
+    made = summary_of("cnn1", "cv", wrong=0.1)
+    summaries.write(made, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["cnn1.cv.json"]
+    assert summaries.read(tmp_path / "cnn1.cv.json") == made
+
+
+def test_a_summary_of_other_data_or_configuration_is_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = summary_of("cnn1", "cv", wrong=0.1)
+    summaries.write(made, tmp_path)
+    summaries.write(dataclasses.replace(made, system="cnn2"), tmp_path)
+    summaries.write(dataclasses.replace(made, system="cnn3", data="other"), tmp_path)
+    (tmp_path / "rf.cv.json").write_text("{")
+    digests = {name: digest(system) for name, system in SYSTEMS.items()}
+    with caplog.at_level(logging.WARNING):
+        found = summaries.read_all_of(tmp_path, GRASPS.digest(), digests)
+    assert found == [made]
+    assert len(caplog.records) == 3
+
+
+def rows(text: str, section: int) -> list[list[str]]:
+    """Cells of the table's rows in a numbered section."""
+    part = text.split("\n## ")[section]
+    lines = [line for line in part.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_the_papers_figures_stand_beside_ours_and_nothing_is_made_up() -> None:
+    ours = summary_of("cnn1", "cv", wrong=0.1)
+    f1 = ours.main.spreads["f1"]
+    text = table([ours], MADE)
+    first = rows(text, 1)
+    found = {(row[0], row[1], row[2]): row[3:] for row in first}
+    assert f1.error is not None
+    assert found["`cnn1`", "`cv`", "F1"] == [
+        "94.2 +- 0.8",
+        f"{100 * f1.mean:.1f} +- {100 * f1.std:.1f}",
+        f"{100 * f1.error:.2f}",
+        "2",
+        f"{100 * f1.mean - 94.2:+.1f}",
+    ]
+    assert found["`cnn1`", "`unknown`", "F1"] == ["87.7 +- 0.4", "-", "-", "-", "-"]
+    del found["`cnn1`", "`cv`", "F1"]
+    assert all(row[1:] == ["-", "-", "-", "-"] for key, row in found.items() if key[0] != "system")
+
+
+@pytest.mark.parametrize(
+    ("system", "protocol", "figure", "paper"),
+    # arXiv:1809.05551: tables I to IV.
+    [
+        ("cnn0-d1-least-contact", "cv", "F1", "91.0 +- 1.4"),
+        ("cnn0-d1-least-contact", "cv", "accuracy", "90.9 +- 1.5"),
+        ("cnn0-d1-least-contact", "cv", "precision", "90.4 +- 2.4"),
+        ("cnn0-d1-least-contact", "cv", "recall", "91.6 +- 2.4"),
+        ("cnn0-d2a-least-contact", "cv", "F1", "89.7 +- 1.5"),
+        ("cnn0-d3-least-contact", "cv", "F1", "89.7 +- 1.4"),
+        ("cnn0", "cv", "F1", "92.6 +- 1.7"),
+        ("cnn0-horizontal", "cv", "F1", "92.1 +- 1.7"),
+        ("cnn0-vertical", "cv", "F1", "92.3 +- 1.8"),
+        ("cnn2", "cv", "F1", "92.0 +- 2.0"),
+        ("cnn3", "cv", "F1", "92.2 +- 2.0"),
+        ("svm", "cv", "F1", "88.0 +- 2.9"),
+        ("rf", "cv", "F1", "92.6 +- 1.5"),
+        ("rf", "unknown", "F1", "90.2 +- 0.5"),
+        ("cnn1-augmented", "unknown", "F1", "90.1 +- 0.4"),
+        ("cnn1-faithful", "cv", "F1", "94.2 +- 0.8"),
+    ],
+)
+def test_every_published_row_is_there_even_if_nothing_was_run(
+    system: str, protocol: str, figure: str, paper: str
+) -> None:
+    assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-", "-", "-"] in rows(
+        table([], MADE), 1
+    )
+
+
+def test_sessions_are_told_by_the_number_of_grasps() -> None:
+    ours = summary_of("svm-session", "session", wrong=0.2)
+    _, row, *_ = rows(table([ours], MADE), 3)
+    f1 = ours.main.spreads["f1"]
+    value = f"{100 * f1.mean:.1f} +- {100 * f1.std:.1f}"
+    assert row == ["`svm-session`", value, "-", "-", "-", value, "-", value, "-"]
+
+
+def test_differences_are_taken_fold_by_fold_on_common_seeds() -> None:
+    good, bad = summary_of("cnn2", "cv", 0.05, seeds=3), summary_of("cnn1", "cv", 0.15, seeds=2)
+    found = difference(good, bad)
+    assert found is not None
+    figures = [np.array(each.main.figures["f1"])[:2] for each in (good, bad)]
+    gaps = (figures[0] - figures[1]).ravel()
+    assert found.splits == 8
+    assert found.mean == pytest.approx(gaps.mean())
+    # Four folds: 100 judged, 300 trained on.
+    assert found.error == pytest.approx(np.sqrt((1 / 8 + 1 / 3) * gaps.var(ddof=1)))
+    fourth = rows(table([bad, good], MADE), 4)
+    cell = f"{100 * found.mean:+.1f} +- {100 * (found.error or 0):.1f}"
+    assert ["`cnn2`", "`cv`", cell, "-", "`cnn2`"] in fourth
+
+
+def test_other_data_are_not_compared() -> None:
+    one = summary_of("cnn1", "cv", 0.1)
+    assert difference(one, dataclasses.replace(one, data="other")) is None
+    assert difference(one, dataclasses.replace(one, seeds=(8, 9))) is None
+
+
+def test_the_table_says_how_it_was_made() -> None:
+    text = table([summary_of("cnn1", "cv", wrong=0.1)], MADE)
+    assert "    graspd evaluate --data DIR\n" in text
+    assert "8 trainings, 16 s in all on one thread each; this run of the command took 90 s" in text
+    assert "machine a desk, numpy 2." in text
+    assert f"- `palm_down.csv` {GRASPS.files[0].sha256}, 200" in text
+    assert "--quick" not in text
+    assert "mean nothing" in table([], dataclasses.replace(MADE, quick=True))
+
+
+def test_every_row_has_as_many_cells_as_its_header() -> None:
+    made = [summary_of("cnn1", "cv", 0.1), summary_of("svm-session", "session", 0.2)]
+    text = table(made, MADE)
+    width = 0
+    for before, line in zip(["", *text.splitlines()], text.splitlines(), strict=False):
+        if line.startswith("|"):
+            width = line.count("|") if not before.startswith("|") else width
+            assert line.count("|") == width
+
+
+@pytest.fixture(scope="module")
+def fonts_are_open(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Matplotlib keeps the files of its fonts open for the life of the process."""
+    pytest.importorskip("matplotlib", reason="no extra: report")
+    from models.training.evaluating.plots import draw
+
+    draw([summary_of("cnn1", "cv", 0.1)], tmp_path_factory.mktemp("plots"))
+
+
+@pytest.mark.usefixtures("fonts_are_open")
+def test_plots_of_everything_are_drawn(tmp_path: Path) -> None:
+    from models.training.evaluating.plots import draw
+
+    session = summary_of("svm-session", "session", 0.2)
+    every = dict.fromkeys(SESSION_VARIANTS, session.variants["n50"])
+    made = [
+        summary_of("cnn1", "cv", 0.1),
+        summary_of("cnn2", "cv", 0.0),
+        dataclasses.replace(session, variants=every),
+    ]
+    written = draw(made, tmp_path)
+    stems = {"cnn1.cv", "cnn2.cv", "svm-session.session", "coverage.cv", "session-calibration"}
+    assert {path.name for path in written} == {
+        f"{stem}.{suffix}" for stem in stems for suffix in ("png", "svg")
+    }
+    for path in written:
+        start = path.read_bytes()[:8]
+        assert start.startswith(b"<?xml" if path.suffix == ".svg" else b"\x89PNG")

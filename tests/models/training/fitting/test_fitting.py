@@ -1,0 +1,184 @@
+"""One function that trains every kind of system."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("sklearn", reason="the train extra is not installed")
+
+from models.contract import VectorInput
+from models.inputs import SessionBuilder, builder, raw_features
+from models.tactile_image import TactileImager
+from models.training.data.augmentation import Augmentation
+from models.training.estimators.classical import BoostingConfig, ForestConfig, SvmConfig
+from models.training.estimators.networks import DenseConfig, NetworkConfig
+from models.training.estimators.recipe import Recipe
+from models.training.fitting.fitting import Fitted, FittedBlend, FittedNetwork, fit
+from models.training.systems.systems import (
+    RANKS,
+    SYSTEMS,
+    BlendConfig,
+    DistilConfig,
+    Member,
+    SessionFeatures,
+    System,
+    epochs,
+    with_recipes,
+)
+from tests.models.training.training_samples import separable_counts
+
+TINY = NetworkConfig(filters=4, hidden=8, dropout=0.2)
+QUICK = Recipe(epochs=3)
+BLEND = BlendConfig(
+    (
+        Member(SvmConfig(3.0, 0.003), weight=2.0),
+        Member(ForestConfig(11, None)),
+        Member(TINY, QUICK, copies=2),
+    )
+)
+MADE = System("made", "Made up.", SessionFeatures(), BLEND)
+SYSTEMS_MADE = {
+    "svm": replace(MADE, estimator=SvmConfig(3.0, 0.003)),
+    "boosting": replace(MADE, estimator=BoostingConfig(iterations=10, leaves=4)),
+    "network": replace(MADE, estimator=TINY, recipe=QUICK),
+    "dense": replace(MADE, estimator=DenseConfig((32,)), recipe=Recipe(epochs=10)),
+    "blend": MADE,
+    "distilled": replace(MADE, estimator=DistilConfig(BLEND, TINY, inner_folds=3), recipe=QUICK),
+}
+FEATURES = SessionBuilder(3, 3.0)
+
+
+def _features(grasps: int, seed: int = 7) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    counts, slipped = separable_counts(grasps, seed)
+    raw = raw_features(separable_counts(160)[0])
+    FEATURES.use(raw.mean(axis=0), raw.std(axis=0))
+    return FEATURES.build_batch(counts)[0], slipped
+
+
+INPUTS, SLIPPED = _features(160)
+
+
+@pytest.mark.parametrize("kind", sorted(SYSTEMS_MADE))
+def test_every_kind_learns_counts_its_epochs_and_repeats_itself(kind: str) -> None:
+    system = SYSTEMS_MADE[kind]
+    ticks: list[None] = []
+    fitted = fit(system, INPUTS, SLIPPED, seed=1, on_epoch=lambda: ticks.append(None))
+    inputs, slipped = _features(80, seed=8)
+    margins = fitted.margins(inputs)
+    assert margins.dtype == np.float64
+    assert ((margins > 0.0) == slipped).all()
+    assert len(ticks) == epochs(system)
+    assert fitted.parameters > 0
+    assert fitted.margins(inputs[:0]).shape == (0,)
+    assert np.array_equal(fit(system, INPUTS, SLIPPED, seed=1).margins(inputs), margins)
+
+
+@pytest.mark.parametrize("kind", ["network", "blend", "distilled"])
+def test_another_seed_gives_other_margins(kind: str) -> None:
+    one, other = (fit(SYSTEMS_MADE[kind], INPUTS, SLIPPED, seed=seed) for seed in (1, 2))
+    assert not np.array_equal(one.margins(INPUTS), other.margins(INPUTS))
+
+
+def test_a_blend_is_the_weighted_mean_of_standardised_margins() -> None:
+    blend = fit(MADE, INPUTS, SLIPPED, seed=3)
+    assert isinstance(blend, FittedBlend)
+    svm, forest, *networks = blend.members
+    assert len(networks) == 2
+    assert not np.array_equal(networks[0].margins(INPUTS), networks[1].margins(INPUTS))
+    inputs = _features(40, seed=8)[0]
+
+    def standardised(member: Fitted) -> NDArray[np.float64]:
+        return member.margins(inputs) / float(member.margins(INPUTS).std())
+
+    expected = (
+        2.0 * standardised(svm)
+        + standardised(forest)
+        + (standardised(networks[0]) + standardised(networks[1])) / 2.0
+    ) / 4.0
+    assert blend.margins(inputs) == pytest.approx(expected, rel=1e-9)
+    assert blend.parameters == sum(member.parameters for member in blend.members)
+
+
+def test_a_member_that_judges_all_grasps_alike_has_no_say() -> None:
+    """No leaf can hold 200 of 160 grasps: the boosting is a constant."""
+    useless = Member(BoostingConfig(iterations=5, leaf_grasps=200))
+    blend = BlendConfig((useless, Member(SvmConfig(3.0, 0.003))))
+    fitted = fit(replace(MADE, estimator=blend), INPUTS, SLIPPED, seed=0)
+    alone = fit(SYSTEMS_MADE["svm"], INPUTS, SLIPPED, seed=0).margins(INPUTS)
+    assert fitted.margins(INPUTS) == pytest.approx(0.5 * alone / alone.std(), rel=1e-9)
+
+
+def test_a_student_learns_the_labels_only_if_they_are_given_all_the_weight() -> None:
+    """With `hard` 1 the teacher says nothing: the student is the network trained alone."""
+    alone = fit(SYSTEMS_MADE["network"], INPUTS, SLIPPED, seed=5).margins(INPUTS)
+    distil = DistilConfig(BLEND, TINY, hard=1.0, inner_folds=3)
+    labels_only = replace(MADE, estimator=distil, recipe=QUICK)
+    taught = replace(labels_only, estimator=replace(distil, hard=0.0))
+    assert np.array_equal(fit(labels_only, INPUTS, SLIPPED, seed=5).margins(INPUTS), alone)
+    assert not np.array_equal(fit(taught, INPUTS, SLIPPED, seed=5).margins(INPUTS), alone)
+
+
+def test_a_teacher_doubts_a_grasp_with_a_wrong_label() -> None:
+    """The teacher judges out of fold: the student must not learn mistaken labels by heart."""
+    wrong = SLIPPED.copy()
+    wrong[:8] = ~wrong[:8]
+    distil = DistilConfig(BlendConfig((Member(SvmConfig(3.0, 0.1)),)), TINY, hard=0.0)
+    # An SVM as sharp as this knows its own training rows by heart.
+    fitted = fit(replace(MADE, estimator=distil, recipe=QUICK), INPUTS, wrong, seed=0)
+    assert isinstance(fitted, FittedNetwork)
+    assert ((fitted.margins(INPUTS[:8]) > 0.0) == SLIPPED[:8]).all()
+
+
+def test_an_augmented_system_sees_four_times_the_grasps() -> None:
+    counts, slipped = separable_counts(64)
+    images = TactileImager(3).build_batch(counts)[0]
+    plain = replace(SYSTEMS["cnn0"], estimator=TINY, recipe=Recipe(epochs=1))
+    augmented = replace(plain, augmentation=Augmentation())
+    given, once = (fit(system, images, slipped, seed=0) for system in (augmented, plain))
+    assert isinstance(given, FittedNetwork)
+    assert isinstance(once, FittedNetwork)
+    norms = [fitted.network.state_dict()["2.num_batches_tracked"] for fitted in (given, once)]
+    assert [int(batches) for batches in norms] == [8, 2]
+    with pytest.raises(ValueError, match="only images"):
+        fit(replace(augmented, input=VectorInput()), INPUTS, SLIPPED, seed=0)
+
+
+def test_a_standardised_system_sees_every_value_by_its_own_mean_and_spread() -> None:
+    svm = SYSTEMS_MADE["svm"]
+    stretched = 1000.0 + 37.0 * INPUTS.astype(np.float64) * np.arange(1, 79)
+    stretched[:, 5] = 2000.0  # an electrode that never changes
+    inputs = stretched.astype(np.float32)
+    spread = stretched.std(axis=0)
+    spread[5] = 1.0
+    expected = ((stretched - stretched.mean(axis=0)) / spread).astype(np.float32)
+    fitted = fit(replace(svm, standardise=True), inputs, SLIPPED, seed=0)
+    plain = fit(svm, expected, SLIPPED, seed=0)
+    assert fitted.margins(inputs) == pytest.approx(plain.margins(expected), abs=1e-4)
+    assert fitted.parameters == plain.parameters + 2 * 78
+
+
+def test_a_network_without_a_recipe_is_refused() -> None:
+    with pytest.raises(ValueError, match="needs a recipe"):
+        fit(replace(MADE, estimator=TINY), INPUTS, SLIPPED, seed=0)
+
+
+RANKS_LEFT_OUT = {f"cnn1-rank-{rank}" for rank in sorted(RANKS)[1:]}
+"""They differ from the smallest by a number alone, and take long."""
+
+
+@pytest.mark.parametrize("name", sorted(SYSTEMS.keys() - RANKS_LEFT_OUT))
+def test_every_system_by_name_can_be_trained(name: str) -> None:
+    """On few grasps and for one epoch: input, estimator and recipe fit together."""
+    counts, slipped = separable_counts(40)
+    system = with_recipes(SYSTEMS[name], epochs=1)
+    if isinstance(system.input, SessionFeatures):
+        inputs = _features(40)[0]
+    else:
+        inputs = builder(system.input, 3).build_batch(counts)[0]
+    fitted = fit(system, inputs, slipped, seed=0)
+    assert np.isfinite(fitted.margins(inputs)).all()

@@ -1,0 +1,300 @@
+"""Every kind of system as a file that judges as its trainer does."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("skl2onnx", reason="the train extra is not installed")
+
+import onnx
+import onnxruntime as ort
+
+from models.bts3 import FINGERS
+from models.contract import (
+    CLASSES,
+    CountsInput,
+    Dataset,
+    ImageInput,
+    Input,
+    MeasuredError,
+    ModelContract,
+    SeenCounts,
+    SessionInput,
+    Sharpness,
+    VectorInput,
+)
+from models.inputs import builder, raw_features
+from models.runtime import TactileModel
+from models.training.data.datasets import read_whole
+from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
+from models.training.estimators.networks import DenseConfig, NetworkConfig, SecondConvolution
+from models.training.estimators.recipe import Recipe
+from models.training.fitting.fitting import Fitted, fit
+from models.training.making.export import ExportError, SessionStandards, export
+from models.training.systems.systems import (
+    SESSION,
+    SYSTEMS,
+    BlendConfig,
+    Estimator,
+    Member,
+    System,
+)
+from tests.models.training.training_samples import separable_counts
+
+COUNTS, SLIPPED = separable_counts(90)
+OTHER_COUNTS = separable_counts(200, seed=12)[0]
+RAW = raw_features(COUNTS)
+IMAGE = ImageInput("D1", "neighbour-mean", "filled-image", "channels")
+SIDE_BY_SIDE = ImageInput("D2a", "least-contact", "filled-image", "horizontal")
+VECTOR = VectorInput()
+STATISTICS = SessionInput(
+    mean=tuple(RAW.mean(axis=0).tolist()),
+    spread=tuple(RAW.std(axis=0).tolist()),
+    clip=3.0,
+    prior_grasps=5.0,
+    calibrated_from=20.0,
+    sharpness=(Sharpness(0.0, 1.0),),
+)
+TINY = NetworkConfig(filters=4, hidden=8)
+QUICK = Recipe(epochs=2)
+BLEND = BlendConfig(
+    (
+        Member(SvmConfig(3.0, 0.003)),
+        Member(BoostingConfig(iterations=15, leaves=5)),
+        Member(ForestConfig(11, None)),
+        Member(MlpConfig((8,), epochs=20)),
+        Member(TINY, QUICK),
+    )
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    input: Input
+    estimator: Estimator
+    recipe: Recipe | None = None
+    standardise: bool = False
+
+
+CASES = {
+    "image network": Case(IMAGE, TINY, QUICK),
+    "plain network": Case(SIDE_BY_SIDE, replace(TINY, batch_norm=False), QUICK),
+    "deep network": Case(
+        IMAGE, replace(TINY, pool=True, second=SecondConvolution(5), dropout=0.3), QUICK
+    ),
+    "session network": Case(STATISTICS, replace(TINY, dropout=0.3), QUICK),
+    "dense network": Case(VECTOR, DenseConfig((8,)), QUICK),
+    "svm": Case(VECTOR, SvmConfig(3.0, 0.1)),
+    "hard svm": Case(STATISTICS, SvmConfig(5000.0, "auto")),
+    "mlp": Case(VECTOR, MlpConfig((8, 8), epochs=30)),
+    "forest": Case(VECTOR, ForestConfig(199, None)),
+    "shallow forest": Case(STATISTICS, ForestConfig(11, 2)),
+    "boosting": Case(STATISTICS, BoostingConfig(iterations=30, leaves=5, features=0.5)),
+    "standardised network": Case(CountsInput(), TINY, QUICK, standardise=True),
+    "standardised forest": Case(CountsInput(), ForestConfig(11, None), standardise=True),
+    "blend": Case(STATISTICS, BLEND),
+}
+
+
+def _contract(wanted: Input) -> ModelContract:
+    low, high, centre = ([[value] * 24] * 3 for value in (0, 4095, 2000.0))
+    return ModelContract(
+        version=2,
+        name="made",
+        input=wanted,
+        fingers=FINGERS,
+        classes=CLASSES,
+        seed=0,
+        datasets=(Dataset("made", "0" * 64, 90),),
+        measured=(MeasuredError("cv", 2, 0.9, 0.01, 0.9, 0.01),),
+        confidence=(),
+        seen=SeenCounts(
+            low=tuple(map(tuple, low)),  # type: ignore[arg-type]
+            high=tuple(map(tuple, high)),  # type: ignore[arg-type]
+            margin=10,
+            centre=tuple(map(tuple, centre)),
+            whitening=tuple((0.001,) * (row + 1) for row in range(72)),
+            distance_max=10.0,
+        ),
+    )
+
+
+def _fit(case: Case, counts: NDArray[np.uint16], slipped: NDArray[np.bool_]) -> Fitted:
+    wanted = case.input
+    inputs = builder(wanted, 3).build_batch(counts)[0]
+    kind = SESSION if isinstance(wanted, SessionInput) else wanted
+    system = System(
+        "made", "Made up.", kind, case.estimator, case.recipe, standardise=case.standardise
+    )
+    return fit(system, inputs, slipped, seed=0)
+
+
+@pytest.fixture(scope="module")
+def fitted() -> Callable[[str], Fitted]:
+    known: dict[str, Fitted] = {}
+
+    def of(name: str) -> Fitted:
+        if name not in known:
+            known[name] = _fit(CASES[name], COUNTS, SLIPPED)
+        return known[name]
+
+    return of
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_the_file_judges_as_the_trainer_on_grasps_that_it_never_saw(
+    name: str, fitted: Callable[[str], Fitted], tmp_path: Path
+) -> None:
+    contract = _contract(CASES[name].input)
+    path = tmp_path / "made.onnx"
+    counts = np.concatenate((COUNTS, OTHER_COUNTS))
+    parity = export(fitted(name), 1.7, contract, counts, path)
+    assert parity.grasps == 290
+    assert parity.largest_difference < 1e-5
+    assert parity.verdicts_flipped == 0
+    assert [entry.name for entry in tmp_path.iterdir()] == ["made.onnx"]
+    model = TactileModel(path)
+    assert model.contract == contract
+    inputs = builder(contract.input, 3).build_batch(counts[:50])[0]
+    for reading, margin in zip(inputs, fitted(name).margins(inputs), strict=True):
+        model.input[...] = reading
+        stable, slip = model.run()
+        assert slip == pytest.approx(1.0 / (1.0 + np.exp(-margin / 1.7)), abs=1e-5)
+        assert stable == pytest.approx(1.0 - slip, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_the_file_takes_any_number_of_inputs(name: str, fitted: Callable[[str], Fitted]) -> None:
+    inputs = builder(CASES[name].input, 3)
+    model = fitted(name).to_onnx(1.0, inputs.name)
+    onnx.checker.check_model(model, full_check=True)
+    assert {opset.domain: opset.version for opset in model.opset_import}[""] == 18
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    (taken,), (given,) = session.get_inputs(), session.get_outputs()
+    assert (taken.name, taken.type, tuple(taken.shape[1:])) == (
+        inputs.name,
+        "tensor(float)",
+        inputs.shape,
+    )
+    assert (given.name, given.type, given.shape[1:]) == ("probability", "tensor(float)", [2])
+    readings = inputs.build_batch(OTHER_COUNTS)[0]
+    (together,) = session.run(None, {inputs.name: readings})
+    for number in (1, 2, 7):
+        (some,) = session.run(None, {inputs.name: readings[:number]})
+        assert some == pytest.approx(together[:number], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "name", ["image network", "session network", "svm", "mlp", "forest", "boosting"]
+)
+def test_the_same_training_makes_the_same_bytes_and_tells_nothing_of_the_machine(
+    name: str, fitted: Callable[[str], Fitted], tmp_path: Path
+) -> None:
+    contract = _contract(CASES[name].input)
+    files = [tmp_path / "once.onnx", tmp_path / "again.onnx"]
+    again = _fit(CASES[name], COUNTS, SLIPPED)
+    for path, trained in zip(files, (fitted(name), again), strict=True):
+        export(trained, 0.8, contract, COUNTS[:5], path)
+    once, twice = (path.read_bytes() for path in files)
+    assert once == twice
+    text = once.decode("latin-1")
+    for trace in (str(Path(__file__).parents[4]), str(Path.home()), "site-packages", ".py"):
+        assert trace not in text
+    assert not re.search(r"/(tmp|home|usr|work|root)/", text)
+
+
+@pytest.mark.parametrize("name", ["image network", "svm", "forest"])
+@pytest.mark.parametrize("temperature", [0.2, 5.0])
+def test_temperature_divides_the_margin(
+    name: str, temperature: float, fitted: Callable[[str], Fitted]
+) -> None:
+    inputs = builder(CASES[name].input, 3)
+    readings = inputs.build_batch(OTHER_COUNTS)[0]
+    model = fitted(name).to_onnx(temperature, inputs.name)
+    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    (probability,) = session.run(None, {inputs.name: readings})
+    odds = np.exp(fitted(name).margins(readings) / temperature)
+    assert probability[:, 1] == pytest.approx(odds / (1.0 + odds), abs=1e-5)
+
+
+def test_a_session_model_is_checked_by_the_statistics_given(
+    fitted: Callable[[str], Fitted], tmp_path: Path
+) -> None:
+    """Every reading by its own: first shifted statistics, then those of the contract."""
+    seen: list[NDArray[np.float32]] = []
+    trained = fitted("hard svm")
+
+    class Watched:
+        parameters = trained.parameters
+
+        def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+            seen.append(inputs)
+            return trained.margins(inputs)
+
+        def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+            return trained.to_onnx(temperature, input_name)
+
+        def margin_graph(self, input_name: str) -> onnx.ModelProto:
+            return trained.margin_graph(input_name)
+
+    mean = np.repeat(RAW.mean(axis=0)[np.newaxis], 4, axis=0)
+    spread = np.repeat(RAW.std(axis=0)[np.newaxis], 4, axis=0)
+    mean[0] += 0.5 * spread[0]
+    standards = SessionStandards(mean, spread)
+    contract = _contract(STATISTICS)
+    parity = export(Watched(), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards)
+    assert parity.grasps == 4
+    expected = np.clip((RAW[:4] - mean) / spread, -3.0, 3.0)
+    assert seen[0] == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["image network", "svm"])
+def test_a_file_that_judges_otherwise_is_not_written(
+    name: str, fitted: Callable[[str], Fitted], tmp_path: Path
+) -> None:
+    class Warmer:
+        parameters = 0
+
+        def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+            return fitted(name).margins(inputs)
+
+        def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+            return fitted(name).to_onnx(temperature * 1.01, input_name)
+
+        def margin_graph(self, input_name: str) -> onnx.ModelProto:
+            return fitted(name).margin_graph(input_name)
+
+    path = tmp_path / "made.onnx"
+    path.write_bytes(b"the file before")
+    with pytest.raises(ExportError, match="differs from the system"):
+        export(Warmer(), 1.0, _contract(CASES[name].input), COUNTS, path)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["made.onnx"]
+    assert path.read_bytes() == b"the file before"
+
+
+@pytest.mark.parametrize("name", ["svm", "mlp", "rf"])
+def test_the_vector_systems_of_the_paper_judge_real_grasps_as_trained(
+    name: str, bts3_dir: Path, tmp_path: Path
+) -> None:
+    """Trained on every second grasp, compared on all of them."""
+    grasps = read_whole(bts3_dir)
+    estimator = SYSTEMS[name].estimator
+    if isinstance(estimator, MlpConfig):
+        estimator = replace(estimator, epochs=20)
+    case = Case(VECTOR, estimator)
+    trained = _fit(case, grasps.counts[::2], grasps.slipped[::2])
+    parity = export(trained, 0.4, _contract(VECTOR), grasps.counts, tmp_path / "made.onnx")
+    assert parity.grasps == 2549
+    assert parity.largest_difference < 1e-5
+    assert parity.verdicts_flipped == 0
+    inputs = builder(VECTOR, 3).build_batch(grasps.counts[1::2])[0]
+    verdicts = trained.margins(inputs) > 0.0
+    assert (verdicts == grasps.slipped[1::2]).mean() > 0.85

@@ -1,0 +1,100 @@
+"""Systems of hands with fewer sensors: fewer channels, and nothing padded."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="the train extra is not installed")
+pytest.importorskip("onnx", reason="the train extra is not installed")
+
+from daemon.assembly.assembly import build_pipeline, load_model, model_path
+from daemon.scene import parse
+from drivers.base import TactileReading
+from models.contract import ModelError
+from models.training.evaluating import jobs
+from models.training.evaluating.jobs import Job
+from models.training.making.making import Order, make
+from models.training.systems.systems import SYSTEMS, digest, with_recipes
+from tests.models.training.evaluation_samples import sessions
+
+FORMS = {
+    "small-session-ff": ("ff",),
+    "small-session-mf": ("mf",),
+    "small-session-th": ("th",),
+    "small-session-ff-mf": ("ff", "mf"),
+    "small-session-ff-th": ("ff", "th"),
+    "small-session-mf-th": ("mf", "th"),
+}
+
+
+def test_there_is_a_form_of_the_default_system_for_every_smaller_hand() -> None:
+    whole = SYSTEMS["small-session"]
+    for name, fingers in FORMS.items():
+        system = SYSTEMS[name]
+        assert system.fingers == fingers
+        assert digest(system) != digest(whole)
+        assert digest(dataclasses.replace(system, fingers=whole.fingers)) == digest(whole)
+
+
+def test_grasps_of_fewer_fingers_are_those_columns() -> None:
+    grasps = sessions(60)
+    two = grasps.of_fingers(("ff", "th"))
+    np.testing.assert_array_equal(two.counts, grasps.counts[:, [0, 2]])
+    np.testing.assert_array_equal(two.slipped, grasps.slipped)
+    with pytest.raises(ValueError, match="have not the fingers lf"):
+        grasps.of_fingers(("lf",))
+    with pytest.raises(ValueError, match="have not the fingers ff"):
+        two.of_fingers(("ff",))
+
+
+def test_what_the_other_fingers_feel_changes_nothing() -> None:
+    grasps = sessions(120)
+    other = dataclasses.replace(grasps, counts=grasps.counts.copy())
+    other.counts[:, 1] = 3000
+    job = Job(with_recipes(SYSTEMS["small-session-ff-th"], epochs=1), "cv", 0, 0, 3)
+    one, two = (jobs.run(job, sample) for sample in (grasps, other))
+    for name, margins in one.margins.items():
+        np.testing.assert_array_equal(margins, two.margins[name])
+
+    assert (
+        one.parameters
+        < jobs.run(
+            Job(with_recipes(SYSTEMS["small-session"], epochs=1), "cv", 0, 0, 3), grasps
+        ).parameters
+    )
+
+
+def test_a_model_of_two_fingers_judges_a_hand_of_two(tmp_path: Path) -> None:
+    grasps = sessions(200)
+    system = with_recipes(SYSTEMS["small-session-ff-th"], epochs=1)
+    make(Order(system, 3, 0, only="cv"), grasps, tmp_path, tmp_path / "jobs", lambda: None)
+    scene = parse(
+        {
+            "hand": {"fingers": ["ff", "th"]},
+            "tactile": {"driver": "spi", "port": "/nowhere"},
+            "model": {"path": str(tmp_path / "small-session-ff-th.onnx")},
+            "gate": {"mode": "every"},
+        },
+        tmp_path / "scene.toml",
+    )
+    model = load_model(scene)
+    assert model.contract.fingers == ("ff", "th")
+    assert model.input.shape == (2 * 26,)
+    pipeline = build_pipeline(scene, model, lambda: 10**9)
+    counts = grasps.counts[:1, [0, 2]][0]
+    judgement = pipeline.judge(TactileReading(10**9, 0, counts, np.zeros((2, 24), dtype=np.uint8)))
+    assert judgement.grasp == 1
+
+
+def test_a_hand_of_fingers_that_were_never_recorded_is_told_so(tmp_path: Path) -> None:
+    scene = parse(
+        {"hand": {"fingers": ["ff", "rf"]}, "tactile": {"driver": "spi", "port": "/nowhere"}},
+        tmp_path / "scene.toml",
+    )
+    assert model_path(scene).name == "small-session.onnx"
+    with pytest.raises(ModelError, match=r"judges the fingers ff, mf, th .* no model for these"):
+        build_pipeline(scene, load_model(scene))
