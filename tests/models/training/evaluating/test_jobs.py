@@ -209,7 +209,7 @@ def test_the_pool_alone_calibrates_a_session() -> None:
 
 def test_the_result_does_not_depend_on_the_process() -> None:
     code = (
-        "from tests.models import test_training_jobs as t\n"
+        "from tests.models.training.evaluating import test_jobs as t\n"
         "result = t.jobs.run(t.Job(t.NETWORK, 'objects', 2, 1, 4), t.GRASPS)\n"
         "print(result.margins['training'].tobytes().hex())"
     )
