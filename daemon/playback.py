@@ -18,7 +18,7 @@ from daemon.judge.memory import decode
 from daemon.judge.pipeline import Pipeline
 from daemon.scene import Scene, SceneError, parse
 from drivers.base import RecordingError
-from drivers.mcap_recording import ASKED, EXCHANGED, RecordingHeader, header_of
+from drivers.mcap_recording import ASKED, EXCHANGED, SKIPPED, RecordingHeader, header_of
 from drivers.mcap_replay import McapReplayDriver
 from models.runtime import TactileModel
 from models.session import SessionState
@@ -94,7 +94,11 @@ class Playback:
             if not self._is_first:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         if driver is not None:
-            driver.on_told = {ASKED: pipeline.ask, EXCHANGED: pipeline.sensors_exchanged}
+            driver.on_told = {
+                ASKED: pipeline.ask,
+                EXCHANGED: pipeline.sensors_exchanged,
+                SKIPPED: pipeline.skip,
+            }
         return pipeline
 
     def restore(self, pipeline: Pipeline) -> None:

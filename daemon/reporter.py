@@ -31,6 +31,7 @@ from models.contract import Finger
 if TYPE_CHECKING:
     from daemon.deadlines import Deadlines
     from daemon.judge.gate import GateChange
+    from daemon.overload import Overload
 
 SHA_DIGITS = 12
 JUDGED_MAX = 1024
@@ -212,6 +213,7 @@ class Reporter:
         drivers: dict[str, dict[str, int]],
         pipeline: Pipeline,
         deadlines: Deadlines,
+        overload: Overload,
     ) -> Status:
         """Send one status message."""
         session, grip = pipeline.session, pipeline.grip
@@ -238,6 +240,8 @@ class Reporter:
             jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
             late_readings=deadlines.late,
             worst_age_ms=deadlines.worst_age_ms,
+            skipped_readings=overload.skipped_readings,
+            overloaded=overload.overloaded,
             model=self._model,
             model_sha=self._model_sha,
             versions=self._versions,

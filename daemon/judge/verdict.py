@@ -93,7 +93,7 @@ ADVICE: dict[Reason, str] = {
     Reason.NO_CONTACT: "not all fingers touch: close the hand; or open it once, to tare",
     Reason.MOVING: "fingers or object move: wait until they are still",
     Reason.SETTLING: "still for too short a time yet: wait for the hold time",
-    Reason.SEQUENCE_GAP: "readings were lost, so motion is not known: check cable and bus load",
+    Reason.SEQUENCE_GAP: "readings were lost, so motion is not known: check cable, bus and PC load",
     Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
     Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
     Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
@@ -284,6 +284,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """Readings since start whose verdict came more than a period after their last byte."""
     worst_age_ms: Duration = 0.0
     """Longest time since start from a reading's last byte to its verdict, ms."""
+    skipped_readings: Count = 0
+    """Readings since start that were not judged because newer ones were there already."""
+    overloaded: bool = False
+    """Whether readings come faster than they are judged, or did within the last five seconds."""
     model: str
     model_sha: str
     versions: dict[str, str]
