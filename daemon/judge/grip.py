@@ -112,6 +112,10 @@ class Grip:
         """The sensors are others, or may be: where they rest is not known, nor what they hold."""
         self._contact.forget()
         self._fresh.reset()
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Readings are missing before the next one: the grasp must settle anew."""
         if self._last_ns is not None:
             self._gate.restart(self._last_ns)
 

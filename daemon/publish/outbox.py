@@ -211,6 +211,9 @@ class Reporter:
         drivers: dict[str, dict[str, int]],
         pipeline: Pipeline,
         deadlines: Deadlines,
+        *,
+        skipped_readings: int = 0,
+        overloaded: bool = False,
     ) -> Status:
         """Send one status message."""
         session, grip = pipeline.session, pipeline.grip
@@ -237,6 +240,8 @@ class Reporter:
             jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
             late_readings=deadlines.late,
             worst_age_ms=deadlines.worst_age_ms,
+            skipped_readings=skipped_readings,
+            overloaded=overloaded,
             model=self._model,
             model_sha=self._model_sha,
             versions=self._versions,

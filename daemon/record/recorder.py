@@ -22,7 +22,7 @@ import msgspec
 
 from daemon.publish.sockets import Sockets
 from daemon.record.files import Joints, MessageFile, Shelf
-from daemon.record.mcap import ASKED, EXCHANGED
+from daemon.record.mcap import ASKED, EXCHANGED, SKIPPED
 from daemon.scene import Record
 from drivers.base import JointReading
 
@@ -127,6 +127,7 @@ class Recorder:
         self._joints_topic = f"joints.{shelf.hand}".encode()
         self._asked_topic = f"{ASKED}.{shelf.hand}".encode()
         self._exchanged_topic = f"{EXCHANGED}.{shelf.hand}".encode()
+        self._skipped_topic = f"{SKIPPED}.{shelf.hand}".encode()
         self._status_topic = f"status.{shelf.hand}".encode()
         self._encoder = msgspec.json.Encoder()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
@@ -164,6 +165,10 @@ class Recorder:
     def exchanged(self) -> None:
         """Record that a sensor is another one than before."""
         self._put(self._exchanged_topic, b"{}")
+
+    def skipped(self) -> None:
+        """Record that readings were left out before the next one."""
+        self._put(self._skipped_topic, b"{}")
 
     def raw(self, entry: object, at_ns: int) -> None:
         """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""

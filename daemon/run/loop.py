@@ -14,7 +14,8 @@ from daemon.process.sleep import Sleep
 from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Status, Verdict
 from daemon.publish.outbox import Reporter
-from drivers.base import Driver, JointReading, TactileReading
+from daemon.run.overload import Overload, after
+from drivers.base import Driver, JointReading, Reading, TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.questions import Questions
@@ -24,6 +25,9 @@ STATUS_PERIOD_NS = 1_000_000_000
 SILENCE_PERIODS = 10
 """Readings that may be missing before the daemon says so, as long as that is longer than the age
 limit. Consumers apply the same rule to the daemon."""
+DRAINS_MAX = 8
+"""How often the driver is asked for more in one round when there is too much: what the kernel keeps
+is taken in fewer, and a flood cannot hold the loop."""
 
 Listener = Callable[[Verdict, bytes, TactileReading | None], None]
 """Gets every verdict after it was published, with its payload and the reading it is about."""
@@ -83,6 +87,7 @@ class Service:
         chore: Callable[[], None] | None = None,
         on_joints: Callable[[JointReading], None] | None = None,
         on_asked: Callable[[], None] | None = None,
+        on_skipped: Callable[[], None] | None = None,
         sockets: Peers | None = None,
         watchdog: Watchdog | None = None,
         on_status: Callable[[Status], None] | None = None,
@@ -93,7 +98,8 @@ class Service:
         """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
 
         `chore` is done before readings are judged, and once a second. `on_joints` gets every joint
-        reading, `on_asked` is done when somebody has asked. Questions that come by
+        reading, `on_asked` is done when somebody has asked, `on_skipped` before a reading is judged
+        if others before it were left out (`daemon.run.overload`). Questions that come by
         `sockets` are answered with the next verdict, or if a grasp is judged on request only, when
         it has been.
         `on_status` gets every status once it is sent. `reload` is done when a reload is asked for,
@@ -108,6 +114,7 @@ class Service:
         self._chore = chore
         self._on_joints = on_joints
         self._on_asked = on_asked
+        self._on_skipped = on_skipped
         self._sockets = sockets
         self._questions = None if sockets is None else sockets.questions
         if self._questions is not None:
@@ -124,6 +131,7 @@ class Service:
         self._max_age_ns = max_age_ns
         self._state = State.RUNNING
         now_ns = clock()
+        self._overload = Overload(now_ns, live=self._tactile.live)
         self._last_t_ns = now_ns
         self._silence_due_ns = now_ns + self._silence_ns()
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
@@ -186,15 +194,21 @@ class Service:
             timer_ns = None if timer is None else timer.due_ns()
             if timer_ns is not None and timer_ns < due_ns:
                 due_ns = timer_ns
-        selector.select(max(due_ns - self._clock(), 0) / 1e9)
+        now_ns = self._clock()
+        if now_ns < due_ns and not selector.select(0):
+            selector.select((due_ns - now_ns) / 1e9)
+            self._overload.waited(self._clock())
+        else:  # there is work already
+            self._overload.rest(now_ns)
 
     def _take_readings(self) -> bool:
         """Judge and report what the drivers have; False if there was no tactile reading."""
         taken = False
-        readings = [reading for driver in self._drivers for reading in driver.read_ready()]
-        received_ns = self._clock()
+        readings, waiting = self._read()
+        received_ns = began_ns = self._clock()
         if readings and self._chore is not None:
             self._chore()
+        skipped: list[TactileReading] = []
         for reading in readings:
             if isinstance(reading, JointReading):
                 self._pipeline.turn(reading)
@@ -202,6 +216,12 @@ class Service:
                 if self._on_joints is not None:
                     self._on_joints(reading)
                 continue
+            waiting -= 1
+            if waiting and (skipped or self._is_too_much(waiting + 1, began_ns - received_ns)):
+                skipped.append(reading)
+                continue
+            if skipped:
+                reading = self._after(skipped, reading)
             self._reporter.tactile(reading, self._joints)
             judgement = self._pipeline.judge(reading)
             if self._sleep.has_slept():
@@ -216,9 +236,35 @@ class Service:
             self._answer(verdict, payload)
             if self._listener is not None:
                 self._listener(verdict, payload, reading)
+            judged_ns = self._clock()
+            self._overload.judged(judged_ns - began_ns)
+            began_ns = judged_ns
         if taken:
             self._pipeline.learn()  # what there is time for only now
         return taken
+
+    def _read(self) -> tuple[list[Reading], int]:
+        """What the drivers have, and how many are tactile; if that is too much, to the newest."""
+        readings = [reading for driver in self._drivers for reading in driver.read_ready()]
+        waiting = _tactile(readings)
+        for _ in range(DRAINS_MAX if self._is_too_much(waiting) else 0):
+            more = self._tactile.read_ready()
+            if not more:
+                break
+            readings += more
+            waiting += _tactile(more)
+        return readings, waiting
+
+    def _is_too_much(self, waiting: int, elapsed_ns: int = 0) -> bool:
+        return self._overload.is_too_much(waiting, elapsed_ns, self._tactile.period_ns)
+
+    def _after(self, skipped: Sequence[TactileReading], newest: TactileReading) -> TactileReading:
+        """The newest reading, as it is to be judged after those that were left out."""
+        self._overload.skip(len(skipped), self._clock())
+        self._pipeline.skip()
+        if self._on_skipped is not None:
+            self._on_skipped()
+        return after(skipped[-1], newest)
 
     def _take_questions(self) -> None:
         if self._questions is not None and self._questions.take(self._clock()):
@@ -266,6 +312,8 @@ class Service:
             self._counters(),
             self._pipeline,
             self._deadlines,
+            skipped_readings=self._overload.skipped_readings,
+            overloaded=self._overload.overloaded,
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns
@@ -276,3 +324,8 @@ class Service:
     def _counters(self) -> dict[str, dict[str, int]]:
         counters = {driver.name: driver.counters.as_dict() for driver in self._drivers}
         return counters if self._sockets is None else counters | self._sockets.counters()
+
+
+def _tactile(readings: Sequence[Reading]) -> int:
+    """How many of them are tactile."""
+    return sum(isinstance(reading, TactileReading) for reading in readings)

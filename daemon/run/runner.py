@@ -191,6 +191,7 @@ class Runner:
                 chore=None if kept is None else kept.mind,
                 on_joints=None if recorder is None else recorder.joints,
                 on_asked=None if recorder is None else recorder.asked,
+                on_skipped=None if recorder is None else recorder.skipped,
                 sockets=output,
                 watchdog=self._manager,
                 on_status=self._on_status(sockets, hot),

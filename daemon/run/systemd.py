@@ -105,6 +105,8 @@ def in_a_line(status: Status) -> str:
     parts += [f"{number} {outcome}" for outcome, number in status.verdicts.items() if number]
     if status.gate is not None:
         parts.append(f"gate {status.gate}")
+    if status.overloaded:
+        parts.append(f"overloaded, {status.skipped_readings} readings left out")
     if status.late_readings:
         parts.append(f"{status.late_readings} late")
     parts += [f"{part} {reason}" for part, reason in list(status.health.items())[:4]]
