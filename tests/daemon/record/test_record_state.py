@@ -16,7 +16,7 @@ from daemon.assembly import assembly
 from daemon.assembly.playback import Playback
 from daemon.assembly.recorder import build_recorder
 from daemon.judge.pipeline import Judgement
-from daemon.publish.outbox import Reporter
+from daemon.publish.outbox import Outbox
 from daemon.record import mcap as mcap_recording
 from daemon.record.files import MessageFile, Shelf
 from daemon.record.recorder import Recorder
@@ -138,7 +138,7 @@ class Daemon:
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)
         assert recorder is not None
         self.recorder = recorder
-        self._reporter = Reporter("right", wanted.hand.fingers, "any", BOOT, Output(recorder))
+        self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [recorder])
 
     def _clock(self) -> int:
         return self._now_ns
@@ -146,23 +146,13 @@ class Daemon:
     def judge(self, reading: TactileReading) -> Judgement:
         """And every second a status, if the thread has had time to look."""
         self._now_ns = reading.t_ns
-        self._reporter.tactile(reading, None)
+        self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)
             self.recorder.send(STATUS, b"{}")
         return judgement
-
-
-class Output:
-    """Everything is wanted."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self.send = recorder.send
-
-    def wanted(self, topic: bytes) -> bool:
-        return bool(topic)
 
 
 def sweeps() -> list[TactileReading]:
