@@ -163,7 +163,9 @@ def _overloaded_hz(lab: Lab) -> float:
         lab.twin("--rate", str(rate_hz))
         time.sleep(TRIAL_S)
         statuses = lab.machine.messages.between("can", "status", began_s, math.inf)
-        judged = [status.body["readings_hz"] for status in statuses if _overloaded(status)]
+        judged: list[float] = [
+            status.body["readings_hz"] for status in statuses if _overloaded(status)
+        ]
         if len(judged) >= TRIAL_STATUSES:
             return statistics.median(judged)
     raise StepError(f"not overloaded at {BURST_RATES_HZ[-1]} Hz")
