@@ -22,8 +22,9 @@ WAIT_MAX_NS: Final = 10_000_000
 """What is there at once is judged one by one if that takes so long at most, ns, or a period."""
 COSTS: Final = 4
 """What judging a reading takes is the least of the last four times: a stall is none of it."""
-LASTING_NS: Final = 1_000_000_000
-"""Readings that are left out for so long, ns, are left out by overload, and not by a stall."""
+LASTING_NS: Final = 3_000_000_000
+APART_NS: Final = 1_000_000_000
+"""What leaves readings out for so long, ns, at most a second apart, is overload and no stall."""
 OVER_NS: Final = 5_000_000_000
 """So long without a reading left out, ns, and the overload is over."""
 REST_AFTER_NS: Final = 10_000_000
@@ -52,7 +53,7 @@ class Overload:
         self._rest_after_ns = REST_AFTER_NS if live else REST_AFTER_RECORDED_NS
         self._rested_ns = now_ns
         self._costs_ns: deque[int] = deque(maxlen=COSTS)
-        self._skipping_since_ns = self._skipped_ns = now_ns - LASTING_NS
+        self._skipping_since_ns = self._skipped_ns = now_ns - APART_NS
         self.skipped_readings = 0
         """Tactile readings that were left out since the start."""
         self.overloaded = False
@@ -88,7 +89,7 @@ class Overload:
     def skip(self, readings: int, now_ns: int) -> None:
         """Readings are left out."""
         self.skipped_readings += readings
-        if now_ns - self._skipped_ns >= LASTING_NS:
+        if now_ns - self._skipped_ns >= APART_NS:
             self._skipping_since_ns = now_ns
         self._skipped_ns = now_ns
         if not self.overloaded and now_ns - self._skipping_since_ns >= LASTING_NS:

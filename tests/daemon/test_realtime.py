@@ -277,7 +277,7 @@ def test_a_daemon_at_three_times_its_capacity_lives_on_and_accounts_for_all(
         stack.callback(daemon.terminate)
         for rate_hz in RATES_HZ:
             twin.sweep(rate_hz)
-            twin.hear(5.0, lambda status: status.overloaded)
+            twin.hear(8.0, lambda status: status.overloaded)
             former = twin.statuses[-1]
             twin.hear(3.2, lambda status: False)
             if former.overloaded and thrice(former, twin.statuses[-1]):
