@@ -16,7 +16,7 @@ from daemon.assembly import assembly
 from daemon.assembly.captures import changed
 from daemon.judge.memory import decode
 from daemon.judge.pipeline import Pipeline
-from daemon.record.mcap import ASKED, EXCHANGED, RecordingHeader, header_of
+from daemon.record.mcap import ASKED, EXCHANGED, SKIPPED, RecordingHeader, header_of
 from daemon.record.player import McapReplayDriver
 from daemon.scene import Scene, SceneError, parse
 from drivers.base import RecordingError
@@ -94,7 +94,11 @@ class Playback:
             if not self._is_first:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         if driver is not None:
-            driver.on_told = {ASKED: pipeline.ask, EXCHANGED: pipeline.sensors_exchanged}
+            driver.on_told = {
+                ASKED: pipeline.ask,
+                EXCHANGED: pipeline.sensors_exchanged,
+                SKIPPED: pipeline.skip,
+            }
         return pipeline
 
     def restore(self, pipeline: Pipeline) -> None:

@@ -140,6 +140,11 @@ class Pipeline:
         if self.on_exchange is not None:
             self.on_exchange()
 
+    def skip(self) -> None:
+        """Readings were left out before the next one: nobody knows what moved meanwhile."""
+        if self.grip is not None:
+            self.grip.interrupt()
+
     def turn(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self.grip is not None:

@@ -27,7 +27,9 @@ ASKED: Final = "asked"
 """Kind of the message that the controller has asked for a judgement."""
 EXCHANGED: Final = "exchanged"
 """Kind of the message that a sensor is another one than before."""
-EVENTS: Final = frozenset({ASKED, EXCHANGED})
+SKIPPED: Final = "skipped"
+"""Kind of the message that readings were left out before the next one."""
+EVENTS: Final = frozenset({ASKED, EXCHANGED, SKIPPED})
 """Kinds of messages without content of their own, that matter to what is judged."""
 RECORD_MAX_BYTES = 64 << 20
 """graspd's chunks have a megabyte; what says to be far longer is damaged."""

@@ -16,18 +16,15 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import Final, Protocol
 
 import msgspec
 
-from daemon.publish.sockets import Sockets
+from daemon.publish.companion import Companion
 from daemon.record.files import Joints, MessageFile, Shelf
-from daemon.record.mcap import ASKED, EXCHANGED
+from daemon.record.mcap import ASKED, EXCHANGED, SKIPPED
 from daemon.scene import Record
 from drivers.base import JointReading
-
-if TYPE_CHECKING:
-    from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
 
@@ -95,8 +92,8 @@ class _Open:
     """Entries taken for these files that the disk may not have."""
 
 
-class Recorder:
-    """Records one run of the daemon. `send`, `joints` and `raw` never block and never raise."""
+class Recorder(Companion):
+    """Records one run of the daemon. `send`, `raw` and the hooks never block and never raise."""
 
     def __init__(
         self,
@@ -127,6 +124,7 @@ class Recorder:
         self._joints_topic = f"joints.{shelf.hand}".encode()
         self._asked_topic = f"{ASKED}.{shelf.hand}".encode()
         self._exchanged_topic = f"{EXCHANGED}.{shelf.hand}".encode()
+        self._skipped_topic = f"{SKIPPED}.{shelf.hand}".encode()
         self._status_topic = f"status.{shelf.hand}".encode()
         self._encoder = msgspec.json.Encoder()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
@@ -153,17 +151,25 @@ class Recorder:
             self._wants_turn = False
             self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
-    def joints(self, reading: JointReading) -> None:
+    def wanted(self, topic: bytes) -> bool:
+        """Always: what nobody subscribes to is recorded all the same."""
+        return True
+
+    def on_joints(self, reading: JointReading) -> None:
         """Record joint angles."""
         self._put(self._joints_topic, reading)
 
-    def asked(self) -> None:
+    def on_asked(self) -> None:
         """Record that the controller asks for a judgement."""
         self._put(self._asked_topic, b"{}")
 
     def exchanged(self) -> None:
         """Record that a sensor is another one than before."""
         self._put(self._exchanged_topic, b"{}")
+
+    def on_skipped(self) -> None:
+        """Record that readings were left out before the next one."""
+        self._put(self._skipped_topic, b"{}")
 
     def raw(self, entry: object, at_ns: int) -> None:
         """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""
@@ -181,6 +187,10 @@ class Recorder:
         """
         writing = self._open is not None
         return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
+
+    def counters_by_part(self) -> dict[str, dict[str, int]]:
+        """The same, as part of the status."""
+        return {"record": self.counters()}
 
     def close(self) -> None:
         """Write what waits and end the files; leave a disk that does not answer alone."""
@@ -323,38 +333,3 @@ class Recorder:
         self._retry_due_ns = self._clock() + RETRY_NS
         say = log.warning if first else log.debug
         say("record: %s: %s; nothing is recorded", self._shelf.directory, error.strerror or error)
-
-
-class Recorded:
-    """The sockets, with everything that is sent recorded too."""
-
-    def __init__(self, sockets: Sockets, recorder: Recorder) -> None:
-        self._sockets = sockets
-        self._recorder = recorder
-
-    @property
-    def questions(self) -> Questions | None:
-        """Who takes questions, if anybody."""
-        return self._sockets.questions
-
-    def filenos(self) -> list[int]:
-        """Become readable when a peer may want something."""
-        return self._sockets.filenos()
-
-    def take(self) -> None:
-        """See to peers that come."""
-        self._sockets.take()
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """What peers and the recorder did."""
-        return self._sockets.counters() | {"record": self._recorder.counters()}
-
-    def wanted(self, topic: bytes) -> bool:
-        """Always: what nobody subscribes to is recorded all the same."""
-        return True
-
-    def send(self, topic: bytes, payload: bytes) -> None:
-        """Publish and record one message; readings are published only if somebody wants them."""
-        if not topic.startswith(b"tactile.") or self._sockets.wanted(topic):
-            self._sockets.send(topic, payload)
-        self._recorder.send(topic, payload)

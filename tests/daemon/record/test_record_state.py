@@ -16,7 +16,8 @@ from daemon.assembly import assembly
 from daemon.assembly.playback import Playback
 from daemon.assembly.recorder import build_recorder
 from daemon.judge.pipeline import Judgement
-from daemon.publish.outbox import Reporter
+from daemon.judge.reasons import GateCause
+from daemon.publish.outbox import Outbox
 from daemon.record import mcap as mcap_recording
 from daemon.record.files import MessageFile, Shelf
 from daemon.record.recorder import Recorder
@@ -138,7 +139,7 @@ class Daemon:
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)
         assert recorder is not None
         self.recorder = recorder
-        self._reporter = Reporter("right", wanted.hand.fingers, "any", BOOT, Output(recorder))
+        self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [recorder])
 
     def _clock(self) -> int:
         return self._now_ns
@@ -146,23 +147,13 @@ class Daemon:
     def judge(self, reading: TactileReading) -> Judgement:
         """And every second a status, if the thread has had time to look."""
         self._now_ns = reading.t_ns
-        self._reporter.tactile(reading, None)
+        self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)
             self.recorder.send(STATUS, b"{}")
         return judgement
-
-
-class Output:
-    """Everything is wanted."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self.send = recorder.send
-
-    def wanted(self, topic: bytes) -> bool:
-        return bool(topic)
 
 
 def sweeps() -> list[TactileReading]:
@@ -207,6 +198,31 @@ def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_fil
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
     assert expected[1249].reasons != expected[1250].reasons
+    paths = files(tmp_path)
+    assert again(*paths) == expected
+    assert len(paths) > 3
+    for path in paths:
+        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
+        assert again(path) == [each for each in expected if each.t_ns in times]
+
+
+def test_where_readings_were_left_out_the_replay_knows_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also right before a new file begins, and in a grasp that had been judged."""
+    daemon = Daemon(tmp_path, monkeypatch)
+    expected = []
+    for reading in sweeps()[:2000]:
+        place = reading.seq % 100
+        if 93 <= place < 98 or reading.seq % 370 == 5:
+            continue
+        if place == 98 or reading.seq % 370 == 6:
+            daemon.pipeline.skip()
+            daemon.recorder.on_skipped()
+        expected.append(daemon.judge(reading))
+    daemon.recorder.close()
+    gaps = [each for each in expected for change in each.changes if change.cause is GateCause.GAP]
+    assert len(gaps) > 3
     paths = files(tmp_path)
     assert again(*paths) == expected
     assert len(paths) > 3

@@ -8,6 +8,7 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from daemon.judge.reasons import GateState, Outcome, Reason
@@ -72,7 +73,7 @@ def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) 
     ears.setblocking(False)
     fed_ms = []
     for elapsed_ms in range(0, 2000, 10):
-        manager.feed()
+        manager.after_round()
         try:
             assert heard(ears) == ["WATCHDOG=1"]
         except BlockingIOError:
@@ -88,7 +89,7 @@ def test_without_a_watchdog_nothing_is_fed_and_nothing_is_due(ears: socket.socke
     manager = Systemd.of({"NOTIFY_SOCKET": ears.getsockname()})
     assert manager is not None
     assert manager.due_ns() is None
-    manager.feed()
+    manager.after_round()
     manager.stopping()
     assert heard(ears) == ["STOPPING=1", "STATUS=stopping"]
     manager.close()
@@ -151,4 +152,7 @@ def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None
     assert in_a_line(status) == (
         "running: 100.0 readings/s, 1 stable, 1 slip, 1 unknown, gate idle, 3 late, "
         "ff_7 saturated, mf not-tared"
+    )
+    assert "1 unknown, gate idle, overloaded, 4 readings left out, 3 late" in in_a_line(
+        msgspec.structs.replace(status, overloaded=True)
     )
