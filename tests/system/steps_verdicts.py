@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import statistics
@@ -169,7 +170,10 @@ def _overloaded_hz(lab: Lab) -> float:
         time.sleep(TRIAL_S)
         statuses = lab.machine.messages.between("can", "status", began_s, math.inf)
         judged: list[float] = [
-            status.body["readings_hz"] for status in statuses if _overloaded(status)
+            later.body["readings_hz"]
+            for former, later in itertools.pairwise(statuses)
+            if _overloaded(later)
+            and later.body["skipped_readings"] > former.body["skipped_readings"]
         ]
         if len(judged) >= TRIAL_STATUSES:
             return statistics.median(judged)
