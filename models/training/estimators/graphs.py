@@ -102,9 +102,8 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
 def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
     """A copy whose input has this name."""
     other = copied(model)
-    former = other.graph.input[0].name
+    _feed(other.graph, other.graph.input[0].name, input_name)
     other.graph.input[0].name = input_name
-    _feed(other.graph, former, input_name)
     return other
 
 
@@ -126,11 +125,33 @@ def standardised(
         ("Sub", (given, "input_mean"), "centred", {}),
         ("Mul", ("centred", "input_scale"), "standardised", {}),
     )
-    nodes = [*_nodes(steps), *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)
+    set_nodes(graph, [*_nodes(steps), *graph.node])
     graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
     return model
+
+
+def set_nodes(graph: onnx.GraphProto, nodes: Sequence[onnx.NodeProto]) -> None:
+    """Let the graph consist of these nodes, in the order in which they run."""
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+@contextmanager
+def quiet(name: str | None) -> Iterator[None]:
+    """Hold back what a logger (None: the root) says below an error, and what will be deprecated.
+
+    Exporter and quantiser talk of their own insides: nothing that a user could act on.
+    """
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", category=FutureWarning)
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
@@ -170,8 +191,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         ("Cast", ("decision",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
     )
     constants.append(_constant("axis", np.array([1])))
-    nodes = _nodes(steps)
-    return _model(nodes, constants, _vectors(input_name, features), MARGIN_NAME, 1)
+    return _model(_nodes(steps), constants, _vectors(input_name, features), MARGIN_NAME, 1)
 
 
 def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.ModelProto:
@@ -257,14 +277,8 @@ def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
         target_opset={"": OPSET, "ai.onnx.ml": ML_OPSET},
         options={id(model): {"zipmap": False}},
     )
-    _rename_input(converted.graph, input_name)
+    _feed(converted.graph, converted.graph.input[0].name, input_name)
     return converted
-
-
-def _rename_input(graph: onnx.GraphProto, input_name: str) -> None:
-    given = graph.input[0].name
-    for node in graph.node:
-        node.input[:] = [input_name if name == given else name for name in node.input]
 
 
 def _from_torch(
@@ -272,7 +286,7 @@ def _from_torch(
 ) -> onnx.ModelProto:
     # Two inputs, because one would let the exporter take the batch for a constant.
     example = torch.zeros(2, *shape)
-    with _quiet_exporter():
+    with quiet("torch.onnx"):
         program = torch.onnx.export(
             network,
             (example,),
@@ -337,18 +351,3 @@ def _vectors(name: str, width: int) -> onnx.ValueInfoProto:
 
 def _constant(name: str, values: NDArray[np.generic]) -> onnx.TensorProto:
     return numpy_helper.from_array(np.ascontiguousarray(values), name)
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Hold back what the exporter says of its own inside: nothing that a user could act on."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=FutureWarning)
-            warnings.filterwarnings("ignore", category=DeprecationWarning)
-            yield
-    finally:
-        logger.setLevel(level)

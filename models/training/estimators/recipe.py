@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -69,9 +69,6 @@ class PublishedRecipe:
 
 AnyRecipe = Recipe | PublishedRecipe
 
-Progress = Callable[[], None]
-"""Called after each epoch."""
-
 
 @contextmanager
 def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
@@ -89,14 +86,13 @@ def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
             torch.use_deterministic_algorithms(deterministic_before)
 
 
-def train(
+def train_network(
     config: AnyNetwork,
     inputs: NDArray[np.float32],
     slipped: NDArray[np.bool_] | NDArray[np.float64],
     recipe: AnyRecipe,
     *,
     seed: int,
-    on_epoch: Progress | None = None,
 ) -> nn.Sequential:
     """Train a network on inputs (N, *shape); returns it in evaluation mode.
 
@@ -113,7 +109,7 @@ def train(
             if isinstance(layer, _BatchNorm):
                 layer.momentum = recipe.norm_momentum
         targets = torch.stack((1.0 - slip, slip), dim=1)
-        _fit(network, torch.from_numpy(inputs), targets, recipe, on_epoch)
+        _fit(network, torch.from_numpy(inputs), targets, recipe)
         return network.eval()
 
 
@@ -127,17 +123,14 @@ def logits(
 
 
 def _fit(
-    network: nn.Sequential,
-    inputs: torch.Tensor,
-    targets: torch.Tensor,
-    recipe: AnyRecipe,
-    on_epoch: Progress | None,
+    network: nn.Sequential, inputs: torch.Tensor, targets: torch.Tensor, recipe: AnyRecipe
 ) -> None:
-    optimizer, schedule = optimization(network, recipe, len(_batches(len(inputs), recipe)))
+    batches = _batches(len(inputs), recipe)
+    optimizer, schedule = optimization(network, recipe, len(batches))
     loss = nn.CrossEntropyLoss(label_smoothing=recipe.label_smoothing)
     for _ in range(recipe.epochs):
         order = torch.randperm(len(inputs))
-        for batch in _batches(len(inputs), recipe):
+        for batch in batches:
             chosen = order[batch]
             seen = inputs[chosen]
             if recipe.input_noise > 0.0:
@@ -146,8 +139,6 @@ def _fit(
             loss(network(seen), targets[chosen]).backward()
             optimizer.step()
             schedule.step()
-        if on_epoch is not None:
-            on_epoch()
 
 
 def optimization(

@@ -12,7 +12,6 @@ from sklearn.metrics import f1_score
 from models.electrodes import Electrodes
 from models.training.data.datasets import COUNT_MAX, Grasps
 from models.training.data.folds import fold_seed, folds_of
-from models.training.fitting.seen import seen_counts
 from models.training.fitting.trained import Trained, train
 from models.training.systems.system import System
 
@@ -87,9 +86,10 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
 def left_out(grasps: Grasps, seed: int) -> list[NDArray[np.bool_]]:
     """Of each training of the study, shape (N,): True for the grasps that it is judged by.
 
-    Raises `TooFewGraspsError` for less than two grasps of a class.
+    Raises `TooFewGraspsError` for less than two grasps of a label.
     """
-    folds = min(FOLDS, max(2, _smaller_class(grasps)))
+    slips = int(grasps.slipped.sum())
+    folds = min(FOLDS, max(2, min(slips, len(grasps) - slips)))
     fold_of = folds_of(grasps.slipped, folds, seed)
     return [fold_of == fold for fold in range(min(JUDGED_FOLDS, folds))]
 
@@ -105,26 +105,24 @@ class _Fold:
         self._slipped = grasps.slipped[left_out]
         self._table_of = grasps.table_of[left_out]
         self._trained: Trained = train(system, rest, seed)
-        looks = self._trained.looks
-        seen = seen_counts(looks.to_training(rest.counts, rest.table_of), looks.margin)
-        self._electrodes = Electrodes(seen)
+        self._electrodes = Electrodes(self._trained.seen())
 
     def judge(self, counts: NDArray[np.generic]) -> float:
         verdict = self._trained.margins(counts, self._table_of) > 0.0
         return float(f1_score(self._slipped, verdict, zero_division=0.0))
 
     def find(self, counts: NDArray[np.generic]) -> NDArray[np.bool_]:
-        values = self._trained.looks.to_training(counts, self._table_of)
+        values = self._trained.sensors.to_training(counts, self._table_of)
         nothing = np.zeros(counts.shape[1:], dtype=np.bool_)
         return np.array(
             [self._electrodes.implausible(reading, nothing, LOOKED_FOR_MAX) for reading in values]
         )
 
     def repair(self, counts: NDArray[np.generic], broken: NDArray[np.bool_]) -> NDArray[np.generic]:
-        values = self._trained.looks.to_training(counts, self._table_of)
+        values = self._trained.sensors.to_training(counts, self._table_of)
         for index in np.flatnonzero(broken.any(axis=(1, 2))):
             values[index] = self._electrodes.repaired(values[index], broken[index])
-        repaired = self._trained.looks.from_training(values, self._table_of)
+        repaired = self._trained.sensors.from_training(values, self._table_of)
         return np.where(broken, np.clip(repaired, 0.0, COUNT_MAX), counts)
 
 
@@ -150,7 +148,3 @@ def _places(shape: tuple[int, ...], number: int, random: np.random.Generator) ->
     order = random.random((shape[0], shape[1] * shape[2])).argsort(axis=1)
     places: NDArray[np.bool_] = (order < number).reshape(shape)
     return places
-
-
-def _smaller_class(grasps: Grasps) -> int:
-    return min(int(grasps.slipped.sum()), int((~grasps.slipped).sum()))

@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from models.training.data.protocols import Protocol
+from models.training.data.protocols import EvalProtocol
 from models.training.estimators.networks import DenseConfig, NetworkConfig
 from models.training.evaluating.metrics import Spread
-from models.training.evaluating.summary import Summary
+from models.training.evaluating.summaries import Summary
 from models.training.systems.system import BlendConfig, DistilConfig, System
 
 
@@ -35,7 +35,7 @@ def grid_of(system: System) -> list[System]:
 
 
 def best_of_grid(
-    system: System, protocol: Protocol, summaries: Sequence[Summary]
+    system: System, protocol: EvalProtocol, summaries: Sequence[Summary]
 ) -> list[GridPoint]:
     """All configurations of a system's grid, the best F1 first."""
     names = {variant.name for variant in grid_of(system)}

@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import logging
-import os
 import threading
 import time
 import warnings
@@ -15,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import joblib
 import numpy as np
@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 from models.inputs import builder, raw_features
 from models.training.data.datasets import Grasps
 from models.training.data.folds import fold_seed
-from models.training.data.protocols import FOLDS, Protocol, Split, splits
-from models.training.fitting.fitting import Fitted, fit
-from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, sit
+from models.training.data.protocols import FOLDS, EvalProtocol, Split, splits
+from models.training.files import write_whole
+from models.training.fitting.fit import fit
+from models.training.fitting.fitted import Fitted
+from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
 from models.training.systems.system import SessionFeatures, System, digest, with_recipes
 
 FORMAT = 1
@@ -39,9 +41,19 @@ _ONE_AT_A_TIME = threading.Lock()
 
 _log = logging.getLogger(__name__)
 
+Number = TypeVar("Number", np.float64, np.int64)
+
 
 class BrokenResultError(Exception):
     """A stored result is not what it claims to be: run the job again."""
+
+
+class ClusterError(Exception):
+    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
+
+
+Outcomes = Iterator[tuple[int, bytes]]
+"""Of jobs in the order in which they finish: index of the job, `JobResult.to_bytes`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +61,7 @@ class Job:
     """One fold of one protocol for one system."""
 
     system: System
-    protocol: Protocol
+    protocol: EvalProtocol
     seed: int
     """Of the split and, with the fold, of the training."""
     fold: int
@@ -131,6 +143,11 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     return JobResult(split.test, margins, len(split.train), seconds, fitted.parameters, ages)
 
 
+def run_numbered(index: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
+    """`run` as a process of its own is asked and answers: an item of `Outcomes`."""
+    return index, run(job, grasps).to_bytes()
+
+
 def load(folder: Path, job: Job, data: str) -> JobResult | None:
     """The stored result of a job, None if there is none or, with a warning, if it is broken."""
     path = folder / job.file_name(data)
@@ -147,16 +164,7 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
 
 def save(folder: Path, job: Job, data: str, content: bytes) -> None:
     """Store the bytes of a result, whole or not at all."""
-    path = folder / job.file_name(data)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_whole(folder / job.file_name(data), content)
 
 
 @contextmanager
@@ -184,12 +192,12 @@ def _run_session(
     if split.calibration is None:
         known = standards.apply(features[test], table_of[test], wanted.clip)
         return fitted, {TRAINING: fitted.margins(known)}, {}
-    sitting = sit(features, test, split.calibration, standards, seed)
+    session = later_session(features, test, split.calibration, standards, seed)
     margins = {
         variant: fitted.margins(by.apply(features[test], wanted.clip))
-        for variant, by in sitting.standards.items()
+        for variant, by in session.standards.items()
     }
-    return fitted, margins, sitting.ages
+    return fitted, margins, session.ages
 
 
 def _alone(system: System) -> System:
@@ -202,35 +210,23 @@ def _result(arrays: dict[str, NDArray[np.generic]]) -> JobResult:
     if meta["format"] != FORMAT:
         raise ValueError(f"format {meta['format']}, not {FORMAT}")
     test = arrays[_TEST].astype(np.int64)
-    margins = {
-        name: values.astype(np.float64)
-        for name, values in _named(arrays, _MARGINS, test.shape).items()
-    }
-    ages = {
-        name: values.astype(np.int64) for name, values in _named(arrays, _AGES, test.shape).items()
-    }
+    margins = _named(arrays, _MARGINS, np.float64)
+    ages = _named(arrays, _AGES, np.int64)
     if test.ndim != 1 or not margins:
         raise ValueError("has no margins")
+    if any(values.shape != test.shape for values in (*margins.values(), *ages.values())):
+        raise ValueError("has margins or ages of another number of grasps")
     if not all(np.isfinite(values).all() for values in margins.values()):
         raise ValueError("has margins that are not finite")
-    return JobResult(
-        test,
-        margins,
-        int(meta["train_grasps"]),
-        float(meta["seconds"]),
-        int(meta["parameters"]),
-        ages,
-    )
+    numbers = int(meta["train_grasps"]), float(meta["seconds"]), int(meta["parameters"])
+    return JobResult(test, margins, *numbers, ages)
 
 
 def _named(
-    arrays: dict[str, NDArray[np.generic]], prefix: str, shape: tuple[int, ...]
-) -> dict[str, NDArray[np.generic]]:
-    found = {
-        name.removeprefix(prefix): values
+    arrays: dict[str, NDArray[np.generic]], prefix: str, kind: type[Number]
+) -> dict[str, NDArray[Number]]:
+    return {
+        name.removeprefix(prefix): values.astype(kind)
         for name, values in arrays.items()
         if name.startswith(prefix)
     }
-    if any(values.shape != shape for values in found.values()):
-        raise ValueError(f"has {prefix} of another number of grasps")
-    return found

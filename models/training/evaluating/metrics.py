@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
 
-from models.training.fitting.calibration import ECE_BINS, margins_of, p_slip, reliability
+from models.training.fitting.calibration import (
+    ECE_BINS,
+    Reliability,
+    margins_of,
+    p_slip,
+    reliability,
+)
 
 METRICS = ("accuracy", "precision", "recall", "f1", "auc", "brier", "ece", "log_loss")
 """Names of the figures of `Scores`."""
@@ -23,7 +29,7 @@ FEWEST_JUDGED = 50
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class Scores(Reliability):
     """Figures of one test set as fractions, slip positive."""
 
     grasps: int
@@ -33,12 +39,6 @@ class Scores:
     f1: float
     auc: float
     """Area under the ROC curve: does it rank, whatever the threshold. NaN for a single class."""
-    brier: float
-    """Mean squared error of the slip probability."""
-    ece: float
-    """Expected calibration error of the verdict's probability."""
-    log_loss: float
-    """Mean negative log-likelihood, nats."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,15 +103,13 @@ def score(
     both = len(np.unique(slipped)) == 2
     reliable = reliability(p_slip(margin) if probability is None else probability, slipped)
     return Scores(
+        **asdict(reliable),
         grasps=len(slipped),
         accuracy=float(accuracy_score(slipped, verdict)),
         precision=float(precision),
         recall=float(recall),
         f1=float(f1),
         auc=float(roc_auc_score(slipped, margin)) if both else math.nan,
-        brier=reliable.brier,
-        ece=reliable.ece,
-        log_loss=reliable.log_loss,
     )
 
 

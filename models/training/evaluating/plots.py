@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from models.training.data.protocols import PROTOCOLS
-from models.training.evaluating.summary import Summary
+from models.training.evaluating.summaries import Summary
 from models.training.fitting.standards import DRAWS
 
 FORMATS = ("png", "svg")

@@ -1,4 +1,4 @@
-"""What the training counts look like, and how much of other data is unlike them."""
+"""Novelty: what the training counts look like, and how much of other data is unlike them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Are the grasps enough for every training of an order? Told before the first, not after hours."""
+"""Check, before training starts, that every training of a plan has enough grasps of both labels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from models.training.data.datasets import Grasps
 from models.training.data.folds import TooFewGraspsError
 from models.training.data.protocols import splits
 from models.training.evaluating.broken import left_out
-from models.training.making.making import Order
+from models.training.making.plan import TrainingPlan
 from models.training.systems.system import DistilConfig, SessionFeatures
 
 FEWEST_STANDARD = 2
@@ -32,15 +32,15 @@ class _Training:
     """Indices of the tables that it is judged by, standardised as in the training."""
 
 
-def check_enough(order: Order, grasps: Grasps) -> None:
-    """Raise `TooFewGraspsError` if one of the trainings cannot be done.
+def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
+    """Raise `TooFewGraspsError` if one of the plan's trainings lacks grasps of a label.
 
-    Each needs grasps of both kinds, a session model some of every table that it is judged by, too.
+    A training of a session model also needs `FEWEST_STANDARD` of each table that it is judged by.
     """
-    estimator = order.system.estimator
+    estimator = plan.system.estimator
     least = estimator.inner_folds if isinstance(estimator, DistilConfig) else 1
-    session = isinstance(order.system.input, SessionFeatures)
-    for training in _trainings(order, grasps):
+    session = isinstance(plan.system.input, SessionFeatures)
+    for training in _trainings(plan, grasps):
         slips = int(training.slipped.sum())
         for kind, number in (("slipped", slips), ("stayed", len(training.slipped) - slips)):
             if number < least:
@@ -56,15 +56,15 @@ def check_enough(order: Order, grasps: Grasps) -> None:
                 )
 
 
-def _trainings(order: Order, grasps: Grasps) -> Iterator[_Training]:
-    for protocol in order.protocols(grasps):
-        for split in splits(protocol, grasps, order.seed, order.folds):
+def _trainings(plan: TrainingPlan, grasps: Grasps) -> Iterator[_Training]:
+    for protocol in plan.protocols(grasps):
+        for split in splits(protocol, grasps, plan.seed, plan.folds):
             # A session that is calibrated while it is judged needs nothing of the training.
             test = split.test if split.calibration is None else split.test[:0]
             yield _training(f"{protocol}, {split.name},", grasps, split.train, test)
-    if order.only is None:
-        kept = grasps.of_tables(order.system.tables)
-        for out in left_out(kept, order.seed):
+    if plan.only is None:
+        kept = plan.chosen(grasps)
+        for out in left_out(kept, plan.seed):
             rest, test = np.flatnonzero(~out), np.flatnonzero(out)
             yield _training("the study of broken electrodes", kept, rest, test)
 

@@ -13,16 +13,14 @@ from models.contract import CountsInput, ImageInput, VectorInput
 from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig
 from models.training.estimators.networks import CNN1, build, parameter_count
 from models.training.estimators.recipe import PublishedRecipe, Recipe
-from models.training.systems.systems import (
-    SYSTEMS,
+from models.training.systems.registry import SYSTEMS
+from models.training.systems.system import (
     BlendConfig,
     DistilConfig,
     Member,
     Published,
     SessionFeatures,
-    System,
     digest,
-    epochs,
     with_recipes,
 )
 
@@ -127,13 +125,3 @@ def test_all_recipes_of_a_system_can_be_changed_at_once() -> None:
     assert recipes
     assert all((recipe.epochs, recipe.threads) == (2, 3) for recipe in recipes)
     assert with_recipes(SYSTEMS["svm"], epochs=2) == SYSTEMS["svm"]
-
-
-def test_epochs_are_those_of_all_networks_that_are_trained() -> None:
-    blend = BlendConfig((Member(SvmConfig(1.0, 0.1)), Member(CNN1, Recipe(epochs=7), copies=3)))
-    made = System("made", "Made up.", VectorInput(), blend)
-    distilled = replace(
-        made, estimator=DistilConfig(blend, CNN1, inner_folds=4), recipe=Recipe(epochs=5)
-    )
-    assert (epochs(SYSTEMS["cnn1"]), epochs(SYSTEMS["svm"])) == (20, 0)
-    assert (epochs(made), epochs(distilled)) == (21, 4 * 21 + 5)
