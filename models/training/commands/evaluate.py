@@ -20,11 +20,11 @@ from models.training.commands.arguments import (
 from models.training.data.datasets import read_all, unpublished
 from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.campaign import Campaign, campaign, quickened
+from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.grid import best_of_grid, grid_of
 from models.training.evaluating.jobs import ClusterError
 from models.training.evaluating.results_table import Made, results_table
 from models.training.evaluating.summaries import Summary, made_with, read_summaries
-from models.training.files import to_json, write_whole
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import System, digest
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from models.bts3 import FINGERS, NEW_SESSION, TABLES, WHOLE
 from models.contract import Dataset
 from models.layout import ELECTRODES
+from models.training.arrays import Bools, Ints
 
 COUNT_MAX = 4095
 """Largest 12-bit count."""
@@ -46,7 +47,7 @@ class Grasps:
 
     counts: NDArray[np.uint16]
     """Shape (N, fingers, 24), raw counts 0..4095; a table has the fingers ff, mf, th."""
-    slipped: NDArray[np.bool_]
+    slipped: Bools
     """Shape (N,): True where the object slipped in the lift."""
     objects: tuple[str, ...]
     """Object name of each grasp."""
@@ -57,12 +58,12 @@ class Grasps:
         return len(self.slipped)
 
     @property
-    def table_of(self) -> NDArray[np.int64]:
+    def table_of(self) -> Ints:
         """Shape (N,): index in `files` of the file that each grasp comes from."""
         return np.repeat(np.arange(len(self.files)), [file.rows for file in self.files])
 
-    def rows(self, indices: NDArray[np.int64]) -> Grasps:
-        """Only these grasps, indices ascending; the files keep their digests, not their rows."""
+    def rows(self, indices: Ints) -> Grasps:
+        """Only these grasps, indices ascending; `files` keep digests and count their rows anew."""
         kept = np.bincount(self.table_of[indices], minlength=len(self.files))
         return Grasps(
             self.counts[indices],
@@ -74,15 +75,15 @@ class Grasps:
             ),
         )
 
-    def rows_of(self, tables: Collection[str]) -> NDArray[np.int64]:
+    def rows_of(self, tables: Collection[str]) -> Ints:
         """Indices, ascending, of the grasps of the tables with these names."""
         wanted = [index for index, file in enumerate(self.files) if file.name in tables]
         return np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64)
 
     def of_fingers(self, fingers: Sequence[str]) -> Grasps:
-        """With these fingers alone, in this order; the grasps must have those of a table.
+        """With these fingers alone, in this order, of grasps with all fingers of a table.
 
-        Raises `ValueError` for a finger that they do not have.
+        Raises `ValueError` for a finger that a table lacks, or if fingers are missing already.
         """
         if self.counts.shape[1] != len(FINGERS) or not set(fingers) <= set(FINGERS):
             raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}")
@@ -90,14 +91,14 @@ class Grasps:
         return dataclasses.replace(self, counts=np.ascontiguousarray(self.counts[:, chosen]))
 
     def digest(self) -> str:
-        """SHA-256, hexadecimal, of what a result may depend on."""
+        """SHA-256, hexadecimal, of counts, labels, objects and the tables' names and rows."""
         text = json.dumps([self.objects, [(file.name, file.rows) for file in self.files]])
         parts = (self.counts.tobytes(), self.slipped.tobytes(), text.encode())
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def read_table(path: Path) -> Grasps:
-    """Read one grasp table. Raises `DatasetError` with file, line and column."""
+    """Read one grasp table (columns above). Raises `DatasetError` with file, line and column."""
     data = _read(path)
     try:
         text = data.decode()

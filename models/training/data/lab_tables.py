@@ -6,13 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from models.bts3 import TABLES
-from models.training.data.datasets import (
-    DatasetError,
-    Grasps,
-    concatenate,
-    read_all,
-    read_table,
-)
+from models.training.data.datasets import DatasetError, Grasps, concatenate, read_all, read_table
 
 FEWEST_GRASPS = 20
 """Of one lab table: the number from which the daemon takes a session for calibrated."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.bts3 import NEW_SESSION, WHOLE
+from models.training.arrays import Ints
 from models.training.data.datasets import Grasps, lab_table_names
 from models.training.data.folds import TooFewGraspsError, folds_of, object_folds
 
@@ -44,9 +44,9 @@ class Split:
     """One training and the grasps that it is judged by: row indices of `Grasps`, ascending."""
 
     name: str
-    train: NDArray[np.int64]
-    test: NDArray[np.int64]
-    calibration: NDArray[np.int64] | None = None
+    train: Ints
+    test: Ints
+    calibration: Ints | None = None
     """In `session`: grasps of the test's session but of other objects. They may calibrate the
     session; their labels are not used."""
 
@@ -112,7 +112,7 @@ _MAKERS: dict[EvalProtocol, _Maker] = {
 }
 
 
-def _rows(grasps: Grasps, *tables: str, with_lab: bool = False) -> NDArray[np.int64]:
+def _rows(grasps: Grasps, *tables: str, with_lab: bool = False) -> Ints:
     """Indices of the grasps of these tables, all of which must be there, and of lab tables."""
     names = [file.name for file in grasps.files]
     if with_lab:
@@ -124,13 +124,11 @@ def _rows(grasps: Grasps, *tables: str, with_lab: bool = False) -> NDArray[np.in
     return grasps.rows_of(tables)
 
 
-def _object_folds(
-    grasps: Grasps, rows: NDArray[np.int64], folds: int, seed: int
-) -> NDArray[np.int64]:
+def _object_folds(grasps: Grasps, rows: Ints, folds: int, seed: int) -> Ints:
     return object_folds([grasps.objects[row] for row in rows], folds, seed)
 
 
-def _leave_out(rows: NDArray[np.int64], fold_of: NDArray[np.int64], folds: int) -> list[Split]:
+def _leave_out(rows: Ints, fold_of: Ints, folds: int) -> list[Split]:
     return [
         Split(f"fold {fold}", rows[fold_of != fold], rows[fold_of == fold]) for fold in range(folds)
     ]

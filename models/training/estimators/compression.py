@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from onnxruntime.quantization import (
     CalibrationDataReader,
@@ -19,6 +18,7 @@ from onnxruntime.quantization import (
 )
 
 from models.runtime import single_threaded
+from models.training.arrays import Floats, Floats32
 from models.training.estimators.graphs import MARGIN_NAME, copied, quiet, set_nodes
 
 CALIBRATION_GRASPS = 256
@@ -48,9 +48,7 @@ class LowRank:
 Compression = HalfWeights | Integers | LowRank
 
 
-def compressed(
-    margin: onnx.ModelProto, how: Compression, inputs: NDArray[np.float32]
-) -> onnx.ModelProto:
+def compressed(margin: onnx.ModelProto, how: Compression, inputs: Floats32) -> onnx.ModelProto:
     """The graph to `margin` in a smaller form; `inputs` (N, *shape) are those of the training.
 
     Raises `ValueError` if the graph has no dense layer to factor.
@@ -69,7 +67,7 @@ def size(model: onnx.ModelProto) -> int:
     return sum(int(np.prod(constant.dims)) for constant in model.graph.initializer)
 
 
-def graph_margins(model: onnx.ModelProto, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+def graph_margins(model: onnx.ModelProto, inputs: Floats32) -> Floats:
     """Log-odds of slip (N,) that a graph to `margin` gives for inputs (N, *shape).
 
     One by one, as the daemon asks: dynamic ranges are those of a whole batch.
@@ -136,9 +134,7 @@ def _low_rank(margin: onnx.ModelProto, rank: int) -> onnx.ModelProto:
     return model
 
 
-def _integers(
-    margin: onnx.ModelProto, inputs: NDArray[np.float32], *, static: bool
-) -> onnx.ModelProto:
+def _integers(margin: onnx.ModelProto, inputs: Floats32, *, static: bool) -> onnx.ModelProto:
     with tempfile.TemporaryDirectory() as folder, quiet(None):
         path = Path(folder) / "small.onnx"
         if static:
@@ -162,8 +158,8 @@ def _integers(
 class _Readings(CalibrationDataReader):  # type: ignore[misc]
     """Hands the inputs of a calibration over, one by one."""
 
-    def __init__(self, name: str, inputs: NDArray[np.float32]) -> None:
+    def __init__(self, name: str, inputs: Floats32) -> None:
         self._readings = iter([{name: inputs[i : i + 1]} for i in range(len(inputs))])
 
-    def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+    def get_next(self) -> dict[str, Floats32] | None:
         return next(self._readings, None)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from skl2onnx import to_onnx
 from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
@@ -20,6 +19,7 @@ from sklearn.svm import SVC
 from torch import nn
 
 from models.contract import OUTPUT_NAME
+from models.training.arrays import Floats, Floats32, Numbers
 from models.training.estimators.classical import PROBABILITY_FLOOR, ClassicalModel
 from models.training.estimators.networks import for_inference, for_margin
 
@@ -65,7 +65,10 @@ def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
 
 
 def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> onnx.ModelProto:
-    """One graph whose margin is the sum of the parts' margins times their factors."""
+    """One graph whose margin is the sum of the parts' margins times their factors.
+
+    The parts have the same input; their nodes are renamed in place.
+    """
     width = parts[0].graph.input[0]
     nodes: list[onnx.NodeProto] = []
     constants: list[onnx.TensorProto] = []
@@ -108,16 +111,17 @@ def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:
-    """One that may be changed."""
+    """A copy that may be changed."""
     other = onnx.ModelProto()
     other.CopyFrom(model)
     return other
 
 
-def standardised(
-    model: onnx.ModelProto, mean: NDArray[np.float32], scale: NDArray[np.float32]
-) -> onnx.ModelProto:
-    """The graph with `(input - mean) * scale` before it; both of the input's shape."""
+def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onnx.ModelProto:
+    """The graph, changed in place, with `(input - mean) * scale` before it.
+
+    Both have the shape of one input.
+    """
     graph = model.graph
     given = graph.input[0].name
     _feed(graph, given, "standardised")
@@ -224,7 +228,7 @@ def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.Mo
     return _model([node], [], _vectors(input_name, model.n_features_in_), MARGIN_NAME, 1)
 
 
-def _float32_below(thresholds: NDArray[np.float64]) -> NDArray[np.float32]:
+def _float32_below(thresholds: Floats) -> Floats32:
     """The largest float32 not above: a float32 is below it exactly if below the threshold."""
     nearest = thresholds.astype(np.float32)
     return np.where(nearest > thresholds, np.nextafter(nearest, np.float32(-np.inf)), nearest)
@@ -349,5 +353,5 @@ def _vectors(name: str, width: int) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", width])
 
 
-def _constant(name: str, values: NDArray[np.generic]) -> onnx.TensorProto:
+def _constant(name: str, values: Numbers) -> onnx.TensorProto:
     return numpy_helper.from_array(np.ascontiguousarray(values), name)

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from models.training.arrays import Bools, Floats, Floats32
 from models.training.estimators.networks import AnyNetwork, build
 
 THREADS = 1
@@ -72,7 +72,7 @@ AnyRecipe = Recipe | PublishedRecipe
 
 @contextmanager
 def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
-    """Seed torch, allow deterministic algorithms only, and fix its threads; restore afterwards."""
+    """Seed torch, allow deterministic algorithms alone and fix its threads; restored afterwards."""
     threads_before = torch.get_num_threads()
     deterministic_before = torch.are_deterministic_algorithms_enabled()
     with torch.random.fork_rng(devices=[]):
@@ -87,12 +87,7 @@ def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
 
 
 def train_network(
-    config: AnyNetwork,
-    inputs: NDArray[np.float32],
-    slipped: NDArray[np.bool_] | NDArray[np.float64],
-    recipe: AnyRecipe,
-    *,
-    seed: int,
+    config: AnyNetwork, inputs: Floats32, slipped: Bools | Floats, recipe: AnyRecipe, *, seed: int
 ) -> nn.Sequential:
     """Train a network on inputs (N, *shape); returns it in evaluation mode.
 
@@ -113,9 +108,7 @@ def train_network(
         return network.eval()
 
 
-def logits(
-    network: nn.Module, inputs: NDArray[np.float32], threads: int = THREADS
-) -> NDArray[np.float64]:
+def logits(network: nn.Module, inputs: Floats32, threads: int = THREADS) -> Floats:
     """Logits (N, 2), order (stable, slip), of inputs (N, *shape)."""
     batches = torch.split(torch.from_numpy(inputs), INFERENCE_BATCH)
     with reproducible(0, threads), torch.no_grad():
@@ -144,7 +137,7 @@ def _fit(
 def optimization(
     network: nn.Sequential, recipe: AnyRecipe, steps: int
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-    """What updates the weights after each of an epoch's `steps` batches, and at which rate."""
+    """Optimizer and schedule of a recipe; an epoch has `steps` batches, each followed by a step."""
     weights = [parameter for parameter in network.parameters() if parameter.ndim > 1]
     others = [parameter for parameter in network.parameters() if parameter.ndim <= 1]
     optimizer: torch.optim.Optimizer

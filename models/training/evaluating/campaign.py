@@ -47,10 +47,10 @@ class Campaign:
         on_summary: Callable[[Summary], None] | None = None,
         keep: bool = True,
     ) -> list[Summary]:
-        """A summary per system and protocol, in their order; see `run_jobs` for the rest.
+        """Run all jobs as `run_jobs` does; a summary per system and protocol, in their order.
 
-        Each is written into `folder` as soon as it is complete, unless not to `keep`; what is
-        stored of each job stands in its folder `jobs`.
+        Results of jobs are stored in `folder`/jobs, and, if `keep`, each summary in `folder` as
+        soon as it is complete. `on_job` is called with the job's system and protocol after each.
         """
         found: dict[Job, JobResult] = {}
         made: dict[tuple[str, EvalProtocol], Summary] = {}
@@ -94,7 +94,10 @@ def campaign(
     seeds: int,
     quick: bool = False,
 ) -> Campaign:
-    """All jobs of these systems. Raises `TooFewGraspsError` if the data do not have the splits."""
+    """Every fold of these systems, protocols and seeds 0..seeds-1; fewer and smaller if `quick`.
+
+    Raises `TooFewGraspsError` if the data do not have the splits.
+    """
     folds = QUICK_FOLDS if quick else FOLDS
     if quick:
         systems = [quickened(system) for system in systems]

@@ -1,4 +1,4 @@
-"""The grid of a classical system: every configuration as a system of its own."""
+"""Grid search: every configuration of a classical system's grid as a system of its own."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from models.training.systems.system import BlendConfig, DistilConfig, System
 
 @dataclass(frozen=True, slots=True)
 class GridPoint:
-    """What one configuration of a grid reached."""
+    """What one configuration of a grid reached, as fractions."""
 
     name: str
     f1: Spread
@@ -23,7 +23,7 @@ class GridPoint:
 
 
 def grid_of(system: System) -> list[System]:
-    """A system for each configuration of the grid; none for what has no grid."""
+    """A system for each configuration of the estimator's grid; none for networks and blends."""
     match system.estimator:
         case BlendConfig() | DistilConfig() | NetworkConfig() | DenseConfig():
             return []

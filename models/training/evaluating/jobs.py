@@ -1,4 +1,4 @@
-"""One training and what it says of the grasps it has not seen: a pure function, kept in a file."""
+"""One training and its judgement of the grasps left out, kept in a file by all it depends on."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.inputs import builder, raw_features
+from models.training.arrays import Floats, Ints, Numbers
 from models.training.data.datasets import Grasps
 from models.training.data.folds import fold_seed
 from models.training.data.protocols import FOLDS, EvalProtocol, Split, splits
-from models.training.files import write_whole
+from models.training.evaluating.files import write_whole
 from models.training.fitting.fit import fit
 from models.training.fitting.fitted import Fitted
 from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
@@ -74,25 +75,25 @@ class Job:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def file_name(self, data: str) -> str:
-        """Of the stored result: readable, and different for every job."""
+        """Of the stored result: different for every job and every data (a digest)."""
         readable = f"{self.system.name}.{self.protocol}.{self.seed}.{self.fold}"
         return f"{readable}.{self.key(data)[:16]}.npz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobResult:
-    """What a trained system says of the test grasps of a job."""
+    """How a trained system judges the test grasps of a job."""
 
-    test: NDArray[np.int64]
+    test: Ints
     """Indices (n,) of the grasps, ascending."""
-    margins: dict[str, NDArray[np.float64]]
+    margins: dict[str, Floats]
     """By variant: uncalibrated log-odds of slip (n,)."""
     train_grasps: int
     seconds: float
     """Of training and judging."""
     parameters: int
     """How many numbers the trained system consists of."""
-    ages: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    ages: dict[str, Ints] = field(default_factory=dict)
     """By running variant: grasps (n,) that the session had seen before."""
 
     def to_bytes(self) -> bytes:
@@ -149,7 +150,7 @@ def run_numbered(index: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
 
 
 def load(folder: Path, job: Job, data: str) -> JobResult | None:
-    """The stored result of a job, None if there is none or, with a warning, if it is broken."""
+    """The stored result of a job on data with this digest; None, if broken with a warning."""
     path = folder / job.file_name(data)
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
@@ -163,7 +164,7 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
 
 
 def save(folder: Path, job: Job, data: str, content: bytes) -> None:
-    """Store the bytes of a result, whole or not at all."""
+    """Store the bytes of a result, for `load`. Raises `OSError`."""
     write_whole(folder / job.file_name(data), content)
 
 
@@ -182,7 +183,7 @@ def _interruptible() -> Iterator[None]:
 
 def _run_session(
     system: System, wanted: SessionFeatures, grasps: Grasps, split: Split, seed: int
-) -> tuple[Fitted, dict[str, NDArray[np.float64]], dict[str, NDArray[np.int64]]]:
+) -> tuple[Fitted, dict[str, Floats], dict[str, Ints]]:
     """Each table is a session, standardised by its own training grasps."""
     features, table_of = raw_features(grasps.counts), grasps.table_of
     train, test = split.train, split.test
@@ -204,7 +205,7 @@ def _alone(system: System) -> System:
     return with_recipes(system, threads=1)
 
 
-def _result(arrays: dict[str, NDArray[np.generic]]) -> JobResult:
+def _result(arrays: dict[str, Numbers]) -> JobResult:
     """Raises `KeyError`, `TypeError` or `ValueError` for what is no result."""
     meta = json.loads(arrays[_META].tobytes())
     if meta["format"] != FORMAT:
@@ -223,7 +224,7 @@ def _result(arrays: dict[str, NDArray[np.generic]]) -> JobResult:
 
 
 def _named(
-    arrays: dict[str, NDArray[np.generic]], prefix: str, kind: type[Number]
+    arrays: dict[str, Numbers], prefix: str, kind: type[Number]
 ) -> dict[str, NDArray[Number]]:
     return {
         name.removeprefix(prefix): values.astype(kind)

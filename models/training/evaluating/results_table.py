@@ -1,4 +1,4 @@
-"""The reproduction table: the paper's figures beside ours, and the new systems, as Markdown."""
+"""RESULTS.md: the paper's figures beside ours, and all systems, as Markdown tables."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Found = dict[tuple[str, EvalProtocol], Summary]
 
 
 def results_table(summaries: Sequence[Summary], made: Made) -> str:
-    """The whole document. Nothing is filled in: what was not run is `-`."""
+    """The whole document as Markdown; what was not run is `-`."""
     found: Found = {(summary.system, summary.protocol): summary for summary in summaries}
     sections = (
         _head(summaries, made),
@@ -164,7 +164,10 @@ def _differences(found: Found) -> Iterator[str]:
 
 
 def difference(ours: Summary, theirs: Summary, figure: str = "f1") -> Difference | None:
-    """Ours less theirs on the splits that both have judged; None if there are none."""
+    """Our mean figure less theirs on the splits that both have judged; None if there are none.
+
+    Of other data or another number of folds no split is the same.
+    """
     seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
     if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
         return None

@@ -1,4 +1,4 @@
-"""What a system reached in a protocol: all its jobs in one summary, kept as JSON."""
+"""What a system reached in a protocol: the figures of all its jobs in one file of JSON."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from models.contract import Dataset
+from models.training.arrays import Bools, Ints
 from models.training.data.datasets import Grasps
 from models.training.data.protocols import PROTOCOLS, EvalProtocol
+from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import (
     METRICS,
@@ -33,13 +34,13 @@ from models.training.evaluating.metrics import (
     score,
     wilson,
 )
-from models.training.files import to_json, write_whole
 from models.training.fitting.calibration import cross_fitted_p_slip, fit_temperature, p_slip
 from models.training.systems.system import System, digest
 
 FORMAT = 1
 HEADLINE = "n50"
-"""Variant that speaks for a session system in a later session: 50 unlabelled grasps."""
+"""Variant whose figures are quoted for a session system in a later session: calibrated by 50
+unlabelled grasps."""
 WANTED_ACCURACIES = (0.9, 0.95, 0.98, 0.99)
 COVERAGES = (0.9, 0.8, 0.5)
 AGES = (0, 5, 10, 20, 50, 100, 300)
@@ -63,7 +64,7 @@ class AgeFigures:
     """Figures of the grasps that came when a running session was this old."""
 
     grasps_before: int
-    """At least so many, and fewer than the next group's."""
+    """The fewest of the group; the most are one less than the next group's fewest."""
     share: Fraction
     temperature: float
     """Makes these margins probabilities."""
@@ -118,13 +119,13 @@ class Summary:
     seconds: float
     """Of all trainings, one thread each."""
     headline: str
-    """The variant that speaks for the system."""
+    """The variant whose figures are quoted for the system."""
     variants: dict[str, Variant]
     made_with: dict[str, str]
 
     @property
     def main(self) -> Variant:
-        """The variant that speaks for the system."""
+        """The variant whose figures are quoted."""
         return self.variants[self.headline]
 
 
@@ -133,7 +134,7 @@ Results = Mapping[int, Sequence[JobResult]]
 
 
 def summarise(system: System, protocol: EvalProtocol, results: Results, grasps: Grasps) -> Summary:
-    """All jobs of a system in a protocol, in one."""
+    """The figures of a system in a protocol; `results` hold every fold of every seed."""
     flat = [result for folds in results.values() for result in folds]
     names = list(flat[0].margins)
     return Summary(
@@ -213,15 +214,15 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
     slipped, verdict = grasps.slipped[rows], margins > 0.0
     objects, tables = np.array(grasps.objects)[rows], grasps.table_of[rows]
 
-    def share(inside: NDArray[np.bool_]) -> Fraction:
+    def share(inside: Bools) -> Fraction:
         # A grasp that was judged once per seed is one grasp to the interval.
         right = verdict[inside] == slipped[inside]
         return wilson(float(right.mean()), max(1, len(right) // len(pools)))
 
-    def by_object(inside: NDArray[np.bool_]) -> ObjectFigures:
+    def by_object(inside: Bools) -> ObjectFigures:
         return ObjectFigures(share(inside), score(margins[inside], slipped[inside]).f1)
 
-    def by_age(group: int, inside: NDArray[np.bool_]) -> AgeFigures:
+    def by_age(group: int, inside: Bools) -> AgeFigures:
         temperature = fit_temperature(margins[inside], slipped[inside])
         return AgeFigures(AGES[group], share(inside), temperature)
 
@@ -245,7 +246,7 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
     )
 
 
-def _counted(verdict: NDArray[np.bool_]) -> tuple[int, int]:
+def _counted(verdict: Bools) -> tuple[int, int]:
     """How many are judged stable and slip."""
     return int((~verdict).sum()), int(verdict.sum())
 
@@ -257,7 +258,7 @@ class _Pool:
         self._fold_of = np.repeat(np.arange(len(folds)), [len(fold.test) for fold in folds])
         self.rows = np.concatenate([fold.test for fold in folds])
         self.margins = np.concatenate([fold.margins[variant] for fold in folds])
-        self.ages: NDArray[np.int64] | None = None
+        self.ages: Ints | None = None
         if variant in folds[0].ages:
             self.ages = np.concatenate([fold.ages[variant] for fold in folds])
         self._slipped = grasps.slipped[self.rows]

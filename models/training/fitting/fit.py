@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.model_selection import StratifiedKFold
 
+from models.training.arrays import Bools, Floats, Floats32
 from models.training.data.augmentation import augment
 from models.training.estimators.classical import ClassicalConfig, fit_classical
 from models.training.estimators.compression import compressed
@@ -27,9 +27,7 @@ from models.training.fitting.fitted import (
 from models.training.systems.system import BlendConfig, DistilConfig, System, digest
 
 
-def fit(
-    system: System, inputs: NDArray[np.float32], slipped: NDArray[np.bool_], *, seed: int
-) -> Fitted:
+def fit(system: System, inputs: Floats32, slipped: Bools, *, seed: int) -> Fitted:
     """Train a system on inputs (N, *shape), as its input's builder makes them, and labels (N,).
 
     The same arguments give the same result on the same machine. Raises `ValueError` if the inputs
@@ -64,9 +62,7 @@ _last: list[tuple[str, Fitted]] = []
 forms of one network follow each other."""
 
 
-def _fit_once(
-    system: System, inputs: NDArray[np.float32], slipped: NDArray[np.bool_], seed: int
-) -> Fitted:
+def _fit_once(system: System, inputs: Floats32, slipped: Bools, seed: int) -> Fitted:
     parts = hashlib.sha256(f"{digest(system)} {seed}".encode())
     parts.update(np.ascontiguousarray(inputs).data)
     parts.update(np.ascontiguousarray(slipped).data)
@@ -79,8 +75,8 @@ def _fit_once(
 def _fit_single(
     estimator: AnyNetwork | ClassicalConfig,
     recipe: AnyRecipe | None,
-    inputs: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
+    inputs: Floats32,
+    slipped: Bools,
     seed: int,
 ) -> FittedNetwork | FittedClassical:
     if isinstance(estimator, NetworkConfig | DenseConfig):
@@ -91,8 +87,8 @@ def _fit_single(
 def _fit_network(
     config: AnyNetwork,
     recipe: AnyRecipe | None,
-    inputs: NDArray[np.float32],
-    slipped: NDArray[np.bool_] | NDArray[np.float64],
+    inputs: Floats32,
+    slipped: Bools | Floats,
     seed: int,
 ) -> FittedNetwork:
     if recipe is None:
@@ -101,9 +97,7 @@ def _fit_network(
     return FittedNetwork(network, inputs.shape[1:], recipe.threads)
 
 
-def _fit_blend(
-    blend: BlendConfig, inputs: NDArray[np.float32], slipped: NDArray[np.bool_], seed: int
-) -> FittedBlend:
+def _fit_blend(blend: BlendConfig, inputs: Floats32, slipped: Bools, seed: int) -> FittedBlend:
     copies = [member for member in blend.members for _ in range(member.copies)]
     total = sum(member.weight for member in blend.members)
     fitted, factors = [], []
@@ -117,9 +111,7 @@ def _fit_blend(
     return FittedBlend(tuple(fitted), tuple(factors))
 
 
-def _targets(
-    distil: DistilConfig, inputs: NDArray[np.float32], slipped: NDArray[np.bool_], seed: int
-) -> NDArray[np.float64]:
+def _targets(distil: DistilConfig, inputs: Floats32, slipped: Bools, seed: int) -> Floats:
     """Probabilities of slip (N,): the labels mixed with what the teacher says out of fold."""
     margins = np.empty(len(inputs))
     split = StratifiedKFold(distil.inner_folds, shuffle=True, random_state=seed)
@@ -129,7 +121,7 @@ def _targets(
         margins[fold] = teacher.margins(inputs[fold])
     temperature = fit_temperature(margins, slipped)
     soft = 1.0 / (1.0 + np.exp(-margins / temperature))
-    targets: NDArray[np.float64] = distil.hard * slipped + (1.0 - distil.hard) * soft
+    targets: Floats = distil.hard * slipped + (1.0 - distil.hard) * soft
     return targets
 
 

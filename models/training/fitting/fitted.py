@@ -7,9 +7,9 @@ from typing import Protocol
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from torch import nn
 
+from models.training.arrays import Floats, Floats32
 from models.training.estimators import compression, graphs
 from models.training.estimators.classical import ClassicalModel, classical_margins, classical_size
 from models.training.estimators.networks import parameter_count
@@ -23,7 +23,7 @@ class Fitted(Protocol):
     def parameters(self) -> int:
         """How many numbers it consists of."""
 
-    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    def margins(self, inputs: Floats32) -> Floats:
         """Log-odds of slip (N,), not yet divided by a temperature, of inputs (N, *shape)."""
 
     def margin_graph(self, input_name: str) -> onnx.ModelProto:
@@ -46,11 +46,11 @@ class FittedNetwork(Fitted):
     def parameters(self) -> int:
         return parameter_count(self.network)
 
-    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    def margins(self, inputs: Floats32) -> Floats:
         if not len(inputs):
             return np.empty(0)
         values = logits(self.network, inputs, self.threads)
-        margins: NDArray[np.float64] = values[:, 1] - values[:, 0]
+        margins: Floats = values[:, 1] - values[:, 0]
         return margins
 
     def margin_graph(self, input_name: str) -> onnx.ModelProto:
@@ -70,7 +70,7 @@ class FittedClassical(Fitted):
     def parameters(self) -> int:
         return classical_size(self.model)
 
-    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    def margins(self, inputs: Floats32) -> Floats:
         return classical_margins(self.model, inputs)
 
     def margin_graph(self, input_name: str) -> onnx.ModelProto:
@@ -89,7 +89,7 @@ class FittedBlend(Fitted):
     def parameters(self) -> int:
         return sum(member.parameters for member in self.members)
 
-    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    def margins(self, inputs: Floats32) -> Floats:
         total = np.zeros(len(inputs))
         for member, factor in zip(self.members, self.factors, strict=True):
             total += factor * member.margins(inputs)
@@ -105,16 +105,16 @@ class FittedStandardised(Fitted):
     """A trained system whose inputs are standardised first."""
 
     inner: Fitted
-    mean: NDArray[np.float32]
+    mean: Floats32
     """Of the training, in the shape of an input."""
-    scale: NDArray[np.float32]
+    scale: Floats32
     """One over the spread in the training, in the shape of an input; 0 where nothing varied."""
 
     @property
     def parameters(self) -> int:
         return self.inner.parameters + self.mean.size + self.scale.size
 
-    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    def margins(self, inputs: Floats32) -> Floats:
         return self.inner.margins((inputs - self.mean) * self.scale)
 
     def margin_graph(self, input_name: str) -> onnx.ModelProto:
@@ -136,7 +136,7 @@ class FittedCompressed(Fitted):
     def parameters(self) -> int:
         return compression.size(self.graph)
 
-    def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+    def margins(self, inputs: Floats32) -> Floats:
         return compression.graph_margins(self.graph, inputs)
 
     def margin_graph(self, input_name: str) -> onnx.ModelProto:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from models.training.arrays import Floats, Ints, Numbers
 from models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
 from models.training.fitting.standards import Standards, TrainingStandards
 
@@ -25,9 +25,7 @@ class SensorMapping:
     """Of the counts (fingers * 24,) of each table; every table is mapped to `prior`."""
 
     @classmethod
-    def of(
-        cls, counts: NDArray[np.generic], table_of: NDArray[np.int64], *, session: bool
-    ) -> SensorMapping:
+    def of(cls, counts: Numbers, table_of: Ints, *, session: bool) -> SensorMapping:
         """Of training counts (N, fingers, 24) and the tables (N,) that they are from."""
         if not session:
             return cls(MARGIN_COUNTS)
@@ -36,25 +34,21 @@ class SensorMapping:
         prior = Standards(centre, tables.prior.spread)
         return cls(SESSION_MARGIN_COUNTS, replace(tables, prior=prior))
 
-    def to_training(
-        self, counts: NDArray[np.generic], table_of: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def to_training(self, counts: Numbers, table_of: Ints) -> Floats:
         """Counts (N, fingers, 24) of these tables (N,) as the training's sensors would read."""
         values = counts.astype(np.float64)
         if self.tables is None:
             return values
         return _moved(values, self.tables.each(table_of), self.tables.prior)
 
-    def from_training(
-        self, values: NDArray[np.float64], table_of: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def from_training(self, values: Floats, table_of: Ints) -> Floats:
         """The inverse of `to_training`."""
         if self.tables is None:
             return values
         return _moved(values, self.tables.prior, self.tables.each(table_of))
 
 
-def _moved(values: NDArray[np.float64], source: Standards, to: Standards) -> NDArray[np.float64]:
+def _moved(values: Floats, source: Standards, to: Standards) -> Floats:
     flat = (values.reshape(len(values), -1) - source.mean) / source.spread
-    moved: NDArray[np.float64] = flat * to.spread + to.mean
+    moved: Floats = flat * to.spread + to.mean
     return moved.reshape(values.shape)

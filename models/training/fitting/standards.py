@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.session import SessionStatistics
+from models.training.arrays import Floats, Floats32, Ints
 
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""
@@ -24,18 +24,18 @@ SESSION_VARIANTS = (NONE, *(f"n{number}" for number in DRAWS), ALL, RUNNING, RUN
 class Standards:
     """Mean and spread of features, each of shape (M,) or, one per grasp, (N, M)."""
 
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
+    mean: Floats
+    spread: Floats
     """Above zero."""
 
     @classmethod
-    def of(cls, features: NDArray[np.float64]) -> Standards:
+    def of(cls, features: Floats) -> Standards:
         """Of features (N, M). The spread of one that does not vary is 1."""
         return cls(features.mean(axis=0), _positive(features.std(axis=0)))
 
-    def apply(self, features: NDArray[np.float64], clip: float) -> NDArray[np.float32]:
+    def apply(self, features: Floats, clip: float) -> Floats32:
         """Features (N, M) standardised and cut off at +-`clip`, as `SessionBuilder` does."""
-        standard: NDArray[np.float64] = (features - self.mean) * (1.0 / self.spread)
+        standard: Floats = (features - self.mean) * (1.0 / self.spread)
         return np.clip(standard, -clip, clip).astype(np.float32)
 
 
@@ -49,7 +49,7 @@ class TrainingStandards:
     """Mean of all rows, and spread within a table: where a new session starts from."""
 
     @classmethod
-    def of(cls, features: NDArray[np.float64], table_of: NDArray[np.int64]) -> TrainingStandards:
+    def of(cls, features: Floats, table_of: Ints) -> TrainingStandards:
         """Of training features (N, M) and the tables (N,) that they are from."""
         tables, within = {}, np.empty_like(features)
         for table in np.unique(table_of):
@@ -59,16 +59,14 @@ class TrainingStandards:
         spread = _positive(np.sqrt((within**2).mean(axis=0)))
         return cls(tables, Standards(features.mean(axis=0), spread))
 
-    def each(self, table_of: NDArray[np.int64]) -> Standards:
+    def each(self, table_of: Ints) -> Standards:
         """Of shape (N, M): each grasp's by its table (N,). Raises `KeyError` for an unknown one."""
         standards = [self.tables[int(table)] for table in table_of]
         return Standards(
             np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])
         )
 
-    def apply(
-        self, features: NDArray[np.float64], table_of: NDArray[np.int64], clip: float
-    ) -> NDArray[np.float32]:
+    def apply(self, features: Floats, table_of: Ints, clip: float) -> Floats32:
         """Features (N, M), each standardised by its table. Raises `KeyError` for an unknown one."""
         return self.each(table_of).apply(features, clip)
 
@@ -82,16 +80,12 @@ class LaterSession:
     """By what the test grasps of a later session are standardised, by variant."""
 
     standards: dict[str, Standards]
-    ages: dict[str, NDArray[np.int64]]
+    ages: dict[str, Ints]
     """Of the running variants, shape (N,): grasps seen before each test grasp."""
 
 
 def later_session(
-    features: NDArray[np.float64],
-    test: NDArray[np.int64],
-    pool: NDArray[np.int64],
-    training: TrainingStandards,
-    seed: int,
+    features: Floats, test: Ints, pool: Ints, training: TrainingStandards, seed: int
 ) -> LaterSession:
     """All variants of judging the rows `test` of features (all grasps, M).
 
@@ -113,11 +107,8 @@ def later_session(
 
 
 def _running(
-    features: NDArray[np.float64],
-    order: NDArray[np.int64],
-    test: NDArray[np.int64],
-    training: TrainingStandards,
-) -> tuple[Standards, NDArray[np.int64]]:
+    features: Floats, order: Ints, test: Ints, training: TrainingStandards
+) -> tuple[Standards, Ints]:
     """Standards (len(test), M) and ages (len(test),) at the moment each test row comes."""
     place = {int(row): index for index, row in enumerate(test)}
     statistics = training.statistics()
@@ -132,5 +123,5 @@ def _running(
     return Standards(mean, spread), ages
 
 
-def _positive(spread: NDArray[np.float64]) -> NDArray[np.float64]:
+def _positive(spread: Floats) -> Floats:
     return np.where(spread > 0.0, spread, 1.0)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from models.contract import SeenCounts
 from models.inputs import builder, raw_features
+from models.training.arrays import Floats, Floats32, Ints, Numbers
 from models.training.data.datasets import Grasps
 from models.training.fitting.fit import fit
 from models.training.fitting.fitted import Fitted
@@ -29,13 +27,11 @@ class Trained:
     standards: TrainingStandards | None
     """Of a session system's features."""
 
-    def margins(
-        self, counts: NDArray[np.generic], table_of: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def margins(self, counts: Numbers, table_of: Ints) -> Floats:
         """Log-odds of slip (N,), uncalibrated, of counts (N, fingers, 24) of known tables (N,)."""
         return self.fitted.margins(_inputs(self.system, self.standards, counts, table_of))
 
-    def mapped_counts(self) -> NDArray[np.float64]:
+    def mapped_counts(self) -> Floats:
         """Counts (N, fingers, 24) of `grasps`, of a session system mapped to common sensors."""
         return self.sensors.to_training(self.grasps.counts, self.grasps.table_of)
 
@@ -59,11 +55,8 @@ def train(system: System, grasps: Grasps, seed: int) -> Trained:
 
 
 def _inputs(
-    system: System,
-    standards: TrainingStandards | None,
-    counts: NDArray[np.generic],
-    table_of: NDArray[np.int64],
-) -> NDArray[np.float32]:
+    system: System, standards: TrainingStandards | None, counts: Numbers, table_of: Ints
+) -> Floats32:
     if isinstance(system.input, SessionFeatures):
         if standards is None:
             raise ValueError("a session system needs standards")

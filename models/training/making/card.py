@@ -57,7 +57,7 @@ class Data(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, files: Sequence[Dataset]) -> Data:
-        """Of the tables that were trained on or judged."""
+        """Of the tables that were trained on or judged by."""
         not_published = tuple(unpublished(files))
         if len(lab_table_names(files)) < len(files):
             return cls(not_published=not_published)
@@ -85,7 +85,7 @@ class Measured(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, summary: Summary) -> Measured:
-        """The part of a summary that a user asks for."""
+        """The figures of a summary that a user of the model needs."""
         main: Variant = summary.main
         several = summary.variants if len(summary.variants) > 1 else {}
         return cls(
@@ -141,7 +141,7 @@ class Card(msgspec.Struct, frozen=True):
 
 
 def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]:
-    """What a user must know, with the figures that were measured; `grasps` are trained on."""
+    """Sentences on what the model cannot do, with measured figures; `grasps` are trained on."""
     texts = []
     for summary in summaries:
         f1 = 100 * summary.main.spreads["f1"].mean

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from models.contract import METADATA_KEY, ModelContract
 from models.inputs import SessionBuilder, builder
 from models.runtime import TactileModel
-from models.training.files import replacing
+from models.training.evaluating.files import replacing
 from models.training.fitting.fitted import Fitted
 from models.training.fitting.standards import Standards
 

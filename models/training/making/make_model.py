@@ -21,11 +21,11 @@ from models.contract import (
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
 from models.training.evaluating.broken import broken_study
+from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import FEWEST_JUDGED
 from models.training.evaluating.run_jobs import run_jobs
 from models.training.evaluating.summaries import Summary, made_with, summarise
-from models.training.files import to_json, write_whole
 from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
 from models.training.fitting.standards import PRIOR_GRASPS, RUNNING
 from models.training.fitting.trained import Trained, train
@@ -43,7 +43,7 @@ from models.training.making.plan import TrainingPlan
 from models.training.systems.system import SessionFeatures, System, configuration
 
 CALIBRATED_FROM = 20.0
-"""Grasps from which on a session counts as calibrated: later ones gain two points at most."""
+"""Grasps from which on a session counts as calibrated: more of them gain two points at most."""
 EXTRA_TRAININGS = 2
 """Beside the folds: one for the repeatability, one for the model itself. The study of broken
 electrodes, three more, comes last."""

@@ -58,11 +58,7 @@ SMALL_RECIPE = Recipe(epochs=20, weight_decay=1.0, input_noise=0.2)
 SESSION_SVM = Svm(c=3.0, gamma=0.003)
 SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
 SESSION_BLEND = BlendConfig(
-    (
-        Member(SESSION_SVM),
-        Member(SESSION_BOOSTING),
-        Member(SMALL_SESSION, SMALL_RECIPE, copies=2),
-    )
+    (Member(SESSION_SVM), Member(SESSION_BOOSTING), Member(SMALL_SESSION, SMALL_RECIPE, copies=2))
 )
 
 

@@ -128,10 +128,7 @@ def _plain(value: object) -> Any:  # noqa: ANN401 - JSON
         names = tuple(field.name for field in dataclasses.fields(value))
     else:
         return value
-    return {
-        "kind": type(value).__name__,
-        **{name: _plain(getattr(value, name)) for name in names},
-    }
+    return {"kind": type(value).__name__, **{name: _plain(getattr(value, name)) for name in names}}
 
 
 T = TypeVar("T")
