@@ -24,7 +24,7 @@ from models.tactile_image import TactileImager
 from models.training.data.datasets import Grasps
 from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig, fit_classical
 from models.training.estimators.networks import CNN1, build
-from models.training.systems.systems import SYSTEMS
+from models.training.systems.registry import SYSTEMS
 
 CLASSICAL = ("svm", "mlp", "rf")
 

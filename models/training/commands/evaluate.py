@@ -7,27 +7,29 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 
-from models.training.commands.arguments import progress_bar, whole
-from models.training.data.datasets import DatasetError, read_all, unpublished
-from models.training.data.folds import TooFewGraspsError
-from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD
+from models.training.commands.arguments import (
+    WrongInputError,
+    exit_code,
+    progress_bar,
+    warn_of_unpublished,
+    whole,
+)
+from models.training.data.datasets import read_all, unpublished
+from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.campaign import Campaign, campaign, quickened
+from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.grid import best_of_grid, grid_of
-from models.training.evaluating.results import Made, table
-from models.training.evaluating.summary import Summary, made_with, read_all_of, to_json
-from models.training.evaluating.sweep import ClusterError
+from models.training.evaluating.jobs import ClusterError
+from models.training.evaluating.results_table import Made, results_table
+from models.training.evaluating.summaries import Summary, made_with, read_summaries
+from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import System, digest
-from models.training.systems.systems import SYSTEMS
 
-EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 SEEDS = 3
 MAX_PROCESSES = 1024
-
-
-class WrongInputError(Exception):
-    """The command line asks for what is not there."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,32 +89,19 @@ def run(args: argparse.Namespace) -> int:
 
     Whatever was finished by then is kept and not run again.
     """
-    try:
-        return _run(args)
-    except KeyboardInterrupt:
-        sys.stderr.write("graspd evaluate: interrupted; the same command goes on from here\n")
-        return EXIT_INTERRUPTED
-    except OSError as error:
-        return _fail(f"{error.filename or args.out}: {error.strerror or error}", EXIT_INPUT)
-    except (DatasetError, TooFewGraspsError, WrongInputError) as error:
-        return _fail(str(error), EXIT_INPUT)
-    except ClusterError as error:
-        return _fail(str(error), EXIT_FAILED)
+    return exit_code("evaluate", args.out, lambda: _run(args), ClusterError)
 
 
-def _run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> None:
     started_s = time.monotonic()
     systems = _systems(args.names, args.grid)
     _check_extras(args)
+    protocols = list(dict.fromkeys(args.protocol or STANDARD))
     grasps = read_all(args.data)
-    for name in unpublished(grasps.files):
-        sys.stderr.write(
-            f"graspd evaluate: warning: {name}.csv is not the published table; the figures are of "
-            "this data only\n"
-        )
+    warn_of_unpublished("evaluate", unpublished(grasps.files))
     wanted = campaign(
         [variant for system in systems for variant in grid_of(system)] if args.grid else systems,
-        args.protocol or list(STANDARD),
+        protocols,
         grasps,
         seeds=args.seeds or (1 if args.quick else SEEDS),
         quick=args.quick,
@@ -121,11 +110,9 @@ def _run(args: argparse.Namespace) -> int:
     if args.json:
         sys.stdout.buffer.write(to_json(summaries))
     if args.grid:
-        _report_grid(systems, summaries, args)
+        _report_grid(systems, protocols, summaries, args)
     if args.table or args.plots:
-        everything = read_all_of(args.out, wanted.data, _digests(args.quick))
-        _report(everything, args, time.monotonic() - started_s)
-    return EXIT_OK
+        _report(wanted.data, args, time.monotonic() - started_s)
 
 
 def _evaluate(wanted: Campaign, args: argparse.Namespace) -> list[Summary]:
@@ -133,7 +120,7 @@ def _evaluate(wanted: Campaign, args: argparse.Namespace) -> list[Summary]:
 
     def on_summary(summary: Summary) -> None:
         if shown:
-            sys.stdout.write(line_of(summary))
+            sys.stdout.write(_line(summary))
             sys.stdout.flush()
 
     with progress_bar("starting", len(wanted.jobs), hidden=args.quiet) as on_job:
@@ -147,8 +134,7 @@ def _evaluate(wanted: Campaign, args: argparse.Namespace) -> list[Summary]:
         )
 
 
-def line_of(summary: Summary) -> str:
-    """One line for people."""
+def _line(summary: Summary) -> str:
     f1, accuracy = (summary.main.spreads[name] for name in ("f1", "accuracy"))
     error = "" if f1.error is None else f", s.e. {100 * f1.error:.2f} over {f1.seeds} seeds"
     return (
@@ -177,26 +163,22 @@ def _check_extras(args: argparse.Namespace) -> None:
         (args.dask, "distributed", "cluster"),
         (args.plots, "matplotlib", "report"),
     ):
-        if wanted and not _is_installed(package):
+        if wanted and find_spec(package) is None:
             raise WrongInputError(f"needs the package '{package}': pip install '.[{extra}]'")
 
 
-def _is_installed(package: str) -> bool:
-    return find_spec(package) is not None
-
-
-def _digests(quick: bool) -> dict[str, str]:
-    return {
-        name: digest(quickened(system) if quick else system) for name, system in SYSTEMS.items()
+def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
+    """Table and plots of all that is in the folder of this data (a digest)."""
+    digests = {
+        name: digest(quickened(system) if args.quick else system)
+        for name, system in SYSTEMS.items()
     }
-
-
-def _report(summaries: Sequence[Summary], args: argparse.Namespace, seconds: float) -> None:
+    summaries = read_summaries(args.out, data, digests)
     if args.table:
         command = "graspd " + " ".join(_command(args))
         made = Made(command, seconds, made_with(), quick=args.quick)
         args.table.parent.mkdir(parents=True, exist_ok=True)
-        args.table.write_text(table(summaries, made))
+        write_whole(args.table, results_table(summaries, made).encode())
     if args.plots:
         from models.training.evaluating.plots import draw
 
@@ -222,20 +204,17 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
 
 
 def _report_grid(
-    systems: Sequence[System], summaries: Sequence[Summary], args: argparse.Namespace
+    systems: Sequence[System],
+    protocols: Sequence[EvalProtocol],
+    summaries: Sequence[Summary],
+    args: argparse.Namespace,
 ) -> None:
-    for system in systems:
-        for protocol in args.protocol or STANDARD:
-            report = best_of_grid(system, protocol, summaries)
-            (args.out / f"{system.name}.{protocol}.grid.json").write_bytes(to_json(report))
-            if not args.json:
-                best = report[0]
-                sys.stdout.write(
-                    f"{best.name} {protocol}: best of {len(report)}, F1 {100 * best.f1.mean:.2f} "
-                    f"+- {100 * best.f1.std:.1f} %\n"
-                )
-
-
-def _fail(problem: str, code: int) -> int:
-    sys.stderr.write(f"graspd evaluate: {problem}\n")
-    return code
+    for system, protocol in product(systems, protocols):
+        report = best_of_grid(system, protocol, summaries)
+        write_whole(args.out / f"{system.name}.{protocol}.grid.json", to_json(report))
+        if not args.json:
+            best = report[0]
+            sys.stdout.write(
+                f"{best.name} {protocol}: best of {len(report)}, F1 {100 * best.f1.mean:.2f} "
+                f"+- {100 * best.f1.std:.1f} %\n"
+            )

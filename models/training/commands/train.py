@@ -8,24 +8,34 @@ import sys
 import time
 from pathlib import Path
 
-from models.training.commands.arguments import progress_bar, whole
-from models.training.data.datasets import DatasetError, Grasps, own_tables, unpublished
+from models.training.commands.arguments import (
+    EXIT_INPUT,
+    WrongInputError,
+    exit_code,
+    progress_bar,
+    say,
+    warn_of_unpublished,
+    whole,
+)
+from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
 from models.training.data.folds import TooFewGraspsError
-from models.training.data.own import ENOUGH_GRASPS, FEWEST_GRASPS, read_with_own
+from models.training.data.lab_tables import ENOUGH_GRASPS, FEWEST_GRASPS, read_with_lab_tables
 from models.training.making.card import Card
-from models.training.making.enough import check_enough
 from models.training.making.export import ExportError
-from models.training.making.making import EXTRA_TRAININGS, Order, make
-from models.training.systems.systems import SYSTEMS
+from models.training.making.make_model import EXTRA_TRAININGS, make_model
+from models.training.making.plan import TrainingPlan
+from models.training.making.preflight import preflight
+from models.training.systems.registry import SYSTEMS
 
-EXIT_OK, EXIT_BUG, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
 MAX_SEED = 2**32 - 1
 """The largest that scikit-learn takes."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
-    parser.add_argument("model", choices=sorted(SYSTEMS), metavar="MODEL", help=_models())
+    parser.add_argument(
+        "model", choices=sorted(SYSTEMS), metavar="MODEL", help=f"one of {', '.join(SYSTEMS)}"
+    )
     parser.add_argument(
         "--data",
         type=Path,
@@ -79,80 +89,58 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Train, measure, export. Returns 0, 1 (export failed), 2 (data or folder), 130 (Ctrl-C)."""
     if args.data is None and not args.own:
-        return _fail("needs --data DIR, --own FILE, or both", EXIT_INPUT)
+        say("train", "needs --data DIR, --own FILE, or both")
+        return EXIT_INPUT
     out: Path = args.out or Path("runs") / args.model
+    return exit_code("train", out, lambda: _train(args, out), ExportError)
+
+
+def _train(args: argparse.Namespace, out: Path) -> None:
     started_s = time.monotonic()
+    grasps = read_with_lab_tables(args.data, args.own)
+    plan = _plan(args, grasps)
+    if args.data is not None:
+        _check_published(plan, grasps, args.data)
+    elif len(grasps) < ENOUGH_GRASPS:
+        say(
+            "train",
+            f"warning: {len(grasps)} grasps are few: the daemon will take many others for unlike "
+            f"the training, and call them unknown; {ENOUGH_GRASPS} are enough",
+        )
     try:
-        grasps = read_with_own(args.data, args.own)
-        order = _order(args, grasps)
-        if args.data is not None:
-            _check_published(order, grasps, args.data)
-        elif len(grasps) < ENOUGH_GRASPS:
-            sys.stderr.write(_few(len(grasps)))
-        check_enough(order, grasps)
+        preflight(plan, grasps)
         # Now, not after minutes of training.
         out.mkdir(parents=True, exist_ok=True)
         results = args.results or out / "trainings"
-        total = len(order.jobs(grasps)) + EXTRA_TRAININGS
+        total = len(plan.jobs(grasps)) + EXTRA_TRAININGS
         with progress_bar(args.model, total, hidden=args.quiet) as on_job:
-            card = make(order, grasps, out, results, lambda: on_job(args.model))
-    except KeyboardInterrupt:
-        sys.stderr.write("graspd train: interrupted; the same command goes on from here\n")
-        return EXIT_INTERRUPTED
-    except OSError as error:
-        return _fail(f"{error.filename or out}: {error.strerror or error}", EXIT_INPUT)
-    except DatasetError as error:
-        return _fail(str(error), EXIT_INPUT)
+            card = make_model(plan, grasps, out, results, lambda: on_job(args.model))
     except TooFewGraspsError as error:
-        return _fail(f"{error} (see --folds and --only)", EXIT_INPUT)
-    except ExportError as error:
-        return _fail(str(error), EXIT_BUG)
-    sys.stdout.write(_summary(card, out / f"{args.model}.onnx", time.monotonic() - started_s))
-    return EXIT_OK
+        raise WrongInputError(f"{error} (see --folds and --only)") from error
+    seconds = time.monotonic() - started_s
+    sys.stdout.write(f"{out / args.model}.onnx: {_figures(card)}, {seconds:.0f} s\n")
 
 
-def _models() -> str:
-    return f"one of {', '.join(SYSTEMS)}"
-
-
-def _order(args: argparse.Namespace, grasps: Grasps) -> Order:
-    system, own = SYSTEMS[args.model], own_tables(grasps.files)
-    if own:
+def _plan(args: argparse.Namespace, grasps: Grasps) -> TrainingPlan:
+    system, lab = SYSTEMS[args.model], lab_table_names(grasps.files)
+    if lab:
         published = () if args.data is None else system.tables
-        system = dataclasses.replace(system, tables=(*published, *own))
+        system = dataclasses.replace(system, tables=(*published, *lab))
     names = tuple(path.name for path in args.own)
-    return Order(system, args.folds, args.seed, args.jobs, args.only, names)
+    return TrainingPlan(system, args.folds, args.seed, args.jobs, args.only, names)
 
 
-def _check_published(order: Order, grasps: Grasps, folder: Path) -> None:
+def _check_published(plan: TrainingPlan, grasps: Grasps, folder: Path) -> None:
     """Raise `DatasetError` if a table is missing; warn of tables that are not the published."""
-    there, own = {file.name for file in grasps.files}, own_tables(grasps.files)
-    for table in order.system.tables:
+    there, lab = {file.name for file in grasps.files}, lab_table_names(grasps.files)
+    for table in plan.system.tables:
         if table not in there:
-            raise DatasetError(folder / f"{table}.csv", f"is missing, {order.system.name} needs it")
-    for name in unpublished(grasps.files):
-        if name not in own:
-            sys.stderr.write(
-                f"graspd train: warning: {name}.csv is not the published table; the figures are of "
-                "this data only\n"
-            )
+            raise DatasetError(folder / f"{table}.csv", f"is missing, {plan.system.name} needs it")
+    warn_of_unpublished("train", (name for name in unpublished(grasps.files) if name not in lab))
 
 
-def _few(grasps: int) -> str:
-    return (
-        f"graspd train: warning: {grasps} grasps are few: the daemon will take many others for "
-        f"unlike the training, and call them unknown; {ENOUGH_GRASPS} are enough\n"
-    )
-
-
-def _summary(card: Card, path: Path, seconds: float) -> str:
-    figures = ", ".join(
+def _figures(card: Card) -> str:
+    return ", ".join(
         f"{measured.protocol} F1 {100 * measured.f1_mean:.1f} +- {100 * measured.f1_std:.1f} %"
         for measured in card.contract.measured
     )
-    return f"{path}: {figures}, {seconds:.0f} s\n"
-
-
-def _fail(problem: str, code: int) -> int:
-    sys.stderr.write(f"graspd train: {problem}\n")
-    return code

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import rotate
+
+from models.training.arrays import Bools, Floats32
 
 COPIES = 4
 """What is left of each grasp: itself, flipped both ways, rotated."""
@@ -21,11 +22,8 @@ class Augmentation:
 
 
 def augment(
-    images: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
-    augmentation: Augmentation,
-    seed: int,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    images: Floats32, slipped: Bools, augmentation: Augmentation, seed: int
+) -> tuple[Floats32, Bools]:
     """Images (N, height, width, fingers) and labels (N,) to (4 N, ...) and (4 N,).
 
     In this order: as they are, flipped left-right, flipped up-down, rotated. A rotated image keeps
@@ -41,7 +39,7 @@ def augment(
     )
 
 
-def _rotated(images: NDArray[np.float32], angle_deg: float, seed: int) -> NDArray[np.float32]:
+def _rotated(images: Floats32, angle_deg: float, seed: int) -> Floats32:
     left = np.random.default_rng(seed).integers(2, size=len(images)).astype(np.bool_)
     rotated = np.empty_like(images)
     for chosen, angle in ((left, angle_deg), (~left, -angle_deg)):

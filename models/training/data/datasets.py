@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from models.bts3 import FINGERS, NEW_SESSION, TABLES, WHOLE
 from models.contract import Dataset
 from models.layout import ELECTRODES
+from models.training.arrays import Bools, Ints
 
 COUNT_MAX = 4095
 """Largest 12-bit count."""
@@ -36,12 +37,8 @@ class DatasetError(Exception):
     def __init__(
         self, path: Path, problem: str, *, line: int | None = None, column: str | None = None
     ) -> None:
-        place = str(path)
-        if line is not None:
-            place += f", line {line}"
-        if column is not None:
-            place += f", column {column}"
-        super().__init__(f"{place}: {problem}")
+        place = str(path) if line is None else f"{path}, line {line}"
+        super().__init__(f"{place if column is None else f'{place}, column {column}'}: {problem}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +47,7 @@ class Grasps:
 
     counts: NDArray[np.uint16]
     """Shape (N, fingers, 24), raw counts 0..4095; a table has the fingers ff, mf, th."""
-    slipped: NDArray[np.bool_]
+    slipped: Bools
     """Shape (N,): True where the object slipped in the lift."""
     objects: tuple[str, ...]
     """Object name of each grasp."""
@@ -61,12 +58,12 @@ class Grasps:
         return len(self.slipped)
 
     @property
-    def table_of(self) -> NDArray[np.int64]:
+    def table_of(self) -> Ints:
         """Shape (N,): index in `files` of the file that each grasp comes from."""
         return np.repeat(np.arange(len(self.files)), [file.rows for file in self.files])
 
-    def rows(self, indices: NDArray[np.int64]) -> Grasps:
-        """Only these grasps, indices ascending; the files keep their digests, not their rows."""
+    def rows(self, indices: Ints) -> Grasps:
+        """Only these grasps, indices ascending; `files` keep digests and count their rows anew."""
         kept = np.bincount(self.table_of[indices], minlength=len(self.files))
         return Grasps(
             self.counts[indices],
@@ -78,15 +75,15 @@ class Grasps:
             ),
         )
 
-    def of_tables(self, tables: Collection[str]) -> Grasps:
-        """Only the grasps of these tables."""
+    def rows_of(self, tables: Collection[str]) -> Ints:
+        """Indices, ascending, of the grasps of the tables with these names."""
         wanted = [index for index, file in enumerate(self.files) if file.name in tables]
-        return self.rows(np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64))
+        return np.flatnonzero(np.isin(self.table_of, wanted)).astype(np.int64)
 
     def of_fingers(self, fingers: Sequence[str]) -> Grasps:
-        """With these fingers alone, in this order; the grasps must have those of a table.
+        """With these fingers alone, in this order, of grasps with all fingers of a table.
 
-        Raises `ValueError` for a finger that they do not have.
+        Raises `ValueError` for a finger that a table lacks, or if fingers are missing already.
         """
         if self.counts.shape[1] != len(FINGERS) or not set(fingers) <= set(FINGERS):
             raise ValueError(f"the grasps have not the fingers {', '.join(fingers)}")
@@ -94,14 +91,14 @@ class Grasps:
         return dataclasses.replace(self, counts=np.ascontiguousarray(self.counts[:, chosen]))
 
     def digest(self) -> str:
-        """SHA-256, hexadecimal, of what a result may depend on."""
+        """SHA-256, hexadecimal, of counts, labels, objects and the tables' names and rows."""
         text = json.dumps([self.objects, [(file.name, file.rows) for file in self.files]])
         parts = (self.counts.tobytes(), self.slipped.tobytes(), text.encode())
         return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def read_table(path: Path) -> Grasps:
-    """Read one grasp table. Raises `DatasetError` with file, line and column."""
+    """Read one grasp table (columns above). Raises `DatasetError` with file, line and column."""
     data = _read(path)
     try:
         text = data.decode()
@@ -137,16 +134,10 @@ def read_whole(folder: Path) -> Grasps:
     return concatenate([read_table(folder / f"{name}.csv") for name in WHOLE])
 
 
-def read_new_session(folder: Path) -> Grasps | None:
-    """The later session, palm_45.csv; None if the folder lacks it. Raises `DatasetError`."""
-    path = folder / f"{NEW_SESSION}.csv"
-    return read_table(path) if path.exists() else None
-
-
 def read_all(folder: Path) -> Grasps:
     """*Whole*, then the later session if the folder has it. Raises `DatasetError`."""
-    whole, later = read_whole(folder), read_new_session(folder)
-    return whole if later is None else concatenate([whole, later])
+    whole, later = read_whole(folder), folder / f"{NEW_SESSION}.csv"
+    return concatenate([whole, read_table(later)]) if later.exists() else whole
 
 
 def concatenate(parts: Sequence[Grasps]) -> Grasps:
@@ -165,7 +156,7 @@ def unpublished(files: Sequence[Dataset]) -> list[str]:
     return [file.name for file in files if (file.name, file.sha256) not in published]
 
 
-def own_tables(files: Sequence[Dataset]) -> tuple[str, ...]:
+def lab_table_names(files: Sequence[Dataset]) -> tuple[str, ...]:
     """Names of the files that do not have the name of a published table, in their order."""
     published = {table.name for table in TABLES}
     return tuple(file.name for file in files if file.name not in published)
@@ -187,29 +178,27 @@ class _Table:
 
     def parse(self, row: list[str], line: int) -> tuple[str, bool, list[int]]:
         if len(row) != len(self._header):
-            raise DatasetError(
-                self._path, f"has {len(row)} values, not {len(self._header)}", line=line
-            )
-        name = row[self._object]
+            problem = f"has {len(row)} values, not {len(self._header)}"
+            raise DatasetError(self._path, problem, line=line)
+        name, slipped = row[self._object], row[self._slipped]
         if not name:
             raise DatasetError(self._path, "object has no name", line=line, column="object")
-        if row[self._slipped] not in ("0", "1"):
+        if slipped not in ("0", "1"):
             raise DatasetError(
-                self._path, f"{row[self._slipped]!r} is not 0 or 1", line=line, column="slipped"
+                self._path, f"{slipped!r} is not 0 or 1", line=line, column="slipped"
             )
-        counts = [self._count(row[column], line, column) for column in self._counts]
-        return name, row[self._slipped] == "1", counts
+        return (
+            name,
+            slipped == "1",
+            [self._count(row[column], line, column) for column in self._counts],
+        )
 
     def _count(self, text: str, line: int, column: int) -> int:
         # No count has more than four digits; int() alone would also take "1_0" or " 7".
         if text.isascii() and text.isdigit() and len(text) <= 4 and int(text) <= COUNT_MAX:
             return int(text)
-        raise DatasetError(
-            self._path,
-            f"{text[:20]!r} is not a count (0..{COUNT_MAX})",
-            line=line,
-            column=self._header[column],
-        )
+        problem = f"{text[:20]!r} is not a count (0..{COUNT_MAX})"
+        raise DatasetError(self._path, problem, line=line, column=self._header[column])
 
 
 def _read(path: Path) -> bytes:

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.model_selection import StratifiedKFold
+
+from models.training.arrays import Bools, Ints
 
 
 class TooFewGraspsError(ValueError):
     """The data cannot be cut into that many folds: take fewer folds or more data."""
 
 
-def folds_of(slipped: NDArray[np.bool_], folds: int, seed: int) -> NDArray[np.int64]:
+def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
     """Fold of each grasp, shape (N,): stratified, shuffled with the seed.
 
     Raises `TooFewGraspsError` if a class has fewer grasps than there are folds.
@@ -31,12 +32,12 @@ def folds_of(slipped: NDArray[np.bool_], folds: int, seed: int) -> NDArray[np.in
 
 
 def fold_seed(seed: int, fold: int) -> int:
-    """Seed of the training of one fold: another start for each, so the spread holds that too."""
+    """Seed of the training of one fold; a different one for each fold and each split seed."""
     return int(np.random.SeedSequence([seed, fold]).generate_state(1)[0])
 
 
-def object_folds(objects: Sequence[str], folds: int, seed: int) -> NDArray[np.int64]:
-    """Fold of each grasp, shape (N,): all grasps of an object in one, objects dealt by the seed.
+def object_folds(objects: Sequence[str], folds: int, seed: int) -> Ints:
+    """Fold of each grasp, shape (N,): objects are dealt to folds by the seed, each to one.
 
     Raises `TooFewGraspsError` if there are fewer objects than folds.
     """

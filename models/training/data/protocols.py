@@ -1,7 +1,7 @@
-"""What is trained on and what is judged: the splits that every figure stands on.
+"""Evaluation protocols: which grasps are trained on and which are judged.
 
-`cv`, `objects` and `objects-whole` take tables of one's own, which are none of the published, in
-addition; of data that have no published table, these alone.
+`cv`, `objects` and `objects-whole` take lab tables (those that are not published) in addition; of
+data without any published table, these alone.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.bts3 import NEW_SESSION, WHOLE
-from models.training.data.datasets import Grasps, own_tables
+from models.training.arrays import Ints
+from models.training.data.datasets import Grasps, lab_table_names
 from models.training.data.folds import TooFewGraspsError, folds_of, object_folds
 
-Protocol = Literal[
+EvalProtocol = Literal[
     "cv", "unknown", "objects", "objects-whole", "session", "cv-palm-down", "cv-palm-side"
 ]
-PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
-STANDARD: tuple[Protocol, ...] = ("cv", "unknown", "objects", "objects-whole", "session")
-"""What is evaluated unless asked for otherwise."""
-ABOUT: dict[Protocol, str] = {
+PROTOCOLS: tuple[EvalProtocol, ...] = get_args(EvalProtocol)
+STANDARD = PROTOCOLS[:5]
+"""What `graspd evaluate` runs by default."""
+ABOUT: dict[EvalProtocol, str] = {
     "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
     "unknown": "the paper's 8 objects left out of palm_down + palm_side",
     "objects": "objects left out in groups, palm_down + palm_side + palm_45",
@@ -41,34 +41,38 @@ FOLDS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """One training and the grasps that it is judged by: indices of rows, ascending."""
+    """One training and the grasps that it is judged by: row indices of `Grasps`, ascending."""
 
     name: str
-    train: NDArray[np.int64]
-    test: NDArray[np.int64]
-    calibration: NDArray[np.int64] | None = None
-    """Grasps of the test's own session, but of other objects, whose labels nobody looks at."""
+    train: Ints
+    test: Ints
+    calibration: Ints | None = None
+    """In `session`: grasps of the test's session but of other objects. They may calibrate the
+    session; their labels are not used."""
 
 
-def splits(protocol: Protocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
-    """The splits of a protocol. `unknown` has one, whatever the seed: only the training differs.
+def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
+    """The splits of a protocol; `unknown` has one whatever `seed` and `folds` are.
 
-    Raises `TooFewGraspsError` if the data do not have the tables, objects or grasps for it.
+    Raises `TooFewGraspsError` if the data lack a table, objects or grasps that the protocol needs.
     """
     return _MAKERS[protocol](grasps, seed, folds)
 
 
-def _stratified(*tables: str, own_too: bool = False) -> Callable[[Grasps, int, int], list[Split]]:
+_Maker = Callable[[Grasps, int, int], list[Split]]
+
+
+def _stratified(*tables: str, with_lab: bool = False) -> _Maker:
     def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-        rows = _rows(grasps, *tables, own_too=own_too)
+        rows = _rows(grasps, *tables, with_lab=with_lab)
         return _leave_out(rows, folds_of(grasps.slipped[rows], folds, seed), folds)
 
     return make
 
 
-def _grouped(*tables: str) -> Callable[[Grasps, int, int], list[Split]]:
+def _grouped(*tables: str) -> _Maker:
     def make(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-        rows = _rows(grasps, *tables, own_too=True)
+        rows = _rows(grasps, *tables, with_lab=True)
         return _leave_out(rows, _object_folds(grasps, rows, folds, seed), folds)
 
     return make
@@ -85,8 +89,7 @@ def _unknown(grasps: Grasps, _seed: int, _folds: int) -> list[Split]:
 def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
     """The same groups of objects leave both days: trained without, tested on the later day."""
     whole, later = _rows(grasps, *WHOLE), _rows(grasps, NEW_SESSION)
-    rows = np.concatenate((whole, later))
-    fold_of = _object_folds(grasps, rows, folds, seed)
+    fold_of = _object_folds(grasps, np.concatenate((whole, later)), folds, seed)
     of_whole, of_later = fold_of[: len(whole)], fold_of[len(whole) :]
     made = []
     for fold in range(folds):
@@ -98,8 +101,8 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
     return made
 
 
-_MAKERS: dict[Protocol, Callable[[Grasps, int, int], list[Split]]] = {
-    "cv": _stratified(*WHOLE, own_too=True),
+_MAKERS: dict[EvalProtocol, _Maker] = {
+    "cv": _stratified(*WHOLE, with_lab=True),
     "unknown": _unknown,
     "objects": _grouped(*WHOLE, NEW_SESSION),
     "objects-whole": _grouped(*WHOLE),
@@ -109,26 +112,23 @@ _MAKERS: dict[Protocol, Callable[[Grasps, int, int], list[Split]]] = {
 }
 
 
-def _rows(grasps: Grasps, *tables: str, own_too: bool = False) -> NDArray[np.int64]:
-    """Indices of the grasps of these tables, all of which must be there, and of one's own."""
+def _rows(grasps: Grasps, *tables: str, with_lab: bool = False) -> Ints:
+    """Indices of the grasps of these tables, all of which must be there, and of lab tables."""
     names = [file.name for file in grasps.files]
-    if own_too:
-        others = own_tables(grasps.files)
-        tables = others if len(others) == len(names) else (*tables, *others)
+    if with_lab:
+        lab = lab_table_names(grasps.files)
+        tables = lab if len(lab) == len(names) else (*tables, *lab)
     for table in tables:
         if table not in names:
             raise TooFewGraspsError(f"the data lack {table}")
-    wanted = [index for index, name in enumerate(names) if name in tables]
-    return np.flatnonzero(np.isin(grasps.table_of, wanted)).astype(np.int64)
+    return grasps.rows_of(tables)
 
 
-def _object_folds(
-    grasps: Grasps, rows: NDArray[np.int64], folds: int, seed: int
-) -> NDArray[np.int64]:
+def _object_folds(grasps: Grasps, rows: Ints, folds: int, seed: int) -> Ints:
     return object_folds([grasps.objects[row] for row in rows], folds, seed)
 
 
-def _leave_out(rows: NDArray[np.int64], fold_of: NDArray[np.int64], folds: int) -> list[Split]:
+def _leave_out(rows: Ints, fold_of: Ints, folds: int) -> list[Split]:
     return [
         Split(f"fold {fold}", rows[fold_of != fold], rows[fold_of == fold]) for fold in range(folds)
     ]

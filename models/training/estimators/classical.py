@@ -10,12 +10,13 @@ from itertools import product
 from typing import Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPClassifier
 from sklearn.svm import SVC
 from threadpoolctl import threadpool_limits
+
+from models.training.arrays import Bools, Floats, Floats32
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
@@ -67,7 +68,7 @@ class MlpConfig:
 
     @staticmethod
     def grid() -> list[MlpConfig]:
-        """One or two hidden layers around the width of the input; the paper does not say."""
+        """One or two hidden layers around the width of the input; the paper gives no grid."""
         hidden = ((32,), (100,), (300,), (64, 32), (100, 100))
         return [MlpConfig(units, alpha) for units, alpha in product(hidden, (1e-4, 0.1, 1.0))]
 
@@ -88,7 +89,7 @@ class BoostingConfig:
 
     @staticmethod
     def grid() -> list[BoostingConfig]:
-        """Not in the paper."""
+        """Our own: the paper has no boosting."""
         return [
             BoostingConfig(iterations, rate, leaves, features=features)
             for (iterations, rate), leaves, features in product(
@@ -105,15 +106,12 @@ class ClassicalModel(Protocol):
 
     n_features_in_: int
 
-    def fit(self, inputs: NDArray[np.float32], slipped: NDArray[np.bool_]) -> object:
+    def fit(self, inputs: Floats32, slipped: Bools) -> object:
         """Fit to inputs (N, M) and labels (N,)."""
 
 
 def fit_classical(
-    config: ClassicalConfig,
-    inputs: NDArray[np.float32],
-    slipped: NDArray[np.bool_],
-    seed: int,
+    config: ClassicalConfig, inputs: Floats32, slipped: Bools, seed: int
 ) -> ClassicalModel:
     """A classifier fitted to inputs (N, M) and labels (N,), on one thread.
 
@@ -129,14 +127,14 @@ def fit_classical(
     return model
 
 
-def classical_margins(model: ClassicalModel, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
     """Log-odds of slip (N,), up to a temperature, of inputs (N, M)."""
     if not len(inputs):
         return np.empty(0)
     with _one_thread():
         match model:
             case SVC() | HistGradientBoostingClassifier():
-                margins: NDArray[np.float64] = model.decision_function(inputs)
+                margins: Floats = model.decision_function(inputs)
             case MLPClassifier():
                 margins = _mlp_margins(model, inputs)
             case RandomForestClassifier():
@@ -195,12 +193,12 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
     return model
 
 
-def _mlp_margins(model: MLPClassifier, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
+def _mlp_margins(model: MLPClassifier, inputs: Floats32) -> Floats:
     """The output layer before its logistic function, which would lose the large ones."""
     values = inputs.astype(np.float64)
     for weights, bias in zip(model.coefs_[:-1], model.intercepts_[:-1], strict=True):
         values = np.maximum(values @ weights + bias, 0.0)
-    margins: NDArray[np.float64] = (values @ model.coefs_[-1] + model.intercepts_[-1])[:, 0]
+    margins: Floats = (values @ model.coefs_[-1] + model.intercepts_[-1])[:, 0]
     return margins
 
 

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import logging
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from onnxruntime.quantization import (
     CalibrationDataReader,
@@ -22,7 +18,8 @@ from onnxruntime.quantization import (
 )
 
 from models.runtime import single_threaded
-from models.training.estimators.graphs import MARGIN_NAME, copied
+from models.training.arrays import Floats, Floats32
+from models.training.estimators.graphs import MARGIN_NAME, copied, quiet, set_nodes
 
 CALIBRATION_GRASPS = 256
 """Training grasps by which static quantisation learns the ranges of what flows between layers."""
@@ -51,9 +48,7 @@ class LowRank:
 Compression = HalfWeights | Integers | LowRank
 
 
-def compressed(
-    margin: onnx.ModelProto, how: Compression, inputs: NDArray[np.float32]
-) -> onnx.ModelProto:
+def compressed(margin: onnx.ModelProto, how: Compression, inputs: Floats32) -> onnx.ModelProto:
     """The graph to `margin` in a smaller form; `inputs` (N, *shape) are those of the training.
 
     Raises `ValueError` if the graph has no dense layer to factor.
@@ -72,23 +67,18 @@ def size(model: onnx.ModelProto) -> int:
     return sum(int(np.prod(constant.dims)) for constant in model.graph.initializer)
 
 
-class GraphMargins:
-    """Runs a graph to `margin` on many inputs."""
+def graph_margins(model: onnx.ModelProto, inputs: Floats32) -> Floats:
+    """Log-odds of slip (N,) that a graph to `margin` gives for inputs (N, *shape).
 
-    def __init__(self, model: onnx.ModelProto) -> None:
-        self._session = single_threaded(model.SerializeToString())
-        self._name = model.graph.input[0].name
-
-    def __call__(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Log-odds of slip (N,) of inputs (N, *shape).
-
-        One by one, as the daemon asks: dynamic ranges are those of a whole batch.
-        """
-        margins = np.empty(len(inputs))
-        for index in range(len(inputs)):
-            given = {self._name: inputs[index : index + 1]}
-            margins[index] = self._session.run([MARGIN_NAME], given)[0][0, 0]
-        return margins
+    One by one, as the daemon asks: dynamic ranges are those of a whole batch.
+    """
+    session = single_threaded(model.SerializeToString())
+    name = model.graph.input[0].name
+    margins = np.empty(len(inputs))
+    for index in range(len(inputs)):
+        given = {name: inputs[index : index + 1]}
+        margins[index] = session.run([MARGIN_NAME], given)[0][0, 0]
+    return margins
 
 
 def _half(margin: onnx.ModelProto) -> onnx.ModelProto:
@@ -106,7 +96,7 @@ def _half(margin: onnx.ModelProto) -> onnx.ModelProto:
         casts.append(
             helper.make_node("Cast", [small.name], [name], to=onnx.TensorProto.FLOAT, name=name)
         )
-    _put_first(model, casts)
+    set_nodes(model.graph, [*casts, *model.graph.node])
     return model
 
 
@@ -139,22 +129,21 @@ def _low_rank(margin: onnx.ModelProto, rank: int) -> onnx.ModelProto:
     second = helper.make_node(
         "Gemm", [inner + "_out", outer, *layer.input[2:]], list(layer.output), transB=1
     )
-    nodes = [*model.graph.node[:place], first, second, *model.graph.node[place + 1 :]]
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
+    nodes = list(model.graph.node)
+    set_nodes(model.graph, [*nodes[:place], first, second, *nodes[place + 1 :]])
     return model
 
 
-def _integers(
-    margin: onnx.ModelProto, inputs: NDArray[np.float32], *, static: bool
-) -> onnx.ModelProto:
-    with tempfile.TemporaryDirectory() as folder, _quiet():
+def _integers(margin: onnx.ModelProto, inputs: Floats32, *, static: bool) -> onnx.ModelProto:
+    with tempfile.TemporaryDirectory() as folder, quiet(None):
         path = Path(folder) / "small.onnx"
         if static:
+            # Every so manieth grasp, so that the calibration sees all objects.
+            some = inputs[:: max(len(inputs) // CALIBRATION_GRASPS, 1)]
             quantize_static(
                 copied(margin),
                 path,
-                _Readings(margin.graph.input[0].name, inputs[:: _step(len(inputs))]),
+                _Readings(margin.graph.input[0].name, some),
                 # The margin itself must not saturate at what the calibration has seen.
                 nodes_to_exclude=[margin.graph.node[-1].name],
                 quant_format=QuantFormat.QDQ,
@@ -166,36 +155,11 @@ def _integers(
         return onnx.load(path)
 
 
-def _step(grasps: int) -> int:
-    """Every so manieth grasp, so that the calibration sees all objects."""
-    return max(grasps // CALIBRATION_GRASPS, 1)
-
-
 class _Readings(CalibrationDataReader):  # type: ignore[misc]
     """Hands the inputs of a calibration over, one by one."""
 
-    def __init__(self, name: str, inputs: NDArray[np.float32]) -> None:
-        self._readings: Iterator[dict[str, NDArray[np.float32]]] = iter(
-            [{name: inputs[index : index + 1]} for index in range(len(inputs))]
-        )
+    def __init__(self, name: str, inputs: Floats32) -> None:
+        self._readings = iter([{name: inputs[i : i + 1]} for i in range(len(inputs))])
 
-    def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+    def get_next(self) -> dict[str, Floats32] | None:
         return next(self._readings, None)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the quantiser's advice about other ways to itself."""
-    root = logging.getLogger()
-    level = root.level
-    root.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        root.setLevel(level)
-
-
-def _put_first(model: onnx.ModelProto, nodes: list[onnx.NodeProto]) -> None:
-    nodes = [*nodes, *model.graph.node]
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)

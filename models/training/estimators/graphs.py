@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from skl2onnx import to_onnx
 from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
@@ -20,6 +19,7 @@ from sklearn.svm import SVC
 from torch import nn
 
 from models.contract import OUTPUT_NAME
+from models.training.arrays import Floats, Floats32, Numbers
 from models.training.estimators.classical import PROBABILITY_FLOOR, ClassicalModel
 from models.training.estimators.networks import for_inference, for_margin
 
@@ -65,7 +65,10 @@ def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
 
 
 def weighted_sum(parts: Sequence[onnx.ModelProto], factors: Sequence[float]) -> onnx.ModelProto:
-    """One graph whose margin is the sum of the parts' margins times their factors."""
+    """One graph whose margin is the sum of the parts' margins times their factors.
+
+    The parts have the same input; their nodes are renamed in place.
+    """
     width = parts[0].graph.input[0]
     nodes: list[onnx.NodeProto] = []
     constants: list[onnx.TensorProto] = []
@@ -102,23 +105,23 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
 def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
     """A copy whose input has this name."""
     other = copied(model)
-    former = other.graph.input[0].name
+    _feed(other.graph, other.graph.input[0].name, input_name)
     other.graph.input[0].name = input_name
-    _feed(other.graph, former, input_name)
     return other
 
 
 def copied(model: onnx.ModelProto) -> onnx.ModelProto:
-    """One that may be changed."""
+    """A copy that may be changed."""
     other = onnx.ModelProto()
     other.CopyFrom(model)
     return other
 
 
-def standardised(
-    model: onnx.ModelProto, mean: NDArray[np.float32], scale: NDArray[np.float32]
-) -> onnx.ModelProto:
-    """The graph with `(input - mean) * scale` before it; both of the input's shape."""
+def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onnx.ModelProto:
+    """The graph, changed in place, with `(input - mean) * scale` before it.
+
+    Both have the shape of one input.
+    """
     graph = model.graph
     given = graph.input[0].name
     _feed(graph, given, "standardised")
@@ -126,11 +129,33 @@ def standardised(
         ("Sub", (given, "input_mean"), "centred", {}),
         ("Mul", ("centred", "input_scale"), "standardised", {}),
     )
-    nodes = [*_nodes(steps), *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)
+    set_nodes(graph, [*_nodes(steps), *graph.node])
     graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
     return model
+
+
+def set_nodes(graph: onnx.GraphProto, nodes: Sequence[onnx.NodeProto]) -> None:
+    """Let the graph consist of these nodes, in the order in which they run."""
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+@contextmanager
+def quiet(name: str | None) -> Iterator[None]:
+    """Hold back what a logger (None: the root) says below an error, and what will be deprecated.
+
+    Exporter and quantiser talk of their own insides: nothing that a user could act on.
+    """
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", category=FutureWarning)
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
@@ -170,8 +195,7 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
         ("Cast", ("decision",), MARGIN_NAME, {"to": onnx.TensorProto.FLOAT}),
     )
     constants.append(_constant("axis", np.array([1])))
-    nodes = _nodes(steps)
-    return _model(nodes, constants, _vectors(input_name, features), MARGIN_NAME, 1)
+    return _model(_nodes(steps), constants, _vectors(input_name, features), MARGIN_NAME, 1)
 
 
 def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.ModelProto:
@@ -204,7 +228,7 @@ def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.Mo
     return _model([node], [], _vectors(input_name, model.n_features_in_), MARGIN_NAME, 1)
 
 
-def _float32_below(thresholds: NDArray[np.float64]) -> NDArray[np.float32]:
+def _float32_below(thresholds: Floats) -> Floats32:
     """The largest float32 not above: a float32 is below it exactly if below the threshold."""
     nearest = thresholds.astype(np.float32)
     return np.where(nearest > thresholds, np.nextafter(nearest, np.float32(-np.inf)), nearest)
@@ -257,14 +281,8 @@ def _from_sklearn(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
         target_opset={"": OPSET, "ai.onnx.ml": ML_OPSET},
         options={id(model): {"zipmap": False}},
     )
-    _rename_input(converted.graph, input_name)
+    _feed(converted.graph, converted.graph.input[0].name, input_name)
     return converted
-
-
-def _rename_input(graph: onnx.GraphProto, input_name: str) -> None:
-    given = graph.input[0].name
-    for node in graph.node:
-        node.input[:] = [input_name if name == given else name for name in node.input]
 
 
 def _from_torch(
@@ -272,7 +290,7 @@ def _from_torch(
 ) -> onnx.ModelProto:
     # Two inputs, because one would let the exporter take the batch for a constant.
     example = torch.zeros(2, *shape)
-    with _quiet_exporter():
+    with quiet("torch.onnx"):
         program = torch.onnx.export(
             network,
             (example,),
@@ -335,20 +353,5 @@ def _vectors(name: str, width: int) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["N", width])
 
 
-def _constant(name: str, values: NDArray[np.generic]) -> onnx.TensorProto:
+def _constant(name: str, values: Numbers) -> onnx.TensorProto:
     return numpy_helper.from_array(np.ascontiguousarray(values), name)
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Hold back what the exporter says of its own inside: nothing that a user could act on."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=FutureWarning)
-            warnings.filterwarnings("ignore", category=DeprecationWarning)
-            yield
-    finally:
-        logger.setLevel(level)

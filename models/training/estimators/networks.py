@@ -100,7 +100,7 @@ class FeatureImages(nn.Module):
 
 
 class Beside(nn.Module):
-    """Looks at the first features through its layers and lays the rest beside the result."""
+    """Puts the first features through layers and lays the rest beside the result."""
 
     def __init__(self, look: nn.Sequential, first: int) -> None:
         super().__init__()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from models.training.arrays import Bools, Floats, Floats32
 from models.training.estimators.networks import AnyNetwork, build
 
 THREADS = 1
@@ -69,13 +69,10 @@ class PublishedRecipe:
 
 AnyRecipe = Recipe | PublishedRecipe
 
-Progress = Callable[[], None]
-"""Called after each epoch."""
-
 
 @contextmanager
 def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
-    """Seed torch, allow deterministic algorithms only, and fix its threads; restore afterwards."""
+    """Seed torch, allow deterministic algorithms alone and fix its threads; restored afterwards."""
     threads_before = torch.get_num_threads()
     deterministic_before = torch.are_deterministic_algorithms_enabled()
     with torch.random.fork_rng(devices=[]):
@@ -89,14 +86,8 @@ def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
             torch.use_deterministic_algorithms(deterministic_before)
 
 
-def train(
-    config: AnyNetwork,
-    inputs: NDArray[np.float32],
-    slipped: NDArray[np.bool_] | NDArray[np.float64],
-    recipe: AnyRecipe,
-    *,
-    seed: int,
-    on_epoch: Progress | None = None,
+def train_network(
+    config: AnyNetwork, inputs: Floats32, slipped: Bools | Floats, recipe: AnyRecipe, *, seed: int
 ) -> nn.Sequential:
     """Train a network on inputs (N, *shape); returns it in evaluation mode.
 
@@ -113,13 +104,11 @@ def train(
             if isinstance(layer, _BatchNorm):
                 layer.momentum = recipe.norm_momentum
         targets = torch.stack((1.0 - slip, slip), dim=1)
-        _fit(network, torch.from_numpy(inputs), targets, recipe, on_epoch)
+        _fit(network, torch.from_numpy(inputs), targets, recipe)
         return network.eval()
 
 
-def logits(
-    network: nn.Module, inputs: NDArray[np.float32], threads: int = THREADS
-) -> NDArray[np.float64]:
+def logits(network: nn.Module, inputs: Floats32, threads: int = THREADS) -> Floats:
     """Logits (N, 2), order (stable, slip), of inputs (N, *shape)."""
     batches = torch.split(torch.from_numpy(inputs), INFERENCE_BATCH)
     with reproducible(0, threads), torch.no_grad():
@@ -127,17 +116,14 @@ def logits(
 
 
 def _fit(
-    network: nn.Sequential,
-    inputs: torch.Tensor,
-    targets: torch.Tensor,
-    recipe: AnyRecipe,
-    on_epoch: Progress | None,
+    network: nn.Sequential, inputs: torch.Tensor, targets: torch.Tensor, recipe: AnyRecipe
 ) -> None:
-    optimizer, schedule = optimization(network, recipe, len(_batches(len(inputs), recipe)))
+    batches = _batches(len(inputs), recipe)
+    optimizer, schedule = optimization(network, recipe, len(batches))
     loss = nn.CrossEntropyLoss(label_smoothing=recipe.label_smoothing)
     for _ in range(recipe.epochs):
         order = torch.randperm(len(inputs))
-        for batch in _batches(len(inputs), recipe):
+        for batch in batches:
             chosen = order[batch]
             seen = inputs[chosen]
             if recipe.input_noise > 0.0:
@@ -146,14 +132,12 @@ def _fit(
             loss(network(seen), targets[chosen]).backward()
             optimizer.step()
             schedule.step()
-        if on_epoch is not None:
-            on_epoch()
 
 
 def optimization(
     network: nn.Sequential, recipe: AnyRecipe, steps: int
 ) -> tuple[torch.optim.Optimizer, torch.optim.lr_scheduler.LRScheduler]:
-    """What updates the weights after each of an epoch's `steps` batches, and at which rate."""
+    """Optimizer and schedule of a recipe; an epoch has `steps` batches, each followed by a step."""
     weights = [parameter for parameter in network.parameters() if parameter.ndim > 1]
     others = [parameter for parameter in network.parameters() if parameter.ndim <= 1]
     optimizer: torch.optim.Optimizer

@@ -1,4 +1,4 @@
-"""What broken electrodes cost: unnoticed, noticed and repaired, or found by their values."""
+"""The study of broken electrodes: what they cost if nobody notices, and after their repair."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.metrics import f1_score
 
 from models.electrodes import Electrodes
+from models.training.arrays import Bools, Numbers
 from models.training.data.datasets import COUNT_MAX, Grasps
 from models.training.data.folds import fold_seed, folds_of
-from models.training.fitting.seen import seen_counts
 from models.training.fitting.trained import Trained, train
 from models.training.systems.system import System
 
@@ -23,7 +22,7 @@ LOOKED_FOR_MAX = 13
 """Broken electrodes of a reading that are looked for at most: one more than the daemon repairs in a
 hand (`BROKEN_MAX` of `daemon.judge.health`, 12), for with so many it refuses the reading."""
 
-Breakage = Callable[[NDArray[np.generic], np.random.Generator], NDArray[np.generic]]
+Breakage = Callable[[Numbers, np.random.Generator], Numbers]
 KINDS: dict[str, Breakage] = {
     "at 0": lambda counts, _: np.zeros_like(counts),
     "at 4095": lambda counts, _: np.full_like(counts, COUNT_MAX),
@@ -35,35 +34,39 @@ KINDS: dict[str, Breakage] = {
 
 @dataclass(frozen=True, slots=True)
 class Broken:
-    """F1 with so many electrodes of each reading broken, at random places."""
+    """F1, 0..1, with `number` electrodes of each reading broken, at random places."""
 
     number: int
     reads: str
+    """A key of `KINDS`."""
     unnoticed: float
     known: float
-    """Flagged by the driver or at a rail, and repaired."""
+    """With the broken electrodes known, and repaired."""
     found: float
-    """Nobody says which, not even the rails: found by what the others let expect, and repaired. The
-    daemon refuses a reading with more than a few of these instead."""
+    """With those repaired whose values do not fit the others of the reading. The daemon refuses a
+    reading with more than a few of them."""
     detected: float
-    """Fraction of the broken electrodes that were found so."""
+    """Fraction of the broken electrodes that were found by their values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """F1 with sound and with broken electrodes, slip positive, on grasps not trained on."""
+    """F1, 0..1, slip positive, with sound and with broken electrodes, on grasps not trained on."""
 
     grasps: int
     sound: float
     false_alarms: float
     """Fraction of the sound readings in which an electrode was repaired."""
     sound_repaired: float
-    """F1 of the sound readings after that."""
+    """F1 of the sound readings after those repairs."""
     broken: tuple[Broken, ...]
 
 
 def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
-    """Train on folds of the grasps, break electrodes of what was left out, and judge it."""
+    """Train on folds of the grasps, break electrodes of the grasps left out, and judge these.
+
+    The grasps have the system's fingers alone. Raises `TooFewGraspsError`.
+    """
     folds = [
         _Fold(system, grasps, out, fold_seed(seed, fold))
         for fold, out in enumerate(left_out(grasps, seed))
@@ -84,12 +87,13 @@ def broken_study(system: System, grasps: Grasps, seed: int) -> Study:
     )
 
 
-def left_out(grasps: Grasps, seed: int) -> list[NDArray[np.bool_]]:
+def left_out(grasps: Grasps, seed: int) -> list[Bools]:
     """Of each training of the study, shape (N,): True for the grasps that it is judged by.
 
-    Raises `TooFewGraspsError` for less than two grasps of a class.
+    Raises `TooFewGraspsError` for less than two grasps of a label.
     """
-    folds = min(FOLDS, max(2, _smaller_class(grasps)))
+    slips = int(grasps.slipped.sum())
+    folds = min(FOLDS, max(2, min(slips, len(grasps) - slips)))
     fold_of = folds_of(grasps.slipped, folds, seed)
     return [fold_of == fold for fold in range(min(JUDGED_FOLDS, folds))]
 
@@ -97,34 +101,30 @@ def left_out(grasps: Grasps, seed: int) -> list[NDArray[np.bool_]]:
 class _Fold:
     """A system trained without some grasps, and those grasps."""
 
-    def __init__(
-        self, system: System, grasps: Grasps, left_out: NDArray[np.bool_], seed: int
-    ) -> None:
+    def __init__(self, system: System, grasps: Grasps, left_out: Bools, seed: int) -> None:
         rest = grasps.rows(np.flatnonzero(~left_out).astype(np.int64))
         self.counts = grasps.counts[left_out]
         self._slipped = grasps.slipped[left_out]
         self._table_of = grasps.table_of[left_out]
         self._trained: Trained = train(system, rest, seed)
-        looks = self._trained.looks
-        seen = seen_counts(looks.to_training(rest.counts, rest.table_of), looks.margin)
-        self._electrodes = Electrodes(seen)
+        self._electrodes = Electrodes(self._trained.seen())
 
-    def judge(self, counts: NDArray[np.generic]) -> float:
+    def judge(self, counts: Numbers) -> float:
         verdict = self._trained.margins(counts, self._table_of) > 0.0
         return float(f1_score(self._slipped, verdict, zero_division=0.0))
 
-    def find(self, counts: NDArray[np.generic]) -> NDArray[np.bool_]:
-        values = self._trained.looks.to_training(counts, self._table_of)
+    def find(self, counts: Numbers) -> Bools:
+        values = self._trained.sensors.to_training(counts, self._table_of)
         nothing = np.zeros(counts.shape[1:], dtype=np.bool_)
         return np.array(
             [self._electrodes.implausible(reading, nothing, LOOKED_FOR_MAX) for reading in values]
         )
 
-    def repair(self, counts: NDArray[np.generic], broken: NDArray[np.bool_]) -> NDArray[np.generic]:
-        values = self._trained.looks.to_training(counts, self._table_of)
+    def repair(self, counts: Numbers, broken: Bools) -> Numbers:
+        values = self._trained.sensors.to_training(counts, self._table_of)
         for index in np.flatnonzero(broken.any(axis=(1, 2))):
             values[index] = self._electrodes.repaired(values[index], broken[index])
-        repaired = self._trained.looks.from_training(values, self._table_of)
+        repaired = self._trained.sensors.from_training(values, self._table_of)
         return np.where(broken, np.clip(repaired, 0.0, COUNT_MAX), counts)
 
 
@@ -139,18 +139,12 @@ def _break(folds: list[_Fold], number: int, reads: str, random: np.random.Genera
         found.append(fold.judge(fold.repair(counts, marked)))
         detected.append((marked & where).sum() / where.sum())
     return Broken(
-        number,
-        reads,
-        *(float(np.mean(values)) for values in (unnoticed, known, found, detected)),
+        number, reads, *(float(np.mean(values)) for values in (unnoticed, known, found, detected))
     )
 
 
-def _places(shape: tuple[int, ...], number: int, random: np.random.Generator) -> NDArray[np.bool_]:
+def _places(shape: tuple[int, ...], number: int, random: np.random.Generator) -> Bools:
     """So many places in each reading, any of them: shape (N, fingers, 24)."""
     order = random.random((shape[0], shape[1] * shape[2])).argsort(axis=1)
-    places: NDArray[np.bool_] = (order < number).reshape(shape)
+    places: Bools = (order < number).reshape(shape)
     return places
-
-
-def _smaller_class(grasps: Grasps) -> int:
-    return min(int(grasps.slipped.sum()), int((~grasps.slipped).sum()))

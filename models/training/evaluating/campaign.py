@@ -12,22 +12,21 @@ from pathlib import Path
 import numpy as np
 
 from models.training.data.datasets import Grasps
-from models.training.data.protocols import FOLDS, Protocol, splits
-from models.training.evaluating import summary as summaries
+from models.training.data.protocols import FOLDS, EvalProtocol, splits
 from models.training.evaluating.jobs import Job, JobResult
-from models.training.evaluating.summary import Summary, summarise
-from models.training.evaluating.sweep import sweep
+from models.training.evaluating.run_jobs import run_jobs
+from models.training.evaluating.summaries import Summary, summarise, write_summary
 from models.training.systems.system import System, digest, with_recipes
 
 QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
 """Enough to see that everything runs; the figures mean nothing."""
 
-Group = tuple[System, Protocol]
+Group = tuple[System, EvalProtocol]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Campaign:
-    """All jobs, and the grasps they are about."""
+    """All jobs, and the grasps that they train on and judge."""
 
     groups: tuple[Group, ...]
     jobs: tuple[Job, ...]
@@ -48,30 +47,35 @@ class Campaign:
         on_summary: Callable[[Summary], None] | None = None,
         keep: bool = True,
     ) -> list[Summary]:
-        """A summary per system and protocol, in their order; see `sweep` for the rest.
+        """Run all jobs as `run_jobs` does; a summary per system and protocol, in their order.
 
-        Summaries are written into `folder`, unless not to `keep`, as soon as they are complete;
-        what is stored of each job stands in its folder `jobs`.
+        Results of jobs are stored in `folder`/jobs, and, if `keep`, each summary in `folder` as
+        soon as it is complete. `on_job` is called with the job's system and protocol after each.
         """
-        collected: dict[tuple[str, Protocol], dict[Job, JobResult]] = {}
-        made: dict[tuple[str, Protocol], Summary] = {}
-        sizes = Counter((job.system.name, job.protocol) for job in self.jobs)
+        found: dict[Job, JobResult] = {}
+        made: dict[tuple[str, EvalProtocol], Summary] = {}
+        missing = Counter((job.system.name, job.protocol) for job in self.jobs)
 
         def on_result(index: int, result: JobResult) -> None:
             job = self.jobs[index]
             key = (job.system.name, job.protocol)
-            collected.setdefault(key, {})[job] = result
+            found[job] = result
+            missing[key] -= 1
             if on_job is not None:
                 on_job(f"{job.system.name} {job.protocol}")
-            if len(collected[key]) < sizes[key]:
+            if missing[key]:
                 return
-            made[key] = _summary(collected.pop(key), self.grasps)
+            by_seed: dict[int, list[JobResult]] = {}
+            for each in self.jobs:
+                if (each.system.name, each.protocol) == key:
+                    by_seed.setdefault(each.seed, []).append(found.pop(each))
+            made[key] = summarise(job.system, job.protocol, by_seed, self.grasps)
             if keep:
-                summaries.write(made[key], folder)
+                write_summary(made[key], folder)
             if on_summary is not None:
                 on_summary(made[key])
 
-        sweep(
+        run_jobs(
             self.jobs,
             self.grasps,
             folder / "jobs",
@@ -84,13 +88,16 @@ class Campaign:
 
 def campaign(
     systems: Sequence[System],
-    protocols: Sequence[Protocol],
+    protocols: Sequence[EvalProtocol],
     grasps: Grasps,
     *,
     seeds: int,
     quick: bool = False,
 ) -> Campaign:
-    """All jobs of these systems. Raises `TooFewGraspsError` if the data do not have the splits."""
+    """Every fold of these systems, protocols and seeds 0..seeds-1; fewer and smaller if `quick`.
+
+    Raises `TooFewGraspsError` if the data do not have the splits.
+    """
     folds = QUICK_FOLDS if quick else FOLDS
     if quick:
         systems = [quickened(system) for system in systems]
@@ -123,11 +130,3 @@ def _forms(systems: Sequence[System]) -> list[list[System]]:
 def quickened(system: System) -> System:
     """The system with networks that are hardly trained."""
     return with_recipes(system, epochs=QUICK_EPOCHS)
-
-
-def _summary(results: dict[Job, JobResult], grasps: Grasps) -> Summary:
-    ordered = sorted(results, key=lambda job: (job.seed, job.fold))
-    by_seed: dict[int, list[JobResult]] = {}
-    for job in ordered:
-        by_seed.setdefault(job.seed, []).append(results[job])
-    return summarise(ordered[0].system, ordered[0].protocol, by_seed, grasps)

@@ -16,8 +16,7 @@ from joblib._dask import DaskDistributedBackend
 
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job
-from models.training.evaluating.sweep import ClusterError, Outcomes
+from models.training.evaluating.jobs import ClusterError, Job, Outcomes
 
 CONNECT_TIMEOUT_S = 10
 WORKERS_TIMEOUT_S = 60
@@ -111,4 +110,4 @@ def _on_worker(place: int, job: Job, name: str) -> tuple[int, bytes]:
     plugin = get_worker().plugins[name]
     if not isinstance(plugin, GraspsPlugin):
         raise TypeError(f"{name} is not the grasps")
-    return place, jobs.run(job, plugin.grasps).to_bytes()
+    return jobs.run_numbered(place, job, plugin.grasps)

@@ -1,4 +1,4 @@
-"""The grid of a classical system: every configuration as a system of its own."""
+"""Grid search: every configuration of a classical system's grid as a system of its own."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from models.training.data.protocols import Protocol
+from models.training.data.protocols import EvalProtocol
 from models.training.estimators.networks import DenseConfig, NetworkConfig
 from models.training.evaluating.metrics import Spread
-from models.training.evaluating.summary import Summary
+from models.training.evaluating.summaries import Summary
 from models.training.systems.system import BlendConfig, DistilConfig, System
 
 
 @dataclass(frozen=True, slots=True)
 class GridPoint:
-    """What one configuration of a grid reached."""
+    """What one configuration of a grid reached, as fractions."""
 
     name: str
     f1: Spread
@@ -23,7 +23,7 @@ class GridPoint:
 
 
 def grid_of(system: System) -> list[System]:
-    """A system for each configuration of the grid; none for what has no grid."""
+    """A system for each configuration of the estimator's grid; none for networks and blends."""
     match system.estimator:
         case BlendConfig() | DistilConfig() | NetworkConfig() | DenseConfig():
             return []
@@ -35,7 +35,7 @@ def grid_of(system: System) -> list[System]:
 
 
 def best_of_grid(
-    system: System, protocol: Protocol, summaries: Sequence[Summary]
+    system: System, protocol: EvalProtocol, summaries: Sequence[Summary]
 ) -> list[GridPoint]:
     """All configurations of a system's grid, the best F1 first."""
     names = {variant.name for variant in grid_of(system)}

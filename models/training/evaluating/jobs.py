@@ -1,4 +1,4 @@
-"""One training and what it says of the grasps it has not seen: a pure function, kept in a file."""
+"""One training and its judgement of the grasps left out, kept in a file by all it depends on."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import logging
-import os
 import threading
 import time
 import warnings
@@ -15,17 +14,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 import joblib
 import numpy as np
 from numpy.typing import NDArray
 
 from models.inputs import builder, raw_features
+from models.training.arrays import Floats, Ints, Numbers
 from models.training.data.datasets import Grasps
 from models.training.data.folds import fold_seed
-from models.training.data.protocols import FOLDS, Protocol, Split, splits
-from models.training.fitting.fitting import Fitted, fit
-from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, sit
+from models.training.data.protocols import FOLDS, EvalProtocol, Split, splits
+from models.training.evaluating.files import write_whole
+from models.training.fitting.fit import fit
+from models.training.fitting.fitted import Fitted
+from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
 from models.training.systems.system import SessionFeatures, System, digest, with_recipes
 
 FORMAT = 1
@@ -39,9 +42,19 @@ _ONE_AT_A_TIME = threading.Lock()
 
 _log = logging.getLogger(__name__)
 
+Number = TypeVar("Number", np.float64, np.int64)
+
 
 class BrokenResultError(Exception):
     """A stored result is not what it claims to be: run the job again."""
+
+
+class ClusterError(Exception):
+    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
+
+
+Outcomes = Iterator[tuple[int, bytes]]
+"""Of jobs in the order in which they finish: index of the job, `JobResult.to_bytes`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +62,7 @@ class Job:
     """One fold of one protocol for one system."""
 
     system: System
-    protocol: Protocol
+    protocol: EvalProtocol
     seed: int
     """Of the split and, with the fold, of the training."""
     fold: int
@@ -62,25 +75,25 @@ class Job:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def file_name(self, data: str) -> str:
-        """Of the stored result: readable, and different for every job."""
+        """Of the stored result: different for every job and every data (a digest)."""
         readable = f"{self.system.name}.{self.protocol}.{self.seed}.{self.fold}"
         return f"{readable}.{self.key(data)[:16]}.npz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobResult:
-    """What a trained system says of the test grasps of a job."""
+    """How a trained system judges the test grasps of a job."""
 
-    test: NDArray[np.int64]
+    test: Ints
     """Indices (n,) of the grasps, ascending."""
-    margins: dict[str, NDArray[np.float64]]
+    margins: dict[str, Floats]
     """By variant: uncalibrated log-odds of slip (n,)."""
     train_grasps: int
     seconds: float
     """Of training and judging."""
     parameters: int
     """How many numbers the trained system consists of."""
-    ages: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    ages: dict[str, Ints] = field(default_factory=dict)
     """By running variant: grasps (n,) that the session had seen before."""
 
     def to_bytes(self) -> bytes:
@@ -131,8 +144,13 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     return JobResult(split.test, margins, len(split.train), seconds, fitted.parameters, ages)
 
 
+def run_numbered(index: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
+    """`run` as a process of its own is asked and answers: an item of `Outcomes`."""
+    return index, run(job, grasps).to_bytes()
+
+
 def load(folder: Path, job: Job, data: str) -> JobResult | None:
-    """The stored result of a job, None if there is none or, with a warning, if it is broken."""
+    """The stored result of a job on data with this digest; None, if broken with a warning."""
     path = folder / job.file_name(data)
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
@@ -146,17 +164,8 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
 
 
 def save(folder: Path, job: Job, data: str, content: bytes) -> None:
-    """Store the bytes of a result, whole or not at all."""
-    path = folder / job.file_name(data)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    """Store the bytes of a result, for `load`. Raises `OSError`."""
+    write_whole(folder / job.file_name(data), content)
 
 
 @contextmanager
@@ -174,7 +183,7 @@ def _interruptible() -> Iterator[None]:
 
 def _run_session(
     system: System, wanted: SessionFeatures, grasps: Grasps, split: Split, seed: int
-) -> tuple[Fitted, dict[str, NDArray[np.float64]], dict[str, NDArray[np.int64]]]:
+) -> tuple[Fitted, dict[str, Floats], dict[str, Ints]]:
     """Each table is a session, standardised by its own training grasps."""
     features, table_of = raw_features(grasps.counts), grasps.table_of
     train, test = split.train, split.test
@@ -184,53 +193,41 @@ def _run_session(
     if split.calibration is None:
         known = standards.apply(features[test], table_of[test], wanted.clip)
         return fitted, {TRAINING: fitted.margins(known)}, {}
-    sitting = sit(features, test, split.calibration, standards, seed)
+    session = later_session(features, test, split.calibration, standards, seed)
     margins = {
         variant: fitted.margins(by.apply(features[test], wanted.clip))
-        for variant, by in sitting.standards.items()
+        for variant, by in session.standards.items()
     }
-    return fitted, margins, sitting.ages
+    return fitted, margins, session.ages
 
 
 def _alone(system: System) -> System:
     return with_recipes(system, threads=1)
 
 
-def _result(arrays: dict[str, NDArray[np.generic]]) -> JobResult:
+def _result(arrays: dict[str, Numbers]) -> JobResult:
     """Raises `KeyError`, `TypeError` or `ValueError` for what is no result."""
     meta = json.loads(arrays[_META].tobytes())
     if meta["format"] != FORMAT:
         raise ValueError(f"format {meta['format']}, not {FORMAT}")
     test = arrays[_TEST].astype(np.int64)
-    margins = {
-        name: values.astype(np.float64)
-        for name, values in _named(arrays, _MARGINS, test.shape).items()
-    }
-    ages = {
-        name: values.astype(np.int64) for name, values in _named(arrays, _AGES, test.shape).items()
-    }
+    margins = _named(arrays, _MARGINS, np.float64)
+    ages = _named(arrays, _AGES, np.int64)
     if test.ndim != 1 or not margins:
         raise ValueError("has no margins")
+    if any(values.shape != test.shape for values in (*margins.values(), *ages.values())):
+        raise ValueError("has margins or ages of another number of grasps")
     if not all(np.isfinite(values).all() for values in margins.values()):
         raise ValueError("has margins that are not finite")
-    return JobResult(
-        test,
-        margins,
-        int(meta["train_grasps"]),
-        float(meta["seconds"]),
-        int(meta["parameters"]),
-        ages,
-    )
+    numbers = int(meta["train_grasps"]), float(meta["seconds"]), int(meta["parameters"])
+    return JobResult(test, margins, *numbers, ages)
 
 
 def _named(
-    arrays: dict[str, NDArray[np.generic]], prefix: str, shape: tuple[int, ...]
-) -> dict[str, NDArray[np.generic]]:
-    found = {
-        name.removeprefix(prefix): values
+    arrays: dict[str, Numbers], prefix: str, kind: type[Number]
+) -> dict[str, NDArray[Number]]:
+    return {
+        name.removeprefix(prefix): values.astype(kind)
         for name, values in arrays.items()
         if name.startswith(prefix)
     }
-    if any(values.shape != shape for values in found.values()):
-        raise ValueError(f"has {prefix} of another number of grasps")
-    return found

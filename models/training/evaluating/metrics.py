@@ -1,16 +1,22 @@
-"""Figures of verdicts: one test set, many folds and seeds, two systems side by side."""
+"""Figures of verdicts: of one test set, over folds and seeds, and between two systems."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
 
-from models.training.fitting.calibration import ECE_BINS, margins_of, p_slip, reliability
+from models.training.arrays import Bools, Floats
+from models.training.fitting.calibration import (
+    ECE_BINS,
+    Reliability,
+    margins_of,
+    p_slip,
+    reliability,
+)
 
 METRICS = ("accuracy", "precision", "recall", "f1", "auc", "brier", "ece", "log_loss")
 """Names of the figures of `Scores`."""
@@ -23,7 +29,7 @@ FEWEST_JUDGED = 50
 
 
 @dataclass(frozen=True, slots=True)
-class Scores:
+class Scores(Reliability):
     """Figures of one test set as fractions, slip positive."""
 
     grasps: int
@@ -33,12 +39,6 @@ class Scores:
     f1: float
     auc: float
     """Area under the ROC curve: does it rank, whatever the threshold. NaN for a single class."""
-    brier: float
-    """Mean squared error of the slip probability."""
-    ece: float
-    """Expected calibration error of the verdict's probability."""
-    log_loss: float
-    """Mean negative log-likelihood, nats."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +85,7 @@ class CurvePoint:
     coverage: float
 
 
-def score(
-    values: NDArray[np.float64],
-    slipped: NDArray[np.bool_],
-    probability: NDArray[np.float64] | None = None,
-) -> Scores:
+def score(values: Floats, slipped: Bools, probability: Floats | None = None) -> Scores:
     """Figures of margins (N,) or logits (N, 2) against labels (N,).
 
     Brier score, calibration error and log loss are those of `probability` (N,) of slip; without it
@@ -103,15 +99,13 @@ def score(
     both = len(np.unique(slipped)) == 2
     reliable = reliability(p_slip(margin) if probability is None else probability, slipped)
     return Scores(
+        **asdict(reliable),
         grasps=len(slipped),
         accuracy=float(accuracy_score(slipped, verdict)),
         precision=float(precision),
         recall=float(recall),
         f1=float(f1),
         auc=float(roc_auc_score(slipped, margin)) if both else math.nan,
-        brier=reliable.brier,
-        ece=reliable.ece,
-        log_loss=reliable.log_loss,
     )
 
 
@@ -156,54 +150,41 @@ def wilson(accuracy: float, grasps: int) -> Fraction:
 
 
 def coverage_curve(
-    probability: NDArray[np.float64], slipped: NDArray[np.bool_], steps: int = CURVE_STEPS
+    probability: Floats, slipped: Bools, steps: int = CURVE_STEPS
 ) -> list[CurvePoint]:
     """Accuracy of the most confident verdicts, from nearly none to all of them.
 
     Of slip probabilities (N,) and labels (N,), N > 0; ascending in coverage. Verdicts of the same
     confidence stay together.
     """
-    confidence, accuracy = _by_confidence(probability, slipped)
-    number = len(confidence)
-    last = np.append(confidence[1:] != confidence[:-1], True)
-    wanted = np.unique(np.ceil(np.linspace(1.0 / steps, 1.0, steps) * number).astype(int)) - 1
-    ends = np.flatnonzero(last)
-    chosen = np.unique(ends[np.searchsorted(ends, wanted)])
-    return [
-        CurvePoint(float(confidence[end]), float(accuracy[end]), (int(end) + 1) / number)
-        for end in chosen
-    ]
+    points = _points(probability, slipped)
+    number = len(slipped)
+    wanted = np.unique(np.ceil(np.linspace(1.0 / steps, 1.0, steps) * number))
+    ends = [round(point.coverage * number) for point in points]
+    return [points[index] for index in np.unique(np.searchsorted(ends, wanted))]
 
 
-def accuracy_at(
-    probability: NDArray[np.float64], slipped: NDArray[np.bool_], coverage: float
-) -> float:
+def accuracy_at(probability: Floats, slipped: Bools, coverage: float) -> float:
     """Accuracy of this share of the grasps, the most confident ones; at least one."""
     _, accuracy = _by_confidence(probability, slipped)
     return float(accuracy[max(1, round(coverage * len(accuracy))) - 1])
 
 
-def reject_threshold(
-    probability: NDArray[np.float64], slipped: NDArray[np.bool_], wanted: float
-) -> CurvePoint | None:
+def reject_threshold(probability: Floats, slipped: Bools, wanted: float) -> CurvePoint | None:
     """The lowest confidence from which on verdicts reach the wanted accuracy.
 
     None if no confidence does so over `FEWEST_JUDGED` verdicts.
     """
-    confidence, accuracy = _by_confidence(probability, slipped)
-    last = np.append(confidence[1:] != confidence[:-1], True)
-    enough = np.arange(1, len(confidence) + 1) >= FEWEST_JUDGED
-    ends = np.flatnonzero(last & enough & (accuracy >= wanted))
-    if not len(ends):
-        return None
-    end = ends[-1]
-    coverage = (int(end) + 1) / len(confidence)
-    return CurvePoint(float(confidence[end]), float(accuracy[end]), coverage)
+    least = FEWEST_JUDGED / len(slipped)
+    reached = (
+        point
+        for point in reversed(_points(probability, slipped))
+        if point.coverage >= least and point.accuracy >= wanted
+    )
+    return next(reached, None)
 
 
-def reliability_bins(
-    probability: NDArray[np.float64], slipped: NDArray[np.bool_]
-) -> list[tuple[float, float, int]]:
+def reliability_bins(probability: Floats, slipped: Bools) -> list[tuple[float, float, int]]:
     """Mean slip probability, share that slipped, and number of grasps of each bin in use."""
     bins = np.minimum((probability * ECE_BINS).astype(np.int64), ECE_BINS - 1)
     return [
@@ -213,9 +194,17 @@ def reliability_bins(
     ]
 
 
-def _by_confidence(
-    probability: NDArray[np.float64], slipped: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _points(probability: Floats, slipped: Bools) -> list[CurvePoint]:
+    """One for each confidence that occurs, ascending in coverage."""
+    confidence, accuracy = _by_confidence(probability, slipped)
+    ends = np.flatnonzero(np.append(confidence[1:] != confidence[:-1], True)).tolist()
+    return [
+        CurvePoint(float(confidence[end]), float(accuracy[end]), (end + 1) / len(confidence))
+        for end in ends
+    ]
+
+
+def _by_confidence(probability: Floats, slipped: Bools) -> tuple[Floats, Floats]:
     """Confidences, falling, and the accuracy of all verdicts up to each."""
     confidence = np.maximum(probability, 1.0 - probability)
     order = np.argsort(-confidence, kind="stable")

@@ -10,8 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from models.training.data.protocols import PROTOCOLS
-from models.training.evaluating.summary import Summary
-from models.training.fitting.standards import DRAWS
+from models.training.evaluating.summaries import Summary
+from models.training.fitting.standards import SESSION_VARIANTS
 
 FORMATS = ("png", "svg")
 DPI = 130
@@ -75,17 +75,11 @@ def _reliability(axes: Axes, summary: Summary) -> None:
     axes.scatter(predicted, seen, s=sizes, color=SLIP, zorder=3)
     ece = summary.main.spreads["ece"].mean
     axes.set_title(f"Reliability (ECE of a fold {100 * ece:.1f} %)", fontsize=10)
-    axes.set_xlabel("predicted slip probability (size: grasps)")
-    axes.set_ylabel("share that slipped")
+    axes.set(xlabel="predicted slip probability (size: grasps)", ylabel="share that slipped")
 
 
 def _coverage(axes: Axes, summary: Summary) -> None:
-    points = summary.main.curve
-    axes.plot(
-        [100.0 * point.coverage for point in points],
-        [100.0 * point.accuracy for point in points],
-        color=LINE,
-    )
+    axes.plot(*_curve(summary), color=LINE)
     for wanted, threshold in summary.main.thresholds.items():
         if threshold is not None:
             place = (100.0 * threshold.coverage, 100.0 * threshold.accuracy)
@@ -100,11 +94,15 @@ def _coverage(axes: Axes, summary: Summary) -> None:
                 va="top" if to_left else "bottom",
                 fontsize=8,
             )
-    axes.set_xlim(0.0, 103.0)
     axes.set_title("Accuracy of the most confident verdicts, and reject thresholds", fontsize=10)
-    axes.set_xlabel("coverage, %")
-    axes.set_ylabel("accuracy, %")
+    axes.set(xlim=(0.0, 103.0), xlabel="coverage, %", ylabel="accuracy, %")
     axes.grid(alpha=0.3)
+
+
+def _curve(summary: Summary) -> tuple[list[float], list[float]]:
+    """Coverage and accuracy, %."""
+    curve = summary.main.curve
+    return [100.0 * point.coverage for point in curve], [100.0 * point.accuracy for point in curve]
 
 
 def _confusion(axes: Axes, summary: Summary) -> None:
@@ -146,9 +144,7 @@ def _objects(axes: Axes, summary: Summary) -> None:
         label="accuracy, 95 %",
     )
     axes.set_yticks(places, [f"{name} ({one.share.grasps})" for name, one in ranked], fontsize=7.5)
-    axes.set_ylim(-0.8, len(ranked) - 0.2)
-    axes.set_xlim(0.0, 101.0)
-    axes.set_xlabel("%")
+    axes.set(ylim=(-0.8, len(ranked) - 0.2), xlim=(0.0, 101.0), xlabel="%")
     axes.set_title("Objects (grasps), slip positive", fontsize=10, loc="left")
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.995), ncols=2, fontsize=8, frameon=False)
     axes.grid(axis="x", alpha=0.3)
@@ -160,15 +156,11 @@ def _comparison(summaries: Sequence[Summary]) -> Figure:
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
     axes = figure.subplots()
     for summary in ranked:
-        axes.plot(
-            [100.0 * point.coverage for point in summary.main.curve],
-            [100.0 * point.accuracy for point in summary.main.curve],
-            label=f"{summary.system} ({100 * summary.main.coverages['0.8']:.1f} % at 80 %)",
-        )
+        right = 100 * summary.main.coverages["0.8"]
+        axes.plot(*_curve(summary), label=f"{summary.system} ({right:.1f} % at 80 %)")
     axes.axvline(80.0, color=GREY, linewidth=0.8, linestyle="--")
-    axes.set_xlabel("coverage, %")
-    axes.set_ylabel("accuracy, %")
-    axes.set_title(f"Accuracy of the most confident verdicts, protocol {ranked[0].protocol}")
+    title = f"Accuracy of the most confident verdicts, protocol {ranked[0].protocol}"
+    axes.set(title=title, xlabel="coverage, %", ylabel="accuracy, %")
     axes.legend(fontsize=8, loc="lower left")
     axes.grid(alpha=0.3)
     return figure
@@ -178,8 +170,7 @@ def _calibration(summaries: Sequence[Summary]) -> Figure:
     """F1 in a later session by the number of unlabelled grasps, and of a running session."""
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.subplots()
-    variants = ["none", *(f"n{number}" for number in DRAWS), "all", "running", "running-sorted"]
-    shown = len(variants) - 2
+    variants, shown = SESSION_VARIANTS, len(SESSION_VARIANTS) - 2  # without the running ones
     for index, summary in enumerate(summaries[:MOST_CURVES]):
         values = [100.0 * summary.variants[name].spreads["f1"].mean for name in variants]
         colour = f"C{index}"
@@ -187,9 +178,11 @@ def _calibration(summaries: Sequence[Summary]) -> Figure:
         axes.plot(range(shown, len(variants)), values[shown:], "s", color=colour)
     labels = [name.removeprefix("n") if name[1:].isdigit() else name for name in variants]
     axes.set_xticks(range(len(variants)), [label.replace("-", ",\n") for label in labels])
-    axes.set_xlabel("unlabelled grasps of the session that calibrate it")
-    axes.set_ylabel("F1, %")
-    axes.set_title("Protocol session: palm_45 by palm_down + palm_side, objects left out")
+    axes.set(
+        title="Protocol session: palm_45 by palm_down + palm_side, objects left out",
+        xlabel="unlabelled grasps of the session that calibrate it",
+        ylabel="F1, %",
+    )
     axes.legend(fontsize=8, loc="lower right")
     axes.grid(alpha=0.3)
     return figure

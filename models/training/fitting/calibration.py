@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from models.training.arrays import Bools, Floats, Ints
 
 TEMPERATURE_RANGE = (0.05, 20.0)
 """Where a temperature is looked for; perfectly separated labels end at the low end."""
@@ -27,12 +28,12 @@ class Reliability:
     """Mean negative log-likelihood, nats: what the temperature is fitted to."""
 
 
-def margins_of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def margins_of(values: Floats) -> Floats:
     """Log-odds of slip (N,) of logits (N, 2), order (stable, slip), or of margins (N,)."""
     return values if values.ndim == 1 else values[:, 1] - values[:, 0]
 
 
-def fit_temperature(values: NDArray[np.float64], slipped: NDArray[np.bool_]) -> float:
+def fit_temperature(values: Floats, slipped: Bools) -> float:
     """The T that makes sigmoid(margin / T) most likely, of logits (N, 2) or margins (N,).
 
     They must be of unseen data.
@@ -47,14 +48,12 @@ def fit_temperature(values: NDArray[np.float64], slipped: NDArray[np.bool_]) -> 
     return float(np.exp((low + high) / 2.0))
 
 
-def p_slip(values: NDArray[np.float64], temperature: float = 1.0) -> NDArray[np.float64]:
+def p_slip(values: Floats, temperature: float = 1.0) -> Floats:
     """Slip probability (N,) of logits (N, 2), order (stable, slip), or of margins (N,)."""
     return _sigmoid(margins_of(values) / temperature)
 
 
-def cross_fitted_p_slip(
-    values: NDArray[np.float64], slipped: NDArray[np.bool_], fold_of: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def cross_fitted_p_slip(values: Floats, slipped: Bools, fold_of: Ints) -> Floats:
     """Slip probability (N,), each fold's by the temperature that the other folds give.
 
     Of logits (N, 2) or margins (N,).
@@ -67,7 +66,7 @@ def cross_fitted_p_slip(
     return probability
 
 
-def reliability(probability: NDArray[np.float64], slipped: NDArray[np.bool_]) -> Reliability:
+def reliability(probability: Floats, slipped: Bools) -> Reliability:
     """How far slip probabilities (N,) are from the labels (N,)."""
     confidence = np.maximum(probability, 1.0 - probability)
     correct = (probability > 0.5) == slipped
@@ -81,8 +80,8 @@ def reliability(probability: NDArray[np.float64], slipped: NDArray[np.bool_]) ->
     )
 
 
-def _sigmoid(value: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sigmoid(value: Floats) -> Floats:
     # exp() of a negative number only: never overflows.
     small = np.exp(-np.abs(value))
-    positive: NDArray[np.float64] = np.where(value >= 0.0, 1.0, small) / (1.0 + small)
+    positive: Floats = np.where(value >= 0.0, 1.0, small) / (1.0 + small)
     return positive

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.session import SessionStatistics
+from models.training.arrays import Floats, Floats32, Ints
 
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""
 NONE, TRAINING, ALL = "none", "training", "all"
-"""Variants: nothing calibrated; by the training rows of one's own table; by the whole pool."""
+"""Variants: not calibrated; by the training rows of the same table; by the whole pool."""
 RUNNING, RUNNING_SORTED = "running", "running-sorted"
 """Variants: each grasp by what came before it, from nothing; objects mixed, or one by one."""
 DRAWS = (5, 10, 20, 50)
@@ -24,24 +24,24 @@ SESSION_VARIANTS = (NONE, *(f"n{number}" for number in DRAWS), ALL, RUNNING, RUN
 class Standards:
     """Mean and spread of features, each of shape (M,) or, one per grasp, (N, M)."""
 
-    mean: NDArray[np.float64]
-    spread: NDArray[np.float64]
+    mean: Floats
+    spread: Floats
+    """Above zero."""
 
     @classmethod
-    def of(cls, features: NDArray[np.float64]) -> Standards:
-        """Of features (N, M). What does not vary keeps its unit."""
-        spread = features.std(axis=0)
-        return cls(features.mean(axis=0), np.where(spread > 0.0, spread, 1.0))
+    def of(cls, features: Floats) -> Standards:
+        """Of features (N, M). The spread of one that does not vary is 1."""
+        return cls(features.mean(axis=0), _positive(features.std(axis=0)))
 
-    def apply(self, features: NDArray[np.float64], clip: float) -> NDArray[np.float32]:
-        """Standardised and clipped features (N, M), as `SessionBuilder` makes them."""
-        standard: NDArray[np.float64] = (features - self.mean) * (1.0 / self.spread)
+    def apply(self, features: Floats, clip: float) -> Floats32:
+        """Features (N, M) standardised and cut off at +-`clip`, as `SessionBuilder` does."""
+        standard: Floats = (features - self.mean) * (1.0 / self.spread)
         return np.clip(standard, -clip, clip).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingStandards:
-    """Statistics of the training rows of each table, which stands for a session."""
+    """Statistics of the training rows of each table; a table stands for a session."""
 
     tables: dict[int, Standards]
     """By index of the table."""
@@ -49,77 +49,66 @@ class TrainingStandards:
     """Mean of all rows, and spread within a table: where a new session starts from."""
 
     @classmethod
-    def of(cls, features: NDArray[np.float64], table_of: NDArray[np.int64]) -> TrainingStandards:
-        """Of training features (N, M) and their tables (N,)."""
-        tables = {
-            int(table): Standards.of(features[table_of == table]) for table in np.unique(table_of)
-        }
-        within = features - _each(tables, table_of).mean
-        spread = np.sqrt((within**2).mean(axis=0))
-        spread = np.where(spread > 0.0, spread, 1.0)
+    def of(cls, features: Floats, table_of: Ints) -> TrainingStandards:
+        """Of training features (N, M) and the tables (N,) that they are from."""
+        tables, within = {}, np.empty_like(features)
+        for table in np.unique(table_of):
+            inside = table_of == table
+            tables[int(table)] = Standards.of(features[inside])
+            within[inside] = features[inside] - tables[int(table)].mean
+        spread = _positive(np.sqrt((within**2).mean(axis=0)))
         return cls(tables, Standards(features.mean(axis=0), spread))
 
-    def apply(
-        self, features: NDArray[np.float64], table_of: NDArray[np.int64], clip: float
-    ) -> NDArray[np.float32]:
-        """Features (N, M), each standardised by its own table. Raises `KeyError` for a new one."""
-        return _each(self.tables, table_of).apply(features, clip)
+    def each(self, table_of: Ints) -> Standards:
+        """Of shape (N, M): each grasp's by its table (N,). Raises `KeyError` for an unknown one."""
+        standards = [self.tables[int(table)] for table in table_of]
+        return Standards(
+            np.stack([one.mean for one in standards]), np.stack([one.spread for one in standards])
+        )
 
-    def each(self, table_of: NDArray[np.int64]) -> Standards:
-        """Of each grasp (N,), by its table. Raises `KeyError` for a new one."""
-        return _each(self.tables, table_of)
+    def apply(self, features: Floats, table_of: Ints, clip: float) -> Floats32:
+        """Features (N, M), each standardised by its table. Raises `KeyError` for an unknown one."""
+        return self.each(table_of).apply(features, clip)
 
-    def statistics(self, prior_grasps: float = PRIOR_GRASPS) -> SessionStatistics:
-        """A session that starts here."""
-        return SessionStatistics(self.prior.mean, self.prior.spread, prior_grasps)
+    def statistics(self) -> SessionStatistics:
+        """Those of a new session."""
+        return SessionStatistics(self.prior.mean, self.prior.spread, PRIOR_GRASPS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sitting:
-    """A later session as it is judged: standards of its test grasps, by variant."""
+class LaterSession:
+    """By what the test grasps of a later session are standardised, by variant."""
 
     standards: dict[str, Standards]
-    ages: dict[str, NDArray[np.int64]]
+    ages: dict[str, Ints]
     """Of the running variants, shape (N,): grasps seen before each test grasp."""
 
 
-def sit(
-    features: NDArray[np.float64],
-    test: NDArray[np.int64],
-    pool: NDArray[np.int64],
-    training: TrainingStandards,
-    seed: int,
-) -> Sitting:
-    """All variants of judging the test rows of features (all grasps, M).
+def later_session(
+    features: Floats, test: Ints, pool: Ints, training: TrainingStandards, seed: int
+) -> LaterSession:
+    """All variants of judging the rows `test` of features (all grasps, M).
 
-    Only the rows of the pool calibrate `n5` ... and `all`; in a running session every grasp counts
-    after it was judged. No label is looked at.
+    Only the rows `pool` calibrate `n5` ... and `all`; in a running session every grasp counts
+    once it was judged. Labels are not used.
     """
     random = np.random.default_rng(seed)
     standards = {NONE: training.prior, ALL: Standards.of(features[pool])}
     for number in DRAWS:
-        drawn = random.permutation(pool)[:number]
-        standards[f"n{number}"] = _after(features[drawn], training)
+        statistics = training.statistics()
+        for row in random.permutation(pool)[:number]:
+            statistics.observe(features[row])
+        standards[f"n{number}"] = Standards(statistics.mean, statistics.spread)
     ages = {}
     session = np.sort(np.concatenate((test, pool)))
     for variant, order in ((RUNNING, random.permutation(session)), (RUNNING_SORTED, session)):
         standards[variant], ages[variant] = _running(features, order, test, training)
-    return Sitting(standards, ages)
-
-
-def _after(features: NDArray[np.float64], training: TrainingStandards) -> Standards:
-    statistics = training.statistics()
-    for row in features:
-        statistics.observe(row)
-    return Standards(statistics.mean, statistics.spread)
+    return LaterSession(standards, ages)
 
 
 def _running(
-    features: NDArray[np.float64],
-    order: NDArray[np.int64],
-    test: NDArray[np.int64],
-    training: TrainingStandards,
-) -> tuple[Standards, NDArray[np.int64]]:
+    features: Floats, order: Ints, test: Ints, training: TrainingStandards
+) -> tuple[Standards, Ints]:
     """Standards (len(test), M) and ages (len(test),) at the moment each test row comes."""
     place = {int(row): index for index, row in enumerate(test)}
     statistics = training.statistics()
@@ -134,8 +123,5 @@ def _running(
     return Standards(mean, spread), ages
 
 
-def _each(tables: dict[int, Standards], table_of: NDArray[np.int64]) -> Standards:
-    return Standards(
-        np.stack([tables[int(table)].mean for table in table_of]),
-        np.stack([tables[int(table)].spread for table in table_of]),
-    )
+def _positive(spread: Floats) -> Floats:
+    return np.where(spread > 0.0, spread, 1.0)

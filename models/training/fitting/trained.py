@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from models.contract import SeenCounts
 from models.inputs import builder, raw_features
+from models.training.arrays import Floats, Floats32, Ints, Numbers
 from models.training.data.datasets import Grasps
-from models.training.fitting.fitting import Fitted, fit
-from models.training.fitting.looks import Looks
+from models.training.fitting.fit import fit
+from models.training.fitting.fitted import Fitted
+from models.training.fitting.novelty import seen_counts
+from models.training.fitting.sensor_mapping import SensorMapping
 from models.training.fitting.standards import TrainingStandards
 from models.training.systems.system import SessionFeatures, System, with_recipes
 
@@ -22,37 +23,40 @@ class Trained:
     system: System
     fitted: Fitted
     grasps: Grasps
-    looks: Looks
+    sensors: SensorMapping
     standards: TrainingStandards | None
-    """Of a session system."""
+    """Of a session system's features."""
 
-    def margins(
-        self, counts: NDArray[np.generic], table_of: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def margins(self, counts: Numbers, table_of: Ints) -> Floats:
         """Log-odds of slip (N,), uncalibrated, of counts (N, fingers, 24) of known tables (N,)."""
         return self.fitted.margins(_inputs(self.system, self.standards, counts, table_of))
 
+    def mapped_counts(self) -> Floats:
+        """Counts (N, fingers, 24) of `grasps`, of a session system mapped to common sensors."""
+        return self.sensors.to_training(self.grasps.counts, self.grasps.table_of)
+
+    def seen(self) -> SeenCounts:
+        """What the training counts look like, for the check of a reading's novelty."""
+        return seen_counts(self.mapped_counts(), self.sensors.margin)
+
 
 def train(system: System, grasps: Grasps, seed: int) -> Trained:
-    """The system trained on these grasps, of its fingers alone, on one thread.
+    """The system trained on these grasps, which have its fingers alone, on one thread.
 
-    Raises `ValueError` for too few.
+    Raises `ValueError` if they are too few.
     """
     counts, table_of = grasps.counts, grasps.table_of
     session = isinstance(system.input, SessionFeatures)
     standards = TrainingStandards.of(raw_features(counts), table_of) if session else None
     inputs = _inputs(system, standards, counts, table_of)
     fitted = fit(with_recipes(system, threads=1), inputs, grasps.slipped, seed=seed)
-    looks = Looks.of(counts, table_of, session=session)
-    return Trained(system, fitted, grasps, looks, standards)
+    sensors = SensorMapping.of(counts, table_of, session=session)
+    return Trained(system, fitted, grasps, sensors, standards)
 
 
 def _inputs(
-    system: System,
-    standards: TrainingStandards | None,
-    counts: NDArray[np.generic],
-    table_of: NDArray[np.int64],
-) -> NDArray[np.float32]:
+    system: System, standards: TrainingStandards | None, counts: Numbers, table_of: Ints
+) -> Floats32:
     if isinstance(system.input, SessionFeatures):
         if standards is None:
             raise ValueError("a session system needs standards")

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
+import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from models.bts3 import CITATIONS, FINGERS, LICENCE, REPOSITORY
+from models.bts3 import CITATIONS, LICENCE, REPOSITORY
 from models.contract import Dataset, ModelContract
-from models.training.data.datasets import Grasps, own_tables, unpublished
+from models.training.data.datasets import Grasps, lab_table_names, unpublished
+from models.training.estimators.graphs import OPSET
 from models.training.evaluating.broken import Study
 from models.training.evaluating.metrics import CurvePoint, Fraction, Spread
-from models.training.evaluating.summary import ObjectFigures, Summary, Variant
+from models.training.evaluating.summaries import ObjectFigures, Summary, Variant
 from models.training.making.export import Parity
-from models.training.systems.system import System, plain
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
 
@@ -40,6 +39,12 @@ class ModelFile(msgspec.Struct, frozen=True):
     opset: int
     parity: Parity
 
+    @classmethod
+    def of(cls, path: Path, parity: Parity) -> ModelFile:
+        """Of a file that was just exported."""
+        data = path.read_bytes()
+        return cls(hashlib.sha256(data).hexdigest(), len(data), OPSET, parity)
+
 
 class Data(msgspec.Struct, frozen=True):
     """Where the data comes from. Digests and rows stand in the contract."""
@@ -52,9 +57,9 @@ class Data(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, files: Sequence[Dataset]) -> Data:
-        """Of the tables that were trained on or judged."""
+        """Of the tables that were trained on or judged by."""
         not_published = tuple(unpublished(files))
-        if len(own_tables(files)) < len(files):
+        if len(lab_table_names(files)) < len(files):
             return cls(not_published=not_published)
         return cls(OWN_LICENCE, None, (), not_published)
 
@@ -80,7 +85,7 @@ class Measured(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, summary: Summary) -> Measured:
-        """The part of a summary that a user asks for."""
+        """The figures of a summary that a user of the model needs."""
         main: Variant = summary.main
         several = summary.variants if len(summary.variants) > 1 else {}
         return cls(
@@ -136,7 +141,7 @@ class Card(msgspec.Struct, frozen=True):
 
 
 def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]:
-    """What a user must know, with the figures that were measured; `grasps` are trained on."""
+    """Sentences on what the model cannot do, with measured figures; `grasps` are trained on."""
     texts = []
     for summary in summaries:
         f1 = 100 * summary.main.spreads["f1"].mean
@@ -159,7 +164,7 @@ def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]
                 f"{f1:.1f} %: it still ranks (AUC {auc:.2f}), its zero has moved. What looks "
                 "unlike the training data is refused."
             )
-    own = own_tables(grasps.files)
+    own = lab_table_names(grasps.files)
     return (*texts, *(_own_data(grasps, own, summaries) if own else [PUBLISHED_DATA]), *WEAK_POINTS)
 
 
@@ -174,25 +179,3 @@ def _own_data(grasps: Grasps, own: Sequence[str], summaries: Sequence[Summary]) 
         yield "The figures of another day are of the published tables alone."
     else:
         yield "What it is worth on another day than those of its data was not measured."
-
-
-def configuration(system: System) -> dict[str, Any]:
-    """Everything that decides the result, JSON-ready."""
-    parts = {name: plain(getattr(system, name)) for name in ("input", "estimator", "recipe")}
-    parts |= {"augmentation": plain(system.augmentation), "tables": list(system.tables)}
-    if system.compression is not None:
-        parts["compression"] = plain(system.compression)
-    if system.fingers != FINGERS:
-        parts["fingers"] = list(system.fingers)
-    return parts
-
-
-def made_with() -> dict[str, str]:
-    """Versions of what decides the weights' last digits."""
-    versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
-    return {"machine": platform.machine(), "python": platform.python_version(), **versions}
-
-
-def write(card: Card, path: Path) -> None:
-    """Write the card as indented JSON."""
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(card), indent=2) + b"\n")

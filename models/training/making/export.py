@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +12,9 @@ from numpy.typing import NDArray
 from models.contract import METADATA_KEY, ModelContract
 from models.inputs import SessionBuilder, builder
 from models.runtime import TactileModel
-from models.training.estimators.graphs import OPSET
-from models.training.fitting.fitting import Fitted
-
-__all__ = ["OPSET", "TOLERANCE", "ExportError", "Parity", "SessionStandards", "export"]
+from models.training.evaluating.files import replacing
+from models.training.fitting.fitted import Fitted
+from models.training.fitting.standards import Standards
 
 TOLERANCE = 1e-5
 """Largest allowed difference of a probability between the trained system and its file."""
@@ -36,36 +34,26 @@ class Parity:
     verdicts_flipped: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SessionStandards:
-    """Statistics by which the readings of a parity check are standardised, in order of reading."""
-
-    mean: NDArray[np.float64]
-    """Shape (N, features)."""
-    spread: NDArray[np.float64]
-    """Shape (N, features), above zero."""
-
-
 def export(
     fitted: Fitted,
     temperature: float,
     contract: ModelContract,
     counts: NDArray[np.uint16],
     path: Path,
-    standards: SessionStandards | None = None,
+    standards: Standards | None = None,
 ) -> Parity:
     """Write `sigmoid(margin / temperature)` with its contract to `path`, one self-contained file.
 
-    The same system and contract give the same bytes. The file is run as the daemon runs it on
-    every reading of counts (N, fingers, 24) first; a session model by `standards`, or by those of
-    its contract. Raises `ExportError` if a probability differs by more than `TOLERANCE` or a
-    verdict flips, and leaves `path` as it was; `ModelError` if the contract does not fit.
+    The same system and contract give the same bytes. The file is first run as the daemon runs it
+    on every reading of counts (N, fingers, 24); those of a session model are standardised by
+    `standards` (N, features), or by its contract. Raises `ExportError` if a probability differs by
+    more than `TOLERANCE` or a verdict flips, and leaves `path` as it was; `ModelError` if the
+    contract does not fit.
     """
     model = fitted.to_onnx(temperature, builder(contract.input, len(contract.fingers)).name)
     onnx.helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     onnx.checker.check_model(model, full_check=True)
-    part = path.with_name(path.name + ".part")
-    try:
+    with replacing(path) as part:
         part.write_bytes(model.SerializeToString(deterministic=True))
         parity = _compare(part, fitted, temperature, counts, standards)
         # Not "greater than": that would let a NaN pass.
@@ -74,9 +62,6 @@ def export(
                 f"the exported file differs from the system by {parity.largest_difference:.1e} "
                 f"and flips {parity.verdicts_flipped} verdicts of {parity.grasps}"
             )
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
     return parity
 
 
@@ -85,7 +70,7 @@ def _compare(
     fitted: Fitted,
     temperature: float,
     counts: NDArray[np.uint16],
-    standards: SessionStandards | None,
+    standards: Standards | None,
 ) -> Parity:
     model = TactileModel(path)
     inputs = np.empty((len(counts), *model.input.shape), dtype=np.float32)

@@ -1,4 +1,4 @@
-"""What a system is: one way from counts to a margin, by configuration alone."""
+"""What a system is: one way from counts to the log-odds of slip, by configuration alone."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
 from models.bts3 import FINGERS, WHOLE
 from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.training.data.augmentation import Augmentation
+from models.training.data.protocols import EvalProtocol
 from models.training.estimators.classical import ClassicalConfig
 from models.training.estimators.compression import Compression
 from models.training.estimators.networks import AnyNetwork
 from models.training.estimators.recipe import AnyRecipe, PublishedRecipe, Recipe
 
-Protocol = Literal["cv", "unknown", "objects", "session"]
 CLIP = 3.0
-"""Standardised session features beyond this say no more: a sensor has moved since."""
+"""Standardised session features are cut off here: what is farther out is a sensor that moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ Estimator = AnyNetwork | ClassicalConfig | BlendConfig | DistilConfig
 class Published:
     """A figure of the paper, %, slip positive: mean and standard deviation."""
 
-    protocol: Protocol
+    protocol: EvalProtocol
     f1: tuple[float, float]
     accuracy: tuple[float, float] | None = None
     precision: tuple[float, float] | None = None
@@ -100,15 +100,17 @@ class System:
 
 
 def digest(system: System) -> str:
-    """SHA-256, hexadecimal, of all that decides a fold's result; not of name and description."""
-    names = ["input", "estimator", "recipe", "augmentation", "standardise"]
-    if system.compression is not None:
-        names.append("compression")
-    if system.fingers != FINGERS:
-        names.append("fingers")
-    parts = {name: plain(getattr(system, name)) for name in names}
+    """SHA-256, hexadecimal, of all that decides a fold's result; name and description do not."""
+    parts = configuration(system, "input", "estimator", "recipe", "augmentation", "standardise")
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def configuration(system: System, *fields: str) -> dict[str, Any]:
+    """These fields of a system, JSON-ready, and its compression and fingers if they are special."""
+    special = {"compression": system.compression is not None, "fingers": system.fingers != FINGERS}
+    names = (*fields, *(name for name, is_special in special.items() if is_special))
+    return {name: _plain(getattr(system, name)) for name in names}
 
 
 def with_recipes(system: System, **changes: float) -> System:
@@ -116,35 +118,17 @@ def with_recipes(system: System, **changes: float) -> System:
     return _changed(system, changes)
 
 
-def epochs(system: System) -> int:
-    """How often one `fit` reports an epoch: once per epoch of each network that it trains."""
-    match system.estimator:
-        case BlendConfig() as blend:
-            return _blend_epochs(blend)
-        case DistilConfig() as distil:
-            own = system.recipe.epochs if system.recipe else 0
-            return own + distil.inner_folds * _blend_epochs(distil.teacher)
-        case _:
-            return system.recipe.epochs if system.recipe else 0
-
-
-def _blend_epochs(blend: BlendConfig) -> int:
-    return sum(member.copies * member.recipe.epochs for member in blend.members if member.recipe)
-
-
-def plain(value: object) -> Any:  # noqa: ANN401 - JSON
+def _plain(value: object) -> Any:  # noqa: ANN401 - JSON
     """JSON-like, with the names of the classes: two kinds with the same fields differ."""
-    if isinstance(value, msgspec.Struct):
-        fields = {name: plain(getattr(value, name)) for name in value.__struct_fields__}
-        return {"kind": type(value).__name__, **fields}
-    if dataclasses.is_dataclass(value):
-        fields = {
-            field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)
-        }
-        return {"kind": type(value).__name__, **fields}
     if isinstance(value, tuple):
-        return [plain(part) for part in value]
-    return value
+        return [_plain(part) for part in value]
+    if isinstance(value, msgspec.Struct):
+        names = value.__struct_fields__
+    elif dataclasses.is_dataclass(value):
+        names = tuple(field.name for field in dataclasses.fields(value))
+    else:
+        return value
+    return {"kind": type(value).__name__, **{name: _plain(getattr(value, name)) for name in names}}
 
 
 T = TypeVar("T")

@@ -21,7 +21,7 @@ from models.training.commands import evaluate
 from models.training.estimators.classical import SvmConfig
 from models.training.evaluating import jobs
 from models.training.evaluating.grid import grid_of
-from models.training.systems.systems import SYSTEMS
+from models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import write_sessions
 
 ROOT = Path(__file__).parents[4]

@@ -16,7 +16,6 @@ from models.training.data.datasets import (
     DatasetError,
     concatenate,
     read_all,
-    read_new_session,
     read_table,
     read_whole,
     unpublished,
@@ -163,7 +162,6 @@ def test_missing_files_and_folders_are_named(tmp_path: Path) -> None:
         read_whole(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match=r"palm_down\.csv: cannot read: No such file"):
         read_whole(tmp_path)
-    assert read_new_session(tmp_path) is None
 
 
 def test_a_table_with_other_bytes_is_known_as_not_published(tmp_path: Path) -> None:

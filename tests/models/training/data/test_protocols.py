@@ -17,14 +17,14 @@ from models.training.data.protocols import (
     ABOUT,
     PROTOCOLS,
     UNKNOWN_OBJECTS,
-    Protocol,
+    EvalProtocol,
     splits,
 )
 from tests.models.training.evaluation_samples import OBJECTS, sessions, table
 
-GROUPED: tuple[Protocol, ...] = ("objects", "objects-whole", "session")
+GROUPED: tuple[EvalProtocol, ...] = ("objects", "objects-whole", "session")
 # Grasps that each protocol judges, from the paper and the tables' own row counts.
-JUDGED: dict[Protocol, int] = {
+JUDGED: dict[EvalProtocol, int] = {
     "cv": 2549,
     "unknown": 485,
     "objects": 4682,
@@ -42,7 +42,7 @@ def real(bts3_dir: Path) -> Grasps:
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_every_grasp_of_a_protocol_is_judged_once_by_who_never_saw_it(
-    real: Grasps, protocol: Protocol
+    real: Grasps, protocol: EvalProtocol
 ) -> None:
     made = splits(protocol, real, seed=3)
     judged = np.concatenate([split.test for split in made])
@@ -71,7 +71,7 @@ def test_unknown_objects_are_the_papers_485_of_2549(real: Grasps) -> None:
 
 
 @pytest.mark.parametrize("protocol", GROUPED)
-def test_no_object_is_on_both_sides(real: Grasps, protocol: Protocol) -> None:
+def test_no_object_is_on_both_sides(real: Grasps, protocol: EvalProtocol) -> None:
     for split in splits(protocol, real, seed=1):
         judged = {real.objects[row] for row in split.test}
         assert 4 <= len(judged) <= 5  # 41 objects in 10 groups
@@ -96,7 +96,7 @@ def test_only_a_session_has_grasps_to_calibrate_with(real: Grasps) -> None:
 
 
 @pytest.mark.parametrize("protocol", ["cv", *GROUPED])
-def test_the_seed_alone_decides_the_split(protocol: Protocol) -> None:
+def test_the_seed_alone_decides_the_split(protocol: EvalProtocol) -> None:
     grasps = sessions(200)
     first, again, other = (splits(protocol, grasps, seed) for seed in (0, 0, 1))
     for one, two in zip(first, again, strict=True):
@@ -125,7 +125,7 @@ def test_more_folds_than_objects_are_refused() -> None:
 
 
 @pytest.mark.parametrize("protocol", ["objects", "session"])
-def test_a_protocol_whose_table_is_missing_is_refused(protocol: Protocol) -> None:
+def test_a_protocol_whose_table_is_missing_is_refused(protocol: EvalProtocol) -> None:
     with pytest.raises(TooFewGraspsError, match="the data lack palm_side"):
         splits(protocol, table("palm_down", 40, 0), seed=0)
 
@@ -140,14 +140,14 @@ def test_a_table_of_ones_own_is_dealt_out_like_a_published_one() -> None:
 
 
 @pytest.mark.parametrize("protocol", ["cv", "objects", "objects-whole"])
-def test_tables_of_ones_own_alone_are_all_that_there_is(protocol: Protocol) -> None:
+def test_tables_of_ones_own_alone_are_all_that_there_is(protocol: EvalProtocol) -> None:
     grasps = concatenate([table("monday", 100, 0), table("friday", 60, 1)])
     judged = np.concatenate([split.test for split in splits(protocol, grasps, seed=0)])
     assert sorted(judged.tolist()) == list(range(160))
 
 
 @pytest.mark.parametrize("protocol", ["unknown", "session", "cv-palm-down", "cv-palm-side"])
-def test_figures_of_published_tables_take_no_other(protocol: Protocol) -> None:
+def test_figures_of_published_tables_take_no_other(protocol: EvalProtocol) -> None:
     alone = splits(protocol, sessions(100), seed=0)
     beside = splits(protocol, concatenate([sessions(100), table("lab", 100, 3)]), seed=0)
     for one, other in zip(alone, beside, strict=True):
@@ -169,4 +169,4 @@ def test_each_fold_of_each_seed_trains_from_another_start() -> None:
 
 
 def test_every_protocol_is_explained() -> None:
-    assert set(ABOUT) == set(get_args(Protocol)) == set(PROTOCOLS)
+    assert set(ABOUT) == set(get_args(EvalProtocol)) == set(PROTOCOLS)

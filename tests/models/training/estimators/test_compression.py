@@ -19,16 +19,17 @@ from onnx import numpy_helper
 
 from models.training.estimators import compression, graphs
 from models.training.estimators.compression import (
-    GraphMargins,
     HalfWeights,
     Integers,
     LowRank,
     compressed,
+    graph_margins,
 )
 from models.training.estimators.networks import NetworkConfig, build
 from models.training.evaluating.campaign import campaign
-from models.training.fitting.fitting import fit
-from models.training.systems.systems import SYSTEMS, digest, with_recipes
+from models.training.fitting.fit import fit
+from models.training.systems.registry import SYSTEMS
+from models.training.systems.system import digest, with_recipes
 from tests.models.training.evaluation_samples import sessions
 
 SHAPE = (12, 11, 3)
@@ -55,7 +56,7 @@ def test_half_weights_move_a_margin_by_the_rounding_of_a_half_and_no_more(
     margin: onnx.ModelProto,
 ) -> None:
     small = compressed(margin, HalfWeights(), inputs())
-    exact, moved = GraphMargins(margin)(inputs()), GraphMargins(small)(inputs())
+    exact, moved = graph_margins(margin, inputs()), graph_margins(small, inputs())
     # IEEE half: 11 bits, so a relative rounding of 2**-11 of each weight.
     assert 0.0 < np.abs(moved - exact).max() < 2.0**-11 * 30
     assert len(small.SerializeToString()) < 0.6 * len(margin.SerializeToString())
@@ -82,7 +83,7 @@ def test_a_factored_layer_is_the_best_approximation_of_its_rank(
 def test_a_layer_factored_to_its_full_rank_judges_as_before(margin: onnx.ModelProto) -> None:
     small = compressed(margin, LowRank(32), inputs())
     np.testing.assert_allclose(
-        GraphMargins(small)(inputs()), GraphMargins(margin)(inputs()), atol=1e-4
+        graph_margins(small, inputs()), graph_margins(margin, inputs()), atol=1e-4
     )
 
 
@@ -91,16 +92,16 @@ def test_integers_of_eight_bits_stay_near_the_margins(
     margin: onnx.ModelProto, static: bool
 ) -> None:
     small = compressed(margin, Integers(static), inputs())
-    exact, moved = GraphMargins(margin)(inputs()), GraphMargins(small)(inputs())
+    exact, moved = graph_margins(margin, inputs()), graph_margins(small, inputs())
     assert np.abs(moved - exact).max() < 0.1 * exact.std()
     assert any(values.dtype == np.int8 for values in weights(small).values())
     assert len(small.SerializeToString()) < 0.5 * len(margin.SerializeToString())
 
 
 def test_a_reading_is_judged_alike_whatever_it_is_judged_with(margin: onnx.ModelProto) -> None:
-    small = GraphMargins(compressed(margin, Integers(static=False), inputs()))
-    one = np.concatenate([small(inputs()[index : index + 1]) for index in range(64)])
-    np.testing.assert_array_equal(small(inputs()), one)
+    small = compressed(margin, Integers(static=False), inputs())
+    one = np.concatenate([graph_margins(small, inputs()[i : i + 1]) for i in range(64)])
+    np.testing.assert_array_equal(graph_margins(small, inputs()), one)
 
 
 def test_the_original_is_left_as_it_was(margin: onnx.ModelProto) -> None:
@@ -128,7 +129,7 @@ def test_a_network_is_trained_once_for_all_its_forms(monkeypatch: pytest.MonkeyP
         trainings.append(arguments)
         return original(*arguments, **more)
 
-    fitting = importlib.import_module("models.training.fitting.fitting")
+    fitting = importlib.import_module("models.training.fitting.fit")
 
     original = fitting.train
     monkeypatch.setattr(fitting, "train", counted)

@@ -20,7 +20,7 @@ from models.training.estimators.recipe import (
     logits,
     optimization,
     reproducible,
-    train,
+    train_network,
 )
 from tests.models.training.training_samples import separable_counts
 
@@ -46,7 +46,7 @@ def slipped() -> NDArray[np.bool_]:
 
 @pytest.fixture(scope="module")
 def trained(images: NDArray[np.float32], slipped: NDArray[np.bool_]) -> nn.Sequential:
-    return train(TINY, images, slipped, QUICK, seed=1)
+    return train_network(TINY, images, slipped, QUICK, seed=1)
 
 
 def _weights(network: nn.Sequential) -> list[float]:
@@ -66,27 +66,18 @@ def test_the_same_seed_gives_the_same_weights_and_another_gives_others(
     trained: nn.Sequential, images: NDArray[np.float32], slipped: NDArray[np.bool_]
 ) -> None:
     torch.manual_seed(99)  # the state around a training does not matter
-    assert _weights(train(TINY, images, slipped, QUICK, seed=1)) == _weights(trained)
-    assert _weights(train(TINY, images, slipped, QUICK, seed=2)) != _weights(trained)
+    assert _weights(train_network(TINY, images, slipped, QUICK, seed=1)) == _weights(trained)
+    assert _weights(train_network(TINY, images, slipped, QUICK, seed=2)) != _weights(trained)
 
 
 def test_training_leaves_torch_as_it_was(
     images: NDArray[np.float32], slipped: NDArray[np.bool_]
 ) -> None:
     threads, state = torch.get_num_threads(), torch.random.get_rng_state()
-    train(TINY, images, slipped, Recipe(epochs=1, threads=threads + 1), seed=1)
+    train_network(TINY, images, slipped, Recipe(epochs=1, threads=threads + 1), seed=1)
     assert torch.get_num_threads() == threads
     assert not torch.are_deterministic_algorithms_enabled()
     assert torch.equal(torch.random.get_rng_state(), state)
-
-
-@pytest.mark.parametrize("recipe", [QUICK, PublishedRecipe(epochs=4)])
-def test_every_epoch_is_reported(
-    images: NDArray[np.float32], slipped: NDArray[np.bool_], recipe: Recipe | PublishedRecipe
-) -> None:
-    epochs: list[None] = []
-    train(TINY, images, slipped, recipe, seed=1, on_epoch=lambda: epochs.append(None))
-    assert len(epochs) == 4
 
 
 @pytest.mark.parametrize("grasps", [0, 1])
@@ -94,7 +85,7 @@ def test_training_on_less_than_two_grasps_is_refused(
     grasps: int, images: NDArray[np.float32], slipped: NDArray[np.bool_]
 ) -> None:
     with pytest.raises(ValueError, match=f"cannot train on {grasps} grasps"):
-        train(TINY, images[:grasps], slipped[:grasps], QUICK, seed=1)
+        train_network(TINY, images[:grasps], slipped[:grasps], QUICK, seed=1)
 
 
 def test_the_published_recipe_updates_as_keras_does(
@@ -102,7 +93,7 @@ def test_the_published_recipe_updates_as_keras_does(
 ) -> None:
     """Forward, backward, L2 loss term, Adam and time decay of Keras 2.0.8, in numpy."""
     recipe = PublishedRecipe(epochs=6, batch=160, learning_rate=0.01, decay=0.5, l2=0.03)
-    network = train(PLAIN, vectors, slipped, recipe, seed=4)
+    network = train_network(PLAIN, vectors, slipped, recipe, seed=4)
     with reproducible(seed=4):
         start = build(PLAIN, (72,))
     weights = [tensor.detach().double().numpy().copy() for tensor in start.parameters()]
@@ -154,7 +145,7 @@ def test_batch_norm_remembers_as_the_recipe_says(
     with reproducible(seed=4):
         start = next(build(config, (72,)).parameters())
     first = vectors.astype(np.float64) @ start.detach().double().numpy().T
-    norm = train(config, vectors, slipped, once, seed=4)[1]
+    norm = train_network(config, vectors, slipped, once, seed=4)[1]
     assert isinstance(norm, nn.BatchNorm1d)
     assert norm.running_mean is not None
     assert norm.running_mean.numpy() == pytest.approx(momentum * first.mean(axis=0), abs=1e-5)
@@ -188,7 +179,7 @@ def test_an_epoch_sees_each_grasp_at_most_once(
 
     monkeypatch.setattr(nn.CrossEntropyLoss, "forward", counting)
     numbers = np.arange(grasps) / grasps
-    train(DenseConfig((3,)), vectors[:grasps], numbers, recipe, seed=0)
+    train_network(DenseConfig((3,)), vectors[:grasps], numbers, recipe, seed=0)
     values = torch.cat(batches)[:, 1].tolist()
     assert len(values) == len(set(values)) == seen
 
@@ -197,7 +188,7 @@ def test_targets_may_be_probabilities(vectors: NDArray[np.float32]) -> None:
     """Without anything to learn from, a network answers with the mean of its targets."""
     targets = np.full(160, 0.8)
     recipe = Recipe(epochs=60, weight_decay=0.0, peak_learning_rate=0.01)
-    values = logits(train(PLAIN, vectors, targets, recipe, seed=0), vectors)
+    values = logits(train_network(PLAIN, vectors, targets, recipe, seed=0), vectors)
     assert np.mean(values[:, 1] - values[:, 0]) == pytest.approx(np.log(0.8 / 0.2), abs=0.05)
 
 
@@ -206,7 +197,7 @@ def test_label_smoothing_bounds_the_margin(
 ) -> None:
     """Smoothed by 0.2 the targets are 0.9 and 0.1: margins of log(9)."""
     recipe = Recipe(epochs=60, weight_decay=0.0, peak_learning_rate=0.01, label_smoothing=0.2)
-    values = logits(train(PLAIN, vectors, slipped, recipe, seed=0), vectors)
+    values = logits(train_network(PLAIN, vectors, slipped, recipe, seed=0), vectors)
     margins = values[:, 1] - values[:, 0]
     assert margins[slipped].mean() == pytest.approx(np.log(9.0), rel=0.05)
     assert margins[~slipped].mean() == pytest.approx(-np.log(9.0), rel=0.05)
@@ -216,9 +207,9 @@ def test_input_noise_is_drawn_from_the_seed(
     vectors: NDArray[np.float32], slipped: NDArray[np.bool_]
 ) -> None:
     noisy = Recipe(epochs=2, input_noise=0.3)
-    first = _weights(train(PLAIN, vectors, slipped, noisy, seed=1))
-    assert first == _weights(train(PLAIN, vectors, slipped, noisy, seed=1))
-    assert first != _weights(train(PLAIN, vectors, slipped, Recipe(epochs=2), seed=1))
+    first = _weights(train_network(PLAIN, vectors, slipped, noisy, seed=1))
+    assert first == _weights(train_network(PLAIN, vectors, slipped, noisy, seed=1))
+    assert first != _weights(train_network(PLAIN, vectors, slipped, Recipe(epochs=2), seed=1))
 
 
 def test_weight_decay_spares_biases_and_norms() -> None:

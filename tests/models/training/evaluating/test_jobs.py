@@ -24,7 +24,12 @@ from models.training.estimators.networks import NetworkConfig
 from models.training.estimators.recipe import Recipe
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import BrokenResultError, Job, JobResult
-from models.training.fitting.standards import SESSION_VARIANTS, Standards, TrainingStandards, sit
+from models.training.fitting.standards import (
+    SESSION_VARIANTS,
+    Standards,
+    TrainingStandards,
+    later_session,
+)
 from models.training.systems.system import SessionFeatures, System
 from tests.models.training.evaluation_samples import sessions
 
@@ -182,15 +187,15 @@ def test_a_running_session_judges_each_grasp_by_what_came_before_it() -> None:
     features = random.normal(50.0, 4.0, (60, 3))
     training = TrainingStandards.of(features[:20], np.zeros(20, dtype=np.int64))
     test, pool = np.arange(25, 30), np.setdiff1d(np.arange(20, 60), np.arange(25, 30))
-    sitting = sit(features, test, pool, training, seed=0)
-    assert sitting.ages["running-sorted"].tolist() == [5, 6, 7, 8, 9]
-    by = sitting.standards["running-sorted"]
+    session = later_session(features, test, pool, training, seed=0)
+    assert session.ages["running-sorted"].tolist() == [5, 6, 7, 8, 9]
+    by = session.standards["running-sorted"]
     statistics = training.statistics()
     for row in range(20, 29):
         statistics.observe(features[row])
     np.testing.assert_allclose(by.mean[4], statistics.mean)
     np.testing.assert_allclose(by.spread[4], statistics.spread)
-    mixed = sitting.ages["running"]
+    mixed = session.ages["running"]
     assert len(set(mixed.tolist())) == 5
     assert mixed.tolist() != [5, 6, 7, 8, 9]
 
@@ -201,7 +206,9 @@ def test_the_pool_alone_calibrates_a_session() -> None:
     test, pool = np.arange(20, 30), np.arange(30, 60)
     changed = features.copy()
     changed[test] += 1000.0
-    ours, theirs = (sit(each, test, pool, training, 0).standards for each in (features, changed))
+    ours, theirs = (
+        later_session(each, test, pool, training, 0).standards for each in (features, changed)
+    )
     for variant in ("none", "n5", "n10", "n20", "n50", "all"):
         np.testing.assert_array_equal(ours[variant].mean, theirs[variant].mean)
     np.testing.assert_allclose(ours["all"].mean, features[pool].mean(axis=0))

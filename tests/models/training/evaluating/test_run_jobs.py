@@ -26,8 +26,8 @@ from models.contract import VectorInput
 from models.training.data.datasets import Grasps
 from models.training.estimators.classical import ForestConfig
 from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job, JobResult
-from models.training.evaluating.sweep import ClusterError, sweep
+from models.training.evaluating.jobs import ClusterError, Job, JobResult
+from models.training.evaluating.run_jobs import run_jobs
 from models.training.systems.system import System
 from tests.models.training.evaluation_samples import sessions
 
@@ -64,8 +64,8 @@ def assert_same(ours: list[JobResult], theirs: list[JobResult]) -> None:
 
 def test_two_processes_give_what_one_gives_bit_for_bit(tmp_path: Path) -> None:
     wanted = some_jobs(6)
-    alone = sweep(wanted, GRASPS, tmp_path / "one")
-    both = sweep(wanted, GRASPS, tmp_path / "two", processes=2)
+    alone = run_jobs(wanted, GRASPS, tmp_path / "one")
+    both = run_jobs(wanted, GRASPS, tmp_path / "two", processes=2)
     assert_same(both, alone)
     names = {path.name for path in (tmp_path / "one").iterdir()}
     assert names == {path.name for path in (tmp_path / "two").iterdir()}
@@ -74,8 +74,8 @@ def test_two_processes_give_what_one_gives_bit_for_bit(tmp_path: Path) -> None:
 
 def test_results_come_in_the_order_of_the_jobs(tmp_path: Path) -> None:
     wanted = some_jobs(4)
-    forth = sweep(wanted, GRASPS, tmp_path)
-    back = sweep(wanted[::-1], GRASPS, tmp_path)
+    forth = run_jobs(wanted, GRASPS, tmp_path)
+    back = run_jobs(wanted[::-1], GRASPS, tmp_path)
     assert_same(forth, back[::-1])
     assert_same(forth, [jobs.run(job, GRASPS) for job in wanted])
 
@@ -95,42 +95,35 @@ def test_an_interrupted_sweep_goes_on_and_runs_nothing_twice(
 
     monkeypatch.setattr(jobs, "run", counted)
     with pytest.raises(KeyboardInterrupt):
-        sweep(wanted, GRASPS, tmp_path)
+        run_jobs(wanted, GRASPS, tmp_path)
     assert len(list(tmp_path.iterdir())) == 3
     stop_after.clear()
-    results = sweep(wanted, GRASPS, tmp_path)
+    results = run_jobs(wanted, GRASPS, tmp_path)
     assert ran == wanted
     assert_same(results, [run(job, GRASPS) for job in wanted])
 
 
 def test_every_job_is_told_once_stored_or_run(tmp_path: Path) -> None:
     wanted = some_jobs(4)
-    sweep(wanted[:2], GRASPS, tmp_path)
+    run_jobs(wanted[:2], GRASPS, tmp_path)
     told: list[int] = []
-    done: list[None] = []
-    results = sweep(
-        wanted,
-        GRASPS,
-        tmp_path,
-        on_done=lambda: done.append(None),
-        on_result=lambda index, _: told.append(index),
-    )
+    results = run_jobs(wanted, GRASPS, tmp_path, on_result=lambda index, _: told.append(index))
     assert sorted(told) == [0, 1, 2, 3]
-    assert len(done) == len(results) == 4
+    assert len(told) == len(results) == 4
 
 
 def test_a_broken_result_is_run_again_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     wanted = some_jobs(2)
-    first = sweep(wanted, GRASPS, tmp_path)
+    first = run_jobs(wanted, GRASPS, tmp_path)
     path = tmp_path / wanted[1].file_name(GRASPS.digest())
     path.write_bytes(path.read_bytes()[:-100])
     with caplog.at_level(logging.WARNING):
-        assert_same(sweep(wanted, GRASPS, tmp_path), first)
+        assert_same(run_jobs(wanted, GRASPS, tmp_path), first)
     assert [record.getMessage().endswith("it is run again") for record in caplog.records] == [True]
     caplog.clear()
-    sweep(wanted, GRASPS, tmp_path)
+    run_jobs(wanted, GRASPS, tmp_path)
     assert not caplog.records
 
 
@@ -140,13 +133,13 @@ def test_a_cluster_that_is_not_there_is_said_so(
     ours = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
     monkeypatch.setattr(ours, "CONNECT_TIMEOUT_S", 1)
     with pytest.raises(ClusterError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
-        sweep(some_jobs(1), GRASPS, tmp_path, dask="tcp://127.0.0.1:9")
+        run_jobs(some_jobs(1), GRASPS, tmp_path, dask="tcp://127.0.0.1:9")
 
 
 def test_a_cluster_that_loses_a_worker_loses_no_result(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="no extra: cluster")
     wanted = some_jobs(12, trees=40)
-    alone = sweep(wanted, GRASPS, tmp_path / "alone")
+    alone = run_jobs(wanted, GRASPS, tmp_path / "alone")
     killed: list[int] = []
     with cluster(tmp_path, workers=2) as (address, _, workers):
 
@@ -155,7 +148,7 @@ def test_a_cluster_that_loses_a_worker_loses_no_result(tmp_path: Path) -> None:
                 workers[0].kill()
                 killed.append(index)
 
-        ours = sweep(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_one)
+        ours = run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_one)
         assert workers[0].wait(START_S) == -signal.SIGKILL
         assert workers[1].poll() is None
     assert len(killed) == 1
@@ -176,10 +169,10 @@ def test_a_cluster_that_dies_leaves_what_was_finished(tmp_path: Path) -> None:
                 scheduler.kill()
 
         with pytest.raises(ClusterError, match="the cluster does not answer"):
-            sweep(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_scheduler)
+            run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_scheduler)
     stored = len(list((tmp_path / "ours").iterdir()))
     assert 3 <= stored == len(told) < 12
-    finished = sweep(wanted, GRASPS, tmp_path / "ours")
+    finished = run_jobs(wanted, GRASPS, tmp_path / "ours")
     assert_same(finished, [jobs.run(job, GRASPS) for job in wanted])
 
 

@@ -20,7 +20,7 @@ from models.training.fitting.calibration import (
     p_slip,
     reliability,
 )
-from models.training.fitting.seen import (
+from models.training.fitting.novelty import (
     held_out_never_seen,
     made_up_never_seen,
     seen_counts,

@@ -37,16 +37,12 @@ from models.training.data.datasets import read_whole
 from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
 from models.training.estimators.networks import DenseConfig, NetworkConfig, SecondConvolution
 from models.training.estimators.recipe import Recipe
-from models.training.fitting.fitting import Fitted, fit
-from models.training.making.export import ExportError, SessionStandards, export
-from models.training.systems.systems import (
-    SESSION,
-    SYSTEMS,
-    BlendConfig,
-    Estimator,
-    Member,
-    System,
-)
+from models.training.fitting.fit import fit
+from models.training.fitting.fitted import Fitted
+from models.training.fitting.standards import Standards
+from models.training.making.export import ExportError, export
+from models.training.systems.registry import SESSION, SYSTEMS
+from models.training.systems.system import BlendConfig, Estimator, Member, System
 from tests.models.training.training_samples import separable_counts
 
 COUNTS, SLIPPED = separable_counts(90)
@@ -248,7 +244,7 @@ def test_a_session_model_is_checked_by_the_statistics_given(
     mean = np.repeat(RAW.mean(axis=0)[np.newaxis], 4, axis=0)
     spread = np.repeat(RAW.std(axis=0)[np.newaxis], 4, axis=0)
     mean[0] += 0.5 * spread[0]
-    standards = SessionStandards(mean, spread)
+    standards = Standards(mean, spread)
     contract = _contract(STATISTICS)
     parity = export(Watched(), 1.0, contract, COUNTS[:4], tmp_path / "made.onnx", standards)
     assert parity.grasps == 4

@@ -17,8 +17,10 @@ from drivers.base import TactileReading
 from models.contract import ModelError
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import Job
-from models.training.making.making import Order, make
-from models.training.systems.systems import SYSTEMS, digest, with_recipes
+from models.training.making.make_model import make_model
+from models.training.making.plan import TrainingPlan
+from models.training.systems.registry import SYSTEMS
+from models.training.systems.system import digest, with_recipes
 from tests.models.training.evaluation_samples import sessions
 
 FORMS = {
@@ -71,7 +73,9 @@ def test_what_the_other_fingers_feel_changes_nothing() -> None:
 def test_a_model_of_two_fingers_judges_a_hand_of_two(tmp_path: Path) -> None:
     grasps = sessions(200)
     system = with_recipes(SYSTEMS["small-session-ff-th"], epochs=1)
-    make(Order(system, 3, 0, only="cv"), grasps, tmp_path, tmp_path / "jobs", lambda: None)
+    make_model(
+        TrainingPlan(system, 3, 0, only="cv"), grasps, tmp_path, tmp_path / "jobs", lambda: None
+    )
     scene = parse(
         {
             "hand": {"fingers": ["ff", "th"]},

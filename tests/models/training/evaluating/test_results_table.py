@@ -13,14 +13,19 @@ from numpy.typing import NDArray
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 
-from models.training.data.protocols import Protocol, splits
-from models.training.evaluating import summary as summaries
+from models.training.data.protocols import EvalProtocol, splits
 from models.training.evaluating.jobs import JobResult
-from models.training.evaluating.results import Made, difference, table
-from models.training.evaluating.summary import Summary, summarise
+from models.training.evaluating.results_table import Made, difference, results_table
+from models.training.evaluating.summaries import (
+    Summary,
+    read_summaries,
+    read_summary,
+    summarise,
+    write_summary,
+)
 from models.training.fitting.standards import SESSION_VARIANTS
+from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import digest
-from models.training.systems.systems import SYSTEMS
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(200)
@@ -28,7 +33,7 @@ MADE = Made("graspd evaluate --data DIR", 90.0, {"machine": "a desk", "numpy": "
 TRUTH = np.where(GRASPS.slipped, 2.0, -2.0)
 
 
-def summary_of(name: str, protocol: Protocol, wrong: float, seeds: int = 2) -> Summary:
+def summary_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> Summary:
     """A system that is wrong on this share of the grasps, at random."""
     flip = np.random.default_rng(len(name)).random(len(GRASPS)) < wrong
     margins = np.where(flip, -TRUTH, TRUTH)
@@ -87,22 +92,22 @@ def test_fifty_grasps_speak_for_a_calibrated_session() -> None:
 
 def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
     made = summary_of("cnn1", "cv", wrong=0.1)
-    summaries.write(made, tmp_path)
+    write_summary(made, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["cnn1.cv.json"]
-    assert summaries.read(tmp_path / "cnn1.cv.json") == made
+    assert read_summary(tmp_path / "cnn1.cv.json") == made
 
 
 def test_a_summary_of_other_data_or_configuration_is_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     made = summary_of("cnn1", "cv", wrong=0.1)
-    summaries.write(made, tmp_path)
-    summaries.write(dataclasses.replace(made, system="cnn2"), tmp_path)
-    summaries.write(dataclasses.replace(made, system="cnn3", data="other"), tmp_path)
+    write_summary(made, tmp_path)
+    write_summary(dataclasses.replace(made, system="cnn2"), tmp_path)
+    write_summary(dataclasses.replace(made, system="cnn3", data="other"), tmp_path)
     (tmp_path / "rf.cv.json").write_text("{")
     digests = {name: digest(system) for name, system in SYSTEMS.items()}
     with caplog.at_level(logging.WARNING):
-        found = summaries.read_all_of(tmp_path, GRASPS.digest(), digests)
+        found = read_summaries(tmp_path, GRASPS.digest(), digests)
     assert found == [made]
     assert len(caplog.records) == 3
 
@@ -117,7 +122,7 @@ def rows(text: str, section: int) -> list[list[str]]:
 def test_the_papers_figures_stand_beside_ours_and_nothing_is_made_up() -> None:
     ours = summary_of("cnn1", "cv", wrong=0.1)
     f1 = ours.main.spreads["f1"]
-    text = table([ours], MADE)
+    text = results_table([ours], MADE)
     first = rows(text, 1)
     found = {(row[0], row[1], row[2]): row[3:] for row in first}
     assert f1.error is not None
@@ -159,13 +164,13 @@ def test_every_published_row_is_there_even_if_nothing_was_run(
     system: str, protocol: str, figure: str, paper: str
 ) -> None:
     assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-", "-", "-"] in rows(
-        table([], MADE), 1
+        results_table([], MADE), 1
     )
 
 
 def test_sessions_are_told_by_the_number_of_grasps() -> None:
     ours = summary_of("svm-session", "session", wrong=0.2)
-    _, row, *_ = rows(table([ours], MADE), 3)
+    _, row, *_ = rows(results_table([ours], MADE), 3)
     f1 = ours.main.spreads["f1"]
     value = f"{100 * f1.mean:.1f} +- {100 * f1.std:.1f}"
     assert row == ["`svm-session`", value, "-", "-", "-", value, "-", value, "-"]
@@ -181,7 +186,7 @@ def test_differences_are_taken_fold_by_fold_on_common_seeds() -> None:
     assert found.mean == pytest.approx(gaps.mean())
     # Four folds: 100 judged, 300 trained on.
     assert found.error == pytest.approx(np.sqrt((1 / 8 + 1 / 3) * gaps.var(ddof=1)))
-    fourth = rows(table([bad, good], MADE), 4)
+    fourth = rows(results_table([bad, good], MADE), 4)
     cell = f"{100 * found.mean:+.1f} +- {100 * (found.error or 0):.1f}"
     assert ["`cnn2`", "`cv`", cell, "-", "`cnn2`"] in fourth
 
@@ -193,18 +198,18 @@ def test_other_data_are_not_compared() -> None:
 
 
 def test_the_table_says_how_it_was_made() -> None:
-    text = table([summary_of("cnn1", "cv", wrong=0.1)], MADE)
+    text = results_table([summary_of("cnn1", "cv", wrong=0.1)], MADE)
     assert "    graspd evaluate --data DIR\n" in text
     assert "8 trainings, 16 s in all on one thread each; this run of the command took 90 s" in text
     assert "machine a desk, numpy 2." in text
     assert f"- `palm_down.csv` {GRASPS.files[0].sha256}, 200" in text
     assert "--quick" not in text
-    assert "mean nothing" in table([], dataclasses.replace(MADE, quick=True))
+    assert "mean nothing" in results_table([], dataclasses.replace(MADE, quick=True))
 
 
 def test_every_row_has_as_many_cells_as_its_header() -> None:
     made = [summary_of("cnn1", "cv", 0.1), summary_of("svm-session", "session", 0.2)]
-    text = table(made, MADE)
+    text = results_table(made, MADE)
     width = 0
     for before, line in zip(["", *text.splitlines()], text.splitlines(), strict=False):
         if line.startswith("|"):

@@ -358,7 +358,7 @@ def test_ctrl_c_ends_cleanly_with_130(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "make", interrupted)
+    monkeypatch.setattr(train, "make_model", interrupted)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 130
     assert capsys.readouterr().err.splitlines()[-1] == (
         "graspd train: interrupted; the same command goes on from here"
@@ -374,6 +374,6 @@ def test_a_failed_export_is_exit_code_1(
     def failing(*_: object) -> None:
         raise ExportError("the exported file differs")
 
-    monkeypatch.setattr(train, "make", failing)
+    monkeypatch.setattr(train, "make_model", failing)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "graspd train: the exported file differs"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
 
 from models.bts3 import FINGERS, NEW_SESSION, WHOLE
 from models.contract import CountsInput, Finger, ImageInput, VectorInput
@@ -25,52 +26,29 @@ from models.training.estimators.recipe import PublishedRecipe, Recipe
 from models.training.systems.system import (
     BlendConfig,
     DistilConfig,
-    Estimator,
     Member,
-    Protocol,
     Published,
     SessionFeatures,
     System,
-    SystemInput,
-    digest,
-    epochs,
-    with_recipes,
 )
-
-__all__ = [
-    "SYSTEMS",
-    "BlendConfig",
-    "DistilConfig",
-    "Estimator",
-    "Member",
-    "Protocol",
-    "Published",
-    "SessionFeatures",
-    "System",
-    "SystemInput",
-    "digest",
-    "epochs",
-    "with_recipes",
-]
 
 
 def image(
     layout: str = D1.name,
     fill: Fill = Fill.NEIGHBOUR_MEAN,
     composition: Composition = Composition.CHANNELS,
-    normalisation: Normalisation = Normalisation.FILLED_IMAGE,
 ) -> ImageInput:
-    """An image input; the best of the paper unless said otherwise."""
-    return ImageInput(layout, fill.value, normalisation.value, composition.value)
+    """An image input; by default the paper's best: D1, neighbour mean, fingers as channels."""
+    return ImageInput(layout, fill.value, Normalisation.FILLED_IMAGE.value, composition.value)
 
 
 EVERY_TABLE = (*WHOLE, NEW_SESSION)
 VECTOR = VectorInput()
 COUNTS = CountsInput()
+IMAGE = image()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
-HAND: tuple[Finger, ...] = FINGERS
 RANKS = (8, 16, 32, 64, 128, 256)
 NARROW = ((4, 32), (8, 64), (16, 64))
 """Filters and hidden units."""
@@ -80,84 +58,77 @@ SMALL_RECIPE = Recipe(epochs=20, weight_decay=1.0, input_noise=0.2)
 SESSION_SVM = Svm(c=3.0, gamma=0.003)
 SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
 SESSION_BLEND = BlendConfig(
-    (
-        Member(SESSION_SVM),
-        Member(SESSION_BOOSTING),
-        Member(SMALL_SESSION, SMALL_RECIPE, copies=2),
-    )
+    (Member(SESSION_SVM), Member(SESSION_BOOSTING), Member(SMALL_SESSION, SMALL_RECIPE, copies=2))
 )
 
+
+def cnn(
+    name: str,
+    description: str,
+    network: NetworkConfig,
+    *published: Published,
+    recipe: Recipe | PublishedRecipe = CNN_RECIPE,
+    augmentation: Augmentation | None = None,
+    takes: ImageInput = IMAGE,
+) -> System:
+    """A convolutional network on tactile images, with the figures that the paper gives of it."""
+    return System(name, description, takes, network, recipe, augmentation, published=published)
+
+
+_CNN1_FIGURES = (Published("cv", (94.2, 0.8)), Published("unknown", (87.7, 0.4)))
+_CNN3_FIGURES = Published("cv", (92.2, 2.0))
+
 _PAPER = (
-    System(
+    cnn(
         "cnn0",
         "Conv32 - FC128 on the D1 image, neighbour mean, fingers as channels.",
-        image(),
         CNN0,
-        CNN_RECIPE,
-        published=(Published("cv", (92.6, 1.7)),),
+        Published("cv", (92.6, 1.7)),
     ),
-    System(
+    cnn(
         "cnn1",
         "Conv32 - FC1024, the paper's best network, in 20 epochs of a one-cycle schedule.",
-        image(),
         CNN1,
-        CNN_RECIPE,
-        published=(Published("cv", (94.2, 0.8)), Published("unknown", (87.7, 0.4))),
+        *_CNN1_FIGURES,
     ),
-    System(
-        "cnn2",
-        "Conv32 - MaxPool2 - FC1024.",
-        image(),
-        CNN2,
-        CNN_RECIPE,
-        published=(Published("cv", (92.0, 2.0)),),
-    ),
-    System(
+    cnn("cnn2", "Conv32 - MaxPool2 - FC1024.", CNN2, Published("cv", (92.0, 2.0))),
+    cnn(
         "cnn3",
         "Conv32 - MaxPool2 - Conv64 (1 x 1, as in the notebooks) - FC1024.",
-        image(),
         CNN3,
-        CNN_RECIPE,
-        published=(Published("cv", (92.2, 2.0)),),
+        _CNN3_FIGURES,
     ),
-    System(
+    cnn(
         "cnn3-3x3",
         "CNN3 with the second convolution 3 x 3, as in the table of the paper.",
-        image(),
-        dataclasses.replace(CNN3, second=SecondConvolution(kernel=3)),
-        CNN_RECIPE,
-        published=(Published("cv", (92.2, 2.0)),),
+        replace(CNN3, second=SecondConvolution(kernel=3)),
+        _CNN3_FIGURES,
     ),
-    System(
+    cnn(
         "cnn1-faithful",
         "CNN1 trained as published: 300 epochs of Adam at a falling rate, L2.",
-        image(),
         CNN1,
-        PublishedRecipe(),
-        published=(Published("cv", (94.2, 0.8)), Published("unknown", (87.7, 0.4))),
+        *_CNN1_FIGURES,
+        recipe=PublishedRecipe(),
     ),
-    System(
+    cnn(
         "cnn1-augmented",
         "CNN1 for new objects as published: flips and rotations, dropout, 30 epochs.",
-        image(),
-        dataclasses.replace(CNN1, dropout=0.25),
-        PublishedRecipe(epochs=30, l2=0.015),
-        Augmentation(),
-        published=(Published("unknown", (90.1, 0.4)),),
+        replace(CNN1, dropout=0.25),
+        Published("unknown", (90.1, 0.4)),
+        recipe=PublishedRecipe(epochs=30, l2=0.015),
+        augmentation=Augmentation(),
     ),
-    System(
+    cnn(
         "cnn1-dropout",
         "CNN1 with dropout, to see what regularisation does.",
-        image(),
-        dataclasses.replace(CNN1, dropout=0.25),
-        CNN_RECIPE,
+        replace(CNN1, dropout=0.25),
     ),
-    System(
+    cnn(
         "cnn1-plain",
         "CNN1 without batch norm and L2, to see what regularisation does.",
-        image(),
-        dataclasses.replace(CNN1, batch_norm=False),
-        dataclasses.replace(CNN_RECIPE, weight_decay=0.0),
+        replace(CNN1, batch_norm=False),
+        recipe=replace(CNN_RECIPE, weight_decay=0.0),
     ),
     System(
         "svm",
@@ -166,12 +137,7 @@ _PAPER = (
         Svm(c=3.0, gamma=0.1),
         published=(Published("cv", (88.0, 2.9)),),
     ),
-    System(
-        "mlp",
-        "Multi-layer perceptron on the 72 z-scored counts.",
-        VECTOR,
-        MlpConfig((300,)),
-    ),
+    System("mlp", "Multi-layer perceptron on the 72 z-scored counts.", VECTOR, MlpConfig((300,))),
     System(
         "rf",
         "Random forest on the 72 z-scored counts.",
@@ -181,80 +147,63 @@ _PAPER = (
     ),
 )
 
-
-def _layouts() -> tuple[System, ...]:
-    """CNN0 on the images of the paper's table I."""
-    least = Fill.LEAST_CONTACT
-    d1 = Published("cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4))
-    d2 = Published("cv", (89.7, 1.5), (89.6, 1.7))
-    d3 = Published("cv", (89.7, 1.4), (89.7, 1.3))
-    return tuple(
-        System(
-            f"cnn0-{layout.name.lower()}-{least.value}",
-            f"CNN0 on the {layout.name} image, gaps filled with the least contact.",
-            image(layout.name, least),
-            CNN0,
-            CNN_RECIPE,
-            published=(published,),
-        )
-        for layout, published in ((D1, d1), (D2A, d2), (D2B, d2), (D3, d3))
+_D2_FIGURES = Published("cv", (89.7, 1.5), (89.6, 1.7))
+_LAYOUTS = tuple(
+    cnn(
+        f"cnn0-{layout.name.lower()}-{Fill.LEAST_CONTACT.value}",
+        f"CNN0 on the {layout.name} image, gaps filled with the least contact.",
+        CNN0,
+        published,
+        takes=image(layout.name, Fill.LEAST_CONTACT),
     )
-
-
-def _compositions() -> tuple[System, ...]:
-    """CNN0 on the images of the paper's table II, beside `cnn0` itself."""
-    horizontal = Published("cv", (92.1, 1.7))
-    vertical = Published("cv", (92.3, 1.8))
-    return tuple(
-        System(
-            f"cnn0-{composition.value}",
-            f"CNN0 on one image with the fingers {where}.",
-            image(composition=composition),
-            CNN0,
-            CNN_RECIPE,
-            published=(published,),
-        )
-        for composition, where, published in (
-            (Composition.HORIZONTAL, "side by side", horizontal),
-            (Composition.VERTICAL, "below one another", vertical),
-        )
+    for layout, published in (
+        (D1, Published("cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4))),
+        (D2A, _D2_FIGURES),
+        (D2B, _D2_FIGURES),
+        (D3, Published("cv", (89.7, 1.4), (89.7, 1.3))),
     )
+)
+"""CNN0 on the images of the paper's table I."""
 
-
-def _smaller() -> tuple[System, ...]:
-    """CNN1 in smaller forms, and narrower networks: what is error worth in run time?"""
-    cnn1 = next(system for system in _PAPER if system.name == "cnn1")
-    forms: dict[str, tuple[str, Compression]] = {
-        "f16": ("with weights of 16 bits", HalfWeights()),
-        "int8": ("with weights and inputs of layers of 8 bits", Integers(static=False)),
-        "int8-static": ("the same, with ranges taken from the training", Integers(static=True)),
-        **{
-            f"rank-{rank}": (f"its large layer factored to rank {rank}", LowRank(rank))
-            for rank in RANKS
-        },
-    }
-    compressed = (
-        dataclasses.replace(
-            cnn1,
-            name=f"cnn1-{name}",
-            description=f"CNN1 {text}.",
-            compression=how,
-            published=(),
-        )
-        for name, (text, how) in forms.items()
+_COMPOSITIONS = tuple(
+    cnn(
+        f"cnn0-{composition.value}",
+        f"CNN0 on one image with the fingers {where}.",
+        CNN0,
+        Published("cv", f1),
+        takes=image(composition=composition),
     )
-    narrow = (
-        System(
+    for composition, where, f1 in (
+        (Composition.HORIZONTAL, "side by side", (92.1, 1.7)),
+        (Composition.VERTICAL, "below one another", (92.3, 1.8)),
+    )
+)
+"""CNN0 on the images of the paper's table II, beside `cnn0` itself."""
+
+_FORMS: dict[str, tuple[str, Compression]] = {
+    "f16": ("with weights of 16 bits", HalfWeights()),
+    "int8": ("with weights and inputs of layers of 8 bits", Integers(static=False)),
+    "int8-static": ("the same, with ranges taken from the training", Integers(static=True)),
+    **{
+        f"rank-{rank}": (f"its large layer factored to rank {rank}", LowRank(rank))
+        for rank in RANKS
+    },
+}
+_SMALLER = (
+    *(
+        replace(cnn(f"cnn1-{name}", f"CNN1 {text}.", CNN1), compression=how)
+        for name, (text, how) in _FORMS.items()
+    ),
+    *(
+        cnn(
             f"narrow-{filters}x{hidden}",
             f"Conv{filters} - FC{hidden} on the same image as CNN1.",
-            image(),
             NetworkConfig(filters=filters, hidden=hidden),
-            CNN_RECIPE,
         )
         for filters, hidden in NARROW
-    )
-    return (*compressed, *narrow)
-
+    ),
+)
+"""CNN1 in smaller forms, and narrower networks: what is error worth in run time?"""
 
 _ELECTRODES = (
     System(
@@ -307,7 +256,7 @@ _SESSION = (
         "cnn1-session",
         "CNN1 on session-calibrated features.",
         SESSION,
-        dataclasses.replace(CNN1, dropout=0.3),
+        replace(CNN1, dropout=0.3),
         SMALL_RECIPE,
     ),
     System(
@@ -335,31 +284,29 @@ _SESSION = (
 )
 
 
-def _fewer_fingers() -> tuple[System, ...]:
+def _fewer_fingers() -> Iterator[System]:
     """The default system for hands with fewer sensors: fewer channels, no padding."""
     whole = next(system for system in _SESSION if system.name == "small-session")
-    return tuple(
-        dataclasses.replace(
+    hand: tuple[Finger, ...] = FINGERS
+    for fingers in (*combinations(hand, 1), *combinations(hand, 2)):
+        yield replace(
             whole,
             name=f"{whole.name}-{'-'.join(fingers)}",
             description=f"Conv16 - FC64 on session-calibrated features of {' and '.join(fingers)}.",
             fingers=fingers,
         )
-        for number in (1, 2)
-        for fingers in itertools.combinations(HAND, number)
-    )
 
 
 SYSTEMS = {
     system.name: system
     for system in (
         *_PAPER,
-        *_layouts(),
-        *_compositions(),
-        *_smaller(),
+        *_LAYOUTS,
+        *_COMPOSITIONS,
+        *_SMALLER,
         *_ELECTRODES,
         *_SESSION,
         *_fewer_fingers(),
     )
 }
-"""By name, the paper's first."""
+"""By name, the paper's first. A new system is one more entry here."""

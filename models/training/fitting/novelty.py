@@ -1,14 +1,14 @@
-"""What the training counts look like, and how much of other data is unlike them."""
+"""Novelty: what the training counts look like, and how much of other data is unlike them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from models.contract import SeenCounts
 from models.seen import SeenCheck
+from models.training.arrays import Numbers
 from models.training.data.datasets import COUNT_MAX
 
 MARGIN_COUNTS = 100
@@ -32,7 +32,7 @@ DIGITS = 9
 RANDOM_READINGS = 10_000
 
 
-def seen_counts(counts: NDArray[np.generic], margin: int = MARGIN_COUNTS) -> SeenCounts:
+def seen_counts(counts: Numbers, margin: int = MARGIN_COUNTS) -> SeenCounts:
     """What counts (N, fingers, 24) look like. Raises `ValueError` for fewer than two readings."""
     if len(counts) < 2:
         raise ValueError("two readings at least have a covariance")
@@ -52,10 +52,11 @@ def seen_counts(counts: NDArray[np.generic], margin: int = MARGIN_COUNTS) -> See
     )
 
 
-def held_out_never_seen(
-    counts: NDArray[np.generic], group_of: NDArray[np.generic], margin: int = MARGIN_COUNTS
-) -> float:
-    """Fraction of counts (N, fingers, 24) unlike those of all other groups (folds, objects)."""
+def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN_COUNTS) -> float:
+    """Fraction of counts (N, fingers, 24) that are refused if their own group is left out.
+
+    `group_of` (N,) are the folds or objects; each is compared with all others.
+    """
     never = np.empty(len(counts), dtype=np.bool_)
     for group in np.unique(group_of):
         inside = group_of == group
@@ -63,14 +64,15 @@ def held_out_never_seen(
     return float(never.mean())
 
 
-def made_up_never_seen(
-    counts: NDArray[np.generic], seen: SeenCounts, seed: int
-) -> dict[str, float]:
-    """Fraction of readings that no hand ever made which are refused, by the way they were made."""
+def made_up_never_seen(counts: Numbers, seen: SeenCounts, seed: int) -> dict[str, float]:
+    """Fraction refused of readings that no hand ever made, by the way they were made up.
+
+    `counts` (N, fingers, 24) are real ones, `seen` is what they look like.
+    """
     random = np.random.default_rng(seed)
     shape = (RANDOM_READINGS, *counts.shape[1:])
     low, high = np.array(seen.low), np.array(seen.high)
-    makers: dict[str, Callable[[], NDArray[np.generic]]] = {
+    makers: dict[str, Callable[[], Numbers]] = {
         "uniform in 0..4095": lambda: random.integers(0, COUNT_MAX, shape, endpoint=True),
         "uniform in each electrode's range": lambda: random.integers(
             low, high, shape, endpoint=True

@@ -9,20 +9,20 @@ import pytest
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
+from models import zoo
 from models.contract import CountsInput, ImageInput, VectorInput
 from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig
 from models.training.estimators.networks import CNN1, build, parameter_count
 from models.training.estimators.recipe import PublishedRecipe, Recipe
-from models.training.systems.systems import (
-    SYSTEMS,
+from models.training.systems.registry import SYSTEMS
+from models.training.systems.system import (
     BlendConfig,
     DistilConfig,
     Member,
     Published,
     SessionFeatures,
-    System,
+    configuration,
     digest,
-    epochs,
     with_recipes,
 )
 
@@ -42,6 +42,67 @@ PUBLISHED = {  # name: protocol, F1, its standard deviation, as printed in the p
     "rf": ("cv", 92.6, 1.5),
     "cnn1-augmented": ("unknown", 90.1, 0.4),
 }
+
+
+DIGESTS = {
+    "cnn0": "d70ec62f176fc5d0",
+    "cnn1": "fb7cb38d6d043e8d",
+    "cnn2": "1c79b98a778a05d2",
+    "cnn3": "b5e925b1ad49e66c",
+    "cnn3-3x3": "95950a88a48c9ccf",
+    "cnn1-faithful": "7ffdc5258c34e975",
+    "cnn1-augmented": "9130a6065746456e",
+    "cnn1-dropout": "b1dee0acbd7b5cf5",
+    "cnn1-plain": "e419af5be9732338",
+    "svm": "d4ba9ba7400e5920",
+    "mlp": "ae0c3261c3424158",
+    "rf": "b9a3fd4d84e0a23f",
+    "cnn0-d1-least-contact": "d015ed9f2cb629d7",
+    "cnn0-d2a-least-contact": "b1d96abbb9eae1ef",
+    "cnn0-d2b-least-contact": "91ba226932557be7",
+    "cnn0-d3-least-contact": "de2b6399d0e374a8",
+    "cnn0-horizontal": "67c4b936b6a0c533",
+    "cnn0-vertical": "0ed7d70f45f76289",
+    "cnn1-f16": "a0fda49cb89a400d",
+    "cnn1-int8": "7b8e85f90d18aeb7",
+    "cnn1-int8-static": "5979621fd7593bbf",
+    "cnn1-rank-8": "388474a4a1160213",
+    "cnn1-rank-16": "81990778239f10c2",
+    "cnn1-rank-32": "7b70a7b23630c13a",
+    "cnn1-rank-64": "15a17cc30be8f195",
+    "cnn1-rank-128": "47a524947e5b5630",
+    "cnn1-rank-256": "cc563a5b887ca41b",
+    "narrow-4x32": "93a587daf72167dd",
+    "narrow-8x64": "098053519dd33f54",
+    "narrow-16x64": "350f27915f9647ab",
+    "svm-electrodes": "51f1f8c6b94928e5",
+    "blend-electrodes": "34c960d716e9e91f",
+    "cnn0-electrodes": "eb858d8898f13d04",
+    "small-electrodes": "791afa534dcfdfea",
+    "svm-session": "18418424dbb018dc",
+    "hgb-session": "55e8da68027a2237",
+    "cnn1-session": "fe2e5adb3ae4be37",
+    "small-session": "bbde1f46a4fe0bb6",
+    "blend-session": "ac8dfa6fd3e074f0",
+    "distilled-session": "533ffd3038846c47",
+    "small-session-ff": "6e347cef38013faf",
+    "small-session-mf": "98f731315ca329b7",
+    "small-session-th": "b1229512d0273336",
+    "small-session-ff-mf": "423ffabe3a8137ec",
+    "small-session-ff-th": "7cfe2656dc39a71d",
+    "small-session-mf-th": "74bd57fc080d5caf",
+}
+"""Stored results are found by these: another digest means that hours of training run again."""
+
+
+def test_stored_results_of_every_system_stay_valid() -> None:
+    assert {name: digest(system)[:16] for name, system in SYSTEMS.items()} == DIGESTS
+
+
+@pytest.mark.parametrize("name", zoo.names())
+def test_a_model_of_the_zoo_was_made_of_the_system_of_its_name(name: str) -> None:
+    fields = ("input", "estimator", "recipe", "augmentation", "tables")
+    assert zoo.card(name)["system"] == configuration(SYSTEMS[name], *fields)
 
 
 @pytest.mark.parametrize("name", sorted(PUBLISHED))
@@ -127,13 +188,3 @@ def test_all_recipes_of_a_system_can_be_changed_at_once() -> None:
     assert recipes
     assert all((recipe.epochs, recipe.threads) == (2, 3) for recipe in recipes)
     assert with_recipes(SYSTEMS["svm"], epochs=2) == SYSTEMS["svm"]
-
-
-def test_epochs_are_those_of_all_networks_that_are_trained() -> None:
-    blend = BlendConfig((Member(SvmConfig(1.0, 0.1)), Member(CNN1, Recipe(epochs=7), copies=3)))
-    made = System("made", "Made up.", VectorInput(), blend)
-    distilled = replace(
-        made, estimator=DistilConfig(blend, CNN1, inner_folds=4), recipe=Recipe(epochs=5)
-    )
-    assert (epochs(SYSTEMS["cnn1"]), epochs(SYSTEMS["svm"])) == (20, 0)
-    assert (epochs(made), epochs(distilled)) == (21, 4 * 21 + 5)

@@ -1,16 +1,16 @@
-"""The reproduction table: the paper's figures beside ours, and the new systems, as Markdown."""
+"""RESULTS.md: the paper's figures beside ours, and all systems, as Markdown tables."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, Protocol
+from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.metrics import Difference, Spread, paired_difference
-from models.training.evaluating.summary import HEADLINE, Summary
-from models.training.fitting.standards import SESSION_VARIANTS
+from models.training.evaluating.summaries import HEADLINE, Summary, Variant
+from models.training.fitting.standards import RUNNING, SESSION_VARIANTS
+from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import Published, SessionFeatures, System
-from models.training.systems.systems import SYSTEMS
 
 NOT_RUN = "-"
 REFERENCE = "cnn1"
@@ -29,11 +29,12 @@ class Made:
     quick: bool = False
 
 
-Found = dict[tuple[str, Protocol], Summary]
+Row = Sequence[str]
+Found = dict[tuple[str, EvalProtocol], Summary]
 
 
-def table(summaries: Sequence[Summary], made: Made) -> str:
-    """The whole document. Nothing is filled in: what was not run is `-`."""
+def results_table(summaries: Sequence[Summary], made: Made) -> str:
+    """The whole document as Markdown; what was not run is `-`."""
     found: Found = {(summary.system, summary.protocol): summary for summary in summaries}
     sections = (
         _head(summaries, made),
@@ -44,49 +45,46 @@ def table(summaries: Sequence[Summary], made: Made) -> str:
         _everything(summaries),
         _how(summaries, made),
     )
-    return "\n".join(line for section in sections for line in (*section, ""))
+    return "\n\n".join(paragraph for section in sections for paragraph in section) + "\n"
 
 
 def _head(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
     yield "# Results"
-    yield ""
     yield (
         "F1 in % with slip as the positive class, unless a column says otherwise. `+-` is the "
         "standard deviation over the folds (`unknown`: over the trainings), s.e. the standard "
         "error over the split seeds."
     )
     if made.quick:
-        yield ""
         yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"
-    yield ""
-    for protocol in PROTOCOLS:
-        if protocol in STANDARD or any(one.protocol == protocol for one in summaries):
-            yield f"- `{protocol}`: {ABOUT[protocol]}"
+    shown = {*STANDARD, *(summary.protocol for summary in summaries)}
+    yield "\n".join(f"- `{name}`: {ABOUT[name]}" for name in PROTOCOLS if name in shown)
 
 
 def _paper(found: Found) -> Iterator[str]:
     yield "## 1. The paper's systems"
-    yield ""
-    yield from _header(
-        "system", "protocol", "figure", "paper", "ours", "s.e.", "seeds", "difference"
+    yield _table(
+        ("system", "protocol", "figure", "paper", "ours", "s.e.", "seeds", "difference"),
+        (
+            row
+            for system in SYSTEMS.values()
+            if not isinstance(system.input, SessionFeatures)
+            for published in system.published or (None,)
+            for row in _published(system, published, found)
+        ),
     )
-    for system in SYSTEMS.values():
-        if isinstance(system.input, SessionFeatures):
-            continue
-        for published in system.published or (None,):
-            yield from _published(system, published, found)
 
 
-def _published(system: System, published: Published | None, found: Found) -> Iterator[str]:
+def _published(system: System, published: Published | None, found: Found) -> Iterator[Row]:
     """A row for each figure that the paper gives; for F1 alone where it gives none."""
-    protocol: Protocol = published.protocol if published else "cv"
+    protocol: EvalProtocol = published.protocol if published else "cv"
     summary = found.get((system.name, protocol))
     for figure in FIGURES:
         paper = getattr(published, figure) if published else None
         if paper is None and (published or figure != "f1"):
             continue
         ours = summary.main.spreads[figure] if summary else None
-        yield _row(
+        yield (
             f"`{system.name}`",
             f"`{protocol}`",
             figure.replace("f1", "F1"),
@@ -100,72 +98,59 @@ def _published(system: System, published: Published | None, found: Found) -> Ite
 
 def _systems(found: Found) -> Iterator[str]:
     yield "## 2. All systems, all protocols"
-    yield ""
     yield (
         f"In `session`, systems with session calibration have seen {HEADLINE[1:]} unlabelled "
         "grasps of other objects of that session, the others none."
     )
-    yield ""
-    yield from _header("system", "parameters", *(f"`{protocol}`" for protocol in STANDARD))
+    rows = []
     for name in SYSTEMS:
         row = [found.get((name, protocol)) for protocol in STANDARD]
         if any(row):
-            sizes = [summary.parameters for summary in row if summary]
-            yield _row(f"`{name}`", f"{max(sizes):,}", *(_with_error(summary) for summary in row))
+            size = max(summary.parameters for summary in row if summary)
+            rows.append((f"`{name}`", f"{size:,}", *(_with_error(summary) for summary in row)))
+    yield _table(("system", "parameters", *(f"`{protocol}`" for protocol in STANDARD)), rows)
 
 
 def _sessions(found: Found) -> Iterator[str]:
     yield "## 3. Session calibration"
-    yield ""
     yield (
         "Protocol `session`, by what the session has shown before: nothing; 5 to 50 unlabelled "
         "grasps of other objects; all of them; a running session from nothing, each grasp judged "
         "before it counts, with the objects mixed or one after the other."
     )
-    yield ""
     columns = [
         variant[1:] if variant[1:].isdigit() else variant.replace("-", ", ")
         for variant in SESSION_VARIANTS
     ]
-    yield from _header("system", *columns)
-    for name in SYSTEMS:
-        summary = found.get((name, "session"))
-        if summary:
-            spreads = {key: value.spreads["f1"] for key, value in summary.variants.items()}
-            yield _row(f"`{name}`", *(_value(spreads.get(key)) for key in SESSION_VARIANTS))
-    yield from _young(found)
-
-
-def _young(found: Found) -> Iterator[str]:
-    """How right the verdicts of a running session are while it is young."""
-    rows = [
-        (name, summary.variants["running"].ages)
-        for name in SYSTEMS
-        if (summary := found.get((name, "session"))) and "running" in summary.variants
-    ]
-    if not rows:
-        return
-    bounds = sorted({age.grasps_before for _, ages in rows for age in ages})
-    yield ""
-    yield "Accuracy, %, in a running session (objects mixed) after at least so many grasps:"
-    yield ""
-    yield from _header("system", *(str(bound) for bound in bounds))
-    for name, ages in rows:
-        by_bound = {age.grasps_before: f"{100 * age.share.accuracy:.1f}" for age in ages}
-        yield _row(f"`{name}`", *(by_bound.get(bound, NOT_RUN) for bound in bounds))
+    here = {name: found[name, "session"].variants for name in SYSTEMS if (name, "session") in found}
+    yield _table(
+        ("system", *columns),
+        (
+            (f"`{name}`", *(_value(_f1(variants.get(key))) for key in SESSION_VARIANTS))
+            for name, variants in here.items()
+        ),
+    )
+    # How right the verdicts of a running session are while it is young.
+    young = {name: variants[RUNNING].ages for name, variants in here.items() if RUNNING in variants}
+    if young:
+        yield "Accuracy, %, in a running session (objects mixed) after at least so many grasps:"
+        bounds = sorted({age.grasps_before for ages in young.values() for age in ages})
+        rows = []
+        for name, ages in young.items():
+            by_bound = {age.grasps_before: f"{100 * age.share.accuracy:.1f}" for age in ages}
+            rows.append((f"`{name}`", *(by_bound.get(bound, NOT_RUN) for bound in bounds)))
+        yield _table(("system", *map(str, bounds)), rows)
 
 
 def _differences(found: Found) -> Iterator[str]:
     yield "## 4. Differences on the same splits"
-    yield ""
     yield (
         f"F1 of the system less that of `{REFERENCE}`, and less that of the protocol's best, in "
         "percentage points, with the standard error over all folds of all seeds, corrected for "
         "trainings that share their grasps (Nadeau and Bengio 2003); in `unknown` over the "
         "trainings alone."
     )
-    yield ""
-    yield from _header("system", "protocol", f"to `{REFERENCE}`", "to the best", "best")
+    rows = []
     for protocol in PROTOCOLS:
         here = [found[name, protocol] for name in SYSTEMS if (name, protocol) in found]
         if len(here) < 2:
@@ -173,17 +158,16 @@ def _differences(found: Found) -> Iterator[str]:
         best = max(here, key=lambda summary: summary.main.spreads["f1"].mean)
         reference = found.get((REFERENCE, protocol))
         for summary in here:
-            yield _row(
-                f"`{summary.system}`",
-                f"`{protocol}`",
-                _difference(summary, reference),
-                _difference(summary, best),
-                f"`{best.system}`",
-            )
+            to_others = (_difference(summary, other) for other in (reference, best))
+            rows.append((f"`{summary.system}`", f"`{protocol}`", *to_others, f"`{best.system}`"))
+    yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best", "best"), rows)
 
 
 def difference(ours: Summary, theirs: Summary, figure: str = "f1") -> Difference | None:
-    """Ours less theirs on the splits that both have judged; None if there are none."""
+    """Our mean figure less theirs on the splits that both have judged; None if there are none.
+
+    Of other data or another number of folds no split is the same.
+    """
     seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
     if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
         return None
@@ -205,68 +189,64 @@ def _of(summary: Summary, figure: str, seed: int) -> list[float | None]:
 
 def _everything(summaries: Sequence[Summary]) -> Iterator[str]:
     yield "## 5. Every figure"
-    yield ""
     yield (
         "Accuracy, precision, recall and F1 in %; AUC, Brier score and expected calibration error "
         "(ECE) as fractions, probabilities calibrated by a temperature of the other folds; "
         "accuracy, %, of the 80 % most confident verdicts; seconds of one training."
     )
-    yield ""
     percent, fractions = ("accuracy", "precision", "recall", "f1"), ("auc", "brier", "ece")
-    yield from _header(
-        "system",
-        "protocol",
-        *(name.replace("f1", "F1") for name in percent),
-        *("AUC", "Brier", "ECE"),
-        "at 80 %",
-        "seeds",
-        "s",
+    yield _table(
+        (
+            *("system", "protocol", "accuracy", "precision", "recall", "F1"),
+            *("AUC", "Brier", "ECE", "at 80 %", "seeds", "s"),
+        ),
+        (
+            (
+                f"`{summary.system}`",
+                f"`{summary.protocol}`",
+                *(_value(summary.main.spreads[name]) for name in percent),
+                *(f"{summary.main.spreads[name].mean:.3f}" for name in fractions),
+                f"{100 * summary.main.coverages['0.8']:.1f}",
+                str(len(summary.seeds)),
+                f"{summary.seconds / _trainings(summary):.1f}",
+            )
+            for summary in summaries
+        ),
     )
-    for summary in summaries:
-        main = summary.main
-        trainings = len(summary.seeds) * summary.folds
-        yield _row(
-            f"`{summary.system}`",
-            f"`{summary.protocol}`",
-            *(_value(main.spreads[name]) for name in percent),
-            *(f"{main.spreads[name].mean:.3f}" for name in fractions),
-            f"{100 * main.coverages['0.8']:.1f}",
-            str(len(summary.seeds)),
-            f"{summary.seconds / trainings:.1f}",
-        )
 
 
 def _how(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
     yield "## How this was made"
-    yield ""
     yield f"    {made.command}"
-    yield ""
     total = sum(summary.seconds for summary in summaries)
-    trainings = sum(len(summary.seeds) * summary.folds for summary in summaries)
     yield (
-        f"{trainings} trainings, {_duration(total)} in all on one thread each; this run of the "
-        f"command took {_duration(made.seconds)}, with what was finished before taken as it was. "
-        "Without names, protocols and seeds the same command makes everything, what is `-` too: "
-        "more than a day on two cores, most of it the 300 epochs of `cnn1-faithful`."
+        f"{sum(map(_trainings, summaries))} trainings, {_duration(total)} in all on one thread "
+        f"each; this run of the command took {_duration(made.seconds)}, with what was finished "
+        "before taken as it was. Without names, protocols and seeds the same command makes "
+        "everything, what is `-` too: more than a day on two cores, most of it the 300 epochs of "
+        "`cnn1-faithful`."
     )
-    yield ""
     yield ", ".join(f"{name} {version}" for name, version in made.made_with.items()) + "."
     files = {file.name: file for summary in summaries for file in summary.files}
     if files:
-        yield ""
         yield "Data (SHA-256, grasps used):"
-        yield ""
-        for file in files.values():
-            yield f"- `{file.name}.csv` {file.sha256}, {file.rows}"
+        yield "\n".join(
+            f"- `{file.name}.csv` {file.sha256}, {file.rows}" for file in files.values()
+        )
 
 
-def _header(*columns: str) -> Iterator[str]:
-    yield _row(*columns)
-    yield "|" + "---|" * len(columns)
+def _table(header: Row, rows: Iterable[Row]) -> str:
+    lines = [" | ".join(cells) for cells in (header, *rows)]
+    rule = "|" + "---|" * len(header)
+    return "\n".join((f"| {lines[0]} |", rule, *(f"| {line} |" for line in lines[1:])))
 
 
-def _row(*cells: str) -> str:
-    return f"| {' | '.join(cells)} |"
+def _trainings(summary: Summary) -> int:
+    return len(summary.seeds) * summary.folds
+
+
+def _f1(variant: Variant | None) -> Spread | None:
+    return None if variant is None else variant.spreads["f1"]
 
 
 def _value(spread: Spread | None) -> str:

@@ -1,4 +1,4 @@
-"""What a system reached in a protocol: all its jobs in one summary, kept as JSON."""
+"""What a system reached in a protocol: the figures of all its jobs in one file of JSON."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from models.contract import Dataset
+from models.training.arrays import Bools, Ints
 from models.training.data.datasets import Grasps
-from models.training.data.protocols import PROTOCOLS, Protocol
+from models.training.data.protocols import PROTOCOLS, EvalProtocol
+from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import (
     METRICS,
@@ -38,7 +39,8 @@ from models.training.systems.system import System, digest
 
 FORMAT = 1
 HEADLINE = "n50"
-"""Variant that speaks for a session system in a later session: 50 unlabelled grasps."""
+"""Variant whose figures are quoted for a session system in a later session: calibrated by 50
+unlabelled grasps."""
 WANTED_ACCURACIES = (0.9, 0.95, 0.98, 0.99)
 COVERAGES = (0.9, 0.8, 0.5)
 AGES = (0, 5, 10, 20, 50, 100, 300)
@@ -62,7 +64,7 @@ class AgeFigures:
     """Figures of the grasps that came when a running session was this old."""
 
     grasps_before: int
-    """At least so many, and fewer than the next group's."""
+    """The fewest of the group; the most are one less than the next group's fewest."""
     share: Fraction
     temperature: float
     """Makes these margins probabilities."""
@@ -103,7 +105,7 @@ class Summary:
     description: str
     digest: str
     """Of the system's configuration."""
-    protocol: Protocol
+    protocol: EvalProtocol
     data: str
     """Digest of the grasps."""
     files: tuple[Dataset, ...]
@@ -117,13 +119,13 @@ class Summary:
     seconds: float
     """Of all trainings, one thread each."""
     headline: str
-    """The variant that speaks for the system."""
+    """The variant whose figures are quoted for the system."""
     variants: dict[str, Variant]
     made_with: dict[str, str]
 
     @property
     def main(self) -> Variant:
-        """The variant that speaks for the system."""
+        """The variant whose figures are quoted."""
         return self.variants[self.headline]
 
 
@@ -131,8 +133,8 @@ Results = Mapping[int, Sequence[JobResult]]
 """By seed: the results of all folds."""
 
 
-def summarise(system: System, protocol: Protocol, results: Results, grasps: Grasps) -> Summary:
-    """All jobs of a system in a protocol, in one."""
+def summarise(system: System, protocol: EvalProtocol, results: Results, grasps: Grasps) -> Summary:
+    """The figures of a system in a protocol; `results` hold every fold of every seed."""
     flat = [result for folds in results.values() for result in folds]
     names = list(flat[0].margins)
     return Summary(
@@ -155,35 +157,19 @@ def summarise(system: System, protocol: Protocol, results: Results, grasps: Gras
     )
 
 
-def made_with() -> dict[str, str]:
-    """Machine and versions of what decides the last digits."""
-    versions = {name: importlib.metadata.version(name) for name in LIBRARIES}
+def made_with(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
+    """Machine, Python and versions of libraries that decide the last digits."""
+    versions = {name: importlib.metadata.version(name) for name in libraries}
     machine = f"{platform.machine()}, {os.cpu_count()} cores"
     return {"machine": machine, "python": platform.python_version(), **versions}
 
 
-def path_of(folder: Path, system: str, protocol: str) -> Path:
-    """Where a summary is kept."""
-    return folder / f"{system}.{protocol}.json"
+def write_summary(summary: Summary, folder: Path) -> None:
+    """Store a summary as `SYSTEM.PROTOCOL.json` in the folder. Raises `OSError`."""
+    write_whole(folder / f"{summary.system}.{summary.protocol}.json", to_json(summary))
 
 
-def write(summary: Summary, folder: Path) -> None:
-    """Store a summary, whole or not at all."""
-    path = path_of(folder, summary.system, summary.protocol)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_bytes(to_json(summary))
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def to_json(value: object) -> bytes:
-    """Indented JSON with a newline."""
-    return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"
-
-
-def read(path: Path) -> Summary:
+def read_summary(path: Path) -> Summary:
     """Read a summary. Raises `OSError`, or `ValueError` if it is none of this format."""
     summary = msgspec.json.decode(path.read_bytes(), type=Summary)
     if summary.format != FORMAT:
@@ -191,18 +177,19 @@ def read(path: Path) -> Summary:
     return summary
 
 
-def read_all_of(folder: Path, data: str, digests: Mapping[str, str]) -> list[Summary]:
-    """Summaries in a folder that are of this data and of these systems, by name: digest.
+def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[Summary]:
+    """The summaries in a folder that are of this data and of these systems.
 
-    In the order of the systems and protocols. What is of another configuration or cannot be read
-    is left out, with a warning.
+    `data` is the digest of the grasps, `digests` are those of the systems by name. In the order of
+    systems and protocols. A summary that is of another configuration or cannot be read is left
+    out, with a warning.
     """
     found = []
     for path in sorted(folder.glob("*.json")):
         if path.name.endswith(".grid.json"):
             continue
         try:
-            summary = read(path)
+            summary = read_summary(path)
         except ValueError as error:
             _log.warning("%s is left out: %s", path, error)
             continue
@@ -224,8 +211,23 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
     rows = np.concatenate([pool.rows for pool in pools])
     margins = np.concatenate([pool.margins for pool in pools])
     probability = np.concatenate([pool.probability for pool in pools])
-    slipped = grasps.slipped[rows]
+    slipped, verdict = grasps.slipped[rows], margins > 0.0
+    objects, tables = np.array(grasps.objects)[rows], grasps.table_of[rows]
+
+    def share(inside: Bools) -> Fraction:
+        # A grasp that was judged once per seed is one grasp to the interval.
+        right = verdict[inside] == slipped[inside]
+        return wilson(float(right.mean()), max(1, len(right) // len(pools)))
+
+    def by_object(inside: Bools) -> ObjectFigures:
+        return ObjectFigures(share(inside), score(margins[inside], slipped[inside]).f1)
+
+    def by_age(group: int, inside: Bools) -> AgeFigures:
+        temperature = fit_temperature(margins[inside], slipped[inside])
+        return AgeFigures(AGES[group], share(inside), temperature)
+
     ages = [pool.ages for pool in pools if pool.ages is not None]
+    groups = np.searchsorted(AGES, np.concatenate(ages), side="right") - 1 if ages else np.array([])
     return Variant(
         spreads={metric: over_seeds(values) for metric, values in figures.items()},
         figures={
@@ -233,100 +235,45 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
             for metric, values in figures.items()
         },
         temperature=fit_temperature(margins, slipped),
-        confusion=_confusion(margins, slipped),
-        objects=_by_object(margins, rows, grasps, len(pools)),
-        palms=_by_palm(margins, rows, grasps, len(pools)),
+        confusion=(_counted(verdict[~slipped]), _counted(verdict[slipped])),
+        objects={name: by_object(objects == name) for name in np.unique(objects).tolist()},
+        palms={grasps.files[table].name: share(tables == table) for table in np.unique(tables)},
         curve=coverage_curve(probability, slipped),
         coverages={f"{c:g}": accuracy_at(probability, slipped, c) for c in COVERAGES},
         thresholds={f"{a:g}": reject_threshold(probability, slipped, a) for a in WANTED_ACCURACIES},
         bins=reliability_bins(probability, slipped),
-        ages=_by_age(margins, slipped, np.concatenate(ages), len(pools)) if ages else [],
+        ages=[by_age(group, groups == group) for group in np.unique(groups)],
     )
+
+
+def _counted(verdict: Bools) -> tuple[int, int]:
+    """How many are judged stable and slip."""
+    return int((~verdict).sum()), int(verdict.sum())
 
 
 class _Pool:
     """The folds of one seed, one after the other, in one variant."""
 
     def __init__(self, variant: str, folds: Sequence[JobResult], grasps: Grasps) -> None:
-        self._grasps = grasps
         self._fold_of = np.repeat(np.arange(len(folds)), [len(fold.test) for fold in folds])
         self.rows = np.concatenate([fold.test for fold in folds])
         self.margins = np.concatenate([fold.margins[variant] for fold in folds])
-        self.ages: NDArray[np.int64] | None = None
+        self.ages: Ints | None = None
         if variant in folds[0].ages:
             self.ages = np.concatenate([fold.ages[variant] for fold in folds])
-        # Who has one fold only is calibrated by the other objects of it.
-        groups = self._fold_of if len(folds) > 1 else self._object_of()
-        slipped = grasps.slipped[self.rows]
+        self._slipped = grasps.slipped[self.rows]
+        groups = self._fold_of
+        if len(folds) == 1:  # calibrated by its other objects, for want of other folds
+            names = np.array(grasps.objects)[self.rows]
+            groups = np.unique(names, return_inverse=True)[1].astype(np.int64)
         if len(np.unique(groups)) > 1:
-            self.probability = cross_fitted_p_slip(self.margins, slipped, groups)
+            self.probability = cross_fitted_p_slip(self.margins, self._slipped, groups)
         else:
             self.probability = p_slip(self.margins)
 
     def scores(self) -> list[Scores]:
         """Of each fold."""
-        made = []
-        for fold in np.unique(self._fold_of):
-            inside = self._fold_of == fold
-            slipped = self._grasps.slipped[self.rows[inside]]
-            made.append(score(self.margins[inside], slipped, self.probability[inside]))
-        return made
-
-    def _object_of(self) -> NDArray[np.int64]:
-        names = np.array([self._grasps.objects[row] for row in self.rows])
-        return np.unique(names, return_inverse=True)[1].astype(np.int64)
-
-
-def _confusion(
-    margins: NDArray[np.float64], slipped: NDArray[np.bool_]
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    verdict = margins > 0.0
-    stable, slip = (
-        (int((~verdict[slipped == truth]).sum()), int(verdict[slipped == truth].sum()))
-        for truth in (False, True)
-    )
-    return stable, slip
-
-
-def _by_object(
-    margins: NDArray[np.float64], rows: NDArray[np.int64], grasps: Grasps, seeds: int
-) -> dict[str, ObjectFigures]:
-    names = np.array([grasps.objects[row] for row in rows])
-    made = {}
-    for name in sorted(set(names.tolist())):
-        inside = names == name
-        one = score(margins[inside], grasps.slipped[rows[inside]])
-        # A grasp that was judged once per seed is one grasp to the interval.
-        made[name] = ObjectFigures(wilson(one.accuracy, one.grasps // seeds), one.f1)
-    return made
-
-
-def _by_palm(
-    margins: NDArray[np.float64], rows: NDArray[np.int64], grasps: Grasps, seeds: int
-) -> dict[str, Fraction]:
-    right = (margins > 0.0) == grasps.slipped[rows]
-    table_of = grasps.table_of[rows]
-    return {
-        grasps.files[table].name: wilson(
-            float(right[table_of == table].mean()), int((table_of == table).sum()) // seeds
-        )
-        for table in np.unique(table_of)
-    }
-
-
-def _by_age(
-    margins: NDArray[np.float64],
-    slipped: NDArray[np.bool_],
-    ages: NDArray[np.int64],
-    seeds: int,
-) -> list[AgeFigures]:
-    """In a running session nearly every seed meets other grasps when it is young."""
-    group_of = np.searchsorted(AGES, ages, side="right") - 1
-    made = []
-    for group in np.unique(group_of):
-        inside = group_of == group
-        right = (margins[inside] > 0.0) == slipped[inside]
-        fraction = wilson(float(right.mean()), max(1, len(right) // seeds))
-        temperature = fit_temperature(margins[inside], slipped[inside])
-        made.append(AgeFigures(AGES[group], fraction, temperature))
-    return made
+        return [
+            score(self.margins[inside], self._slipped[inside], self.probability[inside])
+            for inside in (self._fold_of == fold for fold in np.unique(self._fold_of))
+        ]

@@ -1,4 +1,4 @@
-"""Tables of one's own, beside the published ones or alone: read, and refused where they mislead."""
+"""Lab tables: grasp tables of the user's own hand, beside the published ones or alone."""
 
 from __future__ import annotations
 
@@ -6,34 +6,29 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from models.bts3 import TABLES
-from models.training.data.datasets import (
-    DatasetError,
-    Grasps,
-    concatenate,
-    read_all,
-    read_table,
-)
+from models.training.data.datasets import DatasetError, Grasps, concatenate, read_all, read_table
 
 FEWEST_GRASPS = 20
-"""Of a table of one's own: from so many on the daemon, too, takes a session for calibrated."""
+"""Of one lab table: the number from which the daemon takes a session for calibrated."""
 ENOUGH_GRASPS = 200
-"""Of one's own alone. The daemon refuses readings that are unlike all of the training: of other
-grasps of palm_45, 98 % by 20 of its grasps, 20 % by 100, 6 % by 200, 2.5 % by 500."""
+"""Of lab tables without the published ones. The daemon refuses readings that are unlike all of the
+training: of other grasps of palm_45, 98 % by 20 of its grasps, 20 % by 100, 6 % by 200, 2.5 % by
+500."""
 
 
-def read_with_own(folder: Path | None, own: Sequence[Path]) -> Grasps:
-    """The published tables of a folder, if it is given, and after them each table of one's own.
+def read_with_lab_tables(folder: Path | None, lab: Sequence[Path]) -> Grasps:
+    """The published tables of `folder`, if it is given, and after them each lab table.
 
-    Raises `DatasetError` for what is no table, and for an own table that has a published name or
-    that of another, holds a grasp that is there already, has only one kind of grasps or less than
-    `FEWEST_GRASPS`; `ValueError` if there is nothing to read.
+    Raises `DatasetError` for a file that is no grasp table, and for a lab table that has the name
+    of another, repeats a grasp, has grasps of one label only or fewer than `FEWEST_GRASPS`;
+    `ValueError` if there is neither a folder nor a lab table.
     """
     parts = [] if folder is None else [read_all(folder)]
     paths: dict[str, Path] = {}
-    for path in own:
+    for path in lab:
         _check_name(path, paths)
         paths[path.stem] = path
-        parts.append(_read_own(path))
+        parts.append(_read_lab_table(path))
     grasps = concatenate(parts)
     _check_once(grasps, paths)
     return grasps
@@ -49,7 +44,7 @@ def _check_name(path: Path, others: dict[str, Path]) -> None:
         raise DatasetError(path, f"has the same name as {others[name]}: rename one")
 
 
-def _read_own(path: Path) -> Grasps:
+def _read_lab_table(path: Path) -> Grasps:
     grasps = read_table(path)
     if len(grasps) < FEWEST_GRASPS:
         raise DatasetError(path, f"has {len(grasps)} grasps, {FEWEST_GRASPS} are the fewest")
@@ -59,12 +54,12 @@ def _read_own(path: Path) -> Grasps:
     return grasps
 
 
-def _check_once(grasps: Grasps, own: dict[str, Path]) -> None:
+def _check_once(grasps: Grasps, lab: dict[str, Path]) -> None:
     """A grasp that is there twice would be trained on and judged by: figures too good."""
     first: dict[bytes, str] = {}
     for table, counts in zip(grasps.table_of.tolist(), grasps.counts, strict=True):
         name, key = grasps.files[table].name, counts.tobytes()
-        if key in first and name in own:
+        if key in first and name in lab:
             where = "twice" if first[key] == name else f"that are in {first[key]}, too"
-            raise DatasetError(own[name], f"has counts {where}: the same grasp counts once")
+            raise DatasetError(lab[name], f"has counts {where}: the same grasp counts once")
         first.setdefault(key, name)

@@ -12,37 +12,27 @@ from joblib.externals.loky import get_reusable_executor
 
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job, JobResult
-
-Outcomes = Iterator[tuple[int, bytes]]
-"""Index of a job and the bytes of its result, in the order in which they come."""
-
+from models.training.evaluating.jobs import Job, JobResult, Outcomes
 
 OnResult = Callable[[int, JobResult], None]
 """Called with the index of each job and its result, as they come."""
 
 
-class ClusterError(Exception):
-    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
-
-
-def sweep(
+def run_jobs(
     wanted: Sequence[Job],
     grasps: Grasps,
     folder: Path,
     *,
     processes: int = 1,
     dask: str | None = None,
-    on_done: Callable[[], None] | None = None,
     on_result: OnResult | None = None,
 ) -> list[JobResult]:
-    """Results of all jobs in their order: from the folder where it has them, else run now.
+    """Results of all jobs in their order: read from `folder` where it has them, else run now.
 
-    Each result is in the folder as soon as it is known, so an interrupted sweep goes on where it
-    was. Runs `processes` at a time, or on the Dask cluster whose scheduler has the address `dask`;
-    its workers need graspd with the extras `train` and `cluster`, but no folder and no data. A job
-    whose worker is lost runs again. `on_done` and `on_result` are called after
-    each job, also a stored one.
+    Each result is in the folder as soon as it is known, so an interrupted call goes on where it
+    was. Runs `processes` jobs at a time, or on the Dask cluster whose scheduler has the address
+    `dask`; its workers need graspd with the extras `train` and `cluster`, but no folder and no
+    data. A job whose worker is lost runs again. `on_result` is called for stored results, too.
 
     Raises what `jobs.run` raises, `ClusterError`, and `OSError` if the folder cannot be used.
     """
@@ -52,8 +42,6 @@ def sweep(
 
     def done(index: int, result: JobResult) -> None:
         results[index] = result
-        if on_done is not None:
-            on_done()
         if on_result is not None:
             on_result(index, result)
 
@@ -81,7 +69,9 @@ def _outcomes(
 
         return on_cluster(missing, grasps, dask)
     if processes == 1:
-        return nullcontext(_numbered(place, job, grasps) for place, job in enumerate(missing))
+        return nullcontext(
+            jobs.run_numbered(place, job, grasps) for place, job in enumerate(missing)
+        )
     return _in_processes(missing, grasps, processes)
 
 
@@ -103,8 +93,4 @@ def _in_processes(missing: Sequence[Job], grasps: Grasps, processes: int) -> Ite
 def _in_worker(place: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
     # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return _numbered(place, job, grasps)
-
-
-def _numbered(place: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
-    return place, jobs.run(job, grasps).to_bytes()
+    return jobs.run_numbered(place, job, grasps)

@@ -1,0 +1,14 @@
+"""Short names of array types, so that a signature can say shapes and units instead."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Numbers = NDArray[np.generic]
+"""Counts of whatever type: as read (uint16) or mapped to other sensors (float64)."""
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+"""What a model takes."""
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]

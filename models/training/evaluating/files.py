@@ -1,0 +1,38 @@
+"""Result files: there whole or not at all, whenever the program ends."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a path to write to; the file written there then takes the place of `path`.
+
+    After an exception `path` is as it was before. Nothing else is left in the folder. Raises
+    `OSError` if the file cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write these bytes as the file `path`. Raises `OSError`."""
+    with replacing(path) as part:
+        part.write_bytes(data)
+
+
+def to_json(value: object) -> bytes:
+    """Indented JSON with a newline."""
+    return msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n"

@@ -1,0 +1,192 @@
+"""From grasp tables to a model file and its card: measure, calibrate, train, export."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from models.contract import (
+    CLASSES,
+    ConfidenceStep,
+    Input,
+    MeasuredError,
+    ModelContract,
+    SessionInput,
+    Sharpness,
+)
+from models.training.data.datasets import Grasps
+from models.training.evaluating import jobs
+from models.training.evaluating.broken import broken_study
+from models.training.evaluating.files import to_json, write_whole
+from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.metrics import FEWEST_JUDGED
+from models.training.evaluating.run_jobs import run_jobs
+from models.training.evaluating.summaries import Summary, made_with, summarise
+from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
+from models.training.fitting.standards import PRIOR_GRASPS, RUNNING
+from models.training.fitting.trained import Trained, train
+from models.training.making.card import (
+    LIBRARIES,
+    Card,
+    Data,
+    Measured,
+    ModelFile,
+    NeverSeen,
+    weak_points,
+)
+from models.training.making.export import export
+from models.training.making.plan import TrainingPlan
+from models.training.systems.system import SessionFeatures, System, configuration
+
+CALIBRATED_FROM = 20.0
+"""Grasps from which on a session counts as calibrated: more of them gain two points at most."""
+EXTRA_TRAININGS = 2
+"""Beside the folds: one for the repeatability, one for the model itself. The study of broken
+electrodes, three more, comes last."""
+
+
+def make_model(
+    plan: TrainingPlan, grasps: Grasps, out: Path, results: Path, on_done: Callable[[], None]
+) -> Card:
+    """Write `NAME.onnx` and `NAME.json` into the folder `out`; trainings are kept in `results`.
+
+    `grasps` are those of all tables that there are. `on_done` is called after each of the plan's
+    jobs and of the `EXTRA_TRAININGS`. Raises `TooFewGraspsError` if the grasps are too few for the
+    folds, `ExportError` if the file does not judge as the system does, `OSError` if a folder
+    cannot be written.
+    """
+    wanted = plan.jobs(grasps)
+    found = run_jobs(
+        wanted, grasps, results, processes=plan.processes, on_result=lambda *_: on_done()
+    )
+    summaries = _summaries(plan, grasps, found)
+    again = jobs.run(wanted[0], grasps)
+    on_done()
+    system = plan.system
+    trained = train(system, plan.chosen(grasps).of_fingers(system.fingers), plan.seed)
+    on_done()
+    contract = _contract(plan, trained, summaries)
+    calibrator = _calibrator(summaries)
+    path = out / f"{system.name}.onnx"
+    temperature = calibrator.main.temperature
+    tables = trained.standards
+    standards = None if tables is None else tables.each(trained.grasps.table_of)
+    parity = export(trained.fitted, temperature, contract, trained.grasps.counts, path, standards)
+    card = Card(
+        what=system.description,
+        contract=contract,
+        file=ModelFile.of(path, parity),
+        parameters=trained.fitted.parameters,
+        data=Data.of(grasps.files),
+        system=configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
+        protocols={summary.protocol: Measured.of(summary) for summary in summaries},
+        temperature=temperature,
+        calibrated_by=calibrator.protocol,
+        broken=None if plan.only else broken_study(system, trained.grasps, plan.seed),
+        never_seen=_never_seen(trained, contract, plan.seed),
+        same_seed_same_margins=_same(found[0], again),
+        command=plan.command,
+        made_with=made_with(LIBRARIES) | {"machine": platform.machine()},
+        weak_points=weak_points(summaries, trained.grasps),
+    )
+    write_whole(path.with_suffix(".json"), to_json(card))
+    return card
+
+
+def _calibrator(summaries: list[Summary]) -> Summary:
+    """What probabilities are calibrated by: new objects, where they were measured."""
+    return summaries[min(1, len(summaries) - 1)]
+
+
+def _summaries(plan: TrainingPlan, grasps: Grasps, found: list[JobResult]) -> list[Summary]:
+    return [
+        summarise(
+            plan.system,
+            protocol,
+            {plan.seed: found[index * plan.folds : (index + 1) * plan.folds]},
+            grasps,
+        )
+        for index, protocol in enumerate(plan.protocols(grasps))
+    ]
+
+
+def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) -> ModelContract:
+    return ModelContract(
+        version=2,
+        name=plan.system.name,
+        input=_input(plan.system, trained, summaries),
+        fingers=plan.system.fingers,
+        classes=CLASSES,
+        seed=plan.seed,
+        datasets=tuple(file for file in trained.grasps.files if file.rows),
+        measured=tuple(map(_measured, summaries)),
+        confidence=_confidence(_calibrator(summaries)),
+        seen=trained.seen(),
+    )
+
+
+def _confidence(summary: Summary) -> tuple[ConfidenceStep, ...]:
+    """Of few grasps the surest are too few to say how often they are right."""
+    judged = summary.folds * summary.test_grasps
+    return tuple(
+        ConfidenceStep(point.confidence, point.accuracy, point.coverage)
+        for point in reversed(summary.main.curve)
+        if round(point.coverage * judged) >= FEWEST_JUDGED
+    )
+
+
+def _measured(summary: Summary) -> MeasuredError:
+    f1, accuracy = summary.main.spreads["f1"], summary.main.spreads["accuracy"]
+    return MeasuredError(
+        summary.protocol, summary.folds, f1.mean, f1.std, accuracy.mean, accuracy.std
+    )
+
+
+def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
+    if not isinstance(system.input, SessionFeatures):
+        return system.input
+    if trained.standards is None:
+        raise ValueError("a session system was trained without standards")
+    prior = trained.standards.prior
+    return SessionInput(
+        mean=tuple(prior.mean.tolist()),
+        spread=tuple(prior.spread.tolist()),
+        clip=system.input.clip,
+        prior_grasps=PRIOR_GRASPS,
+        calibrated_from=CALIBRATED_FROM,
+        sharpness=_sharpness(summaries),
+    )
+
+
+def _sharpness(summaries: list[Summary]) -> tuple[Sharpness, ...]:
+    """How much less sure a young session is than the calibrated model, never more sure."""
+    base = _calibrator(summaries).main.temperature
+    later = next((s for s in summaries if s.protocol == "session"), None)
+    if later is None:
+        return (Sharpness(0.0, 1.0),)
+    steps: list[Sharpness] = []
+    for age in reversed(later.variants[RUNNING].ages):
+        least = steps[-1].temperature if steps else 1.0
+        steps.append(Sharpness(float(age.grasps_before), max(least, age.temperature / base)))
+    return tuple(reversed(steps))
+
+
+def _never_seen(trained: Trained, contract: ModelContract, seed: int) -> NeverSeen:
+    objects = np.array(trained.grasps.objects)
+    counts, margin = trained.mapped_counts(), trained.sensors.margin
+    # Two of other objects at least have a covariance.
+    several = len(objects) - max(Counter(trained.grasps.objects).values()) > 1
+    return NeverSeen(
+        held_out_object=held_out_never_seen(counts, objects, margin) if several else None,
+        made_up=made_up_never_seen(counts, contract.seen, seed),
+    )
+
+
+def _same(one: JobResult, other: JobResult) -> bool:
+    return all(
+        np.array_equal(margins, other.margins[name]) for name, margins in one.margins.items()
+    )
