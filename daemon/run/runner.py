@@ -25,7 +25,7 @@ from models.contract import ModelError
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.record.raw import Tap
+    from daemon.record.link_log import Tap
     from daemon.record.recorder import Recorded, Recorder
     from daemon.run.printer import Printer
     from daemon.run.realtime import Hot
@@ -273,7 +273,7 @@ def _tap(parts: Parts) -> Tap | None:
     record = parts.scene.record
     if record is None or not record.raw:
         return None
-    from daemon.record.raw import tap_of
+    from daemon.record.link_log import tap_of
 
     return tap_of(parts.drivers[0], parts.scene.tactile)
 

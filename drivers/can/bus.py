@@ -30,6 +30,7 @@ from drivers.can.frames import (
     LOST,
     REMOTE,
     CanFrame,
+    Stamped,
     unpack_frame,
 )
 from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
@@ -51,10 +52,6 @@ _OPTIONS: Final[dict[str, dict[str, Any]]] = {
 _PACKAGES: Final = {"serial": "pyserial"}
 """Packages whose names are not those of their modules."""
 _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
-
-Stamped = tuple[CanFrame, int, int]
-"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
-interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:

@@ -67,6 +67,11 @@ class CanFrame(NamedTuple):
     """`FrameFlag` bits."""
 
 
+Stamped = tuple[CanFrame, int, int]
+"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
+interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
+
+
 def unpack_frame(raw: bytes) -> CanFrame | None:
     """The frame in a `can_frame` or `canfd_frame`, None if it is neither."""
     if len(raw) == CAN_FRAME.size:
@@ -87,22 +92,6 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
     if word & EFF_FLAG:
         return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | EXTENDED)
     return CanFrame(word & STANDARD_ID_MAX, data[:length], flags)
-
-
-def pack_frame(frame: CanFrame) -> bytes:
-    """The struct that Linux would hand over. Raises `ValueError` for a frame that cannot be."""
-    extended = bool(frame.flags & (EXTENDED | ERROR))
-    if not 0 <= frame.arbitration_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX):
-        raise ValueError(f"arbitration id {frame.arbitration_id:#x} is out of range")
-    if len(frame.data) > (FD_DATA_MAX if frame.flags & FD else CLASSIC_DATA_MAX):
-        raise ValueError(f"{len(frame.data)} bytes of data do not fit into a frame")
-    word = frame.arbitration_id
-    word |= EFF_FLAG if frame.flags & EXTENDED else 0
-    word |= RTR_FLAG if frame.flags & REMOTE else 0
-    word |= ERR_FLAG if frame.flags & ERROR else 0
-    if frame.flags & FD:
-        return CANFD_FRAME.pack(word, len(frame.data), 0, frame.data)
-    return CAN_FRAME.pack(word, len(frame.data), frame.data)
 
 
 def is_bus_off(frame: CanFrame) -> bool:

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from drivers.base import ELECTRODES, DriverCounters
+from drivers.base import ELECTRODES
+from drivers.palm.counters import PalmCounters
 
 CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""
@@ -42,8 +43,8 @@ TYPE_METADATA_FIRST: Final = 0xFFF9
 TYPE_METADATA_LAST: Final = 0xFFFF
 """From here to here `tactile` holds no samples but serial numbers, versions and the like."""
 
-VALID_PAC_0, VALID_PAC_1, VALID_OTHER_0, VALID_OTHER_1 = 1, 2, 4, 8
-"""Bits of `TactileSlot.valid`."""
+VALID_OTHER_0, VALID_OTHER_1 = 4, 8
+"""Bits of `TactileSlot.valid`; 1 and 2 are those of the PAC words."""
 VALID_ALL = 0x0F
 
 _CAN_RECORD: Final = struct.Struct("<BBH8s")
@@ -103,13 +104,6 @@ class TactileSlot(NamedTuple):
     other_1: int
 
 
-class Motor(NamedTuple):
-    """One motor's record: raw torque, and a word that `motor_type` explains."""
-
-    torque: int
-    misc: int
-
-
 class CanRecord(NamedTuple):
     """One message of the hand's motor buses, appended to the packet by the palm."""
 
@@ -134,7 +128,7 @@ class PalmPacket:
     motors_arrived: int
     motors_failed: int
     motor_words: tuple[int, ...]
-    """20 words, those of `motors` one after the other."""
+    """20 words: of each of 10 motors raw torque, and a word that `motor_type` explains."""
     tactile_type: int
     """Which channels `other_0` and `other_1` are: see `position_of`."""
     tactile_valid: int
@@ -144,11 +138,6 @@ class PalmPacket:
     idle_time_us: int
     """What the palm had to spare of its millisecond; should stay above 50."""
     can_record: CanRecord | None = None
-
-    @property
-    def motors(self) -> tuple[Motor, ...]:
-        """10 records. Made when asked for: the driver never does."""
-        return tuple(map(Motor, self.motor_words[::2], self.motor_words[1::2]))
 
     def to_bytes(self) -> bytes:
         """The packet as the palm sends it; what is not read is zero. For twins and tests.
@@ -169,26 +158,10 @@ class PalmPacket:
         return packet + record
 
 
-@dataclass(slots=True)
-class PacketCounters(DriverCounters):
-    """What the parser counts."""
-
-    packets: int = 0
-    """Packets with sensor data."""
-    bad_lengths: int = 0
-    """Datagrams of a length that no known palm sends."""
-    empty_packets: int = 0
-    """Packets that the palm was too late to fill."""
-    service_packets: int = 0
-    """Packets of a service mode of the palm, in which `sensors` holds other things."""
-    nonsense_packets: int = 0
-    """Packets with a field that no palm sends."""
-
-
 class PalmParser:
     """Datagrams in, packets out."""
 
-    def __init__(self, counters: PacketCounters) -> None:
+    def __init__(self, counters: PalmCounters) -> None:
         self._counters = counters
 
     def parse(self, data: bytes) -> PalmPacket | None:

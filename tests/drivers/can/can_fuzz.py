@@ -7,10 +7,11 @@ import random
 import sys
 
 from drivers.base import TactileReading
-from drivers.can.decoders import CanCounters, CanDecoder, make_decoder
+from drivers.can.decoders import CanDecoder, make_decoder
 from drivers.can.formats import CanFormat, SweepFrame, encode_sample
-from drivers.can.frames import CanFrame, FrameFlag, pack_frame, unpack_frame
-from tests.drivers.can.can_words import Clock, samples, truth, word
+from drivers.can.frames import CanFrame, FrameFlag, unpack_frame
+from drivers.can.readings import CanCounters
+from tests.drivers.can.can_words import Clock, pack_frame, samples, truth, word
 
 SAMPLE_ID = 0x100
 

@@ -17,8 +17,9 @@ from drivers.can.formats import (
     parse_sample,
     parse_sweep,
 )
-from drivers.can.frames import CanFrame, FrameFlag, pack_frame, unpack_frame
+from drivers.can.frames import CanFrame, FrameFlag, unpack_frame
 from tests.bench.fuzz import Target
+from tests.drivers.can.can_words import pack_frame
 
 SAMPLE_ID, SWEEP_ID = 0x100, 0x5B0
 SENSORS = 3

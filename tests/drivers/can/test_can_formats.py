@@ -30,12 +30,11 @@ from drivers.can.frames import (
     describe_error,
     is_bus_off,
     is_overflow,
-    pack_frame,
     unpack_frame,
 )
 from tests.conftest import ROOT
 from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder, fuzz
-from tests.drivers.can.can_words import samples, truth, word
+from tests.drivers.can.can_words import pack_frame, samples, truth, word
 
 E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
 """Electrode 1 of three sensors: 2602, 2713, 2391."""

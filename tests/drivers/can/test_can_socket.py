@@ -16,7 +16,7 @@ from drivers.can.driver import (
     CanBridgeDriver,
 )
 from drivers.can.formats import CanFormat
-from drivers.can.frames import CanFrame, FrameFlag, pack_frame
+from drivers.can.frames import CanFrame, FrameFlag
 from drivers.kernel_stamps import SO_RXQ_OVFL
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID, CanTwin
@@ -29,7 +29,7 @@ from tests.drivers.can.can_standin import (
     sweep_of_frames,
     tactile,
 )
-from tests.drivers.can.can_words import SLOT_NS, Clock, truth
+from tests.drivers.can.can_words import SLOT_NS, Clock, pack_frame, truth
 
 MS = 1_000_000
 
@@ -93,7 +93,7 @@ def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
             first.send(CanFrame(0x040, bytes(8), FrameFlag.ERROR))
             assert len(driver.read_ready()) == 1
             assert driver.link_state is LinkState.WAITING
-            assert driver.last_error == "bus-off"
+            assert driver.stream.last_error == "bus-off"
             due_ns = driver.due_ns()
             assert due_ns is not None
             clock.now_ns = due_ns
@@ -156,8 +156,8 @@ def test_an_interface_that_goes_down_is_a_link_fault(monkeypatch: pytest.MonkeyP
         with over_socket() as driver:
             assert driver.read_ready() == []
             assert driver.link_state is LinkState.WAITING
-            assert driver.last_error is not None
-            assert "Network is down" in driver.last_error
+            assert driver.stream.last_error is not None
+            assert "Network is down" in driver.stream.last_error
 
 
 def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
