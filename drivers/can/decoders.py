@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 
@@ -235,15 +234,7 @@ def _id_flags(identifier: int | None) -> int:
     return EXTENDED
 
 
-_COUNTER_OF: Final = {
-    Reject.LENGTH: "wrong_length_frames",
-    Reject.COMMAND: "unknown_commands",
-    Reject.VERSION: "unknown_versions",
-    Reject.CONTENT: "malformed_frames",
-}
-
-
 def _count_reject(counters: CanCounters, reject: Reject, identifier: int | None) -> None:
     """Count by kind; without a configured id nobody knows whether the frame was meant for us."""
-    name = "foreign_frames" if identifier is None else _COUNTER_OF[reject]
+    name = "foreign_frames" if identifier is None else reject.value
     setattr(counters, name, getattr(counters, name) + 1)

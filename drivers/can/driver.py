@@ -195,8 +195,9 @@ class CanBridgeDriver(Opened):
         self._resting_until_ns = self._rest(now_ns)
         counters = self.counters
         counters.frames += frames
-        counters.malformed_frames += self._bus.take_malformed()
-        counters.kernel_drops += self._bus.take_kernel_drops()
+        counters.malformed_frames += self._bus.malformed
+        counters.kernel_drops += self._bus.kernel_drops
+        self._bus.malformed = self._bus.kernel_drops = 0
         self._window_frames += frames
         elapsed_ns = now_ns - self._window_start_ns
         if elapsed_ns >= RATE_WINDOW_NS:

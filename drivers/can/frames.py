@@ -6,7 +6,6 @@ Source: linux/can.h and linux/can/error.h.
 from __future__ import annotations
 
 import struct
-from enum import IntFlag
 from typing import Final, NamedTuple
 
 STANDARD_ID_MAX: Final = 0x7FF
@@ -39,22 +38,17 @@ _ERROR_CLASSES: Final = {
 }
 
 
-class FrameFlag(IntFlag):
-    """What kind of frame this is; none set means a classic data frame with an 11-bit id."""
-
-    EXTENDED = 1
-    """29-bit arbitration id."""
-    REMOTE = 2
-    """Asks for data, has none."""
-    ERROR = 4
-    """Made by the controller: the id holds error classes."""
-    FD = 8
-    LOST = 16
-    """No frame: at this place frames were lost."""
-
-
-EXTENDED, REMOTE, ERROR, FD, LOST = 1, 2, 4, 8, 16
-"""`FrameFlag` as plain integers: an IntFlag costs a microsecond per operation."""
+# What kind of frame it is; none set means a classic data frame with an 11-bit id. Plain integers:
+# an IntFlag costs a microsecond per operation.
+EXTENDED: Final = 1
+"""29-bit arbitration id."""
+REMOTE: Final = 2
+"""Asks for data, has none."""
+ERROR: Final = 4
+"""Made by the controller: the id holds error classes."""
+FD: Final = 8
+LOST: Final = 16
+"""No frame: at this place frames were lost."""
 
 
 class CanFrame(NamedTuple):
@@ -64,7 +58,7 @@ class CanFrame(NamedTuple):
     """Without the flag bits of Linux; for error frames the error classes."""
     data: bytes
     flags: int = 0
-    """`FrameFlag` bits."""
+    """`EXTENDED` and so on, added up."""
 
 
 Stamped = tuple[CanFrame, int, int]

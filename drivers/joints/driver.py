@@ -10,9 +10,8 @@ from drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointParse
 from drivers.link import LinkState
 from drivers.udp.link import DatagramLink
 
-SILENCE_S = 0.5
+SILENCE_NS = 500_000_000
 """Without a message for so long the link is lost: 50 at 100 Hz, and a sender of 10 Hz passes."""
-SILENCE_MIN_S, SILENCE_MAX_S = 0.01, 60.0
 
 
 class JointStreamDriver(Opened):
@@ -31,18 +30,15 @@ class JointStreamDriver(Opened):
         self,
         source: str,
         *,
-        silence_s: float = SILENCE_S,
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        if not SILENCE_MIN_S <= silence_s <= SILENCE_MAX_S:
-            raise ValueError(f"silence_s is {silence_s}, must be {SILENCE_MIN_S}..{SILENCE_MAX_S}")
         self._link = DatagramLink(
             self.name,
             source,
             clock,
             bytes_max=DATAGRAM_BYTES_MAX,
-            silence_ns=round(silence_s * 1e9),
+            silence_ns=SILENCE_NS,
             only_from=only_from,
         )
         self._reset()

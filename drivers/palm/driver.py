@@ -14,8 +14,7 @@ from typing import Final
 
 from drivers.base import Opened, Reading
 from drivers.link import LinkState
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX
+from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
 from drivers.palm.rounds import ROUND_NS
 from drivers.palm.stream import PalmStream
 from drivers.udp.link import DatagramLink

@@ -30,7 +30,6 @@ from drivers.base import (
     TactileReading,
     check_fingers,
 )
-from drivers.palm.counters import PalmCounters
 from drivers.palm.packet import (
     CHANNELS,
     CYCLE_NS,
@@ -39,6 +38,7 @@ from drivers.palm.packet import (
     TYPE_METADATA_LAST,
     VALID_OTHER_0,
     VALID_OTHER_1,
+    PalmCounters,
     PalmPacket,
     position_of,
 )

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.base import JointReading, Reading
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import CYCLE_NS, SENSORS, Palm, PalmPacket, PalmParser
+from drivers.palm.packet import CYCLE_NS, SENSORS, Palm, PalmCounters, PalmPacket, PalmParser
 from drivers.palm.rounds import RoundAssembler
 
 if TYPE_CHECKING:

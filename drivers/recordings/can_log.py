@@ -25,7 +25,6 @@ from drivers.can.frames import (
     STANDARD_ID_MAX,
     CanFrame,
 )
-from drivers.can.readings import CanCounters
 from drivers.can.stream import BoardOptions, CanStream
 from drivers.recordings.csv_rows import open_recording
 
@@ -81,16 +80,6 @@ class CanLog:
         self._fingers, self._board = fingers, board
         self.begin()
 
-    @property
-    def counters(self) -> CanCounters:
-        """Those of the stream."""
-        return self._stream.counters
-
-    @property
-    def period_ns(self) -> int | None:
-        """Time between readings, ns, as measured by the times in the file."""
-        return self._stream.period_ns
-
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
         """Times, ns, and frames of a file; other lines are passed over. Raises `RecordingError`."""
         with open_recording(path) as stream:
@@ -101,15 +90,15 @@ class CanLog:
 
     def begin(self) -> None:
         """Forget all that came."""
-        self._stream = CanStream("link log", self._fingers, **self._board)
-        self._stream.link.greeting()
+        self.stream = CanStream("link log", self._fingers, **self._board)
+        self.stream.link.greeting()
 
     def feed(self, t_ns: int, record: CanFrame) -> Sequence[Reading]:
         """The readings that one frame completes."""
-        self._stream.watch(t_ns)
-        readings, trouble = self._stream.receive([(record, t_ns, t_ns)])
-        self._stream.counters.frames += 1
-        self._stream.watch(t_ns)
+        self.stream.watch(t_ns)
+        readings, trouble = self.stream.receive([(record, t_ns, t_ns)])
+        self.stream.counters.frames += 1
+        self.stream.watch(t_ns)
         if trouble is not None:
-            self._stream.interrupt()
+            self.stream.interrupt()
         return readings

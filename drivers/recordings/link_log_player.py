@@ -20,8 +20,8 @@ CANDUMP, SERIAL = ".log", ".serial"
 Record = TypeVar("Record")
 
 
-class LinkLog(Protocol[Record]):
-    """One kind of file, and what turns its records into readings."""
+class Stream(Protocol):
+    """What makes readings of one link."""
 
     @property
     def counters(self) -> DriverCounters:
@@ -30,6 +30,14 @@ class LinkLog(Protocol[Record]):
     @property
     def period_ns(self) -> int | None:
         """Time between readings, ns, as recorded; None until it is known."""
+
+
+class LinkLog(Protocol[Record]):
+    """One kind of file, and the stream that its records go through."""
+
+    @property
+    def stream(self) -> Stream:
+        """The one that a driver of this link has."""
 
     def records(self, path: Path) -> Iterator[tuple[int, Record]]:
         """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
@@ -62,12 +70,12 @@ class LinkLogDriver(RecordedDriver[Record]):
     @property
     def counters(self) -> DriverCounters:
         """Those of the decoder."""
-        return self._log.counters
+        return self._log.stream.counters
 
     @property
     def period_ns(self) -> int | None:
         """Time between readings, ns, as played."""
-        recorded_ns = self._log.period_ns
+        recorded_ns = self._log.stream.period_ns
         return None if recorded_ns is None else round(recorded_ns / (self.timeline.speed or 1.0))
 
     def open(self) -> None:

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from drivers.base import Reading, RecordingError
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmParser
+from drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, PalmParser
 from drivers.palm.rounds import ROUND_NS
 from drivers.palm.stream import PalmStream
 from drivers.recordings.player import RecordedDriver, Timeline

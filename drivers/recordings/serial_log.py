@@ -20,7 +20,6 @@ from drivers.recordings.csv_rows import open_recording
 from drivers.spi.conversation import Conversation
 from drivers.spi.framing import FrameParser, encode_frame
 from drivers.spi.line import LineEvent
-from drivers.spi.sweeps import BridgeCounters
 
 PIECE_MAX_BYTES: Final = 960
 """Bytes of one record: a frame has 1024 at most. What came at once is cut into several."""
@@ -58,12 +57,6 @@ class SerialLogParser:
     def __init__(self) -> None:
         self._frames = FrameParser()
 
-    @property
-    def damaged(self) -> int:
-        """Pieces that are no records."""
-        counters = self._frames.counters
-        return counters.bad_cobs + counters.bad_crc + counters.too_long
-
     def feed(self, chunk: bytes) -> Iterator[SerialRecord]:
         """Records that these bytes complete, oldest first."""
         for kind, payload in self._frames.feed(chunk):
@@ -85,16 +78,6 @@ class SerialLog:
         self._fingers, self._sensors = fingers, sensors
         self.begin()
 
-    @property
-    def counters(self) -> BridgeCounters:
-        """Those of the conversation."""
-        return self._conversation.counters
-
-    @property
-    def period_ns(self) -> int | None:
-        """Nominal time between sweeps, ns, by the last HELLO."""
-        return self._conversation.period_ns
-
     def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
         """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
         parser = SerialLogParser()
@@ -105,13 +88,13 @@ class SerialLog:
 
     def begin(self) -> None:
         """Forget all that came."""
-        self._conversation = Conversation("link log", self._fingers, self._sensors)
-        self._conversation.opened(0)
+        self.stream = Conversation("link log", self._fingers, self._sensors)
+        self.stream.opened(0)
         self._idle_ns = 0
 
     def feed(self, t_ns: int, record: SerialRecord) -> Sequence[Reading]:
         """The readings that one record completes."""
-        conversation, readings = self._conversation, []
+        conversation, readings = self.stream, []
         if record.event is LineEvent.SENT:
             conversation.sent(record.data, t_ns)
             return ()

@@ -66,8 +66,6 @@ class DatagramLink:
         self._heard: Sender = ("", 0)
         self._t_ns = 0
         self._good_t_ns = 0
-        self._failure: str | None = None
-        """Why the link is down, if it is and that is known."""
         self._heard_from: str | None = None
         """What was heard last, from whom."""
 
@@ -88,8 +86,8 @@ class DatagramLink:
         known = {"source": str(self._endpoint), "link": str(self._link.state)}
         if self._heard_from is not None:
             known["heard"] = self._heard_from
-        if self._failure is not None:
-            known["why"] = self._failure
+        if self._link.reason is not None:
+            known["why"] = self._link.reason
         return known
 
     def open(self, counters: DatagramCounters) -> None:
@@ -147,7 +145,6 @@ class DatagramLink:
         if self._link.state is not LinkState.UP:
             self._sender = self._heard
             self._heard_from = f"{what} from {self._heard[0]} port {self._heard[1]}"
-            self._failure = None
             self._link.up(self._heard_from, self._clock())
 
     def fell_silent(self) -> bool:
@@ -168,9 +165,8 @@ class DatagramLink:
         return self._only_from is None or sender[0] == self._only_from
 
     def _lose(self, why: str) -> None:
-        self._counters.link_losses += self._link.state is LinkState.UP
-        self._failure = why
         self._link.failed(why, self._clock())
+        self._counters.link_losses = self._link.losses
 
     def _listen(self, receiver: DatagramReceiver) -> DatagramReceiver:
         self._receiver = receiver

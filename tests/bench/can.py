@@ -32,9 +32,10 @@ from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
 from drivers.can.driver import CanBridgeDriver
 from drivers.can.frames import CanFrame
 from drivers.twins.can import CanTwin
-from drivers.twins.grasps.grasps import Counts, GeneratedContact
+from drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, bus_options
 from tests.drivers.can.can_words import pack_frame
+from tests.drivers.twins.signals import GeneratedContact
 
 Result = dict[str, object]
 SAMPLE_ID = 0x100

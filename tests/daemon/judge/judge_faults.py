@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import ROUND, PalmParser
+from drivers.palm.packet import ROUND, PalmCounters, PalmParser
 from drivers.palm.rounds import RoundAssembler
 from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from drivers.twins.faults import LinkFaults

@@ -19,8 +19,9 @@ from drivers.can.frames import CanFrame
 from drivers.kernel_stamps import SO_TIMESTAMPNS
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts, GeneratedContact
+from drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_words import Clock, pack_frame, samples
+from tests.drivers.twins.signals import GeneratedContact
 
 MS = 1_000_000
 CHANNELS = itertools.count()

@@ -184,12 +184,6 @@ def test_a_source_that_is_no_udp_address_is_refused(source: str) -> None:
         JointStreamDriver(source)
 
 
-@pytest.mark.parametrize("silence_s", [0.0, 61.0, math.nan])
-def test_a_silence_out_of_range_is_refused(silence_s: float) -> None:
-    with pytest.raises(ValueError, match="silence_s"):
-        JointStreamDriver(LOOPBACK, silence_s=silence_s)
-
-
 def test_a_port_that_is_taken_is_a_link_error(driver: JointStreamDriver) -> None:
     with pytest.raises(LinkError, match="cannot listen"):
         JointStreamDriver(f"udp://127.0.0.1:{driver.port}").open()

@@ -20,12 +20,11 @@ from drivers.joints.message import (
     JointParser,
     MessageOrder,
 )
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import Palm, PalmPacket, PalmParser
+from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
 from drivers.palm.rounds import RoundAssembler
-from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.palm import PalmTwin
 from tests.bench.fuzz import Target
+from tests.drivers.twins.signals import GeneratedContact
 
 CYCLE_NS = 1_000_000
 ROUNDS = 4

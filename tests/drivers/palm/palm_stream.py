@@ -13,9 +13,8 @@ import numpy as np
 
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.joints.driver import JointStreamDriver
-from drivers.palm.counters import PalmCounters
 from drivers.palm.driver import PalmDriver
-from drivers.palm.packet import Palm, PalmPacket, PalmParser
+from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
 from drivers.palm.rounds import RoundAssembler
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.palm import PalmTwin

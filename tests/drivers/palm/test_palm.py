@@ -20,7 +20,7 @@ from drivers.palm.calibration import CalibrationError
 from drivers.palm.driver import PalmDriver
 from drivers.palm.packet import Palm
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import GeneratedContact, recorded_counts
+from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.palm import PalmTwin
 from drivers.udp.receiver import DatagramReceiver
 from tests.conftest import ROOT, data_dir
@@ -36,6 +36,7 @@ from tests.drivers.palm.palm_stream import (
     rows,
     tactile,
 )
+from tests.drivers.twins.signals import GeneratedContact
 
 LOOPBACK = "udp://127.0.0.1:0"
 EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import PalmParser
+from drivers.palm.packet import PalmCounters, PalmParser
 from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.palm.counters import PalmCounters
 from drivers.palm.packet import (
     CHANNELS,
     CanRecord,
     Palm,
+    PalmCounters,
     PalmPacket,
     PalmParser,
     TactileSlot,

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault
-from drivers.palm.counters import PalmCounters
-from drivers.palm.packet import PalmPacket
+from drivers.palm.packet import PalmCounters, PalmPacket
 from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import recorded_counts

@@ -19,10 +19,11 @@ from drivers.spi.clock import UNKNOWN_DELAY_NS
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import DIGEST
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts, GeneratedContact, recorded_counts
+from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.spi import SpiTwin
 from tests.conftest import data_dir
 from tests.drivers.spi.bridge_bench import FINGERS, MS, replug_times_s, run
+from tests.drivers.twins.signals import GeneratedContact
 
 SWEEPS = 600
 REPLUGS = 50
