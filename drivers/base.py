@@ -21,6 +21,27 @@ COUNT_MAX = 4095
 """Largest 12-bit reading of an electrode (manual section 5.1)."""
 
 
+def check_fingers(fingers: Sequence[str]) -> None:
+    """Raise `ValueError` unless these are different ones of `FINGERS`, and at least one."""
+    if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
+        raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
+
+
+def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
+    """Which sensor of a device, from 0, is which row of a reading.
+
+    `fingers`: the rows. `sensors`: the fingers in the order of the device, the same if None; it may
+    have more than are wanted. Raises `ValueError` for fingers that are none or not of the device.
+    """
+    check_fingers(fingers)
+    if sensors is None:
+        return tuple(range(len(fingers)))
+    check_fingers(sensors)
+    if not set(fingers) <= set(sensors):
+        raise ValueError(f"fingers {list(fingers)} are not all of {list(sensors)}")
+    return tuple(list(sensors).index(finger) for finger in fingers)
+
+
 class ElectrodeFault(IntFlag):
     """What is wrong with one electrode of one reading. Zero means: a fresh 12-bit count."""
 

@@ -25,11 +25,6 @@ five seconds of idle clock. Never sent."""
 CHANNELS = (PAC, PDC, TAC, TDC, *range(E1, E24 + 1))
 """All channels that are sampled."""
 
-CLOCK_MIN_HZ, CLOCK_MAX_HZ = 500_000, 10_000_000
-"""SPI clock range; mode 0, most significant bit first (manual section 8.2)."""
-SETTLE_US = 50
-"""Least wait between a command and reading its answer (manual figure 14)."""
-
 ERROR_WORDS: dict[int, str] = {
     0xA52D: "insufficient sampling delay",
     0xA558: "channel not recognised",
@@ -53,8 +48,6 @@ SEQUENCE_INTERLEAVED = tuple(
     channel for other in (*range(E1, E24 + 1), PDC, TAC, TDC) for channel in (other, PAC)
 )
 """The default: every other sample is PAC, 54 samples (manual table 12, order of the C library)."""
-SEQUENCE_PRESSURE = (PAC, PDC)
-"""Vibration and pressure only: 2 samples (manual table 12)."""
 
 SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
     "electrodes": SEQUENCE_ELECTRODES,
@@ -62,9 +55,6 @@ SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
     "interleaved": SEQUENCE_INTERLEAVED,
 }
 """Sampling sequences by the name that a scene gives them."""
-
-REFERENCE_OHM = 10_000.0
-"""Resistor in series with an electrode (manual section 5.1)."""
 
 
 def sample_command(channel: int) -> int:
@@ -107,20 +97,6 @@ def decode_words(
     A word with a fault has the count 0. Words are the 16 bits as sent, first byte high.
     """
     return _COUNTS[words], _FAULTS[words]
-
-
-def impedance_ohm(counts: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """Impedance of electrodes, ohm: `(4095 / count - 1) * 10 kohm` (manual section 5.1).
-
-    A count of 0 is infinite: more pressure means more impedance and a lower count.
-    """
-    with np.errstate(divide="ignore"):
-        return (COUNT_MAX / counts.astype(np.float64) - 1.0) * REFERENCE_OHM
-
-
-def counts_of_impedance(impedance: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Counts at which electrodes of these impedances, ohm and not negative, are read."""
-    return np.rint(COUNT_MAX / (impedance / REFERENCE_OHM + 1.0)).astype(np.uint16)
 
 
 def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:

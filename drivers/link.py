@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from enum import StrEnum
 
 BACKOFF_FIRST_S = 0.05
@@ -30,44 +29,47 @@ class LinkState(StrEnum):
 
 
 class Link:
-    """State and retry schedule of one link. Does no I/O itself.
+    """State and retry schedule of one link. Does no I/O; times are monotonic ns.
 
     A failure is a warning when its reason is new in this outage and a debug line otherwise, so that
     a night without the device does not fill the journal, and a device of the wrong version that is
     plugged in at last is heard of.
     """
 
-    def __init__(self, name: str, clock: Callable[[], int]) -> None:
-        """`clock` gives monotonic ns."""
+    def __init__(self, name: str) -> None:
+        """`name` begins every line in the log."""
         self.name = name
         self.state = LinkState.CLOSED
         self.retry_ns: int | None = None
-        """When to try again, monotonic ns, while waiting."""
+        """When to try again, while waiting."""
         self.losses = 0
         """Times that the link was up and was lost."""
         self.reason: str | None = None
         """Why it is not up, None while it is or has not been tried."""
-        self._clock = clock
         self._tries = 0
         self._warned: set[str] = set()
-        self._down_since_ns = clock()
+        self._down_since_ns = 0
 
-    def start(self) -> None:
+    def is_due(self, now_ns: int) -> bool:
+        """Whether it waits no longer for the next try."""
+        return self.retry_ns is None or now_ns >= self.retry_ns
+
+    def start(self, now_ns: int) -> None:
         """Want the link: the first try is due at once."""
         self.state = LinkState.WAITING
         self.reason = None
         self._tries = 0
         self._warned.clear()
-        self._down_since_ns = self.retry_ns = self._clock()
+        self._down_since_ns = self.retry_ns = now_ns
 
     def greeting(self) -> None:
         """The device was opened."""
         self.state = LinkState.GREETING
         self.retry_ns = None
 
-    def up(self, what: str) -> None:
+    def up(self, what: str, now_ns: int) -> None:
         """The device has said what it is; `what` goes into the log."""
-        down_s = (self._clock() - self._down_since_ns) / 1e9
+        down_s = (now_ns - self._down_since_ns) / 1e9
         _log.info("%s: up after %.2f s: %s", self.name, down_s, what)
         self.state = LinkState.UP
         self.retry_ns = None
@@ -75,9 +77,8 @@ class Link:
         self._tries = 0
         self._warned.clear()
 
-    def failed(self, why: str) -> None:
+    def failed(self, why: str, now_ns: int) -> None:
         """A try did not succeed or the link was lost: wait, longer after each failure."""
-        now_ns = self._clock()
         if self.state is LinkState.UP:
             self.losses += 1
             self._down_since_ns = now_ns

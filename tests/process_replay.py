@@ -25,9 +25,10 @@ from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.outbox import Outbox
 from drivers.base import JointReading, Reading
-from drivers.can.decoders import CanCounters, make_decoder
+from drivers.can.decoders import make_decoder
 from drivers.can.formats import CanFormat
 from drivers.can.frames import CanFrame
+from drivers.can.readings import CanCounters
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaultInjector, LinkFaults

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 DEFAULT_MODEL = "small-session"
 MCAP = ".mcap"
 """Ending of graspd's own recordings."""
-CAPTURES = (".log", ".serial")
+LINK_LOGS = (".log", ".serial")
 """Endings of what came over a link: candump text, serial bytes."""
 
 Clock = Callable[[], int]
@@ -265,18 +265,35 @@ def _tactile(scene: Scene, clock: Clock) -> Driver:
             wanted = options.model_dump(exclude={"driver"})
             return CanBridgeDriver(fingers=scene.hand.fingers, clock=clock, **wanted)
         case PalmTactile() as options:
-            from drivers.palm.driver import PalmDriver
-
             joints = scene.joints
             calibration = joints.calibration if isinstance(joints, PalmJoints) else None
-            return PalmDriver(
-                options.source,
-                scene.hand.fingers,
-                calibration=calibration,
-                only_from=options.only_from,
-                heed_finger_bits=options.heed_finger_bits,
-                clock=clock,
-            )
+            return _palm(options, scene.hand.fingers, calibration, clock)
+
+
+def _palm(
+    options: PalmTactile, fingers: Sequence[str], calibration: Path | None, clock: Clock
+) -> Driver:
+    heed = options.heed_finger_bits
+    if options.source.startswith("udp://"):
+        from drivers.palm.driver import PalmDriver
+
+        return PalmDriver(
+            options.source,
+            fingers,
+            calibration=calibration,
+            only_from=options.only_from,
+            heed_finger_bits=heed,
+            clock=clock,
+        )
+    from drivers.recordings.palm_file import PalmFileDriver
+
+    return PalmFileDriver(
+        Path(options.source),
+        fingers,
+        calibration=calibration,
+        heed_finger_bits=heed,
+        clock=clock,
+    )
 
 
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:

@@ -18,7 +18,7 @@ from drivers.base import Driver
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.record.raw import Tap
+    from daemon.record.link_log import Tap
 
 log = logging.getLogger("graspd")
 
@@ -68,7 +68,7 @@ class Assembly:
         """
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
-            from daemon.record.raw import tap_of
+            from daemon.record.link_log import tap_of
 
             self._tap = tap_of(drivers[0], self._parts.scene.tactile)
         for driver in drivers:

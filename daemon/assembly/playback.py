@@ -13,7 +13,7 @@ from typing import Any, Final
 import msgspec
 
 from daemon.assembly import assembly
-from daemon.assembly.captures import changed
+from daemon.assembly.link_logs import changed
 from daemon.judge.memory import decode
 from daemon.judge.pipeline import Pipeline
 from daemon.record.mcap import ASKED, EXCHANGED, SKIPPED, RecordingHeader, header_of

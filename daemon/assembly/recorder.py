@@ -17,7 +17,7 @@ from daemon.scene import Scene, SceneError
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.record.raw import Tap
+    from daemon.record.link_log import Tap
     from daemon.record.recorder import Recorder
 
 log = logging.getLogger("graspd")

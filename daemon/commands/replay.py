@@ -170,16 +170,16 @@ class Recorded(Protocol):
 def _recorded(args: argparse.Namespace) -> Recorded | None:
     """What graspd has recorded, if that is replayed. Imported only where it is."""
     endings = {path.suffix for path in args.recordings}
-    if endings.isdisjoint({assembly.MCAP, *assembly.CAPTURES}):
+    if endings.isdisjoint({assembly.MCAP, *assembly.LINK_LOGS}):
         if args.scene is not None:
             raise SceneError("--scene is for what came over a link")
         return None
     if args.loop or args.strict:
         raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
     if assembly.MCAP not in endings:
-        from daemon.assembly.captures import Captures
+        from daemon.assembly.link_logs import LinkLogs
 
-        return Captures(args.recordings, args.scene)
+        return LinkLogs(args.recordings, args.scene)
     try:
         from daemon.assembly.playback import Playback
     except ModuleNotFoundError as error:

@@ -21,7 +21,7 @@ from drivers.base import (
     TactileReading,
 )
 from drivers.recordings.csv_rows import open_recording
-from drivers.recordings.player import TimedDriver
+from drivers.recordings.player import RecordedDriver, Timeline
 
 _log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class _Due:
     """Kinds of `EVENTS`, in their order."""
 
 
-class McapReplayDriver(TimedDriver[_Due]):
+class McapReplayDriver(RecordedDriver[_Due]):
     """Plays MCAP files of graspd, one reading per call of `read_ready` at most.
 
     `recorded_ns` of a reading is its `t_ns` when it was recorded, counted from `axis_ns`; `t_ns`
@@ -88,7 +88,7 @@ class McapReplayDriver(TimedDriver[_Due]):
         axis_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        super().__init__(paths, speed, clock)
+        super().__init__(paths, Timeline(speed, clock))
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_told: Mapping[str, Callable[[], None]] = {}
@@ -96,46 +96,49 @@ class McapReplayDriver(TimedDriver[_Due]):
         self._reset()
 
     def _reset(self) -> None:
-        super()._reset()
         self.counters = McapCounters()
         self.period_ns: int | None = None
         """Shortest time, ns, between two readings so far, as played."""
         self._last_ns: int | None = None
 
-    def _check(self) -> None:
-        for path in self._paths:
+    def open(self) -> None:
+        """Check the header of every file, then start over with the first one."""
+        self.close()
+        self._reset()
+        for path in self.paths:
             recorded = header_of(path).fingers
             missing = [finger for finger in self._fingers if finger not in recorded]
             if missing:
                 raise RecordingError(path, f"has no finger {missing[0]}, only {recorded}")
+        self.timeline.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
         """The next reading if it is due, else none."""
-        taken = self._take_due()
+        taken = self.timeline.take()
         if taken is None:
             return ()
         at_ns, due, late_ns = taken
-        if self._speed is not None and self.period_ns is not None:
+        if self.timeline.speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
         for kind in due.told:
             if kind in self.on_told:
                 self.on_told[kind]()
         if isinstance(due.reading, TactileReading):
             self._count(due.reading)
-        return [self._hand_over(due.reading, at_ns, self._axis_ns)]
+        return [self.timeline.hand_over(due.reading, at_ns, self._axis_ns)]
 
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
         self.counters.faulty_readings += bool(made.faults.any())
         step_ns = made.t_ns - self._last_ns if self._last_ns is not None else 0
         if step_ns > 0:
-            step_ns = round(step_ns / (self._speed or 1.0))
+            step_ns = round(step_ns / (self.timeline.speed or 1.0))
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 
-    def _play(self) -> Generator[tuple[int, _Due], None, None]:
+    def _items(self) -> Generator[tuple[int, _Due], None, None]:
         told: tuple[str, ...] = ()
-        for path in self._paths:
+        for path in self.paths:
             with open_recording(path) as stream:
                 recording = McapRecording(path, stream)
                 for message in recording:

@@ -30,6 +30,7 @@ from drivers.can.frames import (
     LOST,
     REMOTE,
     CanFrame,
+    Stamped,
     unpack_frame,
 )
 from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
@@ -51,10 +52,6 @@ _OPTIONS: Final[dict[str, dict[str, Any]]] = {
 _PACKAGES: Final = {"serial": "pyserial"}
 """Packages whose names are not those of their modules."""
 _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module is)? not installed")
-
-Stamped = tuple[CanFrame, int, int]
-"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
-interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
@@ -99,8 +96,10 @@ class CanBus:
         """Whether the last drain left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
         """Gets what every drain brings, if it brings anything."""
-        self._malformed = 0
-        self._kernel_drops = 0
+        self.malformed = 0
+        """Records from the socket that are no CAN frames, until somebody resets it."""
+        self.kernel_drops = 0
+        """Frames dropped by the kernel because its buffer was full, likewise."""
         self._interface = interface
         self._channel = channel
         self._options = {**_OPTIONS.get(interface, {}), **options}
@@ -142,16 +141,6 @@ class CanBus:
     def fileno(self) -> int | None:
         """Descriptor to wait on, None where the interface has none."""
         return self._fileno
-
-    def take_malformed(self) -> int:
-        """Records from the socket that are no CAN frames, since the last call."""
-        taken, self._malformed = self._malformed, 0
-        return taken
-
-    def take_kernel_drops(self) -> int:
-        """Frames dropped by the kernel because its buffer was full, since the last call."""
-        taken, self._kernel_drops = self._kernel_drops, 0
-        return taken
 
     def drain(self) -> list[Stamped]:
         """Frames that have arrived, oldest first, at most `FRAMES_PER_DRAIN`.
@@ -204,7 +193,7 @@ class CanBus:
                     self._count_drops(total, frames)
             frame = unpack_frame(record)
             if frame is None:
-                self._malformed += 1
+                self.malformed += 1
             else:
                 frames.append((frame, t_ns, t_ns))
 
@@ -214,7 +203,7 @@ class CanBus:
         if dropped:
             now_ns = self._clock()
             frames.append((CanFrame(0, b"", LOST), now_ns, now_ns))
-        self._kernel_drops += dropped
+        self.kernel_drops += dropped
         self._drops_seen = total
 
     def _drain_bus(self, bus: can.BusABC, frames: list[Stamped]) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final, Protocol
 
 import numpy as np
 
-from drivers.base import FINGERS, ElectrodeFault, TactileReading
+from drivers.base import FINGERS, ElectrodeFault, TactileReading, check_fingers, sensor_rows
 from drivers.biotac import SEQUENCES, decode_words
 from drivers.can.formats import (
     CanFormat,
@@ -25,8 +24,9 @@ from drivers.can.frames import (
     STANDARD_ID_MAX,
     CanFrame,
 )
-from drivers.can.samples import SampleSweeps, SweepCounters
-from drivers.can.sweep_frames import FrameSweeps
+from drivers.can.readings import CanCounters
+from drivers.can.samples import SampleAssembler
+from drivers.can.sweep_frames import FrameAssembler
 
 _ABSENT, _REPEATED, _OVERRUN = (
     int(SweepStatus.ABSENT),
@@ -36,59 +36,27 @@ _ABSENT, _REPEATED, _OVERRUN = (
 _MISSING, _HELD = int(ElectrodeFault.MISSING), int(ElectrodeFault.HELD)
 
 
-@dataclass(slots=True)
-class CanCounters(SweepCounters):
-    """What a CAN bus brought, and what became of it."""
-
-    frames: int = 0
-    """Frames of every kind that the bus brought."""
-    accepted_frames: int = 0
-    """Of these, samples or sweep frames of our sensors, before duplicates and losses."""
-    foreign_frames: int = 0
-    """Frames with another arbitration id than the configured or the latched one; until an id is
-    latched, frames that are no sound sample."""
-    remote_frames: int = 0
-    error_frames: int = 0
-    """Frames in which the controller reports trouble on the bus."""
-    wrong_length_frames: int = 0
-    """Our arbitration id, another length than configured."""
-    unknown_commands: int = 0
-    """Our arbitration id, but the first byte samples no channel."""
-    unknown_versions: int = 0
-    """Sweep frames of another layout version."""
-    malformed_frames: int = 0
-    """Our arbitration id, contents that the format forbids."""
-    stuck_ticks: int = 0
-    """Sweep frames of a new sweep with the tick of the sweep before; their words are `HELD`."""
-    overruns: int = 0
-    """Sweep frames that report a sweep that began late."""
-    controller_overflows: int = 0
-    """Error frames that report a receive overflow of the controller."""
-    kernel_drops: int = 0
-    """Frames that the kernel dropped because the socket's buffer was full (socketcan only)."""
-    bus_off: int = 0
-    """Times that the controller left the bus after too many errors."""
-    bus_faults: int = 0
-    """Failures of the bus or of python-can, opening it included."""
-    link_losses: int = 0
-    """Times that the link was up and was lost."""
-
-
-class CanDecoder(Protocol):
+class CanDecoder(ABC):
     """Turns the data frames of one format into readings."""
+
+    arbitration_id: int | None
+    """Whose frames are taken, of finger 0 if each has its own; None while any would be."""
+
+    def __init__(self, assembler: SampleAssembler | FrameAssembler, counters: CanCounters) -> None:
+        self._assembler = assembler
+        self._counters = counters
 
     @property
     def period_ns(self) -> int | None:
         """Time between readings, ns, as measured; None until it is known."""
+        return self._assembler.period_ns
 
     @property
     def expected_ns(self) -> int | None:
         """When the next reading should be complete, monotonic ns, where many frames make one."""
+        return None
 
-    @property
-    def arbitration_id(self) -> int | None:
-        """Whose frames are taken; None while any would be."""
-
+    @abstractmethod
     def push(
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
@@ -98,10 +66,13 @@ class CanDecoder(Protocol):
         """
 
     def cut(self) -> Sequence[TactileReading]:
-        """Frames were lost here: the readings that end with that."""
+        """Frames were lost here: the readings that end with that. None where frames are numbered:
+        there a loss shows by itself."""
+        return ()
 
     def interrupt(self) -> None:
         """The link broke."""
+        self._assembler.interrupt()
 
 
 def make_decoder(
@@ -119,20 +90,11 @@ def make_decoder(
     `fingers`: rows of a reading. `sensors`: fingers in the order of a sample's words, the same
     unless given (`syntouch` only).
     """
-    for names in (fingers, sensors if sensors is not None else fingers):
-        if not names or len(set(names)) != len(names) or not set(names) <= set(FINGERS):
-            raise ValueError(f"fingers {list(names)} are not different ones of {list(FINGERS)}")
+    check_fingers(fingers)
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:
         raise ValueError(f"arbitration_id {arbitration_id} is not in 0..{EXTENDED_ID_MAX:#x}")
     if frame_format is CanFormat.SYNTOUCH:
-        return SynTouchDecoder(
-            fingers,
-            fingers if sensors is None else sensors,
-            arbitration_id,
-            sequence,
-            data_length,
-            counters,
-        )
+        return SynTouchDecoder(fingers, sensors, arbitration_id, sequence, data_length, counters)
     if sensors is not None:
         raise ValueError("sensors is for the format syntouch; sweep frames say whose they are")
     if data_length is not None:
@@ -140,13 +102,18 @@ def make_decoder(
     return SweepFrameDecoder(fingers, arbitration_id, counters)
 
 
-class SynTouchDecoder:
-    """Samples of SynTouch's board, one frame each."""
+class SynTouchDecoder(CanDecoder):
+    """Samples of SynTouch's board, one frame each.
+
+    Without a configured id it is that of the first sound sample since the link broke.
+    """
+
+    _assembler: SampleAssembler
 
     def __init__(
         self,
         fingers: Sequence[str],
-        sensors: Sequence[str],
+        sensors: Sequence[str] | None,
         arbitration_id: int | None,
         sequence: str,
         data_length: int | None,
@@ -154,37 +121,26 @@ class SynTouchDecoder:
     ) -> None:
         if sequence not in SEQUENCES:
             raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
-        if not set(fingers) <= set(sensors):
-            raise ValueError(f"fingers {list(fingers)} are not all of {list(sensors)}")
-        self._sensors = len(sensors)
-        self._length = sample_length(len(sensors), data_length)
+        rows = sensor_rows(fingers, sensors)
+        self._sensors = len(fingers if sensors is None else sensors)
+        self._length = sample_length(self._sensors, data_length)
         self._configured = arbitration_id is not None
-        self._id = arbitration_id
+        self.arbitration_id = arbitration_id
         self._flags = _id_flags(arbitration_id)
-        self._counters = counters
-        rows = [sensors.index(finger) for finger in fingers]
-        self._sweeps = SampleSweeps(len(sensors), SEQUENCES[sequence], counters, rows)
-
-    @property
-    def period_ns(self) -> int | None:
-        """Time between sweeps, ns, as measured; None until it is known."""
-        return self._sweeps.period_ns
+        super().__init__(
+            SampleAssembler(self._sensors, SEQUENCES[sequence], counters, rows), counters
+        )
 
     @property
     def expected_ns(self) -> int | None:
         """When the next reading should be complete, monotonic ns; None while not known."""
-        return self._sweeps.expected_ns
-
-    @property
-    def arbitration_id(self) -> int | None:
-        """The configured id, or the first heard with a sound sample since the link broke."""
-        return self._id
+        return self._assembler.expected_ns
 
     def push(
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
         """Take a data frame received at `t_ns`; the readings that it completes, oldest first."""
-        identifier = self._id
+        identifier = self.arbitration_id
         if identifier is not None and (
             frame.arbitration_id != identifier or frame.flags & EXTENDED != self._flags
         ):
@@ -201,54 +157,40 @@ class SynTouchDecoder:
             if not _is_sound(sample.words):
                 self._counters.foreign_frames += 1
                 return ()
-            self._id, self._flags = frame.arbitration_id, frame.flags & EXTENDED
+            self.arbitration_id, self._flags = frame.arbitration_id, frame.flags & EXTENDED
         self._counters.accepted_frames += 1
-        return self._sweeps.push(sample.channel, sample.words, t_ns, until_ns)
+        return self._assembler.push(sample.channel, sample.words, t_ns, until_ns)
 
     def cut(self) -> Sequence[TactileReading]:
         """Frames were lost here: the sweep at hand ends."""
-        return self._sweeps.cut()
+        return self._assembler.cut()
 
     def interrupt(self) -> None:
         """The link broke: what comes next may be another board."""
-        self._sweeps.interrupt()
+        super().interrupt()
         if not self._configured:
-            self._id = None
+            self.arbitration_id = None
 
 
-class SweepFrameDecoder:
-    """graspd's own frames, one per finger and sweep."""
+class SweepFrameDecoder(CanDecoder):
+    """graspd's own frames, one per finger and sweep; three a sweep are no reason to rest."""
+
+    _assembler: FrameAssembler
 
     def __init__(self, fingers: Sequence[str], base_id: int | None, counters: CanCounters) -> None:
         self._rows = {FINGERS.index(finger): row for row, finger in enumerate(fingers)}
-        self._base = base_id
+        self.arbitration_id = base_id
         self._flags = _id_flags(None if base_id is None else base_id + len(FINGERS) - 1)
         if base_id is not None and _id_flags(base_id) != self._flags:
             raise ValueError(f"arbitration_id {base_id:#x}: the fingers' ids are of two kinds")
-        self._counters = counters
-        self._sweeps = FrameSweeps(len(fingers), counters, list(self._rows))
         self._ticks: dict[int, tuple[int, int]] = {}
-
-    @property
-    def period_ns(self) -> int | None:
-        """Time between sweeps, ns, as measured; None until it is known."""
-        return self._sweeps.period_ns
-
-    @property
-    def expected_ns(self) -> int | None:
-        """None: three frames a sweep are no reason to rest."""
-        return None
-
-    @property
-    def arbitration_id(self) -> int | None:
-        """That of finger 0."""
-        return self._base
+        super().__init__(FrameAssembler(len(fingers), counters, list(self._rows)), counters)
 
     def push(
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
         """Take a data frame received at `t_ns`; the readings that it completes, oldest first."""
-        base, counters = self._base, self._counters
+        base, counters = self.arbitration_id, self._counters
         expected: int | None = None
         if base is not None:
             expected = frame.arbitration_id - base
@@ -268,15 +210,7 @@ class SweepFrameDecoder:
         counters.overruns += bool(sweep.status & _OVERRUN)
         faults = _MISSING if sweep.status & _ABSENT else 0
         faults |= _HELD if stands or sweep.status & _REPEATED else 0
-        return self._sweeps.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
-
-    def cut(self) -> Sequence[TactileReading]:
-        """Nothing: sweep frames are numbered, so a loss shows by itself."""
-        return ()
-
-    def interrupt(self) -> None:
-        """The link broke."""
-        self._sweeps.interrupt()
+        return self._assembler.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
 
     def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:
         """Whether another sweep of a finger has ended at the same time: nothing was sampled."""
@@ -300,15 +234,7 @@ def _id_flags(identifier: int | None) -> int:
     return EXTENDED
 
 
-_COUNTER_OF: Final = {
-    Reject.LENGTH: "wrong_length_frames",
-    Reject.COMMAND: "unknown_commands",
-    Reject.VERSION: "unknown_versions",
-    Reject.CONTENT: "malformed_frames",
-}
-
-
 def _count_reject(counters: CanCounters, reject: Reject, identifier: int | None) -> None:
     """Count by kind; without a configured id nobody knows whether the frame was meant for us."""
-    name = "foreign_frames" if identifier is None else _COUNTER_OF[reject]
+    name = "foreign_frames" if identifier is None else reject.value
     setattr(counters, name, getattr(counters, name) + 1)

@@ -48,12 +48,12 @@ class CanFormat(StrEnum):
 
 
 class Reject(StrEnum):
-    """Why data is not of the format."""
+    """Why data is not of the format; the values are names of `CanCounters`."""
 
-    LENGTH = "wrong length"
-    COMMAND = "unknown command byte"
-    VERSION = "unknown layout version"
-    CONTENT = "contents that the layout forbids"
+    LENGTH = "wrong_length_frames"
+    COMMAND = "unknown_commands"
+    VERSION = "unknown_versions"
+    CONTENT = "malformed_frames"
 
 
 class SynTouchSample(NamedTuple):

@@ -6,7 +6,6 @@ Source: linux/can.h and linux/can/error.h.
 from __future__ import annotations
 
 import struct
-from enum import IntFlag
 from typing import Final, NamedTuple
 
 STANDARD_ID_MAX: Final = 0x7FF
@@ -39,22 +38,17 @@ _ERROR_CLASSES: Final = {
 }
 
 
-class FrameFlag(IntFlag):
-    """What kind of frame this is; none set means a classic data frame with an 11-bit id."""
-
-    EXTENDED = 1
-    """29-bit arbitration id."""
-    REMOTE = 2
-    """Asks for data, has none."""
-    ERROR = 4
-    """Made by the controller: the id holds error classes."""
-    FD = 8
-    LOST = 16
-    """No frame: at this place frames were lost."""
-
-
-EXTENDED, REMOTE, ERROR, FD, LOST = 1, 2, 4, 8, 16
-"""`FrameFlag` as plain integers: an IntFlag costs a microsecond per operation."""
+# What kind of frame it is; none set means a classic data frame with an 11-bit id. Plain integers:
+# an IntFlag costs a microsecond per operation.
+EXTENDED: Final = 1
+"""29-bit arbitration id."""
+REMOTE: Final = 2
+"""Asks for data, has none."""
+ERROR: Final = 4
+"""Made by the controller: the id holds error classes."""
+FD: Final = 8
+LOST: Final = 16
+"""No frame: at this place frames were lost."""
 
 
 class CanFrame(NamedTuple):
@@ -64,7 +58,12 @@ class CanFrame(NamedTuple):
     """Without the flag bits of Linux; for error frames the error classes."""
     data: bytes
     flags: int = 0
-    """`FrameFlag` bits."""
+    """`EXTENDED` and so on, added up."""
+
+
+Stamped = tuple[CanFrame, int, int]
+"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
+interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
 
 
 def unpack_frame(raw: bytes) -> CanFrame | None:
@@ -87,22 +86,6 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
     if word & EFF_FLAG:
         return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | EXTENDED)
     return CanFrame(word & STANDARD_ID_MAX, data[:length], flags)
-
-
-def pack_frame(frame: CanFrame) -> bytes:
-    """The struct that Linux would hand over. Raises `ValueError` for a frame that cannot be."""
-    extended = bool(frame.flags & (EXTENDED | ERROR))
-    if not 0 <= frame.arbitration_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX):
-        raise ValueError(f"arbitration id {frame.arbitration_id:#x} is out of range")
-    if len(frame.data) > (FD_DATA_MAX if frame.flags & FD else CLASSIC_DATA_MAX):
-        raise ValueError(f"{len(frame.data)} bytes of data do not fit into a frame")
-    word = frame.arbitration_id
-    word |= EFF_FLAG if frame.flags & EXTENDED else 0
-    word |= RTR_FLAG if frame.flags & REMOTE else 0
-    word |= ERR_FLAG if frame.flags & ERROR else 0
-    if frame.flags & FD:
-        return CANFD_FRAME.pack(word, len(frame.data), 0, frame.data)
-    return CAN_FRAME.pack(word, len(frame.data), frame.data)
 
 
 def is_bus_off(frame: CanFrame) -> bool:

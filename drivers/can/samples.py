@@ -19,28 +19,18 @@ sweep did not receive is `MISSING` in it.
 
 from __future__ import annotations
 
-import statistics
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
-from drivers.biotac import (
-    E1,
-    E24,
-    decode_words,
-)
+from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
+from drivers.biotac import E1, E24
+from drivers.can.readings import OUTAGE_NS, CanCounters, ReadingMaker
 
 REORDER_MAX: Final = 3
 """Samples may come so many electrodes late: adapters with two or three receive buffers swap
 neighbours, a bus does not."""
-PERIODS_KEPT: Final = 15
-PERIODS_NEEDED: Final = 5
-"""The period is the median of the last 15 and known after 5."""
 NEXT_SWEEP_PERIODS: Final = 0.75
 """A sample this much later than its place explains, in periods, is of another sweep. Samples of
 whole sweeps that are lost make it one period or more: a sweep broken without need is flagged, two
@@ -53,103 +43,18 @@ ARRIVAL_JITTER_NS: Final = 5_000_000
 EVEN_SHARE: Final = 1 / 3
 """Of the time from one end to the next, what two samples may at most be apart where no sweep is
 missing; one that is takes half of it."""
-OUTAGE_NS: Final = 2_000_000_000
-"""After this long, ns, nobody knows how many sweeps were made: it counts as one missed."""
 
 _ALL: Final = (1 << ELECTRODES) - 1
 
 
-@dataclass(slots=True)
-class SweepCounters(DriverCounters):
-    """What happened to samples and sweep frames on the way to a reading."""
-
-    lost_frames: int = 0
-    """Frames with electrodes that did not come although others of their sweep did."""
-    duplicate_frames: int = 0
-    """Frames that came again; the copy is dropped."""
-    reordered_frames: int = 0
-    """Frames that came after their successor and in time for their sweep; of sweep frames, those
-    of a finger after one with a higher number."""
-    late_frames: int = 0
-    """Frames that came when their sweep was over; dropped."""
-    unsynchronised_frames: int = 0
-    """Frames dropped after opening, or after a known loss, until a sweep began."""
-    untimed_frames: int = 0
-    """Samples dropped because nobody knows when they came: the loop stalled, and the bus does not
-    stamp them."""
-    unexpected_channels: int = 0
-    """Samples of a channel that the configured sequence does not have."""
-    interrupted_sweeps: int = 0
-    """Sweeps dropped because the link broke in the middle."""
-    cut_sweeps: int = 0
-    """Sweeps ended in the middle because frames were known to be lost there."""
-    restarts: int = 0
-    """Times that the device's sweep counter or clock started anew."""
-    contradicting_frames: int = 0
-    """Frames with the number of the sweep at hand and another tick; dropped."""
-    parity_words: int = 0
-    """Response words with a byte of even parity."""
-    error_words: int = 0
-    """Response words that are error words."""
-    unplugged_words: int = 0
-    """Response words of a line that nothing drives, or of a sensor that is reported absent."""
-
-
-class ReadingMaker:
-    """Numbers readings, counts what is wrong with them, knows their period."""
-
-    def __init__(self, counters: SweepCounters) -> None:
-        self.counters = counters
-        self.seq = 0
-        self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
-        self.period_ns: int | None = None
-
-    def learn(self, gap_ns: int) -> None:
-        """Take in the time between two sweeps in a row, ns."""
-        self._gaps_ns.append(gap_ns)
-        if len(self._gaps_ns) >= PERIODS_NEEDED:
-            self.period_ns = max(round(statistics.median(self._gaps_ns)), 1)
-
-    def miss(self, sweeps: int) -> None:
-        """So many sweeps were made and never arrived."""
-        self.seq += sweeps
-        self.counters.missed_readings += sweeps
-
-    def make(
-        self, words: NDArray[np.uint16], marks: NDArray[np.uint8], t_ns: int
-    ) -> TactileReading:
-        """The reading of response words, shape (fingers, 24).
-
-        `marks`: `ElectrodeFault` bits that are known beforehand; a word under `MISSING` means
-        nothing and is not looked at.
-        """
-        counts, faults = decode_words(words)
-        absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
-        faults[absent] = 0
-        if faults.any():
-            self._count_words(faults)
-        faults |= marks
-        counts[absent] = 0
-        self.counters.readings += 1
-        self.counters.faulty_readings += bool(faults.any())
-        reading = TactileReading(t_ns, self.seq, counts, faults)
-        self.seq += 1
-        return reading
-
-    def _count_words(self, faults: NDArray[np.uint8]) -> None:
-        self.counters.parity_words += int((faults == ElectrodeFault.PARITY).sum())
-        self.counters.error_words += int((faults == ElectrodeFault.ERROR_WORD).sum())
-        self.counters.unplugged_words += int((faults == ElectrodeFault.MISSING).sum())
-
-
-class SampleSweeps:
+class SampleAssembler:
     """Sweeps from single samples in the order of a sequence."""
 
     def __init__(
         self,
         sensors: int,
         sequence: Sequence[int],
-        counters: SweepCounters,
+        counters: CanCounters,
         rows: Sequence[int] | None = None,
     ) -> None:
         """`sensors`: words of a sample. `sequence`: channels in order.

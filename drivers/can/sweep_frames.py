@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.can.samples import OUTAGE_NS, ReadingMaker, SweepCounters
+from drivers.can.readings import OUTAGE_NS, CanCounters, ReadingMaker
 
 SEQUENCE_JUMP_MAX: Final = 1000
 """Sweep counters that jump by more have started anew; 1000 sweeps last ten seconds."""
@@ -25,11 +25,11 @@ PATIENCE_NS: Final = 100_000_000
 _TICKS: Final = 1 << 32
 
 
-class FrameSweeps:
+class FrameAssembler:
     """Sweeps from frames that hold all electrodes of one finger and the sweep's number."""
 
     def __init__(
-        self, fingers: int, counters: SweepCounters, order: Sequence[int] | None = None
+        self, fingers: int, counters: CanCounters, order: Sequence[int] | None = None
     ) -> None:
         """`order`: for each row when its frame comes in a sweep; each in its turn unless given."""
         self._order = range(fingers) if order is None else order

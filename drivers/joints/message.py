@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import DriverCounters
 from drivers.hand import joint_name
+from drivers.udp.link import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
 """All 28 joints in full precision have about 900 bytes."""
@@ -28,8 +28,11 @@ _NAMES_KEPT = 64
 
 
 @dataclass(slots=True)
-class JointCounters(DriverCounters):
-    """What happened to joint messages. `readings` are joint readings here."""
+class JointCounters(DatagramCounters):
+    """What happened to joint messages. `readings` are joint readings here.
+
+    `missed_readings` needs a sender that counts.
+    """
 
     bad_messages: int = 0
     """Datagrams that are not such a message; dropped."""
@@ -75,11 +78,6 @@ class JointParser:
     def __init__(self, counters: JointCounters) -> None:
         self._counters = counters
         self._joints: dict[str, str | None] = {}
-
-    @property
-    def names_kept(self) -> int:
-        """Names that are remembered, 64 at most."""
-        return len(self._joints)
 
     def parse(self, data: bytes) -> JointMessage | None:
         """The message, or None if it is none, which is counted."""

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, NamedTuple
 
-from drivers.base import ELECTRODES, DriverCounters
+from drivers.base import ELECTRODES
+from drivers.udp.link import DatagramCounters
 
 CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""
@@ -42,8 +43,8 @@ TYPE_METADATA_FIRST: Final = 0xFFF9
 TYPE_METADATA_LAST: Final = 0xFFFF
 """From here to here `tactile` holds no samples but serial numbers, versions and the like."""
 
-VALID_PAC_0, VALID_PAC_1, VALID_OTHER_0, VALID_OTHER_1 = 1, 2, 4, 8
-"""Bits of `TactileSlot.valid`."""
+VALID_OTHER_0, VALID_OTHER_1 = 4, 8
+"""Bits of `TactileSlot.valid`; 1 and 2 are those of the PAC words."""
 VALID_ALL = 0x0F
 
 _CAN_RECORD: Final = struct.Struct("<BBH8s")
@@ -103,13 +104,6 @@ class TactileSlot(NamedTuple):
     other_1: int
 
 
-class Motor(NamedTuple):
-    """One motor's record: raw torque, and a word that `motor_type` explains."""
-
-    torque: int
-    misc: int
-
-
 class CanRecord(NamedTuple):
     """One message of the hand's motor buses, appended to the packet by the palm."""
 
@@ -134,7 +128,7 @@ class PalmPacket:
     motors_arrived: int
     motors_failed: int
     motor_words: tuple[int, ...]
-    """20 words, those of `motors` one after the other."""
+    """20 words: of each of 10 motors raw torque, and a word that `motor_type` explains."""
     tactile_type: int
     """Which channels `other_0` and `other_1` are: see `position_of`."""
     tactile_valid: int
@@ -144,11 +138,6 @@ class PalmPacket:
     idle_time_us: int
     """What the palm had to spare of its millisecond; should stay above 50."""
     can_record: CanRecord | None = None
-
-    @property
-    def motors(self) -> tuple[Motor, ...]:
-        """10 records. Made when asked for: the driver never does."""
-        return tuple(map(Motor, self.motor_words[::2], self.motor_words[1::2]))
 
     def to_bytes(self) -> bytes:
         """The packet as the palm sends it; what is not read is zero. For twins and tests.
@@ -170,8 +159,11 @@ class PalmPacket:
 
 
 @dataclass(slots=True)
-class PacketCounters(DriverCounters):
-    """What the parser counts."""
+class PalmCounters(DatagramCounters):
+    """What became of packets, values and angles.
+
+    `readings` and `faulty_readings` are the tactile ones.
+    """
 
     packets: int = 0
     """Packets with sensor data."""
@@ -183,12 +175,46 @@ class PacketCounters(DriverCounters):
     """Packets of a service mode of the palm, in which `sensors` holds other things."""
     nonsense_packets: int = 0
     """Packets with a field that no palm sends."""
+    lost_packets: int = 0
+    """Packets that a round was handed over without, for whatever reason."""
+    duplicate_packets: int = 0
+    """Packets that came again; the copy is dropped."""
+    reordered_packets: int = 0
+    """Packets that came after their successor and in time for their round."""
+    late_packets: int = 0
+    """Packets that came when their round was over; dropped."""
+    conflicting_packets: int = 0
+    """Packets for a place where another one already was; both are dropped."""
+    unsynchronised_packets: int = 0
+    """Packets dropped until a round began, after opening or an outage."""
+    interrupted_rounds: int = 0
+    """Rounds dropped because the link broke in the middle."""
+    metadata_packets: int = 0
+    """Packets whose tactile part is about the sensors themselves."""
+    unknown_types: int = 0
+    """Packets whose `tactile_type` nobody knows."""
+    held_values: int = 0
+    """Electrode values that the palm marked as not fresh."""
+    not_counts: int = 0
+    """Electrode values outside 0..4095."""
+    invalid_fingers: int = 0
+    """Slots of wanted fingers that the palm marked as not valid."""
+    absent_fingers: int = 0
+    """Fingers of rounds without a sensor: channels that are no counts, or nothing but zeros."""
+    joint_readings: int = 0
+    """Joint readings handed over."""
+    bad_angles: int = 0
+    """Angles handed over as NaN although the joint is calibrated: its raw value is no count."""
+    impossible_angles: int = 0
+    """Angles handed over that are out of the joint's range by more than 10 degrees."""
+    other_palms: int = 0
+    """Packets of another kind of palm than the first since the link came up; dropped."""
 
 
 class PalmParser:
     """Datagrams in, packets out."""
 
-    def __init__(self, counters: PacketCounters) -> None:
+    def __init__(self, counters: PalmCounters) -> None:
         self._counters = counters
 
     def parse(self, data: bytes) -> PalmPacket | None:

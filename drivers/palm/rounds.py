@@ -17,13 +17,19 @@ What cannot be told: damage that leaves a value in 0..4095 and its validity bit 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, FINGERS, ElectrodeFault, TactileReading
+from drivers.base import (
+    COUNT_MAX,
+    ELECTRODES,
+    FINGERS,
+    ElectrodeFault,
+    TactileReading,
+    check_fingers,
+)
 from drivers.palm.packet import (
     CHANNELS,
     CYCLE_NS,
@@ -32,7 +38,7 @@ from drivers.palm.packet import (
     TYPE_METADATA_LAST,
     VALID_OTHER_0,
     VALID_OTHER_1,
-    PacketCounters,
+    PalmCounters,
     PalmPacket,
     position_of,
 )
@@ -49,50 +55,17 @@ _TELLING: Final = 0b11
 """The packets with pressure and temperature, by which an absent sensor is told."""
 
 
-@dataclass(slots=True)
-class RoundCounters(PacketCounters):
-    """What happened to packets and values on the way to a reading."""
-
-    lost_packets: int = 0
-    """Packets that a round was handed over without, for whatever reason."""
-    duplicate_packets: int = 0
-    """Packets that came again; the copy is dropped."""
-    reordered_packets: int = 0
-    """Packets that came after their successor and in time for their round."""
-    late_packets: int = 0
-    """Packets that came when their round was over; dropped."""
-    conflicting_packets: int = 0
-    """Packets for a place where another one already was; both are dropped."""
-    unsynchronised_packets: int = 0
-    """Packets dropped until a round began, after opening or an outage."""
-    interrupted_rounds: int = 0
-    """Rounds dropped because the link broke in the middle."""
-    metadata_packets: int = 0
-    """Packets whose tactile part is about the sensors themselves."""
-    unknown_types: int = 0
-    """Packets whose `tactile_type` nobody knows."""
-    held_values: int = 0
-    """Electrode values that the palm marked as not fresh."""
-    not_counts: int = 0
-    """Electrode values outside 0..4095."""
-    invalid_fingers: int = 0
-    """Slots of wanted fingers that the palm marked as not valid."""
-    absent_fingers: int = 0
-    """Fingers of rounds without a sensor: channels that are no counts, or nothing but zeros."""
-
-
-class PalmSweeps:
+class RoundAssembler:
     """Rounds of the fingers that are wanted, in the order in which they are wanted."""
 
     def __init__(
-        self, fingers: Sequence[str], counters: RoundCounters, *, heed_finger_bits: bool = True
+        self, fingers: Sequence[str], counters: PalmCounters, *, heed_finger_bits: bool = True
     ) -> None:
         """Without `heed_finger_bits` the packet's `tactile_valid` is ignored.
 
         Raises `ValueError` unless `fingers` are different ones of `drivers.base.FINGERS`.
         """
-        if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
-            raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
+        check_fingers(fingers)
         self._slots = tuple(FINGERS.index(finger) for finger in fingers)
         self._counters = counters
         self._heed_finger_bits = heed_finger_bits
@@ -111,11 +84,6 @@ class PalmSweeps:
     def cycles_to_go(self) -> int:
         """Packets until the round at hand can be complete; 0 while nothing is known."""
         return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
-
-    @property
-    def packets_kept(self) -> int:
-        """Packets that are remembered, 14 at most."""
-        return sum(packet is not None for packet in self._packets)
 
     def repeats(self, packet: PalmPacket) -> bool:
         """Whether the round at hand, or the one just finished, already has this very packet."""

@@ -1,4 +1,4 @@
-"""The replay: recordings played as a driver like any other, in real time, fast or step by step."""
+"""The replay: tables and streams played as a driver like any other, in real time or fast."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import (
-    FINGERS,
     ElectrodeFault,
     JointReading,
     Reading,
-    RecordingError,
     TactileReading,
+    check_fingers,
 )
 from drivers.recordings.csv_rows import Recording, Row, open_recording, read_lines
 from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
-from drivers.recordings.player import TimelineDriver
+from drivers.recordings.player import RecordedDriver, Timeline
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Synthetic grasps, drawn by `drivers.twins.grasps.synthetic`: nobody ever grasped these."""
@@ -46,8 +45,6 @@ class Pace(StrEnum):
     """As recorded (tables: at `rate_hz`), times `speed`."""
     FAST = "fast"
     """At once."""
-    STEPPED = "stepped"
-    """When `ReplayDriver.step` has released it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,12 +53,11 @@ class _Scheduled:
 
     row: Row
     joint_names: tuple[str, ...]
-    at_ns: int
-    """Since the first row of the run, as played."""
     period_ns: int | None
+    """Nominal time to the next row, as played; None before it is known."""
 
 
-class ReplayDriver(TimelineDriver[_Scheduled]):
+class ReplayDriver(RecordedDriver[_Scheduled]):
     """Plays CSV recordings, one row per call of `read_ready` at most.
 
     `fingers` picks the fingers and their order. A row gives a `TactileReading`, in a stream with
@@ -89,44 +85,49 @@ class ReplayDriver(TimelineDriver[_Scheduled]):
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        super().__init__(paths, clock)
-        if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
-            raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
+        check_fingers(fingers)
         if not RATE_MIN_HZ <= rate_hz <= RATE_MAX_HZ:
             raise ValueError(f"rate_hz is {rate_hz}, must be in {RATE_MIN_HZ}..{RATE_MAX_HZ}")
         if not SPEED_MIN <= speed <= SPEED_MAX:
             raise ValueError(f"speed is {speed}, must be in {SPEED_MIN}..{SPEED_MAX}")
+        self._delay_ns = round(faults.delayed_s * _NS_PER_S)
+        # Rows are scheduled as played, so that rounding does not add up.
+        played = None if pace is Pace.FAST else 1.0
+        super().__init__(paths, Timeline(played, clock, delay_ns=self._delay_ns))
+        self._clock = clock
         self._fingers = tuple(fingers)
-        self._pace = pace
         self._speed = speed
         self._ns_per_recorded_s = _NS_PER_S / speed
         self._table_period_ns = _NS_PER_S / (rate_hz * speed)
         self._loop = loop
         self._strict = strict
         self._faults = faults
-        self._delay_ns = round(faults.delayed_s * _NS_PER_S)
         self.ignored_columns: tuple[str, ...] = ()
         """Columns of the files that are not known, each once. Set by `open`."""
         self._reset()
 
     def _reset(self) -> None:
-        super()._reset()
         self.counters = ReplayCounters()
         self.period_ns: int | None = None
         """Nominal time, ns, between readings as played, before any fault.
 
-        Tables: from `rate_hz` and `speed`. Streams: the mean so far; None before it is known.
+        Tables: from `rate_hz` and `speed`. Streams: the shortest step so far; None before it is
+        known.
         """
         self._injector = FaultInjector(self._faults, self._fingers, self.counters)
-        self._failure: RecordingError | None = None
-        self._started_ns: int | None = None
         self._row_index = 0
         self._seq = 0
-        self._released = 0
+
+    def open(self) -> None:
+        """Check the header of every file, then start over with the first one."""
+        self.close()
+        self._reset()
+        self._check()
+        self.timeline.start(self._schedules())
 
     def _check(self) -> None:
         ignored: dict[str, None] = {}
-        for path in self._paths:
+        for path in self.paths:
             with open_recording(path) as stream:
                 ignored.update(dict.fromkeys(self._recording(path, stream).columns.ignored))
         self.ignored_columns = tuple(ignored)
@@ -134,70 +135,30 @@ class ReplayDriver(TimelineDriver[_Scheduled]):
             few = ", ".join(map(repr, self.ignored_columns[:IGNORED_COLUMNS_LOGGED]))
             _log.info("replay: unknown columns ignored: %d, such as %s", len(ignored), few)
 
-    def due_ns(self) -> int | None:
-        """When the next row is due, a time in the past for at once, or None for not by itself."""
-        if self._timeline is None or self.exhausted:
-            return None
-        if self._pace is Pace.STEPPED and self._released < 1:
-            return None
-        if self._pace is not Pace.REALTIME or self._started_ns is None or self._next is None:
-            return self._opened_ns
-        return self._started_ns + self._next.at_ns + self._delay_ns
-
-    def step(self, readings: int = 1) -> None:
-        """Let so many more rows come. For `Pace.STEPPED` only, else `ValueError`."""
-        if self._pace is not Pace.STEPPED:
-            raise ValueError(f"the pace is {self._pace}, only a stepped replay can be stepped")
-        if readings < 1:
-            raise ValueError(f"cannot step by {readings} readings")
-        self._released += readings
-
     def read_ready(self) -> Sequence[Reading]:
         """The readings of one row if it is due, else none. Raises `RecordingError` for bad rows."""
-        if self._timeline is None:
-            raise RuntimeError("the replay is not open")
-        now_ns = self._clock()
-        if self._started_ns is None:
-            self._started_ns = now_ns
-        due_ns = self.due_ns()
-        if due_ns is None or now_ns < due_ns:
+        taken = self.timeline.take()
+        if taken is None:
             return ()
-        if self._pace is Pace.STEPPED:
-            self._released -= 1
-        scheduled = self._next
-        if scheduled is None:
-            return self._give_up()
-        if self._pace is Pace.REALTIME and scheduled.period_ns is not None:
-            self.counters.late += now_ns - due_ns > scheduled.period_ns
+        at_ns, scheduled, late_ns = taken
+        if self.timeline.speed is not None and scheduled.period_ns is not None:
+            self.counters.late += late_ns > scheduled.period_ns
         self.period_ns = scheduled.period_ns
-        # Reading ahead now keeps the work of reading out of the reading's age.
-        self._prepare_next()
-        return self._readings(scheduled)
+        return self._readings(at_ns, scheduled)
 
-    def _give_up(self) -> Sequence[Reading]:
-        self.exhausted = True
-        if self._failure is not None:
-            raise self._failure
-        return ()
-
-    def _prepare_next(self) -> None:
-        """Read one row ahead; an error waits until the readings before it are handed over."""
-        try:
-            super()._prepare_next()
-        except RecordingError as error:
-            self._next, self._failure = None, error
-
-    def _play(self) -> Generator[_Scheduled, None, None]:
+    def _schedules(self) -> Generator[tuple[int, _Scheduled], None, None]:
         """All rows of all files on one time axis."""
         start_ns = 0
         while True:
-            for path in self._paths:
+            for path in self.paths:
                 with open_recording(path) as stream:
                     start_ns = yield from self._schedule(self._recording(path, stream), start_ns)
             if not self._loop:
                 return
 
-    def _schedule(self, recording: Recording, start_ns: int) -> Generator[_Scheduled, None, int]:
+    def _schedule(
+        self, recording: Recording, start_ns: int
+    ) -> Generator[tuple[int, _Scheduled], None, int]:
         """The rows of one file; returns when the file after it starts."""
         names = recording.columns.joint_names
         table_ns = self._table_period_ns
@@ -213,20 +174,20 @@ class ReplayDriver(TimelineDriver[_Scheduled]):
                 at_ns = start_ns + round((row.t_s - first_s) * self._ns_per_recorded_s)
                 if at_ns > before_ns:  # the shortest step, so that a gap is seen as a gap
                     period_ns = min(at_ns - before_ns, period_ns or at_ns)
-            yield _Scheduled(row, names, at_ns, period_ns)
+            yield at_ns, _Scheduled(row, names, period_ns)
         return at_ns + (period_ns or round(table_ns))
 
     def _recording(self, path: Path, stream: BinaryIO) -> Recording:
         return Recording(path, read_lines(path, stream), self._fingers, strict=self._strict)
 
-    def _readings(self, scheduled: _Scheduled) -> Sequence[Reading]:
+    def _readings(self, at_ns: int, scheduled: _Scheduled) -> Sequence[Reading]:
         row, index = scheduled.row, self._row_index
         self._row_index += 1
         seq = self._seq_after_faults(row, index)
         t_ns = self._clock() - self._delay_ns
-        if self._pace is Pace.REALTIME and self._started_ns is not None:
-            t_ns = self._started_ns + scheduled.at_ns
-        made_ns = round(scheduled.at_ns * self._speed)
+        if self.timeline.speed is not None:
+            t_ns = self.timeline.played_ns(at_ns)
+        made_ns = round(at_ns * self._speed)
         readings: list[Reading] = []
         if row.position_rad is not None:
             names, angles = scheduled.joint_names, row.position_rad

@@ -230,6 +230,12 @@ def columns_of(path: Path, fingers: Sequence[str]) -> Columns:
         return Recording(path, read_lines(path, file), fingers).columns
 
 
+def read_rows(path: Path, fingers: Sequence[str], *, strict: bool = False) -> Iterator[Row]:
+    """The rows of a file, as those of a `Recording`. Raises `RecordingError`."""
+    with open_recording(path) as file:
+        yield from Recording(path, read_lines(path, file), fingers, strict=strict)
+
+
 def open_recording(path: Path) -> BinaryIO:
     """Open a recording. Raises `RecordingError` unless it is a regular file that can be read."""
     try:

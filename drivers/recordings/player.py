@@ -1,40 +1,135 @@
-"""What drivers that play recordings have in common: files in a row, read one item ahead."""
+"""What drivers that play files have in common: items read one ahead, each due at its time."""
 
 from __future__ import annotations
 
 import dataclasses
-from abc import abstractmethod
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from drivers.base import Opened, Reading
+from drivers.base import Opened, Reading, RecordingError
 
 Item = TypeVar("Item")
 
 
-class TimelineDriver(Opened, Generic[Item]):
-    """Plays the items of its files, one after the other. Whoever derives says what items are."""
+class Timeline(Generic[Item]):
+    """Plays items of known times, ns on a clock of the recording's, at any speed.
+
+    The first item is due at once and begins the run when it is asked for. Reading one ahead keeps
+    the work of reading out of the age of what is read; an error waits until the items before it
+    are taken.
+    """
+
+    def __init__(self, speed: float | None, clock: Callable[[], int], *, delay_ns: int = 0) -> None:
+        """Without `speed` as fast as possible, else items come `delay_ns` late; `clock`: ns.
+
+        Raises `ValueError` for a speed that is not positive.
+        """
+        if speed is not None and not speed > 0.0:
+            raise ValueError(f"{speed} is no positive speed")
+        self.speed = speed
+        self.exhausted = False
+        """True when the last item has been taken, or after an error, until `start`."""
+        self.handed_over_ns = self._opened_ns = clock()
+        """When the last reading was handed over: what a judge must take for now, to find it as old
+        as it was found then, however busy the machine is."""
+        self._clock = clock
+        self._delay_ns = delay_ns
+        self._items: Generator[tuple[int, Item], None, None] | None = None
+        self._next: tuple[int, Item] | None = None
+        self._failure: RecordingError | None = None
+        self._began: tuple[int, int] | None = None
+        """When the first item was asked for, by the clock and by the recording's."""
+
+    def start(self, items: Generator[tuple[int, Item], None, None]) -> None:
+        """Play these from the first one on."""
+        self.stop()
+        self._began = None
+        self.handed_over_ns = self._opened_ns = self._clock()
+        self._items = items
+        self._read_ahead(items)
+
+    def stop(self) -> None:
+        """Close the file that plays."""
+        if self._items is not None:
+            self._items.close()
+            self._items = None
+
+    def due_ns(self) -> int | None:
+        """When the next item is due; a time in the past for at once; None if there is none."""
+        if self._items is None or self.exhausted:
+            return None
+        if self.speed is None or self._next is None or self._began is None:
+            return self._opened_ns
+        return self.played_ns(self._next[0]) + self._delay_ns
+
+    def played_ns(self, at_ns: int) -> int:
+        """When an item of this time should be played, monotonic ns, without any delay."""
+        began_ns, first_ns = self._began or (self._opened_ns, at_ns)
+        return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
+
+    def take(self) -> tuple[int, Item, int] | None:
+        """Time and content of the next item, and how late it is, ns; None if it is not due.
+
+        Raises `RecordingError` where the files cannot be read on.
+        """
+        if self._items is None:
+            raise RuntimeError("the replay is not open")
+        now_ns, item = self._clock(), self._next
+        if self._began is None and item is not None:
+            self._began = now_ns, item[0]
+        due_ns = self.due_ns()
+        if due_ns is None or now_ns < due_ns:
+            return None
+        if item is None:
+            self.exhausted = True
+            if self._failure is not None:
+                raise self._failure
+            return None
+        self._read_ahead(self._items)
+        return *item, now_ns - due_ns
+
+    def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
+        """A reading of the recording as one of now, as old as it was at the recording's `at_ns`.
+
+        `recorded_ns` is counted from `axis_ns`.
+        """
+        self.handed_over_ns = self._clock()
+        t_ns = self.handed_over_ns - (at_ns - made.t_ns)
+        return dataclasses.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
+
+    def _read_ahead(self, items: Generator[tuple[int, Item], None, None]) -> None:
+        self._next, self._failure = None, None
+        try:
+            self._next = next(items, None)
+            self.exhausted = self._next is None
+        except RecordingError as error:
+            self._failure = error
+            self.exhausted = False
+
+
+class RecordedDriver(Opened, Generic[Item]):
+    """A driver without a device. Whoever derives starts `timeline`, and makes readings of it."""
 
     name = "replay"
     live = False
 
-    def __init__(self, paths: Sequence[Path], clock: Callable[[], int]) -> None:
-        """Nothing is opened yet. Raises `ValueError` without files.
-
-        Whoever derives calls `_reset` at the end of its own.
-        """
+    def __init__(self, paths: Sequence[Path], timeline: Timeline[Item]) -> None:
+        """Nothing is opened yet. Raises `ValueError` without files."""
         if not paths:
             raise ValueError("no recording to replay")
-        self._paths = tuple(paths)
-        self._clock = clock
-        self._timeline: Generator[Item, None, None] | None = None
+        self.paths = tuple(paths)
+        self.timeline = timeline
 
-    def _reset(self) -> None:
-        self.exhausted = False
+    @property
+    def exhausted(self) -> bool:
         """True when the last item has been handed over, or after an error, until `open`."""
-        self._opened_ns = self._clock()
-        self._next: Item | None = None
+        return self.timeline.exhausted
+
+    @property
+    def handed_over_ns(self) -> int:
+        """When the last reading was handed over, monotonic ns; see `Timeline`."""
+        return self.timeline.handed_over_ns
 
     @property
     def serials(self) -> dict[str, str]:
@@ -43,84 +138,16 @@ class TimelineDriver(Opened, Generic[Item]):
 
     def describe(self) -> dict[str, str]:
         """Which recordings are played."""
-        return {"recordings": ", ".join(map(str, self._paths))}
-
-    def open(self) -> None:
-        """Check the beginning of every file, then start over with the first one."""
-        self.close()
-        self._reset()
-        self._check()
-        self._timeline = self._play()
-        self._prepare_next()
-
-    @abstractmethod
-    def _check(self) -> None:
-        """Raises `RecordingError` if a file is not what it should be."""
-
-    @abstractmethod
-    def _play(self) -> Generator[Item, None, None]:
-        """All items of all files."""
-
-    def _prepare_next(self) -> None:
-        if self._timeline is not None:
-            self._next = next(self._timeline, None)
-            self.exhausted = self._next is None
+        return {"recordings": ", ".join(map(str, self.paths))}
 
     def close(self) -> None:
         """Close the file that plays."""
-        if self._timeline is not None:
-            self._timeline.close()
-            self._timeline = None
+        self.timeline.stop()
 
     def fileno(self) -> int | None:
         """None: a file is always readable, the clock says when."""
         return None
 
-
-class TimedDriver(TimelineDriver[tuple[int, Item]]):
-    """Plays items of known times, ns on a clock of the recording's, at any speed."""
-
-    def __init__(
-        self, paths: Sequence[Path], speed: float | None, clock: Callable[[], int]
-    ) -> None:
-        """Without `speed` as fast as possible. Raises `ValueError` also for one that is none."""
-        super().__init__(paths, clock)
-        if speed is not None and not speed > 0.0:
-            raise ValueError(f"{speed} is no positive speed")
-        self._speed = speed
-
-    def _reset(self) -> None:
-        super()._reset()
-        self.handed_over_ns = self._opened_ns
-        """When the last reading was: what a judge must take for now, to find it as old as it was
-        found then, however busy the machine is."""
-        self._began: tuple[int, int] | None = None
-        """When the first item was played, by the clock and by the recording's."""
-
     def due_ns(self) -> int | None:
         """When the next item is due; a time in the past for at once."""
-        if self._timeline is None or self.exhausted:
-            return None
-        if self._speed is None or self._next is None or self._began is None:
-            return self._opened_ns
-        began_ns, recorded_ns = self._began
-        return began_ns + round((self._next[0] - recorded_ns) / self._speed)
-
-    def _take_due(self) -> tuple[int, Item, int] | None:
-        """Time and content of the next item, and how late it is, ns; None if it is not due."""
-        item, due_ns, now_ns = self._next, self.due_ns(), self._clock()
-        if item is None or due_ns is None or now_ns < due_ns:
-            return None
-        if self._began is None:
-            self._began = now_ns, item[0]
-        self._prepare_next()
-        return *item, now_ns - due_ns
-
-    def _hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
-        """A reading of the recording as one of now, as old as it was at the recording's `at_ns`.
-
-        `recorded_ns` is counted from `axis_ns`.
-        """
-        self.handed_over_ns = self._clock()
-        t_ns = self.handed_over_ns - (at_ns - made.t_ns)
-        return dataclasses.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
+        return self.timeline.due_ns()

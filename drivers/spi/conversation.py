@@ -1,181 +1,311 @@
-"""One session with a bridge, from its HELLO on: sweeps in, readings out. No I/O."""
+"""The host's side of the bridge's protocol: bytes in, readings and bytes out. No I/O.
+
+The protocol is `deploy/bridge/PROTOCOL.md`, its messages are `drivers.spi.messages`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
-from drivers.biotac import UNPLUGGED_WORDS, channel_of, decode_words, electrode_columns
+from drivers.base import Reading, TactileReading, sensor_rows
+from drivers.link import Link, LinkState
 from drivers.spi.clock import DeviceClock
-from drivers.spi.messages import Hello, Sweep
+from drivers.spi.framing import DELIMITER
+from drivers.spi.messages import (
+    DIGEST,
+    VERSION,
+    Hello,
+    HelloHead,
+    Message,
+    Ping,
+    Start,
+    Status,
+    Stop,
+    Sweep,
+    decode,
+    encode,
+    frame_parser,
+)
+from drivers.spi.sweeps import BridgeCounters, SweepDecoder
 
-SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
-SEQ_FIRST_MAX = 1_000
-"""A first sweep with a higher number was not lost after START: the bridge was sweeping before."""
+NAME: Final = "spi"
+GREETING_NS = 500_000_000
+"""How long the bridge may take to answer a PING at the start."""
+GREETING_TRIES = 4
+"""PINGs at the start before the port is opened anew: a board that resets when its port is opened
+needs a second or two."""
+PING_PERIOD_NS = 1_000_000_000
+PING_FIRST_NS = 50_000_000
+PINGS_FIRST = 8
+"""So many PINGs at the start follow each other quickly, so that times are good from the start."""
+NONCES = 1 << 32
+PINGS_OUT_MAX = 8
+"""PINGs that may wait for an answer; the oldest is given up."""
+PERIOD_MAX_NS = 1_000_000_000
+"""A bridge that sweeps less often is of no use, and its silence would not be noticed in time."""
+SILENCE_PERIODS = 10
+"""Sweeps that may be missing before the link is lost."""
+SILENCE_MIN_NS = 100_000_000
+"""Shortest silence that is one: above what a USB adapter or a busy host holds back."""
 
-
-@dataclass(slots=True)
-class BridgeCounters(DriverCounters):
-    """What a bridge's driver counts since `open`: every kind of drop and fault."""
-
-    bytes: int = 0
-    frames: int = 0
-    bad_cobs: int = 0
-    bad_crc: int = 0
-    too_long: int = 0
-    """Damaged frames by what gave them away, see `drivers.spi.framing`. All are dropped."""
-    unknown_frames: int = 0
-    """Whole frames of a type that no bridge of version 1 sends."""
-    bad_frames: int = 0
-    """Whole frames whose content makes no sense or does not fit the HELLO."""
-    duplicates: int = 0
-    """Sweeps that came twice, the second dropped."""
-    reordered: int = 0
-    """Sweeps that came after a later one, dropped, and so also counted as missed."""
-    stale_sweeps: int = 0
-    """Sweeps from before START, dropped."""
-    parity_words: int = 0
-    """Words of electrodes with bad parity, never a reading, and so on."""
-    error_words: int = 0
-    missing_words: int = 0
-    """Words of electrodes that nothing drove; those of absent sensors are not counted."""
-    absent_sensors: int = 0
-    """Sensors without serial number, one per sweep and sensor."""
-    link_losses: int = 0
-    """Times that the link was up and was lost."""
-    link_failures: int = 0
-    """Times that opening or greeting failed or the link was lost."""
-    refused_bridges: int = 0
-    """Greetings of a bridge with another version, layout or number of sensors."""
-    restarts: int = 0
-    """Times that the bridge said in the middle that it was reset."""
-    unanswered_pings: int = 0
-    host_tx_dropped: int = 0
-    """Frames to the bridge for which there was no room."""
-    clock_faults: int = 0
-    """Times that the bridge's clock stopped being trusted."""
-    clock_fallbacks: int = 0
-    """Readings whose time is a cautious guess from their arrival."""
-    bridge_overruns: int = 0
-    bridge_tx_dropped: int = 0
-    bridge_rx_errors: int = 0
-    """The bridge's own counters, since its reset, as it last told them."""
+_FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, Status.TYPE)
 
 
-class BridgeSession:
-    """Readings of the sweeps between one START and the loss of the link."""
+class Conversation:
+    """What is said on one port, however often it is opened. All times are monotonic ns.
+
+    Whoever has the port calls `opened`, then `receive` with what comes, then writes what `say`
+    gives and calls `sent` right before. `link` says how it stands: when it is `WAITING`, the port
+    is to be closed and opened again at `link.retry_ns`. A link log has no port and nothing to say:
+    it calls `opened`, `receive` and `sent` with what it holds.
+    """
 
     def __init__(
-        self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters, next_seq: int
+        self,
+        port: str,
+        fingers: Sequence[str],
+        sensors: Sequence[str] | None = None,
+        *,
+        nonce: int = 0,
     ) -> None:
-        """`sensors` names the bridge's sensor, from 0, of each row of a reading.
+        """`port` names it for people; `nonce` is that of the PING before the first.
 
-        The first reading made has number `next_seq`.
+        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the chip selects,
+        the same unless given. Raises `ValueError` for fingers that are none or not wired.
         """
-        self.period_ns = hello.period_ns
-        """Nominal time between sweeps, ns."""
-        self.clock = DeviceClock(hello.tick_hz)
-        self.next_seq = next_seq
-        self.hello = hello
-        """What the bridge said of itself at the start."""
-        self._sensors = tuple(sensors)
-        self._counters = counters
-        self._bridge_seq: int | None = None
-        channels = [channel_of(command) for command in hello.commands]
-        columns = electrode_columns([-1 if channel is None else channel for channel in channels])
-        samples = hello.slots * hello.sensors
-        # Where each electrode's word is in a sweep; one that is not sampled gets the word after
-        # the last, which nothing drives.
-        self._source = np.full((len(sensors), ELECTRODES), samples, dtype=np.intp)
-        for row, sensor in enumerate(sensors):
-            self._source[row, columns[:, 1]] = columns[:, 0] * hello.sensors + sensor
-        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.uint16)
-        self._is_sampled = self._source < samples
+        self.link = Link(NAME)
+        self.hello: Hello | None = None
+        """The last HELLO of a bridge that fits, None before the first."""
+        self.status: Status | None = None
+        """The last STATUS, None before the first."""
+        self._sensors = sensor_rows(fingers, sensors)
+        self._fingers = tuple(fingers)
+        self._port = port
+        self._nonce = nonce
+        self._counters = BridgeCounters()
+        self._parser, self._sent = frame_parser(), frame_parser()
+        self._next_seq = 0
+        self._sweeps: SweepDecoder | None = None
+        self._starts = False
+        self._pings: dict[int, int] = {}
+        """When the PINGs that wait for an answer were sent, by their nonce."""
+        self._pings_sent = 0
+        self._ping_due_ns = self._silent_at_ns = 0
 
-    def fits(self, hello: Hello) -> bool:
-        """Whether a later HELLO describes the same sampling."""
-        ours = self.hello
-        return (hello.sensors, hello.commands, hello.tick_hz, hello.period_ticks) == (
-            ours.sensors,
-            ours.commands,
-            ours.tick_hz,
-            ours.period_ticks,
-        )
+    @property
+    def counters(self) -> BridgeCounters:
+        """What came, and every kind of drop and fault."""
+        frames, counters = self._parser.counters, self._counters
+        counters.bytes, counters.frames = frames.bytes, frames.frames
+        counters.bad_cobs, counters.bad_crc = frames.bad_cobs, frames.bad_crc
+        counters.too_long, counters.link_losses = frames.too_long, self.link.losses
+        return counters
 
-    def round_trip(self, hello: Hello, sent_ns: int, received_ns: int) -> None:
-        """Take in the answer to a PING, for the clock."""
-        faults = self.clock.faults
-        self.clock.round_trip(hello.tick, sent_ns, received_ns)
-        self._counters.clock_faults += self.clock.faults - faults
+    @property
+    def period_ns(self) -> int | None:
+        """Nominal time between sweeps by the last HELLO, ns; None before the first."""
+        return None if self.hello is None else self.hello.period_ns
 
-    def reading(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
-        """The reading of a sweep, or None for one that is not newer or does not fit.
+    @property
+    def clock(self) -> DeviceClock | None:
+        """The bridge's clock: drift, round trip, trust. None while not greeted."""
+        return None if self._sweeps is None else self._sweeps.clock
 
-        `idle_ns` is when nothing was waiting to be read for the last time before its arrival.
-        """
-        if sweep.words.shape != (self.hello.slots, self.hello.sensors):
-            self._counters.bad_frames += 1
-            return None
-        if not self._is_next(sweep):
-            return None
-        faults, fallbacks = self.clock.faults, self.clock.fallbacks
-        t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
-        self._counters.clock_faults += self.clock.faults - faults
-        self._counters.clock_fallbacks += self.clock.fallbacks - fallbacks
-        return TactileReading(t_ns, self.next_seq - 1, *self._counts_and_faults(sweep))
+    @property
+    def serials(self) -> dict[str, str]:
+        """By finger, from the last HELLO; without the sensors that did not answer."""
+        found = () if self.hello is None else self.hello.serials
+        known = zip(self._fingers, self._sensors, strict=True)
+        return {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
-    def _is_next(self, sweep: Sweep) -> bool:
-        """Whether the sweep is newer than all before it; counts what is missing between."""
-        if self._bridge_seq is None:
-            if sweep.tick_start < self.hello.tick:
-                self._counters.stale_sweeps += 1  # it was under way when STOP arrived
-                return False
-            missed = sweep.seq if sweep.seq <= SEQ_FIRST_MAX else 0
+    @property
+    def due_ns(self) -> int:
+        """When to call `say`, though nothing has come."""
+        if self._sweeps is None:
+            return self._ping_due_ns
+        return min(self._ping_due_ns, self._silent_at_ns)
+
+    def describe(self) -> dict[str, str]:
+        """Port, link, and what the bridge last said of itself, for people."""
+        known = {"port": self._port, "link": str(self.link.state)}
+        if self.link.reason is not None:
+            known["why"] = self.link.reason
+        if self.hello is not None:
+            known.update(_about(self.hello))
+        if self.clock is not None:
+            known["clock"] = "trusted" if self.clock.trusted else "not trusted"
+            if self.clock.round_trip_ns is not None:
+                known["round trip"] = f"{self.clock.round_trip_ns / 1e6:.2f} ms"
+            if self.clock.drift_ppm is not None:
+                known["clock drift"] = f"{self.clock.drift_ppm:+.1f} ppm"
+        return known
+
+    def opened(self, now_ns: int) -> None:
+        """The port has just been opened: what was true of the bridge behind it is over."""
+        self._parser.reset()
+        self._sent.reset()
+        self._sweeps = None
+        self._starts = False
+        self._pings.clear()
+        self._pings_sent = 0
+        self._ping_due_ns = self._silent_at_ns = now_ns
+        self.link.greeting()
+
+    def lost(self, why: str, now_ns: int) -> None:
+        """Nothing more can come until `opened`."""
+        self._sweeps = None
+        self._counters.link_failures += 1
+        self._counters.unanswered_pings += len(self._pings)
+        self._pings.clear()
+        self.link.failed(why, now_ns)
+
+    def say(self, now_ns: int) -> list[bytes]:
+        """What is to be sent now, frame by frame; may find that the link is lost instead."""
+        if self.link.state is LinkState.WAITING:
+            return []
+        said = [encode(Start())] if self._starts else []
+        self._starts = False
+        if self._sweeps is not None and now_ns >= self._silent_at_ns:
+            self.lost(f"no sweep for {self._silence_ns() / 1e6:.0f} ms", now_ns)
+        elif now_ns < self._ping_due_ns:
+            return said
+        elif self._sweeps is not None:
+            is_first = self._pings_sent + 1 < PINGS_FIRST
+            self._ping_due_ns = now_ns + (PING_FIRST_NS if is_first else PING_PERIOD_NS)
+            return [*said, self._next_ping()]
+        elif self._pings_sent < GREETING_TRIES:
+            self._ping_due_ns = now_ns + GREETING_NS
+            # The zero byte ends whatever the line held before.
+            return [DELIMITER + encode(Stop()), self._next_ping()]
         else:
-            step = (sweep.seq - self._bridge_seq) % SEQ_END
-            if step == 0 or step >= SEQ_HALF:
-                self._counters.duplicates += step == 0
-                self._counters.reordered += step != 0
-                return False
-            missed = step - 1
-        self._bridge_seq = sweep.seq
-        self._counters.missed_readings += missed
-        self.next_seq += missed + 1
-        return True
+            self.lost(f"no answer from {self._port}", now_ns)
+        return []
 
-    def _counts_and_faults(self, sweep: Sweep) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-        """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
-        self._words[:-1] = sweep.words.ravel()
-        counts, faults = decode_words(self._words[self._source])
-        absent = [
-            row for row, sensor in enumerate(self._sensors) if not sweep.present >> sensor & 1
-        ]
-        if absent:
-            counts[absent] = 0
-            faults[absent] = int(ElectrodeFault.MISSING)
-        self._count(faults, absent)
-        return counts, faults
+    def sent(self, data: bytes, t_ns: int) -> None:
+        """Note what is sent: a PING is answered by a HELLO, which tells the bridge's time."""
+        for kind, payload in self._sent.feed(data):
+            message = decode(kind, payload)
+            if isinstance(message, Ping):
+                while len(self._pings) >= PINGS_OUT_MAX:
+                    self._pings.pop(next(iter(self._pings)))
+                    self._counters.unanswered_pings += 1
+                self._pings[message.nonce] = t_ns
+                self._pings_sent += 1
 
-    def _count(self, faults: NDArray[np.uint8], absent: list[int]) -> None:
-        counters = self._counters
-        counters.readings += 1
-        counters.absent_sensors += len(absent)
-        if not faults.any():
+    def not_sent(self) -> None:
+        """There was no room for a frame: it is given up."""
+        self._counters.host_tx_dropped += 1
+
+    def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
+        """The readings that these bytes complete, oldest first; never raises.
+
+        `idle_ns` is when nothing was waiting to be read for the last time before they came.
+        """
+        readings: list[Reading] = []
+        for kind, payload in self._parser.feed(chunk):
+            if self.link.state is LinkState.WAITING:
+                break  # lost because of a frame before this one
+            if kind == Hello.TYPE and not self._speaks_our_language(payload, arrival_ns):
+                continue
+            message = decode(kind, payload)
+            if message is None:
+                self._counters.bad_frames += kind in _FROM_BRIDGE
+                self._counters.unknown_frames += kind not in _FROM_BRIDGE
+            elif isinstance(message, Sweep):
+                reading = self._on_sweep(message, arrival_ns, idle_ns)
+                if reading is not None:
+                    readings.append(reading)
+            else:
+                self._on_message(message, arrival_ns)
+        return readings
+
+    def _next_ping(self) -> bytes:
+        self._nonce = (self._nonce + 1) % NONCES or 1  # 0 is that of a reset
+        return encode(Ping(self._nonce))
+
+    def _silence_ns(self) -> int:
+        return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
+
+    def _speaks_our_language(self, payload: bytes, now_ns: int) -> bool:
+        """Whether a HELLO is of our version and layout; if not the link is given up for now."""
+        head = HelloHead.from_bytes(payload)
+        if head is None or (head.version, head.digest) == (VERSION, DIGEST):
+            return True
+        if head.version != VERSION:
+            self._refuse(f"speaks version {head.version}, this is version {VERSION}", now_ns)
+        else:
+            layout = f"has layout 0x{head.digest:08X} of version {VERSION}"
+            self._refuse(f"{layout}, this is 0x{DIGEST:08X}", now_ns)
+        return False
+
+    def _refuse(self, why: str, now_ns: int) -> None:
+        self._counters.refused_bridges += 1
+        self.lost(f"{self._port}: the bridge {why}", now_ns)
+
+    def _on_message(self, message: Message, arrival_ns: int) -> None:
+        if isinstance(message, Hello):
+            self._on_hello(message, arrival_ns)
+        elif isinstance(message, Status):
+            self.status = message
+            self._counters.bridge_overruns = message.overruns
+            self._counters.bridge_tx_dropped = message.tx_dropped
+            self._counters.bridge_rx_errors = message.rx_errors
+        else:
+            self._counters.unknown_frames += 1  # our own words: an echo
+
+    def _on_hello(self, hello: Hello, arrival_ns: int) -> None:
+        if hello.nonce == 0:
+            self._on_reset(arrival_ns)
             return
-        counters.faulty_readings += 1
-        read = self._is_sampled.copy()
-        read[absent] = False
-        of_words = faults[read]
-        counters.parity_words += int((of_words == ElectrodeFault.PARITY).sum())
-        counters.error_words += int((of_words == ElectrodeFault.ERROR_WORD).sum())
-        counters.missing_words += int((of_words == ElectrodeFault.MISSING).sum())
+        sent_ns = self._pings.pop(hello.nonce, None)
+        if sent_ns is None:
+            return  # an answer that came twice or too late says nothing about time
+        if self._sweeps is None:
+            self._begin(hello, arrival_ns)
+        elif not self._sweeps.fits(hello):
+            self.lost("the bridge changed what it samples", arrival_ns)
+        if self._sweeps is not None:
+            self.hello = hello
+            self._sweeps.round_trip(hello, sent_ns, arrival_ns)
+
+    def _on_reset(self, now_ns: int) -> None:
+        """The bridge says that it has just been reset."""
+        if self._sweeps is not None:
+            self._counters.restarts += 1
+            self.lost("the bridge was reset", now_ns)
+        elif self._pings_sent < GREETING_TRIES:
+            self._ping_due_ns = now_ns
+
+    def _begin(self, hello: Hello, now_ns: int) -> None:
+        """Begin sweeping with a bridge that has just answered for the first time."""
+        needed = max(self._sensors) + 1
+        if hello.sensors < needed:
+            self._refuse(f"has {hello.sensors} sensors, the scene needs {needed}", now_ns)
+        elif hello.period_ns > PERIOD_MAX_NS:
+            self._refuse(f"sweeps once in {hello.period_ns / 1e9:g} s only", now_ns)
+        else:
+            self.hello = hello
+            self._starts = True
+            self._ping_due_ns = now_ns + PING_FIRST_NS
+            self._silent_at_ns = now_ns + self._silence_ns()
+            self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
+
+    def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
+        if self._sweeps is None:
+            self._counters.stale_sweeps += 1
+            return None
+        reading = self._sweeps.reading(sweep, arrival_ns, idle_ns)
+        if reading is None:
+            return None
+        self._next_seq = self._sweeps.next_seq
+        self._silent_at_ns = arrival_ns + self._silence_ns()
+        if self.link.state is LinkState.GREETING:
+            self.link.up(", ".join(_about(self._sweeps.hello).values()), arrival_ns)
+        return reading
 
 
-def about(hello: Hello) -> dict[str, str]:
+def _about(hello: Hello) -> dict[str, str]:
     """What a bridge says of itself, for people."""
     return {
         "board": hello.board or "unnamed",

@@ -9,11 +9,11 @@ import select
 import termios
 import time
 from collections.abc import Callable
+from enum import IntEnum
 
 import serial
 
 from drivers.base import DriverError, LinkError
-from drivers.recordings.serial_file import Way
 
 READ_BYTES = 4096
 """A terminal hands over no more than this at once."""
@@ -25,6 +25,15 @@ WRITE_TIMEOUT_S = 0.05
 """Longest wait for room that was there a moment ago."""
 
 _log = logging.getLogger(__name__)
+
+
+class LineEvent(IntEnum):
+    """What happened on a line."""
+
+    RECEIVED = 1
+    SENT = 2
+    OPENED = 3
+    """The port was opened: what came before is over."""
 
 
 class SerialLine:
@@ -39,7 +48,7 @@ class SerialLine:
         self.port = port
         self.drained = True
         """Whether the last `read` left nothing behind."""
-        self.tap: Callable[[Way, bytes], None] | None = None
+        self.tap: Callable[[LineEvent, bytes], None] | None = None
         """Gets all bytes that are read, and those that are about to be written."""
         self._baud = baud
         self._serial: serial.Serial | None = None
@@ -63,7 +72,7 @@ class SerialLine:
         self._fileno = self._descriptor()
         self._lower_latency()
         if self.tap is not None:
-            self.tap(Way.OPENED, b"")
+            self.tap(LineEvent.OPENED, b"")
 
     def close(self) -> None:
         """Give the port back. May be called more than once; a device that is gone is no error."""
@@ -109,7 +118,7 @@ class SerialLine:
                 raise LinkError(f"{self.port}: {_loss(error)}") from error
         data = b"".join(chunks)
         if self.tap is not None and data:
-            self.tap(Way.RECEIVED, data)
+            self.tap(LineEvent.RECEIVED, data)
         return data
 
     def write(self, data: bytes) -> bool:
@@ -119,7 +128,7 @@ class SerialLine:
             if self._fileno is not None and not select.select([], [self._fileno], [], 0)[1]:
                 return False
             if self.tap is not None:
-                self.tap(Way.SENT, data)
+                self.tap(LineEvent.SENT, data)
             port.write(data)
         except serial.SerialTimeoutException:
             return False

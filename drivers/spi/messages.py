@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,36 +274,30 @@ class Ping:
         return cls(*_PING.unpack(payload)) if len(payload) == _PING.size else None
 
 
-@dataclass(frozen=True, slots=True)
-class Start:
+@dataclass(frozen=True)
+class _Bare:
+    """A message that is all said by its type."""
+
+    def to_bytes(self) -> bytes:
+        """The payload: nothing."""
+        return b""
+
+    @classmethod
+    def from_bytes(cls, payload: bytes) -> Self | None:
+        """The message, or None if there is a payload."""
+        return None if payload else cls()
+
+
+class Start(_Bare):
     """Begins sweeping with sequence number 0; ignored while sweeping."""
 
     TYPE: ClassVar[int] = 0x82
 
-    def to_bytes(self) -> bytes:
-        """The payload: nothing."""
-        return b""
 
-    @classmethod
-    def from_bytes(cls, payload: bytes) -> Start | None:
-        """The message, or None if there is a payload."""
-        return None if payload else cls()
-
-
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(_Bare):
     """Ends sweeping after the sweep at hand."""
 
     TYPE: ClassVar[int] = 0x83
-
-    def to_bytes(self) -> bytes:
-        """The payload: nothing."""
-        return b""
-
-    @classmethod
-    def from_bytes(cls, payload: bytes) -> Stop | None:
-        """The message, or None if there is a payload."""
-        return None if payload else cls()
 
 
 Message = Hello | Sweep | Status | Ping | Start | Stop

@@ -7,7 +7,7 @@ import dataclasses
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import can
@@ -63,7 +63,6 @@ class CanTwin(Opened):
         rate_hz: float = 100.0,
         first_sweep: int = 0,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
-        bus_options: Mapping[str, Any] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._format = CanFormat(format)
@@ -89,11 +88,11 @@ class CanTwin(Opened):
         self._injector = LinkFaultInjector(dataclasses.replace(faults, burst_frames=1))
         self._clock = clock
         self._interface, self._channel = interface, channel
-        self._options = dict(bus_options or {})
+        self._options: dict[str, Any] = {}
         if is_sweep and interface == "virtual":
-            self._options.setdefault("protocol", can.CanProtocol.CAN_FD)
+            self._options["protocol"] = can.CanProtocol.CAN_FD
         elif is_sweep:
-            self._options.setdefault("fd", True)
+            self._options["fd"] = True
         self._send_timeout_s = 0.0 if interface == "virtual" else SEND_TIMEOUT_S
         self._bus: can.BusABC | None = None
         self._held_id: int | None = None

@@ -141,11 +141,6 @@ class SpiTwin(Opened):
         """Faults injected so far by name."""
         return self._injector.injected
 
-    @property
-    def started(self) -> bool:
-        """Whether the host has asked for sweeps."""
-        return self._started
-
     def open(self) -> None:
         """Plug in."""
         self.plug()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from dataclasses import dataclass
 
-from drivers.base import LinkError
+from drivers.base import DriverCounters, LinkError
 from drivers.link import Link, LinkState
 from drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
 
@@ -13,14 +14,15 @@ DRAIN_MAX = 256
 """Datagrams taken at once at most: a flood must not keep the loop from its other work."""
 
 
-class DatagramCounters(Protocol):
+@dataclass(slots=True)
+class DatagramCounters(DriverCounters):
     """What the link counts, in the counters of its driver."""
 
-    foreign_datagrams: int
-    """From another sender than the one that is listened to."""
-    kernel_drops: int
-    """Dropped by the kernel because nobody took them in time."""
-    link_losses: int
+    foreign_datagrams: int = 0
+    """Datagrams from another sender than the one that is listened to; dropped."""
+    kernel_drops: int = 0
+    """Datagrams that the kernel dropped because nobody took them in time."""
+    link_losses: int = 0
     """Times that the link was up and fell silent or broke."""
 
 
@@ -35,31 +37,36 @@ class DatagramLink:
     def __init__(
         self,
         name: str,
-        endpoint: Endpoint,
-        counters: DatagramCounters,
+        source: str,
         clock: Callable[[], int],
         *,
         bytes_max: int,
         silence_ns: int,
         only_from: str | None = None,
     ) -> None:
-        """Without a good datagram for `silence_ns` the link is lost. `clock` gives monotonic ns."""
-        self._endpoint = endpoint
+        """`source` is `udp://ADDRESS:PORT`, `only_from` an IP address; `clock` gives monotonic ns.
+
+        Without a good datagram for `silence_ns` the link is lost. Raises `ValueError`.
+        """
+        self._name = name
+        self._endpoint = Endpoint.parse(source)
+        self._only_from = None if only_from is None else str(ipaddress.ip_address(only_from))
         self._bytes_max = bytes_max
         self._silence_ns = silence_ns
-        self._only_from = only_from
-        self._counters = counters
         self._clock = clock
-        self._link = Link(name, clock)
         self._receiver: DatagramReceiver | None = None
+        self._described = {"source": str(self._endpoint)}
+        self._begin(DatagramCounters())
+
+    def _begin(self, counters: DatagramCounters) -> None:
+        self._counters = counters
+        self._link = Link(self._name)
         self._earlier_drops = 0
         self._sender: Sender | None = None
         self._heard: Sender = ("", 0)
         self._t_ns = 0
         self._good_t_ns = 0
-        self.failure: str | None = None
-        """Why the link is down, if it is and that is known."""
-        self.heard: str | None = None
+        self._heard_from: str | None = None
         """What was heard last, from whom."""
 
     @property
@@ -73,23 +80,29 @@ class DatagramLink:
         return None if self._receiver is None else self._receiver.port
 
     def describe(self) -> dict[str, str]:
-        """Address, state, what is heard and why it is not, for people."""
+        """Address, state, what is heard and why it is not, for people; after `close` as then."""
+        if self._link.state is LinkState.CLOSED:
+            return self._described
         known = {"source": str(self._endpoint), "link": str(self._link.state)}
-        if self.heard is not None:
-            known["heard"] = self.heard
-        if self.failure is not None:
-            known["why"] = self.failure
+        if self._heard_from is not None:
+            known["heard"] = self._heard_from
+        if self._link.reason is not None:
+            known["why"] = self._link.reason
         return known
 
-    def open(self) -> None:
-        """Listen. Raises `LinkError`: at the start a wrong address is a mistake in the scene."""
+    def open(self, counters: DatagramCounters) -> None:
+        """Listen, and count there. Raises `LinkError`: at the start that is the scene's mistake."""
         self.close()
-        self._link.start()
-        self._listen()
+        self._begin(counters)
+        receiver = DatagramReceiver(self._endpoint, self._bytes_max)
+        self._link.start(self._clock())
+        self._listen(receiver)
 
     def close(self) -> None:
         """Stop listening."""
+        self._described = self.describe()
         self._drop_receiver()
+        self._sender = None
         self._link.close()
 
     def fileno(self) -> int | None:
@@ -107,6 +120,8 @@ class DatagramLink:
 
         Whoever takes one and finds it good calls `confirm` before the next.
         """
+        if self._link.state is LinkState.CLOSED:
+            raise RuntimeError(f"the {self._name} link is not open")
         receiver = self._receiver or self._listen_again()
         if receiver is None:
             return
@@ -129,9 +144,8 @@ class DatagramLink:
         self._good_t_ns = self._t_ns
         if self._link.state is not LinkState.UP:
             self._sender = self._heard
-            self.heard = f"{what} from {self._heard[0]} port {self._heard[1]}"
-            self.failure = None
-            self._link.up(self.heard)
+            self._heard_from = f"{what} from {self._heard[0]} port {self._heard[1]}"
+            self._link.up(self._heard_from, self._clock())
 
     def fell_silent(self) -> bool:
         """Call after `receive`: whether the link is down now and was up the last time."""
@@ -151,20 +165,19 @@ class DatagramLink:
         return self._only_from is None or sender[0] == self._only_from
 
     def _lose(self, why: str) -> None:
-        self._counters.link_losses += self._link.state is LinkState.UP
-        self.failure = why
-        self._link.failed(why)
+        self._link.failed(why, self._clock())
+        self._counters.link_losses = self._link.losses
 
-    def _listen(self) -> DatagramReceiver:
-        self._receiver = DatagramReceiver(self._endpoint, self._bytes_max)
+    def _listen(self, receiver: DatagramReceiver) -> DatagramReceiver:
+        self._receiver = receiver
         self._link.greeting()
-        return self._receiver
+        return receiver
 
     def _listen_again(self) -> DatagramReceiver | None:
-        if self._link.retry_ns is None or self._clock() < self._link.retry_ns:
+        if not self._link.is_due(self._clock()):
             return None
         try:
-            return self._listen()
+            return self._listen(DatagramReceiver(self._endpoint, self._bytes_max))
         except LinkError as error:
             self._lose(str(error))
             return None
@@ -174,4 +187,3 @@ class DatagramLink:
             self._earlier_drops += self._receiver.dropped
             self._receiver.close()
             self._receiver = None
-        self._sender = None if self._link.state is LinkState.CLOSED else self._sender

@@ -30,10 +30,12 @@ from drivers.base import TactileReading
 from drivers.biotac import SEQUENCES
 from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
 from drivers.can.driver import CanBridgeDriver
-from drivers.can.frames import CanFrame, pack_frame
+from drivers.can.frames import CanFrame
 from drivers.twins.can import CanTwin
-from drivers.twins.grasps.grasps import Counts, GeneratedContact
-from tests.drivers.can.can_standin import LOOPBACK, SocketBus
+from drivers.twins.grasps.grasps import Counts
+from tests.drivers.can.can_standin import LOOPBACK, SocketBus, bus_options
+from tests.drivers.can.can_words import pack_frame
+from tests.drivers.twins.signals import GeneratedContact
 
 Result = dict[str, object]
 SAMPLE_ID = 0x100
@@ -73,14 +75,16 @@ def limited(counts: Iterator[Counts], sweeps: int) -> Iterator[Counts]:
 
 def serve(interface: str, frame_format: str, rate_hz: float, sweeps: int, go: ProcessEvent) -> None:
     counts = limited(GeneratedContact(rate_hz=rate_hz), sweeps)
-    with CanTwin(
-        interface,
-        GROUP,
-        counts,
-        format=frame_format,
-        rate_hz=rate_hz,
-        bus_options=options_of(interface),
-    ) as twin:
+    with (
+        bus_options(**options_of(interface)),
+        CanTwin(
+            interface,
+            GROUP,
+            counts,
+            format=frame_format,
+            rate_hz=rate_hz,
+        ) as twin,
+    ):
         go.wait()
         twin.serve(threading.Event())
 
@@ -93,7 +97,6 @@ def over_bus(interface: str, frame_format: str, frames_per_s: float, seconds: fl
         GROUP,
         format=frame_format,
         arbitration_id=SAMPLE_ID if frame_format == "syntouch" else None,
-        bus_options=options_of(interface),
     )
     go = multiprocessing.Event()
     arguments = (interface, frame_format, rate_hz, sweeps, go)
@@ -102,7 +105,7 @@ def over_bus(interface: str, frame_format: str, frames_per_s: float, seconds: fl
         sender = threading.Thread(target=serve, args=arguments)
     else:
         sender = multiprocessing.Process(target=serve, args=arguments)
-    with driver:
+    with bus_options(**options_of(interface)), driver:
         sender.start()
         try:
             result = consume(driver, sweeps, seconds + 2.0, go.set)

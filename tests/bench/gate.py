@@ -23,7 +23,6 @@ from daemon.judge.reasons import Outcome
 from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.tactile_noise import fresh_residuals
 from drivers.twins.grasps.whole_grasps import (
     Moment,
     Sampling,
@@ -33,6 +32,7 @@ from drivers.twins.grasps.whole_grasps import (
 )
 from models import zoo
 from models.runtime import TactileModel
+from tests.drivers.twins.signals import crept_s, fresh_residuals, played
 
 TABLES = ("palm_down", "palm_side")
 MAX_AGE_NS = 100_000_000
@@ -60,7 +60,7 @@ class Seen:
     @property
     def waited_s(self) -> float:
         """From the moment when everything is still to the first verdict, s."""
-        return self.judged[0][0] - self.truth.crept_s(RATE_LIMIT)
+        return self.judged[0][0] - crept_s(self.truth, RATE_LIMIT)
 
 
 @dataclass(slots=True)
@@ -150,9 +150,9 @@ def streams(
     noise = residuals(data / "untouched")
     return {
         "71.43 Hz held": WholeGrasps(
-            rest, points, sampling=Sampling.HELD, residuals=noise, seed=seed
+            rest, points, sampling=Sampling.HELD, noise=played(noise), seed=seed
         ),
-        "100 Hz fresh": WholeGrasps(rest, points, residuals=noise, seed=seed),
+        "100 Hz fresh": WholeGrasps(rest, points, noise=played(noise), seed=seed),
     }
 
 

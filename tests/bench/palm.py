@@ -21,8 +21,8 @@ import numpy as np
 
 from drivers.base import TactileReading
 from drivers.palm.driver import PalmDriver
-from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.palm import PalmTwin
+from tests.drivers.twins.signals import GeneratedContact
 
 EXAMPLE = Path(__file__).parents[2] / "deploy" / "calibration" / "example_hand.toml"
 PACKETS_PER_S = 1000

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from drivers.spi.driver import SpiBridgeDriver
-from drivers.twins.grasps.grasps import GeneratedContact
 from drivers.twins.spi import SpiTwin
 from tests.drivers.spi.bridge_bench import FINGERS, replug_times_s
+from tests.drivers.twins.signals import GeneratedContact
 
 
 def serve(path: Path, rate_hz: float) -> None:

@@ -17,15 +17,12 @@ from drivers.biotac import (
     SEQUENCE_ALL,
     SEQUENCE_ELECTRODES,
     SEQUENCE_INTERLEAVED,
-    SEQUENCE_PRESSURE,
     TAC,
     TDC,
     channel_of,
-    counts_of_impedance,
     decode_words,
     electrode_columns,
     encode_word,
-    impedance_ohm,
     sample_command,
 )
 
@@ -135,20 +132,12 @@ def test_sequences_are_those_of_the_manual() -> None:
     electrodes = list(range(17, 41))
     assert list(SEQUENCE_ELECTRODES) == electrodes
     assert sorted(SEQUENCE_ALL) == [0, 1, 2, 3, *electrodes]
-    assert SEQUENCE_PRESSURE == (PAC, PDC)
-    lengths = (SEQUENCE_INTERLEAVED, SEQUENCE_ALL, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE)
-    assert [len(sequence) for sequence in lengths] == [54, 28, 24, 2]
+    lengths = (SEQUENCE_INTERLEAVED, SEQUENCE_ALL, SEQUENCE_ELECTRODES)
+    assert [len(sequence) for sequence in lengths] == [54, 28, 24]
     assert set(SEQUENCE_INTERLEAVED[1::2]) == {PAC}
     assert list(SEQUENCE_INTERLEAVED[::2]) == [*electrodes, PDC, TAC, TDC]
 
 
 def test_electrodes_are_found_in_a_sequence() -> None:
     assert electrode_columns([PAC, E1 + 5, TDC, E1]).tolist() == [[1, 5], [3, 0]]
-    assert electrode_columns(SEQUENCE_PRESSURE).shape == (0, 2)
-
-
-# Manual section 5.1: R = (4095 / E - 1) * 10 kohm.
-@pytest.mark.parametrize(("count", "ohm"), [(4095, 0.0), (1365, 20e3), (819, 40e3), (0, np.inf)])
-def test_impedance_is_that_of_the_manual(count: int, ohm: float) -> None:
-    assert impedance_ohm(words(count)).tolist() == [ohm]
-    assert counts_of_impedance(np.array([ohm])).tolist() == [count]
+    assert electrode_columns((PAC, PDC)).shape == (0, 2)

@@ -12,35 +12,35 @@ from tests.drivers.spi.bridge_bench import Clock
 
 def test_patience_grows_up_to_a_limit_and_begins_anew_when_the_link_is_up() -> None:
     clock = Clock()
-    link = Link("spi", clock)
-    link.start()
+    link = Link("spi")
+    link.start(clock.now_ns)
     assert link.retry_ns == clock.now_ns
     waits_s = []
     for _ in range(12):
-        link.failed("not there")
+        link.failed("not there", clock.now_ns)
         assert link.retry_ns is not None
         waits_s.append((link.retry_ns - clock.now_ns) / 1e9)
         clock.now_ns = link.retry_ns
     assert waits_s == sorted(waits_s)
     assert (waits_s[0], waits_s[-1]) == (BACKOFF_FIRST_S, BACKOFF_MAX_S)
     link.greeting()
-    link.up("a device")
-    link.failed("gone")
+    link.up("a device", clock.now_ns)
+    link.failed("gone", clock.now_ns)
     assert link.retry_ns is not None
     assert (link.retry_ns - clock.now_ns) / 1e9 == BACKOFF_FIRST_S
 
 
 def test_only_a_link_that_was_up_is_lost() -> None:
-    link = Link("spi", Clock())
-    link.start()
-    link.failed("not there")
+    link = Link("spi")
+    link.start(0)
+    link.failed("not there", 0)
     link.greeting()
-    link.failed("no answer")
+    link.failed("no answer", 0)
     assert link.losses == 0
     link.greeting()
-    link.up("a device")
+    link.up("a device", 0)
     assert (link.state, link.reason, link.retry_ns) == (LinkState.UP, None, None)
-    link.failed("gone")
+    link.failed("gone", 0)
     assert link.losses == 1
     assert link.reason == "gone"
     link.close()
@@ -48,14 +48,14 @@ def test_only_a_link_that_was_up_is_lost() -> None:
 
 
 def test_a_reason_is_warned_of_once_per_outage(caplog: pytest.LogCaptureFixture) -> None:
-    link = Link("spi", Clock())
+    link = Link("spi")
     with caplog.at_level(logging.DEBUG):
-        link.start()
+        link.start(0)
         for _ in range(50):
-            link.failed("not there")
-            link.failed("wrong version")
-        link.up("a device")
-        link.failed("not there")
+            link.failed("not there", 0)
+            link.failed("wrong version", 0)
+        link.up("a device", 0)
+        link.failed("not there", 0)
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert warnings == [
         "spi: not there; trying again",
@@ -67,9 +67,9 @@ def test_a_reason_is_warned_of_once_per_outage(caplog: pytest.LogCaptureFixture)
 def test_reasons_that_never_repeat_do_not_fill_the_journal(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    link = Link("spi", Clock())
-    link.start()
+    link = Link("spi")
+    link.start(0)
     with caplog.at_level(logging.WARNING):
         for number in range(1000):
-            link.failed(f"reason {number}")
+            link.failed(f"reason {number}", 0)
     assert len(caplog.records) == 8

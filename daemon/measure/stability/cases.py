@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
-from drivers.recordings.csv_rows import Recording, open_recording, read_lines
+from drivers.recordings.csv_rows import read_rows
 from models.bts3 import TABLES
 from models.contract import SeenCounts
 
@@ -158,6 +158,4 @@ def _not_counts(fingers: int, likely: NDArray[np.uint16]) -> Iterator[StabilityC
 
 def _counts(path: Path, fingers: Sequence[str]) -> NDArray[np.uint16]:
     """Counts (N, fingers, 24) of the rows of a recording."""
-    with open_recording(path) as file:
-        rows = [row.counts for row in Recording(path, read_lines(path, file), fingers)]
-    return np.array(rows)
+    return np.array([row.counts for row in read_rows(path, fingers)])

@@ -9,11 +9,11 @@ import numpy as np
 from daemon.measure.stability.steps import StepRow
 from drivers.base import ELECTRODES
 from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.can.samples import SweepCounters
-from drivers.can.sweep_frames import FrameSweeps
+from drivers.can.readings import CanCounters
+from drivers.can.sweep_frames import FrameAssembler
 from drivers.spi.clock import UNKNOWN_DELAY_NS, DeviceClock
-from drivers.spi.conversation import BridgeCounters, BridgeSession
 from drivers.spi.messages import Hello, Sweep
+from drivers.spi.sweeps import BridgeCounters, SweepDecoder
 
 TICK_HZ = 1_000_000
 S, MS = 1_000_000_000, 1_000_000
@@ -98,8 +98,8 @@ def _follow_clock(step_s: float, first_tick: int) -> tuple[int, int, bool]:
 
 def _frames_around_wrap() -> tuple[int, int, int]:
     """Readings, missed ones and restarts of a board whose counters wrap in the middle."""
-    counters = SweepCounters()
-    sweeps = FrameSweeps(3, counters)
+    counters = CanCounters()
+    sweeps = FrameAssembler(3, counters)
     words = encode_word(2000).to_bytes(2, "big") * ELECTRODES
     readings = 0
     for number in range(-FRAMES // 2, FRAMES // 2):
@@ -115,14 +115,14 @@ def _bridge_around_wrap() -> tuple[int, int, list[int]]:
     commands = tuple(sample_command(channel) for channel in SEQUENCE_ELECTRODES)
     hello = Hello(1, 0, TICK_HZ, PERIOD_NS // 1_000, ("a", "b", "c"), commands)
     counters = BridgeCounters()
-    session = BridgeSession(hello, (0, 1, 2), counters, 0)
+    sweeps = SweepDecoder(hello, (0, 1, 2), counters, 0)
     words = np.full((len(commands), 3), encode_word(2000), dtype=np.uint16)
     numbers = []
     for number in range(FRAMES):
         made_ns = S + number * PERIOD_NS
         seq = (number - FRAMES // 2) % (1 << 32)
         tick = made_ns // 1_000
-        reading = session.reading(
+        reading = sweeps.reading(
             Sweep(seq, tick - 1, tick, 0b111, words), made_ns + WAY_NS, made_ns
         )
         if reading is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -118,17 +117,6 @@ class Timetable:
     creep_tau_s: float
     creep_counts_per_s: float
     """Mean over all electrodes of how fast they creep at `closed_s`, counts/s."""
-
-    def crept_s(self, rate_counts_per_s: float) -> float:
-        """When the mean rate of the electrodes falls below this rate, s, leaving out the lift.
-
-        Never before `closed_s`; later than `lift_s` if the lift comes first.
-        """
-        if self.creep_counts_per_s <= rate_counts_per_s:
-            return self.closed_s
-        return self.closed_s + self.creep_tau_s * math.log(
-            self.creep_counts_per_s / rate_counts_per_s
-        )
 
     def phase(self, t_s: float) -> Phase:
         """What the hand does at a time; outside of the grasp it rests."""

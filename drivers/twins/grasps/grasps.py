@@ -1,4 +1,4 @@
-"""What a hardware twin's sensors feel: a recording, or a generated contact with measured noise."""
+"""What a hardware twin's sensors feel: a recording; and the noise that recordings show."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES, FINGERS, RecordingError
-from drivers.recordings.csv_rows import Recording, open_recording, read_lines
+from drivers.recordings.csv_rows import read_rows
 
 Counts = NDArray[np.uint16]
 """Shape (fingers, 24), raw counts 0..4095."""
@@ -24,13 +24,6 @@ SPIKE_COUNTS = (25.0, 150.0)
 """Depth of a spike, counts; upward spikes were never seen."""
 DRIFT_COUNTS_PER_S = 0.7
 """Warm-up drift, counts/s; measured 0.56 to 0.84, always upward."""
-UNTOUCHED_COUNTS = (2400.0, 3400.0)
-"""Range in which untouched electrodes rest, counts."""
-CONTACT_COUNTS = 700.0
-"""Deepest fall of an electrode under the generated contact, counts."""
-CONTACT_PERIOD_S = 4.0
-"""A touch comes and goes this often, s."""
-
 TACTILES_COLUMN = "tactiles"
 """Column of a Shadow hand's recording as exported from a ROS bag: its header has 43 columns, its
 rows have 38, and finger i starts at column 8 + 6 i in the order FF MF RF LF TH."""
@@ -50,13 +43,10 @@ def recorded_counts(path: Path, fingers: Sequence[str] = ("ff", "mf", "th")) -> 
     if TACTILES_COLUMN in header.split(","):
         yield from _exported_counts(path, fingers)
         return
-    with open_recording(path) as file:
-        for row in Recording(path, read_lines(path, file), fingers):
-            if row.faults.any():
-                raise RecordingError(
-                    path, "holds a value that is no count", line=row.annotation.line
-                )
-            yield row.counts
+    for row in read_rows(path, fingers):
+        if row.faults.any():
+            raise RecordingError(path, "holds a value that is no count", line=row.annotation.line)
+        yield row.counts
 
 
 def _exported_counts(path: Path, fingers: Sequence[str]) -> Iterator[Counts]:
@@ -76,29 +66,3 @@ def _electrodes(cells: Sequence[str], finger: str) -> list[int]:
     if len(counts) != ELECTRODES or not all(0 <= count <= COUNT_MAX for count in counts):
         raise ValueError(f"{finger} has no {ELECTRODES} counts")
     return list(counts)
-
-
-class GeneratedContact:
-    """An endless, synthetic contact: rest, a touch that comes and goes, and the measured noise."""
-
-    def __init__(self, fingers: int = 3, rate_hz: float = 100.0, seed: int = 0) -> None:
-        """`rate_hz` is how many readings make a second; the same seed gives the same counts."""
-        self._random = np.random.default_rng(seed)
-        shape = (fingers, ELECTRODES)
-        self._rest = self._random.uniform(*UNTOUCHED_COUNTS, shape)
-        self._yielding = self._random.uniform(0.0, CONTACT_COUNTS, shape)
-        self._period_s = 1.0 / rate_hz
-        self._t_s = 0.0
-
-    def __iter__(self) -> Iterator[Counts]:
-        return self
-
-    def __next__(self) -> Counts:
-        touch = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._t_s / CONTACT_PERIOD_S)
-        counts = self._rest - touch * self._yielding + DRIFT_COUNTS_PER_S * self._t_s
-        counts = counts + self._random.normal(0.0, NOISE_COUNTS, counts.shape)
-        spiked = self._random.random(counts.shape) < SPIKE_PROBABILITY
-        counts = counts - spiked * self._random.uniform(*SPIKE_COUNTS, counts.shape)
-        self._t_s += self._period_s
-        readable: Counts = np.clip(np.rint(counts), 1, COUNT_MAX - 1).astype(np.uint16)
-        return readable

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from drivers.base import ELECTRODES, RecordingError
 from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
 from drivers.recordings.csv_player import DEMO_TABLE
-from drivers.recordings.csv_rows import Recording, open_recording, read_lines
+from drivers.recordings.csv_rows import read_rows
 
 FINGERS = ("ff", "mf", "th")
 COUNTS = len(FINGERS) * ELECTRODES
@@ -125,12 +125,11 @@ def read_tables(paths: Sequence[Path]) -> tuple[NDArray[np.uint16], NDArray[np.b
     """Counts (grasps, 72) and labels (grasps,) of labelled tables. Raises `RecordingError`."""
     counts, slipped = [], []
     for path in paths:
-        with open_recording(path) as stream:
-            for row in Recording(path, read_lines(path, stream), FINGERS, strict=True):
-                if row.annotation.slipped is None:
-                    raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
-                counts.append(row.counts.ravel())
-                slipped.append(row.annotation.slipped)
+        for row in read_rows(path, FINGERS, strict=True):
+            if row.annotation.slipped is None:
+                raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
+            counts.append(row.counts.ravel())
+            slipped.append(row.annotation.slipped)
     return np.array(counts, dtype=np.uint16), np.array(slipped, dtype=np.bool_)
 
 

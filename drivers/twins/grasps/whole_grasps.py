@@ -10,7 +10,7 @@ lies at or below the rest; see `rest_above`.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import count
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
 from drivers.recordings.csv_columns import OBJECT, SLIPPED, TIME, electrode_columns
 from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.recordings.csv_rows import Recording, open_recording, read_lines
+from drivers.recordings.csv_rows import read_rows
 from drivers.twins.grasps import synthetic
 from drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
@@ -34,13 +34,12 @@ from drivers.twins.grasps.grasp_script import (
     Timetable,
     check_rest,
 )
-from drivers.twins.grasps.tactile_noise import MeasuredNoise, PlayedNoise, TactileNoise
+from drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
 
 RATE_HZ = 100.0
 """Rows per second of the public recordings, and sweeps per second of an SPI bridge."""
 PALM_RATE_HZ = 1000 / 14
 """Sweeps per second of a palm: 14 requests of a millisecond each."""
-HELD_PERIOD_MS = 10
 ROUND_MS = 14
 PLACES_MS = 1 + np.arange(1, ELECTRODES + 1) // 2
 """Shape (24,): when in a round an electrode is sampled, ms. PDC/TAC, TDC/E1, E2/E3, ... E24."""
@@ -106,25 +105,22 @@ class WholeGrasps:
         *,
         sampling: Sampling = Sampling.FRESH,
         rate_hz: float = RATE_HZ,
-        residuals: NDArray[np.float64] | None = None,
+        noise: Callable[[int, np.random.Generator], TactileNoise] = MeasuredNoise,
         durations: Durations = Durations(),  # noqa: B008 (immutable)
         loop: bool = False,
         seed: int = 0,
     ) -> None:
         """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points for ever.
 
-        Noise is the measured model, or else `residuals`, counts of shape (rows, fingers, 24), one
-        row per sweep in a loop from a random start (see `tactile_noise.fresh_residuals`). Raises
-        `ValueError` for shapes that do not fit, for no end points, and for a rate that is not
-        positive or, held, not 100 Hz.
+        `noise` is made of the number of fingers and a source of chance. Raises `ValueError` for
+        shapes that do not fit, for no end points, and for a rate that is not positive or, held,
+        not 100 Hz.
         """
         check_rest(rest)
         if not end_points:
             raise ValueError("there are no end points to grasp")
         if any(end_point.counts.shape != rest.shape for end_point in end_points):
             raise ValueError(f"an end point has not the shape of the rest, {rest.shape}")
-        if residuals is not None and (not len(residuals) or residuals.shape[1:] != rest.shape):
-            raise ValueError(f"residuals have shape {residuals.shape}, not (rows, *{rest.shape})")
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         if sampling is Sampling.HELD and rate_hz != RATE_HZ:
@@ -133,7 +129,7 @@ class WholeGrasps:
         self._end_points = end_points
         self._sampling = sampling
         self._rate_hz = rate_hz
-        self._residuals = residuals
+        self._noise = noise
         self._durations = durations
         self._loop = loop
         self._seed = seed
@@ -173,13 +169,8 @@ class WholeGrasps:
             start_s = script.timetable.end_s
 
     def _sampler(self, rng: np.random.Generator) -> _Fresh | _Held:
-        noise: TactileNoise
-        if self._residuals is None:
-            noise = MeasuredNoise(len(self._rest), rng)
-        else:
-            noise = PlayedNoise(self._residuals, rng)
         kind = _Held if self._sampling is Sampling.HELD else _Fresh
-        return kind(self._rest, noise)
+        return kind(self._rest, self._noise(len(self._rest), rng))
 
 
 class _Fresh:
@@ -275,14 +266,13 @@ def synthetic_grasps(
 def read_end_points(path: Path) -> list[EndPoint]:
     """The grasps of a labelled table in the order of the file. Raises `RecordingError`."""
     end_points = []
-    with open_recording(path) as stream:
-        for row in Recording(path, read_lines(path, stream), synthetic.FINGERS, strict=True):
-            note = row.annotation
-            if row.t_s is not None:
-                raise RecordingError(path, "a stream, not a table of grasps", column=TIME)
-            if note.slipped is None:
-                raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
-            end_points.append(EndPoint(row.counts, note.slipped, note.object_name or ""))
+    for row in read_rows(path, synthetic.FINGERS, strict=True):
+        note = row.annotation
+        if row.t_s is not None:
+            raise RecordingError(path, "a stream, not a table of grasps", column=TIME)
+        if note.slipped is None:
+            raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
+        end_points.append(EndPoint(row.counts, note.slipped, note.object_name or ""))
     return end_points
 
 

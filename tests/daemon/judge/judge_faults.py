@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.packet import ROUND, PalmParser
-from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.palm.packet import ROUND, PalmCounters, PalmParser
+from drivers.palm.rounds import RoundAssembler
 from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
@@ -133,8 +133,8 @@ def on_a_palm_link(faults: LinkFaults) -> Fault:
     def spoil(sound: Sequence[Step]) -> list[Step]:
         counts = [step.tactile.counts for step in sound if step.tactile is not None]
         joints = {step.now_ns: step.joints for step in sound}
-        counters = RoundCounters()
-        parser, sweeps = PalmParser(counters), PalmSweeps(FINGERS, counters)
+        counters = PalmCounters()
+        parser, sweeps = PalmParser(counters), RoundAssembler(FINGERS, counters)
         before = PalmTwin([counts[0]] * SYNCHRONISING, seed=1).packets()
         lead_in = ([packet.to_bytes()] for packet in before)
         steps: list[Step] = []

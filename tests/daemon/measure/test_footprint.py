@@ -37,13 +37,14 @@ NEVER = {
         "daemon.record.files",
         "daemon.assembly.recorder",
         "daemon.assembly.playback",
-        "daemon.assembly.captures",
+        "daemon.assembly.link_logs",
     ),
     *(
         "daemon.record.mcap",
         "daemon.record.player",
-        "drivers.recordings.candump",
-        "drivers.recordings.capture_player",
+        "drivers.recordings.can_log",
+        "drivers.recordings.serial_log",
+        "drivers.recordings.link_log_player",
     ),
     *(
         "zstandard",

@@ -7,10 +7,11 @@ import random
 import sys
 
 from drivers.base import TactileReading
-from drivers.can.decoders import CanCounters, CanDecoder, make_decoder
+from drivers.can.decoders import CanDecoder, make_decoder
 from drivers.can.formats import CanFormat, SweepFrame, encode_sample
-from drivers.can.frames import CanFrame, FrameFlag, pack_frame, unpack_frame
-from tests.drivers.can.can_words import Clock, samples, truth, word
+from drivers.can.frames import ERROR, FD, REMOTE, CanFrame, unpack_frame
+from drivers.can.readings import CanCounters
+from tests.drivers.can.can_words import Clock, pack_frame, samples, truth, word
 
 SAMPLE_ID = 0x100
 
@@ -46,7 +47,7 @@ def sweep_frames(frame_format: CanFormat, sweep: int) -> list[CanFrame]:
                 sweep,
                 b"".join(word(int(count)) for count in truth(sweep)[row]),
             ).to_bytes(),
-            FrameFlag.FD,
+            FD,
         )
         for row, finger in enumerate((0, 1, 4))
     ]
@@ -93,7 +94,7 @@ def push_damaged(frame_format: CanFormat, frames: int, seed: int) -> int:
             pushed += 1
             clock.now_ns += chance.randrange(10) * 100_000
             frame = unpack_frame(damaged(chance.choice(raws), chance))
-            if frame is None or frame.flags & (FrameFlag.REMOTE | FrameFlag.ERROR):
+            if frame is None or frame.flags & (REMOTE | ERROR):
                 continue
             readings += len(made.push(frame, clock.now_ns))
         if chance.random() < 0.1:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Self
+from unittest import mock
 
 import can
 import pytest
@@ -13,12 +15,13 @@ import pytest
 from drivers.base import Reading, TactileReading
 from drivers.can.driver import CanBridgeDriver
 from drivers.can.formats import encode_sample
-from drivers.can.frames import CanFrame, pack_frame
+from drivers.can.frames import CanFrame
 from drivers.kernel_stamps import SO_TIMESTAMPNS
 from drivers.twins.can import SAMPLE_ID, CanTwin
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts, GeneratedContact
-from tests.drivers.can.can_words import Clock, samples
+from drivers.twins.grasps.grasps import Counts
+from tests.drivers.can.can_words import Clock, pack_frame, samples
+from tests.drivers.twins.signals import GeneratedContact
 
 MS = 1_000_000
 CHANNELS = itertools.count()
@@ -101,6 +104,18 @@ class FailingBus:
         self.bus.shutdown()
 
 
+@contextlib.contextmanager
+def bus_options(**options: object) -> Iterator[None]:
+    """Have python-can open its buses with these options too."""
+    real: Callable[..., object] = can.Bus
+
+    def open_bus(**given: object) -> object:
+        return real(**{**given, **options})
+
+    with mock.patch("drivers.can.bus.can.Bus", open_bus):
+        yield
+
+
 Opener = Callable[[], object]
 
 
@@ -150,6 +165,14 @@ def sweep_of_frames(sweep: int) -> list[CanFrame]:
     ]
 
 
+class StampingTwin(CanTwin):
+    """A twin whose frames are stamped by its own clock."""
+
+    def open(self) -> None:
+        with bus_options(preserve_timestamps=True):
+            super().open()
+
+
 class TwinLink:
     """Driver and twins on one virtual bus and one clock that tests move, sweep by sweep."""
 
@@ -165,7 +188,7 @@ class TwinLink:
 
     def send(self, counts: Sequence[Counts], faults: LinkFaults = LinkFaults()) -> CanTwin:  # noqa: B008
         """Send sweeps at 100 Hz; the frames of each arrive at once."""
-        twin = CanTwin(
+        twin = StampingTwin(
             "virtual",
             self.where,
             iter(counts),
@@ -173,7 +196,6 @@ class TwinLink:
             sequence=self.sequence,
             first_sweep=self.sweeps_sent,
             faults=faults,
-            bus_options={"preserve_timestamps": True},
             clock=self.clock,
         )
         self.sweeps_sent += len(counts)
@@ -189,15 +211,13 @@ class TwinLink:
 
     def half(self, counts: Counts) -> int:
         """Send the first half of a sweep; its frames."""
-        options = {"preserve_timestamps": True}
-        twin = CanTwin(
+        twin = StampingTwin(
             "virtual",
             self.where,
             iter([counts]),
             format=self.format,
             sequence=self.sequence,
             first_sweep=self.sweeps_sent,
-            bus_options=options,
             clock=self.clock,
         )
         self.clock.now_ns += 10 * MS

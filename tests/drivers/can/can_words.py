@@ -9,8 +9,24 @@ from numpy.typing import NDArray
 
 from drivers.base import TactileReading
 from drivers.biotac import E1, SEQUENCES
-from drivers.can.decoders import CanCounters
-from drivers.can.samples import SampleSweeps
+from drivers.can.frames import (
+    CAN_FRAME,
+    CANFD_FRAME,
+    CLASSIC_DATA_MAX,
+    EFF_FLAG,
+    ERR_FLAG,
+    ERROR,
+    EXTENDED,
+    EXTENDED_ID_MAX,
+    FD,
+    FD_DATA_MAX,
+    REMOTE,
+    RTR_FLAG,
+    STANDARD_ID_MAX,
+    CanFrame,
+)
+from drivers.can.readings import CanCounters
+from drivers.can.samples import SampleAssembler
 
 FINGERS = 3
 SLOT_NS = 227_000
@@ -63,9 +79,9 @@ def samples(sweep: int, sequence: str = "electrodes", start_ns: int = 0) -> list
     ]
 
 
-def assembler(sequence: str = "electrodes") -> tuple[SampleSweeps, CanCounters]:
+def assembler(sequence: str = "electrodes") -> tuple[SampleAssembler, CanCounters]:
     counters = CanCounters()
-    return SampleSweeps(FINGERS, SEQUENCES[sequence], counters), counters
+    return SampleAssembler(FINGERS, SEQUENCES[sequence], counters), counters
 
 
 def concatenated(sweeps: Sequence[Sequence[Sample]]) -> list[Sample]:
@@ -77,3 +93,19 @@ def assert_true(reading: TactileReading, sweep: int) -> None:
     sound = reading.faults == 0
     assert (reading.counts[sound] == truth(sweep)[sound]).all()
     assert not reading.counts[~sound].any()
+
+
+def pack_frame(frame: CanFrame) -> bytes:
+    """The struct that Linux would hand over. Raises `ValueError` for a frame that cannot be."""
+    extended = bool(frame.flags & (EXTENDED | ERROR))
+    if not 0 <= frame.arbitration_id <= (EXTENDED_ID_MAX if extended else STANDARD_ID_MAX):
+        raise ValueError(f"arbitration id {frame.arbitration_id:#x} is out of range")
+    if len(frame.data) > (FD_DATA_MAX if frame.flags & FD else CLASSIC_DATA_MAX):
+        raise ValueError(f"{len(frame.data)} bytes of data do not fit into a frame")
+    word = frame.arbitration_id
+    word |= EFF_FLAG if frame.flags & EXTENDED else 0
+    word |= RTR_FLAG if frame.flags & REMOTE else 0
+    word |= ERR_FLAG if frame.flags & ERROR else 0
+    if frame.flags & FD:
+        return CANFD_FRAME.pack(word, len(frame.data), 0, frame.data)
+    return CAN_FRAME.pack(word, len(frame.data), frame.data)

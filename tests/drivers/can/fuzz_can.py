@@ -17,8 +17,9 @@ from drivers.can.formats import (
     parse_sample,
     parse_sweep,
 )
-from drivers.can.frames import CanFrame, FrameFlag, pack_frame, unpack_frame
+from drivers.can.frames import FD, CanFrame, unpack_frame
 from tests.bench.fuzz import Target
+from tests.drivers.can.can_words import pack_frame
 
 SAMPLE_ID, SWEEP_ID = 0x100, 0x5B0
 SENSORS = 3
@@ -53,7 +54,7 @@ def _sweep_frame(rng: random.Random) -> tuple[bytes, SweepFrame]:
         rng.randbytes(48),
         rng.randrange(8),
     )
-    return pack_frame(CanFrame(SWEEP_ID + sweep.finger, sweep.to_bytes(), FrameFlag.FD)), sweep
+    return pack_frame(CanFrame(SWEEP_ID + sweep.finger, sweep.to_bytes(), FD)), sweep
 
 
 def _is_sample(value: SynTouchSample) -> bool:

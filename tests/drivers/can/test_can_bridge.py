@@ -21,6 +21,7 @@ from tests.conftest import data_dir
 from tests.drivers.can.can_standin import (
     TwinLink,
     bridge,
+    bus_options,
     channel,
     contact,
     message,
@@ -75,14 +76,12 @@ def test_a_recording_arrives_count_for_count(frame_format: str, sequence: str) -
 
 @pytest.mark.parametrize("frame_format", FORMATS)
 def test_a_recording_arrives_over_udp_multicast(frame_format: str) -> None:
-    options = {"port": 23000 + os.getpid() % 2000}
     counts = contact(100)
     driver = CanBridgeDriver(
         "udp_multicast",
         GROUP,
         format=frame_format,
         arbitration_id=SAMPLE_ID,
-        bus_options=options,
     )
     twin = CanTwin(
         "udp_multicast",
@@ -90,12 +89,11 @@ def test_a_recording_arrives_over_udp_multicast(frame_format: str) -> None:
         iter(counts),
         format=frame_format,
         arbitration_id=SAMPLE_ID,
-        bus_options=options,
     )
     readings: list[TactileReading] = []
-    with driver:
+    with bus_options(port=23000 + os.getpid() % 2000), driver:
         if driver.link_state is LinkState.WAITING:
-            pytest.skip(f"no multicast here: {driver.last_error}")
+            pytest.skip(f"no multicast here: {driver.stream.last_error}")
         with twin:
             for at in range(len(counts)):
                 time.sleep(0.01)
@@ -144,7 +142,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         }
         assert counted["frames"] == len(ours) + len(strange)
         assert driver.link_state is LinkState.UP
-        assert driver.last_error == "bus error"
+        assert driver.stream.last_error == "bus error"
 
 
 @pytest.mark.parametrize(

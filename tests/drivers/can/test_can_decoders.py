@@ -6,7 +6,7 @@ import pytest
 
 from drivers.base import TactileReading
 from drivers.can.formats import CanFormat, SweepFrame, SweepStatus, encode_sample
-from drivers.can.frames import CanFrame, FrameFlag
+from drivers.can.frames import EXTENDED, FD, CanFrame
 from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder
 from tests.drivers.can.can_words import samples, truth, word
 from tests.drivers.can.test_can_formats import E1_SAMPLE, SWEEP_EXAMPLE
@@ -16,12 +16,12 @@ from tests.drivers.can.test_can_formats import E1_SAMPLE, SWEEP_EXAMPLE
     ("frame", "counter"),
     [
         (CanFrame(0x101, E1_SAMPLE), "foreign_frames"),
-        (CanFrame(0x100, E1_SAMPLE, FrameFlag.EXTENDED), "foreign_frames"),
+        (CanFrame(0x100, E1_SAMPLE, EXTENDED), "foreign_frames"),
         (CanFrame(0x100, E1_SAMPLE[:5]), "wrong_length_frames"),
         (CanFrame(0x100, E1_SAMPLE + b"\0"), "wrong_length_frames"),
         (CanFrame(0x100, b""), "wrong_length_frames"),
         (CanFrame(0x100, b"\xa1" + E1_SAMPLE[1:]), "unknown_commands"),
-        (CanFrame(0x100, E1_SAMPLE, FrameFlag.FD), "malformed_frames"),
+        (CanFrame(0x100, E1_SAMPLE, FD), "malformed_frames"),
         (CanFrame(0x100, E1_SAMPLE), "accepted_frames"),
     ],
 )
@@ -35,15 +35,15 @@ def test_every_dropped_sample_frame_is_counted_by_its_reason(frame: CanFrame, co
 @pytest.mark.parametrize(
     ("identifier", "changed", "flags", "counter"),
     [
-        (0x104, {}, FrameFlag.FD, "accepted_frames"),
-        (0x105, {}, FrameFlag.FD, "foreign_frames"),
-        (0x102, {}, FrameFlag.FD, "foreign_frames"),  # rf, which this scene does not have
-        (0x104, {}, FrameFlag.FD | FrameFlag.EXTENDED, "foreign_frames"),
-        (0x100, {}, FrameFlag.FD, "malformed_frames"),  # the id of ff, the data of th
-        (0x104, {1: 2}, FrameFlag.FD, "malformed_frames"),
+        (0x104, {}, FD, "accepted_frames"),
+        (0x105, {}, FD, "foreign_frames"),
+        (0x102, {}, FD, "foreign_frames"),  # rf, which this scene does not have
+        (0x104, {}, FD | EXTENDED, "foreign_frames"),
+        (0x100, {}, FD, "malformed_frames"),  # the id of ff, the data of th
+        (0x104, {1: 2}, FD, "malformed_frames"),
         (0x104, {}, 0, "malformed_frames"),
-        (0x104, {0: 2}, FrameFlag.FD, "unknown_versions"),
-        (0x104, {63: 1}, FrameFlag.FD, "malformed_frames"),
+        (0x104, {0: 2}, FD, "unknown_versions"),
+        (0x104, {63: 1}, FD, "malformed_frames"),
     ],
 )
 def test_every_dropped_sweep_frame_is_counted_by_its_reason(
@@ -67,7 +67,7 @@ def test_every_dropped_sweep_frame_is_counted_by_its_reason(
         CanFrame(0x7FF, E1_SAMPLE[:1] + b"\xff" * 6),  # no sensor is there
         CanFrame(0x7FF, E1_SAMPLE[:1] + bytes.fromhex("A52D A8C8 94B9")),  # an error word
         CanFrame(0x7FF, E1_SAMPLE[:1] + bytes.fromhex("A250 A8C8 94B9")),  # even parity
-        CanFrame(0x7FF, E1_SAMPLE, FrameFlag.FD),
+        CanFrame(0x7FF, E1_SAMPLE, FD),
     ],
 )
 def test_without_an_id_that_of_the_first_sound_sample_is_taken(unsound: CanFrame) -> None:
@@ -78,7 +78,7 @@ def test_without_an_id_that_of_the_first_sound_sample_is_taken(unsound: CanFrame
     made.push(CanFrame(0x321, E1_SAMPLE[:1] + bytes.fromhex("FFFF A8C8 94B9")), 0)
     assert made.arbitration_id == 0x321
     made.push(CanFrame(0x322, E1_SAMPLE), 0)
-    made.push(CanFrame(0x321, E1_SAMPLE, FrameFlag.EXTENDED), 0)
+    made.push(CanFrame(0x321, E1_SAMPLE, EXTENDED), 0)
     made.push(CanFrame(0x321, E1_SAMPLE[:6]), 0)
     made.push(CanFrame(0x321, bytes(7)), 0)
     assert (counters.accepted_frames, counters.foreign_frames) == (1, 3)
@@ -91,7 +91,7 @@ def test_an_id_that_was_heard_is_forgotten_with_the_link(configured: int | None)
     made.push(CanFrame(0x100, E1_SAMPLE), 0)
     made.interrupt()
     assert made.arbitration_id == configured
-    made.push(CanFrame(0x12345, E1_SAMPLE, FrameFlag.EXTENDED), 0)
+    made.push(CanFrame(0x12345, E1_SAMPLE, EXTENDED), 0)
     assert counters.foreign_frames == (configured is not None)
 
 
@@ -122,7 +122,7 @@ def test_a_tick_that_stands_and_a_sweep_that_began_late_are_counted() -> None:
     for sequence in range(3):
         for finger in (0, 1, 4):
             sweep = SweepFrame(finger, sequence, 77, word(2602) * 24, SweepStatus.OVERRUN)
-            made.push(CanFrame(SAMPLE_ID + finger, sweep.to_bytes(), FrameFlag.FD), sequence)
+            made.push(CanFrame(SAMPLE_ID + finger, sweep.to_bytes(), FD), sequence)
     assert (counters.stuck_ticks, counters.faulty_readings) == (6, 2)
     assert counters.overruns == 9
     assert counters.readings == 3
@@ -133,7 +133,7 @@ def test_a_sensor_reported_absent_gives_no_counts() -> None:
     readings: list[TactileReading] = []
     for finger, status in ((0, SweepStatus.ABSENT), (1, SweepStatus.NONE), (4, SweepStatus.NONE)):
         sweep = SweepFrame(finger, 0, 0, word(2602) * 24, status)
-        frame = CanFrame(SAMPLE_ID + finger, sweep.to_bytes(), FrameFlag.FD)
+        frame = CanFrame(SAMPLE_ID + finger, sweep.to_bytes(), FD)
         readings += made.push(frame, 0)
     assert (readings[0].faults[0] != 0).all()
     assert not readings[0].faults[1:].any()

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.can.formats import CanFormat, SweepFrame
-from drivers.can.frames import CanFrame, FrameFlag
+from drivers.can.frames import FD, CanFrame
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID
 from drivers.twins.faults import LinkFaults
@@ -128,7 +128,7 @@ def truth_frames(sweep: int) -> list[CanFrame]:
                 10_000 * sweep,
                 b"".join(word(int(count)) for count in truth(sweep)[row]),
             ).to_bytes(),
-            FrameFlag.FD,
+            FD,
         )
         for row, finger in enumerate((0, 1, 4))
     ]

@@ -25,17 +25,19 @@ from drivers.can.formats import (
     parse_sweep,
 )
 from drivers.can.frames import (
+    ERROR,
+    EXTENDED,
+    FD,
+    REMOTE,
     CanFrame,
-    FrameFlag,
     describe_error,
     is_bus_off,
     is_overflow,
-    pack_frame,
     unpack_frame,
 )
 from tests.conftest import ROOT
 from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder, fuzz
-from tests.drivers.can.can_words import samples, truth, word
+from tests.drivers.can.can_words import pack_frame, samples, truth, word
 
 E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
 """Electrode 1 of three sensors: 2602, 2713, 2391."""
@@ -201,13 +203,13 @@ def test_the_dbc_file_reads_a_sweep_frame_field_by_field(dbc: Database, finger: 
     ("raw", "frame"),
     [
         ("00010000 07 000000 A2A251A8C894B9 00", CanFrame(0x100, E1_SAMPLE)),
-        ("34120080 02 000000 0102 000000000000", CanFrame(0x1234, b"\1\2", FrameFlag.EXTENDED)),
-        ("00010040 07 000000 0000000000000000", CanFrame(0x100, b"", FrameFlag.REMOTE)),
+        ("34120080 02 000000 0102 000000000000", CanFrame(0x1234, b"\1\2", EXTENDED)),
+        ("00010040 07 000000 0000000000000000", CanFrame(0x100, b"", REMOTE)),
         (
             "40000020 08 000000 0000000000000000",
-            CanFrame(0x40, bytes(8), FrameFlag.ERROR),
+            CanFrame(0x40, bytes(8), ERROR),
         ),
-        ("B0050000 40 01 0000" + "55" * 64, CanFrame(0x5B0, b"\x55" * 64, FrameFlag.FD)),
+        ("B0050000 40 01 0000" + "55" * 64, CanFrame(0x5B0, b"\x55" * 64, FD)),
     ],
 )
 def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
@@ -232,9 +234,9 @@ def test_what_is_no_struct_of_the_kernel_is_no_frame(raw: bytes) -> None:
     [
         CanFrame(0x800, b""),
         CanFrame(-1, b""),
-        CanFrame(1 << 29, b"", FrameFlag.EXTENDED),
+        CanFrame(1 << 29, b"", EXTENDED),
         CanFrame(1, bytes(9)),
-        CanFrame(1, bytes(65), FrameFlag.FD),
+        CanFrame(1, bytes(65), FD),
     ],
 )
 def test_frames_that_no_bus_has_are_our_mistake(frame: CanFrame) -> None:
@@ -248,25 +250,25 @@ def test_frames_that_no_bus_has_are_our_mistake(frame: CanFrame) -> None:
     st.sampled_from([0, 1, 4, 8, 9]),
 )
 def test_frames_come_back_as_they_went(identifier: int, data: bytes, flags: int) -> None:
-    identifier &= 0x1FFFFFFF if flags & (FrameFlag.EXTENDED | FrameFlag.ERROR) else 0x7FF
-    data = data if flags & FrameFlag.FD else data[:8]
+    identifier &= 0x1FFFFFFF if flags & (EXTENDED | ERROR) else 0x7FF
+    data = data if flags & FD else data[:8]
     frame = CanFrame(identifier, data, flags)
     assert unpack_frame(pack_frame(frame)) == frame
 
 
 def test_error_frames_say_what_happened() -> None:
     """Classes and bits of linux/can/error.h."""
-    bus_off = CanFrame(0x040, bytes(8), FrameFlag.ERROR)
-    overflow = CanFrame(0x004, bytes.fromhex("0001000000000000"), FrameFlag.ERROR)
-    passive = CanFrame(0x204, bytes.fromhex("0010000000008000"), FrameFlag.ERROR)
+    bus_off = CanFrame(0x040, bytes(8), ERROR)
+    overflow = CanFrame(0x004, bytes.fromhex("0001000000000000"), ERROR)
+    passive = CanFrame(0x204, bytes.fromhex("0010000000008000"), ERROR)
     assert is_bus_off(bus_off)
     assert not is_bus_off(CanFrame(0x040, bytes(8)))
     assert is_overflow(overflow)
     assert not is_overflow(passive)
-    assert not is_overflow(CanFrame(0x004, b"", FrameFlag.ERROR))
+    assert not is_overflow(CanFrame(0x004, b"", ERROR))
     assert describe_error(bus_off) == "bus-off"
     assert describe_error(passive) == "controller problem, error counters"
-    assert describe_error(CanFrame(0, b"", FrameFlag.ERROR)) == "unknown error class"
+    assert describe_error(CanFrame(0, b"", ERROR)) == "unknown error class"
 
 
 @pytest.mark.parametrize("frame_format", list(CanFormat))

@@ -12,7 +12,8 @@ import pytest
 
 from drivers.base import Reading
 from drivers.can.bus import FRAMES_PER_DRAIN, CanBus
-from drivers.can.driver import POLL_NS, SILENCE_MIN_NS, SILENCE_PERIODS, CanBridgeDriver
+from drivers.can.driver import POLL_NS, CanBridgeDriver
+from drivers.can.stream import SILENCE_MIN_NS, SILENCE_PERIODS
 from drivers.link import BACKOFF_MAX_S, LinkState
 from drivers.twins.can import SAMPLE_ID
 from tests.drivers.can.can_standin import (
@@ -46,8 +47,8 @@ def test_an_absent_socketcan_interface_is_waited_for(caplog: pytest.LogCaptureFi
             clock.now_ns = due_ns
             assert driver.read_ready() == ()
         assert driver.counters.bus_faults == 21
-        assert driver.last_error is not None
-        assert "nocan77" in driver.last_error
+        assert driver.stream.last_error is not None
+        assert "nocan77" in driver.stream.last_error
     noisy = [record for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(noisy) == 1, "one warning per outage, and none of python-can's"
 
@@ -168,12 +169,13 @@ def test_frames_per_second_are_told_until_there_are_none() -> None:
         assert driver.frames_per_s == 0.0
 
 
-def test_bus_options_reach_python_can_over_our_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     seen: dict[str, object] = {}
     monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **options: seen.update(options))
-    options = {"rx_queue_size": 7}
-    CanBridgeDriver("virtual", "x", bitrate=500_000, bus_options=options).open()
-    assert seen["rx_queue_size"] == 7
+    CanBridgeDriver("virtual", "x", bitrate=500_000).open()
+    assert seen["rx_queue_size"] == 16384
     assert seen["bitrate"] == 500_000
     assert seen["ignore_config"] is True
 

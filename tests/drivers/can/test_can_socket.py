@@ -16,7 +16,7 @@ from drivers.can.driver import (
     CanBridgeDriver,
 )
 from drivers.can.formats import CanFormat
-from drivers.can.frames import CanFrame, FrameFlag, pack_frame
+from drivers.can.frames import ERROR, CanFrame
 from drivers.kernel_stamps import SO_RXQ_OVFL
 from drivers.link import LinkState
 from drivers.twins.can import SAMPLE_ID, CanTwin
@@ -29,7 +29,7 @@ from tests.drivers.can.can_standin import (
     sweep_of_frames,
     tactile,
 )
-from tests.drivers.can.can_words import SLOT_NS, Clock, truth
+from tests.drivers.can.can_words import SLOT_NS, Clock, pack_frame, truth
 
 MS = 1_000_000
 
@@ -90,10 +90,10 @@ def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
         with over_socket(clock=clock) as driver:
             for frame in sweep_of_frames(0) + sweep_of_frames(1)[:9]:
                 first.send(frame)
-            first.send(CanFrame(0x040, bytes(8), FrameFlag.ERROR))
+            first.send(CanFrame(0x040, bytes(8), ERROR))
             assert len(driver.read_ready()) == 1
             assert driver.link_state is LinkState.WAITING
-            assert driver.last_error == "bus-off"
+            assert driver.stream.last_error == "bus-off"
             due_ns = driver.due_ns()
             assert due_ns is not None
             clock.now_ns = due_ns
@@ -108,7 +108,7 @@ def test_bus_off_loses_the_link_and_drops_the_sweep_at_hand(
 def test_other_error_frames_are_counted_only(socket_bus: SocketBus) -> None:
     with over_socket() as driver:
         frames = sweep_of_frames(0)
-        frames.insert(9, CanFrame(0x080, bytes(8), FrameFlag.ERROR))
+        frames.insert(9, CanFrame(0x080, bytes(8), ERROR))
         for frame in frames:
             socket_bus.send(frame)
         (reading,) = tactile(driver.read_ready())
@@ -120,7 +120,7 @@ def test_other_error_frames_are_counted_only(socket_bus: SocketBus) -> None:
 def test_an_overflow_of_the_controller_cuts_the_sweep_there(socket_bus: SocketBus) -> None:
     with over_socket() as driver:
         frames = sweep_of_frames(0)
-        frames[3:5] = [CanFrame(0x004, bytes.fromhex("0001000000000000"), FrameFlag.ERROR)]
+        frames[3:5] = [CanFrame(0x004, bytes.fromhex("0001000000000000"), ERROR)]
         for frame in [*frames, *sweep_of_frames(1)]:
             socket_bus.send(frame)
         cut, whole = tactile(driver.read_ready())
@@ -156,8 +156,8 @@ def test_an_interface_that_goes_down_is_a_link_fault(monkeypatch: pytest.MonkeyP
         with over_socket() as driver:
             assert driver.read_ready() == []
             assert driver.link_state is LinkState.WAITING
-            assert driver.last_error is not None
-            assert "Network is down" in driver.last_error
+            assert driver.stream.last_error is not None
+            assert "Network is down" in driver.stream.last_error
 
 
 def test_what_the_kernel_drops_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:

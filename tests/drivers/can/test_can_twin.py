@@ -16,13 +16,13 @@ from drivers.base import DriverError, LinkError, TactileReading
 from drivers.can.driver import CanBridgeDriver
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import GeneratedContact
 from tests.drivers.can.can_standin import (
     bridge,
     channel,
     contact,
     tactile,
 )
+from tests.drivers.twins.signals import GeneratedContact
 
 MS = 1_000_000
 

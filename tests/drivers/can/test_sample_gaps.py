@@ -11,7 +11,7 @@ import pytest
 
 from drivers.base import TactileReading
 from drivers.biotac import SEQUENCES
-from drivers.can.samples import NEXT_SWEEP_PERIODS, SampleSweeps
+from drivers.can.samples import NEXT_SWEEP_PERIODS, SampleAssembler
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,
@@ -26,7 +26,7 @@ from tests.drivers.can.can_words import (
 MS = 1_000_000
 
 
-def feed(sweeps: SampleSweeps, stream: Sequence[Sample]) -> list[TactileReading]:
+def feed(sweeps: SampleAssembler, stream: Sequence[Sample]) -> list[TactileReading]:
     return [reading for sample in stream for reading in sweeps.push(*sample)]
 
 

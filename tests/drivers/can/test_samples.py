@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.biotac import PAC, SEQUENCE_ELECTRODES, SEQUENCE_PRESSURE, SEQUENCES
-from drivers.can.decoders import CanCounters
-from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED, SampleSweeps
+from drivers.biotac import PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES
+from drivers.can.readings import OUTAGE_NS, PERIODS_NEEDED, CanCounters
+from drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,
@@ -27,7 +27,7 @@ MISSING = ElectrodeFault.MISSING
 SWEEP_NS = 24 * SLOT_NS
 
 
-def feed(sweeps: SampleSweeps, stream: Iterable[Sample]) -> list[TactileReading]:
+def feed(sweeps: SampleAssembler, stream: Iterable[Sample]) -> list[TactileReading]:
     readings: list[TactileReading] = []
     for channel, words, t_ns in stream:
         readings += sweeps.push(channel, words, t_ns)
@@ -242,11 +242,11 @@ def test_channels_that_the_sequence_lacks_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    "sequence", [SEQUENCE_PRESSURE, SEQUENCE_ELECTRODES[1:], (*SEQUENCE_ELECTRODES, 17)]
+    "sequence", [(PAC, PDC), SEQUENCE_ELECTRODES[1:], (*SEQUENCE_ELECTRODES, 17)]
 )
 def test_a_sequence_must_have_every_electrode_once(sequence: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="exactly once"):
-        SampleSweeps(FINGERS, sequence, CanCounters())
+        SampleAssembler(FINGERS, sequence, CanCounters())
 
 
 def test_the_next_reading_is_expected_when_its_last_electrode_is() -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.decoders import CanCounters
-from drivers.can.samples import OUTAGE_NS, PERIODS_NEEDED
-from drivers.can.sweep_frames import LATE_FRAMES_MAX, SEQUENCE_JUMP_MAX, FrameSweeps
+from drivers.can.readings import OUTAGE_NS, PERIODS_NEEDED, CanCounters
+from drivers.can.sweep_frames import LATE_FRAMES_MAX, SEQUENCE_JUMP_MAX, FrameAssembler
 from tests.drivers.can.can_words import FINGERS, assert_true, truth, word
 
 MISSING = ElectrodeFault.MISSING
@@ -17,20 +16,20 @@ TICK_US = 10_000
 
 
 def push(
-    sweeps: FrameSweeps, row: int, sweep: int, t_ns: int = 0, tick_us: int | None = None
+    sweeps: FrameAssembler, row: int, sweep: int, t_ns: int = 0, tick_us: int | None = None
 ) -> list[TactileReading]:
     words = b"".join(word(int(count)) for count in truth(sweep)[row])
     tick_us = sweep * TICK_US if tick_us is None else tick_us
     return list(sweeps.push(row, sweep % (1 << 16), tick_us % (1 << 32), words, 0, t_ns))
 
 
-def frame_sweeps() -> tuple[FrameSweeps, CanCounters]:
+def frame_sweeps() -> tuple[FrameAssembler, CanCounters]:
     counters = CanCounters()
-    return FrameSweeps(FINGERS, counters), counters
+    return FrameAssembler(FINGERS, counters), counters
 
 
 def whole(
-    sweeps: FrameSweeps, sweep: int, t_ns: int = 0, tick_us: int | None = None
+    sweeps: FrameAssembler, sweep: int, t_ns: int = 0, tick_us: int | None = None
 ) -> list[TactileReading]:
     pushed = [push(sweeps, row, sweep, t_ns, tick_us) for row in range(FINGERS)]
     return [reading for readings in pushed for reading in readings]
@@ -113,7 +112,7 @@ def test_a_copy_is_a_copy_however_late_it_comes() -> None:
 PERIOD_NS = 10_000_000
 
 
-def running(sweeps: FrameSweeps, sweep: int) -> int:
+def running(sweeps: FrameAssembler, sweep: int) -> int:
     """Sweeps up to before `sweep`, on time; when that is due, ns."""
     for before in range(sweep - 8, sweep):
         whole(sweeps, before, before * PERIOD_NS)

@@ -20,11 +20,11 @@ from drivers.joints.message import (
     JointParser,
     MessageOrder,
 )
-from drivers.palm.packet import Palm, PalmPacket, PalmParser
-from drivers.palm.rounds import PalmSweeps, RoundCounters
-from drivers.twins.grasps.grasps import GeneratedContact
+from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
+from drivers.palm.rounds import RoundAssembler
 from drivers.twins.palm import PalmTwin
 from tests.bench.fuzz import Target
+from tests.drivers.twins.signals import GeneratedContact
 
 CYCLE_NS = 1_000_000
 ROUNDS = 4
@@ -48,9 +48,9 @@ class _Palm:
     """Packets, and behind them the rounds, which must bear whatever the parser lets through."""
 
     def __init__(self) -> None:
-        counters = RoundCounters()
+        counters = PalmCounters()
         self._parser = PalmParser(counters)
-        self._sweeps = PalmSweeps(FINGERS, counters)
+        self._sweeps = RoundAssembler(FINGERS, counters)
         self._t_ns = 0
         self._fed = 0
 
@@ -70,7 +70,7 @@ class _Palm:
 
     @property
     def held_bytes(self) -> int:
-        return self._sweeps.packets_kept
+        return sum(packet is not None for packet in self._sweeps._packets)
 
 
 def _is_a_packet(packet: PalmPacket) -> bool:
@@ -123,7 +123,7 @@ class _Joints:
 
     @property
     def held_bytes(self) -> int:
-        return self._parser.names_kept
+        return len(self._parser._joints)
 
 
 def _are_angles(message: Angles) -> bool:

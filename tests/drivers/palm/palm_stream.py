@@ -14,8 +14,8 @@ import numpy as np
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.joints.driver import JointStreamDriver
 from drivers.palm.driver import PalmDriver
-from drivers.palm.packet import Palm, PalmPacket, PalmParser
-from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
+from drivers.palm.rounds import RoundAssembler
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.palm import PalmTwin
 
@@ -44,7 +44,7 @@ def rows(number: int, seed: int = 1) -> list[Counts]:
 class Played:
     """What came out of a stream."""
 
-    counters: RoundCounters = field(default_factory=RoundCounters)
+    counters: PalmCounters = field(default_factory=PalmCounters)
     readings: list[TactileReading] = field(default_factory=list)
 
     def sound(self) -> list[TactileReading]:
@@ -54,7 +54,7 @@ class Played:
 def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) -> Played:
     """Datagrams by the millisecond through parser and sweeps, as the driver does it."""
     played = Played()
-    parser, sweeps = PalmParser(played.counters), PalmSweeps(fingers, played.counters)
+    parser, sweeps = PalmParser(played.counters), RoundAssembler(fingers, played.counters)
     for cycle, datagrams in enumerate(cycles):
         for data in datagrams:
             packet = parser.parse(data)

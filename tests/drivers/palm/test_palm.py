@@ -20,7 +20,7 @@ from drivers.palm.calibration import CalibrationError
 from drivers.palm.driver import PalmDriver
 from drivers.palm.packet import Palm
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import GeneratedContact, recorded_counts
+from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.palm import PalmTwin
 from drivers.udp.receiver import DatagramReceiver
 from tests.conftest import ROOT, data_dir
@@ -36,6 +36,7 @@ from tests.drivers.palm.palm_stream import (
     rows,
     tactile,
 )
+from tests.drivers.twins.signals import GeneratedContact
 
 LOOPBACK = "udp://127.0.0.1:0"
 EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"
@@ -52,7 +53,7 @@ def driver(clock: Clock) -> Iterator[PalmDriver]:
         yield driver
 
 
-def state(driver: PalmDriver) -> LinkState | None:
+def state(driver: PalmDriver) -> LinkState:
     return driver.link_state
 
 
@@ -114,7 +115,6 @@ def test_a_real_recording_plays_count_for_count() -> None:
         ("udp://:5000", {}),
         (LOOPBACK, {"fingers": ("ff", "ff")}),
         (LOOPBACK, {"fingers": ("rh",)}),
-        (LOOPBACK, {"joint_period_s": 0.0}),
         (LOOPBACK, {"only_from": "somewhere"}),
     ],
 )
@@ -344,15 +344,6 @@ def test_a_raw_value_that_is_no_count_gives_no_angle_and_is_counted() -> None:
         (reading,) = joints(driver.read_ready())
         assert np.isnan(reading.position_rad[reading.names.index("FFJ1")])
         assert driver.counters.bad_angles == 1
-
-
-def test_joints_can_be_switched_off() -> None:
-    with (
-        PalmDriver(LOOPBACK, calibration=EXAMPLE, joints=False) as driver,
-        Sender(driver) as sender,
-    ):
-        sender.send(*datagrams(1))
-        assert joints(driver.read_ready()) == []
 
 
 def test_a_wrong_calibration_keeps_the_driver_from_opening(tmp_path: Path) -> None:

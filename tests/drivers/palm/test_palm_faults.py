@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.packet import PalmParser
-from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.palm.packet import PalmCounters, PalmParser
+from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import FINGERS, MS, ROUND, Played, play, row_of, rows
@@ -154,8 +154,8 @@ def test_rounds_of_damaged_packets_keep_no_memory_and_end_with_the_damage() -> N
     seed = 11
     random = np.random.default_rng(seed)
     good = [packet.to_bytes() for packet in PalmTwin(rows(40)).packets()]
-    counters = RoundCounters()
-    parser, sweeps = PalmParser(counters), PalmSweeps(FINGERS, counters)
+    counters = PalmCounters()
+    parser, sweeps = PalmParser(counters), RoundAssembler(FINGERS, counters)
 
     def feed(data: bytes, cycle: int) -> list[TactileReading]:
         packet = parser.parse(data)

@@ -13,9 +13,8 @@ import pytest
 from drivers.palm.packet import (
     CHANNELS,
     CanRecord,
-    Motor,
-    PacketCounters,
     Palm,
+    PalmCounters,
     PalmPacket,
     PalmParser,
     TactileSlot,
@@ -138,7 +137,7 @@ def filled(palm: Palm) -> ctypes.LittleEndianStructure:
 
 
 def parse(data: bytes) -> PalmPacket | None:
-    return PalmParser(PacketCounters()).parse(data)
+    return PalmParser(PalmCounters()).parse(data)
 
 
 def packet_of(palm: Palm) -> PalmPacket:
@@ -166,7 +165,9 @@ def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None
     assert list(packet.sensors) == SNAPSHOT
     assert (packet.command, packet.motor_type, packet.which_motors) == (1, 5, 1)
     assert (packet.motors_arrived, packet.motors_failed) == (0xAAAAA, 0x00400)
-    assert packet.motors == tuple(Motor(motor.torque, motor.misc) for motor in status.motors)
+    assert packet.motor_words == tuple(
+        word for motor in status.motors for word in (motor.torque, motor.misc)
+    )
     assert (packet.tactile_type, packet.tactile_valid) == (0x0019, 0x13)
     biotacs = [finger.biotac for finger in status.tactile]
     assert packet.tactile == tuple(
@@ -187,7 +188,7 @@ def test_a_packet_is_written_where_it_is_read(palm: Palm, record: CanRecord | No
     assert parse(data) == packet
     status = STRUCTURES[palm].from_buffer_copy(data)
     assert status.tactile[4].biotac.other_1 == packet.tactile[4].other_1
-    assert status.motors[9].torque == packet.motors[9].torque
+    assert status.motors[9].torque == packet.motor_words[18]
 
 
 @pytest.mark.parametrize(
@@ -209,14 +210,14 @@ def test_what_does_not_fit_a_packet_is_not_written(change: dict[str, Any]) -> No
 
 @pytest.mark.parametrize("length", [0, 1, 219, 221, 231, 233, 415, 417, 429, 531, 541, 543, 65507])
 def test_a_length_that_no_palm_sends_is_counted_and_dropped(length: int) -> None:
-    counters = PacketCounters()
+    counters = PalmCounters()
     assert PalmParser(counters).parse(b"\x01" + bytes(max(length - 1, 0))) is None
     assert (counters.bad_lengths, counters.packets) == (1, 0)
 
 
 @pytest.mark.parametrize("length", [220, 232, 416, 428, 530, 542])
 def test_an_empty_packet_is_counted_and_dropped(length: int) -> None:
-    counters = PacketCounters()
+    counters = PalmCounters()
     assert PalmParser(counters).parse(bytes(length)) is None
     assert (counters.empty_packets, counters.packets) == (1, 0)
 
@@ -237,7 +238,7 @@ def test_a_field_that_no_palm_sends_is_counted_and_dropped(
     offset: int, value: int, counter: str
 ) -> None:
     data = bytearray(bytes(filled(Palm.PALM_0220)) + bytes(12))
-    counters = PacketCounters()
+    counters = PalmCounters()
     assert PalmParser(counters).parse(bytes(data)) is not None
     data[offset] = value
     assert PalmParser(counters).parse(bytes(data)) is None
@@ -249,7 +250,7 @@ def test_a_field_that_no_palm_sends_is_counted_and_dropped(
 def test_finger_bits_that_nobody_defined_spoil_nothing(bits: int) -> None:
     data = bytearray(bytes(filled(Palm.PALM_0220)))
     data[136:138] = bits.to_bytes(2, "little")
-    packet = PalmParser(PacketCounters()).parse(bytes(data))
+    packet = PalmParser(PalmCounters()).parse(bytes(data))
     assert packet is not None
     assert packet.tactile_valid == bits
 
@@ -286,7 +287,7 @@ def test_a_round_has_fourteen_types_and_every_electrode_once() -> None:
 def test_random_bytes_of_the_right_length_never_raise(palm: Palm) -> None:
     seed = 20
     random = np.random.default_rng(seed)
-    counters = PacketCounters()
+    counters = PalmCounters()
     parser = PalmParser(counters)
     for _ in range(2000):
         parser.parse(b"\x01\x00\x00\x00" + random.bytes(LENGTHS[palm] - 4))

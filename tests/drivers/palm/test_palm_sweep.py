@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault
-from drivers.palm.packet import PalmPacket
-from drivers.palm.rounds import PalmSweeps, RoundCounters
+from drivers.palm.packet import PalmCounters, PalmPacket
+from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.palm import PalmTwin
@@ -87,7 +87,7 @@ def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("fingers", [(), ("ff", "ff"), ("ff", "xx")])
 def test_other_fingers_are_refused(fingers: tuple[str, ...]) -> None:
     with pytest.raises(ValueError, match="different ones"):
-        PalmSweeps(fingers, RoundCounters())
+        RoundAssembler(fingers, PalmCounters())
 
 
 @pytest.mark.parametrize("position", range(ROUND))
@@ -145,7 +145,7 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
         stream[index] = change(stream[index], "ff", {}, tactile_valid=0b10010)
     reading = play_packets(stream).readings[0]
     assert flags(reading, MISSING) == [[0, electrode] for electrode in range(7, 24)]
-    sweeps = PalmSweeps(FINGERS, RoundCounters(), heed_finger_bits=False)
+    sweeps = RoundAssembler(FINGERS, PalmCounters(), heed_finger_bits=False)
     heedless = [reading for packet in stream for reading in sweeps.push(packet, 0)]
     assert not heedless[0].faults.any()
 
@@ -205,8 +205,8 @@ def test_a_packet_that_comes_again_and_again_gives_no_reading() -> None:
 
 
 def test_after_an_interruption_a_reading_begins_with_a_round() -> None:
-    counters = RoundCounters()
-    sweeps = PalmSweeps(FINGERS, counters)
+    counters = PalmCounters()
+    sweeps = RoundAssembler(FINGERS, counters)
     stream = packets(60)
     readings = [reading for at in range(20) for reading in sweeps.push(stream[at], at * MS)]
     sweeps.interrupt()

@@ -165,28 +165,6 @@ def test_fast_is_never_waiting_and_never_late(tmp_path: Path) -> None:
     assert driver.counters.late == 0
 
 
-def test_stepped_gives_as_many_readings_as_were_released(tmp_path: Path) -> None:
-    with ReplayDriver([write(tmp_path, table(4))], pace=Pace.STEPPED, clock=Clock()) as driver:
-        assert driver.due_ns() is None
-        assert driver.read_ready() == ()
-        driver.step()
-        assert driver.due_ns() is not None
-        assert [reading.seq for reading in driver.read_ready()] == [0]
-        assert driver.read_ready() == ()
-        driver.step(10)
-        assert [r.seq for _ in range(5) for r in driver.read_ready()] == [1, 2, 3]
-        assert driver.exhausted
-        assert driver.due_ns() is None
-
-
-def test_only_a_stepped_replay_can_be_stepped(tmp_path: Path) -> None:
-    path = write(tmp_path, table())
-    with pytest.raises(ValueError, match="the pace is fast, only a stepped replay"):
-        ReplayDriver([path], pace=Pace.FAST).step()
-    with pytest.raises(ValueError, match="cannot step by 0"):
-        ReplayDriver([path], pace=Pace.STEPPED).step(0)
-
-
 def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:
     clock = Clock()
     paths = [

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault
-from drivers.biotac import E1, PAC, SEQUENCE_ALL, SEQUENCE_INTERLEAVED, SEQUENCE_PRESSURE, TDC
+from drivers.biotac import E1, PAC, PDC, SEQUENCE_ALL, SEQUENCE_INTERLEAVED, TDC
 from drivers.link import LinkState
 from drivers.spi.clock import UNKNOWN_DELAY_NS
 from drivers.spi.driver import SpiBridgeDriver
@@ -41,7 +41,7 @@ def test_a_sweep_becomes_a_reading_by_slot_and_sensor(rig: Rig) -> None:
     rig.bridge.send(sweep(0, 100))
     (reading,) = take(rig.driver, rig.bridge)
     assert rig.driver.link_state is LinkState.UP
-    assert rig.driver.failure is None
+    assert rig.driver.conversation.link.reason is None
     described = rig.driver.describe()
     assert described["board"] == "b"
     assert described["sensors"] == "BTSP-1, BTSP-1, BTSP-1"
@@ -107,7 +107,7 @@ def test_electrodes_that_are_not_in_the_sequence_are_missing(rig: Rig) -> None:
 
 
 def test_a_sequence_without_electrodes_gives_nothing_but_missing_ones(rig: Rig) -> None:
-    rig.greet(hello(0, channels=SEQUENCE_PRESSURE))
+    rig.greet(hello(0, channels=(PAC, PDC)))
     rig.bridge.send(sweep(0, 100, read=words(1000, 2)))
     (reading,) = take(rig.driver, rig.bridge)
     assert (reading.faults == ElectrodeFault.MISSING).all()
@@ -208,7 +208,7 @@ def test_status_is_kept_and_its_counts_are_shown(rig: Rig) -> None:
     rig.greet()
     rig.bridge.send(status)
     take(rig.driver, rig.bridge)
-    assert rig.driver.status == status
+    assert rig.driver.conversation.status == status
     shown = rig.driver.counters.as_dict()
     assert [shown[f"bridge_{name}"] for name in ("overruns", "tx_dropped", "rx_errors")] == [
         3,

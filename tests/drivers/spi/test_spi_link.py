@@ -71,8 +71,8 @@ def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
     assert [type(message) for message in said] == [Stop, Ping]
     assert [type(message) for message in rig.bridge.heard(Start)] == [Start]
     assert rig.driver.link_state is LinkState.GREETING
-    assert rig.driver.hello is not None
-    assert rig.driver.hello.board == "b"
+    assert rig.driver.conversation.hello is not None
+    assert rig.driver.conversation.hello.board == "b"
     assert rig.driver.period_ns == 10 * MS
 
 
@@ -105,7 +105,7 @@ def test_a_bridge_of_another_version_is_refused_in_one_line(
     with caplog.at_level(logging.WARNING):
         rig.bridge.send(answer, encode(sweep(0, 0)))
         assert take(rig.driver, rig.bridge) == []
-    assert rig.driver.failure == f"{rig.bridge.port}: {why}"
+    assert rig.driver.conversation.link.reason == f"{rig.bridge.port}: {why}"
     assert rig.driver.link_state is LinkState.WAITING
     assert rig.driver.counters.refused_bridges == 1
     assert [record.levelname for record in caplog.records] == ["WARNING"]
@@ -114,15 +114,15 @@ def test_a_bridge_of_another_version_is_refused_in_one_line(
 
 def test_a_bridge_with_too_few_sensors_is_refused(rig: Rig) -> None:
     rig.greet(hello(0, sensors=2))
-    assert rig.driver.failure is not None
-    assert "the bridge has 2 sensors, the scene needs 3" in rig.driver.failure
+    assert rig.driver.conversation.link.reason is not None
+    assert "the bridge has 2 sensors, the scene needs 3" in rig.driver.conversation.link.reason
     assert rig.driver.counters.refused_bridges == 1
 
 
 def test_a_bridge_that_hardly_ever_sweeps_is_refused(rig: Rig) -> None:
     rig.greet(dataclasses.replace(hello(0), period_ticks=1_000_001))
-    assert rig.driver.failure is not None
-    assert "the bridge sweeps once in 1 s only" in rig.driver.failure
+    assert rig.driver.conversation.link.reason is not None
+    assert "the bridge sweeps once in 1 s only" in rig.driver.conversation.link.reason
     assert rig.driver.counters.refused_bridges == 1
     assert rig.bridge.says_nothing_more(), "not even START"
 
@@ -136,7 +136,7 @@ def test_a_silent_device_is_asked_again_and_then_given_up(rig: Rig) -> None:
         assert rig.bridge.says_nothing_more()
         rig.wait(1)
     assert rig.driver.link_state is LinkState.WAITING
-    assert rig.driver.failure == f"no answer from {rig.bridge.port}"
+    assert rig.driver.conversation.link.reason == f"no answer from {rig.bridge.port}"
     assert rig.driver.counters.unanswered_pings == 4
 
 
@@ -178,7 +178,7 @@ def test_ten_missing_sweeps_are_a_lost_link(rig: Rig) -> None:
     assert str(rig.driver.link_state) == "up"
     rig.wait(1)
     assert str(rig.driver.link_state) == "waiting"
-    assert rig.driver.failure == "no sweep for 100 ms"
+    assert rig.driver.conversation.link.reason == "no sweep for 100 ms"
     assert rig.driver.counters.link_losses == 1
     assert rig.driver.fileno() is None
 
@@ -209,7 +209,7 @@ def test_a_bridge_that_was_reset_in_the_middle_is_greeted_again(rig: Rig) -> Non
     rig.greet()
     rig.bridge.send(sweep(0, 10_000), hello(0), sweep(1, 20_000))
     assert len(take(rig.driver, rig.bridge)) == 1
-    assert rig.driver.failure == "the bridge was reset"
+    assert rig.driver.conversation.link.reason == "the bridge was reset"
     assert rig.driver.counters.restarts == 1
 
 
@@ -221,7 +221,7 @@ def test_a_bridge_that_changes_its_sampling_is_greeted_again(rig: Rig) -> None:
     (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
     rig.bridge.send(hello(ping.nonce, 60_000, channels=SEQUENCE_ALL))
     take(rig.driver, rig.bridge)
-    assert rig.driver.failure == "the bridge changed what it samples"
+    assert rig.driver.conversation.link.reason == "the bridge changed what it samples"
 
 
 def test_pings_come_quickly_at_first_and_then_once_a_second(rig: Rig) -> None:
@@ -238,8 +238,8 @@ def test_pings_come_quickly_at_first_and_then_once_a_second(rig: Rig) -> None:
             assert isinstance(ping, Ping)
             rig.bridge.send(hello(ping.nonce, now_ms * 1000))
     assert times_ms == [50, 100, 150, 200, 250, 300, 350, 1350, 2350, 3350]
-    assert rig.driver.bridge_clock is not None
-    assert rig.driver.bridge_clock.trusted
+    assert rig.driver.conversation.clock is not None
+    assert rig.driver.conversation.clock.trusted
     assert rig.driver.counters.unanswered_pings == 0
 
 
@@ -256,7 +256,7 @@ def test_a_device_that_is_not_there_is_tried_again_with_growing_patience(
             waits_ms.append((due_ns - clock.now_ns) / MS)
             clock.now_ns = due_ns
             assert driver.read_ready() == ()
-        assert driver.failure == f"{port}: no such file or directory"
+        assert driver.conversation.link.reason == f"{port}: no such file or directory"
     assert waits_ms == sorted(waits_ms)
     assert (waits_ms[0], waits_ms[-1]) == (50, 1000)
     assert [r.levelname for r in caplog.records].count("WARNING") == 1
@@ -265,7 +265,7 @@ def test_a_device_that_is_not_there_is_tried_again_with_growing_patience(
 def test_a_port_that_another_program_has_is_said(rig: Rig) -> None:
     rig.greet()
     with SpiBridgeDriver(rig.bridge.port, FINGERS) as second:
-        assert second.failure == f"{rig.bridge.port}: another program has it open"
+        assert second.conversation.link.reason == f"{rig.bridge.port}: another program has it open"
     assert rig.driver.link_state is LinkState.GREETING
 
 
@@ -276,7 +276,7 @@ def test_unplugging_is_noticed_at_once(rig: Rig) -> None:
     rig.bridge.unplug()
     assert rig.driver.read_ready() == ()
     assert rig.driver.link_state is LinkState.WAITING
-    assert rig.driver.failure == f"{rig.bridge.port}: the device went away"
+    assert rig.driver.conversation.link.reason == f"{rig.bridge.port}: the device went away"
     assert rig.driver.counters.link_losses == 1
 
 

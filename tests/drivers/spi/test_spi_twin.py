@@ -19,10 +19,11 @@ from drivers.spi.clock import UNKNOWN_DELAY_NS
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import DIGEST
 from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import Counts, GeneratedContact, recorded_counts
+from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.spi import SpiTwin
 from tests.conftest import data_dir
 from tests.drivers.spi.bridge_bench import FINGERS, MS, replug_times_s, run
+from tests.drivers.twins.signals import GeneratedContact
 
 SWEEPS = 600
 REPLUGS = 50
@@ -182,8 +183,8 @@ def test_a_dead_electrode_and_an_unplugged_finger_are_where_they_are(tmp_path: P
         same[0, 7] = same[2, 17] = True
         assert same[[0, 2]].all()
     assert driver.counters.absent_sensors == 100
-    assert driver.hello is not None
-    assert driver.hello.serials[1] == ""
+    assert driver.conversation.hello is not None
+    assert driver.conversation.hello.serials[1] == ""
 
 
 def test_a_stuck_clock_gives_old_times_and_the_same_counts(tmp_path: Path) -> None:
@@ -203,8 +204,8 @@ def test_a_twin_of_a_wrong_version_gives_no_reading(tmp_path: Path) -> None:
     with twin, SpiBridgeDriver(str(tmp_path / "b"), FINGERS) as driver:
         readings = run(twin, driver, lambda _: driver.counters.refused_bridges >= 3)
         assert readings == []
-        assert driver.failure is not None
-        assert "speaks version 2, this is version 1" in driver.failure
+        assert driver.conversation.link.reason is not None
+        assert "speaks version 2, this is version 1" in driver.conversation.link.reason
         assert twin.sweeps_made == 0
 
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from drivers.twins.grasps.grasp_script import Durations, EndPoint
 from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.tactile_noise import MeasuredNoise, fresh_residuals
+from drivers.twins.grasps.tactile_noise import MeasuredNoise
 from drivers.twins.grasps.whole_grasps import Moment, Sampling, WholeGrasps, synthetic_grasps
+from tests.drivers.twins.signals import fresh_residuals, played
 
 REST = np.full((3, 24), 3000.0)
 UNPRESSED = EndPoint(REST.astype(np.uint16), False, "nothing")
@@ -52,7 +53,7 @@ def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_p
             np.ones((3, 24)),
             [EndPoint(np.ones((3, 24), dtype=np.uint16), False, "")],
             sampling=Sampling.HELD,
-            residuals=numbers,
+            noise=played(numbers),
             seed=seed,
         )
         rows = counts_of(list(itertools.islice(grasps, 100)))

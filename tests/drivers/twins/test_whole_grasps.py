@@ -15,7 +15,6 @@ from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from drivers.twins.grasps import whole_grasps
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
-from drivers.twins.grasps.tactile_noise import fresh_residuals
 from drivers.twins.grasps.whole_grasps import (
     Moment,
     Sampling,
@@ -24,6 +23,7 @@ from drivers.twins.grasps.whole_grasps import (
     synthetic_grasps,
 )
 from tests.drivers.recordings.tables import rows_of, stream, table, write
+from tests.drivers.twins.signals import crept_s, fresh_residuals, played
 
 REST = np.full((3, 24), 3000.0)
 SILENCE = np.zeros((1, 3, 24))
@@ -41,7 +41,7 @@ GRASPS = [pressed(seed, slipped=seed % 2 == 1) for seed in range(4)]
 @pytest.fixture(scope="module")
 def silent() -> tuple[list[Moment], list[Timetable]]:
     """Four grasps at 1000 Hz without noise; two slip."""
-    grasps = WholeGrasps(REST, GRASPS, rate_hz=1000.0, residuals=SILENCE, seed=5)
+    grasps = WholeGrasps(REST, GRASPS, rate_hz=1000.0, noise=played(SILENCE), seed=5)
     return list(grasps), list(grasps.timetables())
 
 
@@ -124,15 +124,15 @@ def test_the_creep_falls_to_a_rate_when_the_timetable_says(
     times = np.array([moment.t_s for moment in moments])
     for timetable in timetables:
         for rate in (100.0, 30.0):
-            crept_s = timetable.crept_s(rate)
-            assert timetable.closed_s < crept_s < timetable.lift_s
-            middle = int(np.searchsorted(times, crept_s))
+            when_s = crept_s(timetable, rate)
+            assert timetable.closed_s < when_s < timetable.lift_s
+            middle = int(np.searchsorted(times, when_s))
             window = counts_of(moments[middle - 20 : middle + 21])
             measured = np.abs(window[-1] - window[0]).mean() / 0.04
             # Whole counts over 40 ms: the mean of 72 electrodes is good to some counts/s.
             assert measured == pytest.approx(rate, rel=0.05, abs=4.0)
-        assert timetable.crept_s(1e6) == timetable.closed_s
-        assert timetable.crept_s(1e-6) > timetable.lift_s
+        assert crept_s(timetable, 1e6) == timetable.closed_s
+        assert crept_s(timetable, 1e-6) > timetable.lift_s
 
 
 def test_the_end_point_is_reached_when_the_lift_starts(
@@ -252,7 +252,7 @@ def test_one_finger_can_grasp() -> None:
 @pytest.mark.parametrize("slipped", [False, True])
 def test_a_grasp_that_touches_nothing_stays_at_rest(slipped: bool) -> None:
     nothing = EndPoint(REST.astype(np.uint16), slipped, "")
-    assert (counts_of(list(WholeGrasps(REST, [nothing], residuals=SILENCE))) == 3000).all()
+    assert (counts_of(list(WholeGrasps(REST, [nothing], noise=played(SILENCE)))) == 3000).all()
 
 
 def test_the_rest_above_a_table_is_an_upper_quantile_of_each_electrode() -> None:
@@ -273,8 +273,6 @@ def test_what_does_not_fit_is_refused() -> None:
         WholeGrasps(REST, [])
     with pytest.raises(ValueError, match="not the shape of the rest"):
         WholeGrasps(REST[:2], GRASPS)
-    with pytest.raises(ValueError, match="residuals have shape"):
-        WholeGrasps(REST, GRASPS, residuals=np.zeros((5, 2, 24)))
     with pytest.raises(ValueError, match="must be positive"):
         WholeGrasps(REST, GRASPS, rate_hz=0.0)
     with pytest.raises(ValueError, match="held values come at 100 Hz"):
@@ -289,7 +287,7 @@ def test_real_end_points_are_reached_with_real_noise(bts3_dir: Path, sampling: S
     residuals = fresh_residuals(np.array(list(recorded_counts(path))))
     end_points = whole_grasps.read_end_points(bts3_dir / "palm_down.csv")
     rest = rest_above(np.array([end_point.counts for end_point in end_points]))
-    grasps = WholeGrasps(rest, end_points[:10], sampling=sampling, residuals=residuals)
+    grasps = WholeGrasps(rest, end_points[:10], sampling=sampling, noise=played(residuals))
     moments = list(grasps)
     for timetable, end_point in zip(grasps.timetables(), end_points, strict=False):
         before = [m for m in moments if timetable.lift_s - 0.2 < m.t_s < timetable.lift_s]

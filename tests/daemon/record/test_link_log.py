@@ -13,9 +13,9 @@ import can
 from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.record.mcap import header_of
 from drivers.base import TactileReading
-from drivers.recordings.can_capture import CanCapture, frames_of
-from drivers.recordings.capture_player import CaptureReplayDriver
+from drivers.recordings.can_log import CanLog
 from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.recordings.link_log_player import LinkLogDriver
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.daemon.record.recorded import messages
 
@@ -48,7 +48,7 @@ def scene(kind: str, folder: Path) -> Path:
 
 
 def record(kind: str, folder: Path) -> tuple[Path, Path]:
-    """The recording of a twin that plays the demo grasps under faults, and the capture."""
+    """The recording of a twin that plays the demo grasps under faults, and the link log."""
     options = [filled(option, folder) for option in TWINS[kind]]
     path = scene(kind, folder)
     with start("run", path) as daemon:
@@ -63,8 +63,8 @@ def record(kind: str, folder: Path) -> tuple[Path, Path]:
         _, said = daemon.communicate(timeout=TIMEOUT_S)
     assert daemon.returncode == 0, said
     (recording,) = (folder / "record").glob("*.mcap")
-    (capture,) = set((folder / "record").iterdir()) - {recording}
-    return recording, capture
+    (log,) = set((folder / "record").iterdir()) - {recording}
+    return recording, log
 
 
 def compared(verdict: dict[str, Any]) -> dict[str, Any]:
@@ -74,15 +74,15 @@ def compared(verdict: dict[str, Any]) -> dict[str, Any]:
 def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given(
     tmp_path: Path,
 ) -> None:
-    recording, capture = record("spi", tmp_path)
-    assert capture.suffix == ".serial"
+    recording, log = record("spi", tmp_path)
+    assert log.suffix == ".serial"
     kept = messages(recording)
     times = {content["t_mono_ns"] for what, content in kept if what == "tactile"}
     before: dict[int, dict[str, Any]] = {}
     for what, content in kept:
         if what == "verdict" and content["t_mono_ns"] in times:
             before.setdefault(content["t_mono_ns"], content)
-    result = graspd("replay", "--json", capture, "--scene", tmp_path / "scene.toml")
+    result = graspd("replay", "--json", log, "--scene", tmp_path / "scene.toml")
     assert result.returncode == 0, result.stderr
     now = [json.loads(line) for line in result.stdout.splitlines()]
     assert len(before) > 400
@@ -99,12 +99,12 @@ def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given
 def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_were(
     tmp_path: Path,
 ) -> None:
-    recording, capture = record("can", tmp_path)
+    recording, log = record("can", tmp_path)
     offset_ns = header_of(recording).wall_minus_monotonic_ns
-    board = CanCapture(("ff", "mf", "th"), arbitration_id=0x100, sequence="electrodes")
+    board = CanLog(("ff", "mf", "th"), arbitration_id=0x100, sequence="electrodes")
     decoded: dict[int, TactileReading] = {}
     readings = 0
-    with CaptureReplayDriver([capture], frames_of, board) as driver:
+    with LinkLogDriver([log], board) as driver:
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)
@@ -119,15 +119,15 @@ def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_wer
             same += found.faults.tolist() == content["faults"]
     # A machine that is too busy to look at the bus for 100 ms takes it for silent, and cuts sweeps.
     assert same > 0.95 * len(known)
-    result = graspd("replay", "--json", capture, "--scene", tmp_path / "scene.toml")
+    result = graspd("replay", "--json", log, "--scene", tmp_path / "scene.toml")
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) == readings
 
 
 def test_candump_text_is_what_other_programs_read(tmp_path: Path) -> None:
-    _, capture = record("can", tmp_path)
-    assert capture.name.endswith(".can.log")
-    with can.CanutilsLogReader(capture) as reader:
+    _, log = record("can", tmp_path)
+    assert log.name.endswith(".can.log")
+    with can.CanutilsLogReader(log) as reader:
         frames = list(reader)
     assert len(frames) > 5000
     assert {frame.arbitration_id for frame in frames} == {0x100}

@@ -1,9 +1,10 @@
-"""Captured frames and bytes come back as they were; damage costs what is damaged and no more."""
+"""Logged frames and bytes come back as they were; damage costs what is damaged and no more."""
 
 from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -12,11 +13,15 @@ from hypothesis import strategies as st
 
 from drivers.base import RecordingError
 from drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
-from drivers.recordings.can_capture import CanCapture, frames_of
-from drivers.recordings.candump import frame_of, line_of
-from drivers.recordings.capture_player import CaptureReplayDriver
-from drivers.recordings.serial_capture import SerialCapture, records_of
-from drivers.recordings.serial_file import RawParser, RawRecord, Way, encode_records
+from drivers.recordings.can_log import CanLog, frame_of, line_of
+from drivers.recordings.link_log_player import LinkLogDriver
+from drivers.recordings.serial_log import (
+    SerialLog,
+    SerialLogParser,
+    SerialRecord,
+    encode_records,
+)
+from drivers.spi.line import LineEvent
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
 
@@ -116,72 +121,73 @@ def test_no_text_makes_the_line_parser_raise(text: str) -> None:
 
 
 records = st.builds(
-    RawRecord, st.sampled_from(Way), st.integers(0, 2**64 - 1), st.binary(max_size=900)
+    SerialRecord, st.sampled_from(LineEvent), st.integers(0, 2**64 - 1), st.binary(max_size=900)
 )
 
 
-def encoded(found: list[RawRecord]) -> bytes:
-    return b"".join(encode_records(record.way, record.t_ns, record.data) for record in found)
+def encoded(found: list[SerialRecord]) -> bytes:
+    return b"".join(encode_records(record.event, record.t_ns, record.data) for record in found)
 
 
 @given(st.lists(records, max_size=10), st.integers(1, 50))
 def test_records_come_back_however_the_file_is_cut_into_chunks(
-    made: list[RawRecord], size: int
+    made: list[SerialRecord], size: int
 ) -> None:
     data = encoded(made)
-    parser = RawParser()
+    parser = SerialLogParser()
     found = [
         record
         for start in range(0, len(data), size)
         for record in parser.feed(data[start : start + size])
     ]
     assert found == made
-    assert parser.damaged == 0
+    counters = parser._frames.counters
+    assert counters.bad_cobs + counters.bad_crc + counters.too_long == 0
 
 
 @given(st.binary(min_size=961, max_size=5000))
 def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
-    found = list(RawParser().feed(encode_records(Way.RECEIVED, 5, data)))
+    found = list(SerialLogParser().feed(encode_records(LineEvent.RECEIVED, 5, data)))
     assert b"".join(record.data for record in found) == data
-    assert {(record.way, record.t_ns) for record in found} == {(Way.RECEIVED, 5)}
+    assert {(record.event, record.t_ns) for record in found} == {(LineEvent.RECEIVED, 5)}
 
 
 @given(st.lists(records, min_size=3, max_size=6), st.data())
 def test_damage_costs_the_record_that_is_damaged_and_the_one_after_it_at_most(
-    made: list[RawRecord], data: st.DataObject
+    made: list[SerialRecord], data: st.DataObject
 ) -> None:
     whole = bytearray(encoded(made))
     at = data.draw(st.integers(0, len(whole) - 1))
     whole[at] ^= data.draw(st.integers(1, 255))
-    found = list(RawParser().feed(bytes(whole)))
+    found = list(SerialLogParser().feed(bytes(whole)))
     assert len(found) >= len(made) - 2
     assert all(record in made for record in found)
 
 
 @given(st.lists(records, min_size=1, max_size=5), st.data())
 def test_a_file_that_was_cut_off_has_all_but_its_last_record(
-    made: list[RawRecord], data: st.DataObject
+    made: list[SerialRecord], data: st.DataObject
 ) -> None:
     cut = encoded(made)[: -data.draw(st.integers(1, len(encoded(made[-1:]))))]
-    assert list(RawParser().feed(cut)) == made[:-1]
+    assert list(SerialLogParser().feed(cut)) == made[:-1]
 
 
 @given(st.binary(max_size=3000))
 def test_no_bytes_make_the_record_parser_raise(data: bytes) -> None:
-    list(RawParser().feed(data))
+    list(SerialLogParser().feed(data))
 
 
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"no frames\n" * 1000, bytes(range(256))])
 def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "capture"
+    path = tmp_path / "link.log"
     path.write_bytes(content)
     fingers = ("ff", "mf", "th")
-    drivers = (
-        CaptureReplayDriver([path], frames_of, CanCapture(fingers)),
-        CaptureReplayDriver([path], records_of, SerialCapture(fingers)),
+    drivers: tuple[LinkLogDriver[Any], ...] = (
+        LinkLogDriver([path], CanLog(fingers)),
+        LinkLogDriver([path], SerialLog(fingers)),
     )
     for driver in drivers:
         with pytest.raises(RecordingError, match="nothing that came over a link"), driver:
             pass
     with pytest.raises(ValueError, match="positive speed"):
-        CaptureReplayDriver([path], frames_of, CanCapture(fingers), speed=0.0)
+        LinkLogDriver([path], CanLog(fingers), speed=0.0)

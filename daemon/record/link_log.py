@@ -14,12 +14,13 @@ from daemon.record.files import create
 from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
 from drivers.can.frames import LOST
-from drivers.recordings.candump import line_of
-from drivers.recordings.serial_file import Way, encode_records
+from drivers.recordings.can_log import line_of
+from drivers.recordings.serial_log import encode_records
 
 if TYPE_CHECKING:
     from daemon.record.recorder import RawFile
-    from drivers.can.bus import Stamped
+    from drivers.can.frames import Stamped
+    from drivers.spi.line import LineEvent
 
 EARLY_MAX: Final = 1000
 """Entries held while the recorder is not there yet: those of the link's opening."""
@@ -50,9 +51,9 @@ class Tap:
         """CAN frames have come."""
         self._take(stamped)
 
-    def bytes(self, way: Way, data: bytes) -> None:
+    def bytes(self, event: LineEvent, data: bytes) -> None:
         """Bytes went over a serial line."""
-        self._take((way, data))
+        self._take((event, data))
 
     def _take(self, entry: object) -> None:
         if self._taker is None:
@@ -126,7 +127,7 @@ class CandumpFile(_File):
 
 
 class SerialFile(_File):
-    """Serial bytes in the frames of `drivers.recordings.serial_file`, with monotonic times."""
+    """Serial bytes in the frames of `drivers.recordings.serial_log`, with monotonic times."""
 
     def __init__(self, name: Path) -> None:
         super().__init__(name, ".serial")
@@ -134,5 +135,5 @@ class SerialFile(_File):
     def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
         """Take bytes that came or went at once."""
         if isinstance(entry, tuple):
-            way, data = entry
-            self._stream.write(encode_records(way, at_ns, data))
+            event, data = entry
+            self._stream.write(encode_records(event, at_ns, data))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.base import RecordingError
-from drivers.palm.driver import PalmDriver
 from drivers.palm.packet import Palm
+from drivers.recordings.palm_file import PalmFileDriver
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import MS, Clock, datagrams, rows, tactile
 
@@ -24,8 +24,10 @@ def test_a_file_of_packets_plays_count_for_count(
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(packet.to_bytes() for packet in twin.packets()) + bytes(5))
     readings = []
-    with PalmDriver(path, realtime=False) as driver:
+    clock = Clock()
+    with PalmFileDriver(path, clock=clock) as driver:
         while not driver.exhausted:
+            clock.now_ns = driver.due_ns() or clock.now_ns
             readings += tactile(driver.read_ready())
         assert driver.counters.bad_lengths == 1  # the file ends in the middle of a packet
         assert driver.due_ns() is None
@@ -37,7 +39,7 @@ def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(datagrams(10)))
     times = []
-    with PalmDriver(path, clock=clock) as driver:
+    with PalmFileDriver(path, clock=clock) as driver:
         start_ns = clock.now_ns
         while (due_ns := driver.due_ns()) is not None:
             clock.now_ns = due_ns
@@ -49,7 +51,7 @@ def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "hand.palm"
     os.mkfifo(path)
     with pytest.raises(RecordingError, match="is not a file"):
-        PalmDriver(path).open()
+        PalmFileDriver(path).open()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])
@@ -58,18 +60,17 @@ def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"hand\.palm"):
-        PalmDriver(path).open()
+        PalmFileDriver(path).open()
     with pytest.raises(RecordingError, match=r"is not a file|cannot be opened"):
-        PalmDriver(tmp_path).open()
+        PalmFileDriver(tmp_path).open()
 
 
-@pytest.mark.parametrize("realtime", [False, True])
-def test_a_file_that_is_read_late_has_lost_no_packet(tmp_path: Path, realtime: bool) -> None:
+def test_a_file_that_is_read_late_has_lost_no_packet(tmp_path: Path) -> None:
     clock = Clock()
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(datagrams(40)))
     readings = []
-    with PalmDriver(path, realtime=realtime, clock=clock) as driver:
+    with PalmFileDriver(path, clock=clock) as driver:
         while not driver.exhausted:
             readings += tactile(driver.read_ready())
             clock.now_ns += 500 * MS

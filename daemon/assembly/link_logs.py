@@ -12,16 +12,16 @@ from daemon.assembly import assembly
 from daemon.judge.pipeline import Pipeline
 from daemon.scene import Scene, SceneError
 from daemon.scene.drivers import CanTactile, SpiTactile
-from drivers.recordings.capture_player import CANDUMP, SERIAL, CaptureReplayDriver
+from drivers.recordings.link_log_player import CANDUMP, SERIAL, LinkLogDriver
 from models.runtime import TactileModel
 
 _DRIVER = {CANDUMP: "can", SERIAL: "spi"}
 _SECTIONS = ("hand", "tactile", "model", "gate", "session")
-"""Those that say how readings are judged; a capture has no joints."""
+"""Those that say how readings are judged; a link log has no joints."""
 
 
-class Captures:
-    """Files of one kind, in the order of time, and the scene that they are of."""
+class LinkLogs:
+    """Link logs of one kind, in the order of time, and the scene that they are of."""
 
     def __init__(self, paths: Sequence[Path], path: Path | None) -> None:
         """`path` is of the scene; without it the link is one of this kind with the usual options.
@@ -34,13 +34,13 @@ class Captures:
         self._paths = tuple(paths)
         self._ending = paths[0].suffix
         self._scene_path = path
-        self._driver: CaptureReplayDriver | None = None
+        self._driver: LinkLogDriver[Any] | None = None
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
         """The scene of the link, with another model or gate mode if given. Raises `SceneError`."""
         driver = _DRIVER[self._ending]
         if self._scene_path is None:
-            port = {"port": "capture"} if self._ending == SERIAL else {}
+            port = {"port": "link log"} if self._ending == SERIAL else {}
             sections: dict[str, dict[str, Any]] = {"tactile": {"driver": driver, **port}}
         else:
             wanted = scene.load(self._scene_path)
@@ -52,8 +52,8 @@ class Captures:
             changed(sections, publish, model, mode), self._scene_path or Path("command line")
         )
 
-    def build_driver(self, wanted: Scene, speed: float | None) -> CaptureReplayDriver:
-        """The driver of the captures, not yet open. Raises `SceneError`."""
+    def build_driver(self, wanted: Scene, speed: float | None) -> LinkLogDriver[Any]:
+        """The driver of the files, not yet open. Raises `SceneError`."""
         try:
             self._driver = _driver(wanted, self._paths, speed)
         except ValueError as error:
@@ -67,7 +67,7 @@ class Captures:
         return assembly.build_pipeline(wanted, model, clock, learns=learns)
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Nothing: a capture does not know the session."""
+        """Nothing: a link log does not know the session."""
 
 
 def changed(
@@ -84,18 +84,17 @@ def changed(
     return {**sections, "model": former | model, "gate": gate, "publish": publish}
 
 
-def _driver(wanted: Scene, paths: Sequence[Path], speed: float | None) -> CaptureReplayDriver:
+def _driver(wanted: Scene, paths: Sequence[Path], speed: float | None) -> LinkLogDriver[Any]:
     tactile, fingers = wanted.tactile, wanted.hand.fingers
     if isinstance(tactile, SpiTactile):
-        from drivers.recordings.serial_capture import SerialCapture, records_of
+        from drivers.recordings.serial_log import SerialLog
 
-        bridge = SerialCapture(fingers, tactile.sensors)
-        return CaptureReplayDriver(paths, records_of, bridge, speed=speed)
+        return LinkLogDriver(paths, SerialLog(fingers, tactile.sensors), speed=speed)
     if not isinstance(tactile, CanTactile):
-        raise ValueError("captures are of the drivers can and spi")
-    from drivers.recordings.can_capture import CanCapture, frames_of
+        raise ValueError("link logs are of the drivers can and spi")
+    from drivers.recordings.can_log import CanLog
 
-    options = tactile.model_dump(
+    board = tactile.model_dump(
         exclude={"driver", "interface", "channel", "bitrate", "data_bitrate"}
     )
-    return CaptureReplayDriver(paths, frames_of, CanCapture(fingers, **options), speed=speed)
+    return LinkLogDriver(paths, CanLog(fingers, **board), speed=speed)

@@ -1,4 +1,4 @@
-"""CAN frames as lines of text, as `candump -L` writes and `canplayer` reads them. Text only.
+"""The link log of a CAN bus: frames as `candump -L` writes and `canplayer` reads them.
 
 `(1436509052.249713) can0 100#0D3A1F` - seconds with six digits, interface, id in three or eight
 digits, `#`, data. `##` and a digit of flags begin the data of CAN FD, `R` stands for that of a
@@ -8,8 +8,11 @@ remote frame, and bit 29 of an id marks an error frame (can-utils, lib.c and lin
 from __future__ import annotations
 
 import re
-from typing import Final
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final, Unpack
 
+from drivers.base import Reading
 from drivers.can.frames import (
     CLASSIC_DATA_MAX,
     ERR_FLAG,
@@ -22,6 +25,8 @@ from drivers.can.frames import (
     STANDARD_ID_MAX,
     CanFrame,
 )
+from drivers.can.stream import BoardOptions, CanStream
+from drivers.recordings.csv_rows import open_recording
 
 LINE_MAX: Final = 256
 """A frame of CAN FD takes 170 characters."""
@@ -65,3 +70,35 @@ def frame_of(line: str) -> tuple[int, CanFrame] | None:
     if word & ERR_FLAG:
         return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags | ERROR)
     return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags | EXTENDED)
+
+
+class CanLog:
+    """Candump text through the stream that the driver has. A `LinkLog`."""
+
+    def __init__(self, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
+        """As those of a `CanStream`. Raises `ValueError`."""
+        self._fingers, self._board = fingers, board
+        self.begin()
+
+    def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
+        """Times, ns, and frames of a file; other lines are passed over. Raises `RecordingError`."""
+        with open_recording(path) as stream:
+            while line := stream.readline(LINE_MAX + 1):
+                found = frame_of(line.decode("ascii", "replace"))
+                if found is not None:
+                    yield found
+
+    def begin(self) -> None:
+        """Forget all that came."""
+        self.stream = CanStream("link log", self._fingers, **self._board)
+        self.stream.link.greeting()
+
+    def feed(self, t_ns: int, record: CanFrame) -> Sequence[Reading]:
+        """The readings that one frame completes."""
+        self.stream.watch(t_ns)
+        readings, trouble = self.stream.receive([(record, t_ns, t_ns)])
+        self.stream.counters.frames += 1
+        self.stream.watch(t_ns)
+        if trouble is not None:
+            self.stream.interrupt()
+        return readings

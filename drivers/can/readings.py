@@ -1,0 +1,135 @@
+"""What both formats share on the way to a reading: counters, numbers, the period, the words."""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import DriverCounters, ElectrodeFault, TactileReading
+from drivers.biotac import decode_words
+
+PERIODS_KEPT: Final = 15
+PERIODS_NEEDED: Final = 5
+"""The period is the median of the last 15 and known after 5."""
+OUTAGE_NS: Final = 2_000_000_000
+"""After this long, ns, nobody knows how many sweeps were made: it counts as one missed."""
+
+
+@dataclass(slots=True)
+class CanCounters(DriverCounters):
+    """What a CAN bus brought, and what became of it."""
+
+    lost_frames: int = 0
+    """Frames with electrodes that did not come although others of their sweep did."""
+    duplicate_frames: int = 0
+    """Frames that came again; the copy is dropped."""
+    reordered_frames: int = 0
+    """Frames that came after their successor and in time for their sweep; of sweep frames, those
+    of a finger after one with a higher number."""
+    late_frames: int = 0
+    """Frames that came when their sweep was over; dropped."""
+    unsynchronised_frames: int = 0
+    """Frames dropped after opening, or after a known loss, until a sweep began."""
+    untimed_frames: int = 0
+    """Samples dropped because nobody knows when they came: the loop stalled, and the bus does not
+    stamp them."""
+    unexpected_channels: int = 0
+    """Samples of a channel that the configured sequence does not have."""
+    interrupted_sweeps: int = 0
+    """Sweeps dropped because the link broke in the middle."""
+    cut_sweeps: int = 0
+    """Sweeps ended in the middle because frames were known to be lost there."""
+    restarts: int = 0
+    """Times that the device's sweep counter or clock started anew."""
+    contradicting_frames: int = 0
+    """Frames with the number of the sweep at hand and another tick; dropped."""
+    parity_words: int = 0
+    """Response words with a byte of even parity."""
+    error_words: int = 0
+    """Response words that are error words."""
+    unplugged_words: int = 0
+    """Response words of a line that nothing drives, or of a sensor that is reported absent."""
+    frames: int = 0
+    """Frames of every kind that the bus brought."""
+    accepted_frames: int = 0
+    """Of these, samples or sweep frames of our sensors, before duplicates and losses."""
+    foreign_frames: int = 0
+    """Frames with another arbitration id than the configured or the latched one; until an id is
+    latched, frames that are no sound sample."""
+    remote_frames: int = 0
+    error_frames: int = 0
+    """Frames in which the controller reports trouble on the bus."""
+    wrong_length_frames: int = 0
+    """Our arbitration id, another length than configured."""
+    unknown_commands: int = 0
+    """Our arbitration id, but the first byte samples no channel."""
+    unknown_versions: int = 0
+    """Sweep frames of another layout version."""
+    malformed_frames: int = 0
+    """Our arbitration id, contents that the format forbids."""
+    stuck_ticks: int = 0
+    """Sweep frames of a new sweep with the tick of the sweep before; their words are `HELD`."""
+    overruns: int = 0
+    """Sweep frames that report a sweep that began late."""
+    controller_overflows: int = 0
+    """Error frames that report a receive overflow of the controller."""
+    kernel_drops: int = 0
+    """Frames that the kernel dropped because the socket's buffer was full (socketcan only)."""
+    bus_off: int = 0
+    """Times that the controller left the bus after too many errors."""
+    bus_faults: int = 0
+    """Failures of the bus or of python-can, opening it included."""
+    link_losses: int = 0
+    """Times that the link was up and was lost."""
+
+
+class ReadingMaker:
+    """Numbers readings, counts what is wrong with them, knows their period."""
+
+    def __init__(self, counters: CanCounters) -> None:
+        self.counters = counters
+        self.seq = 0
+        self._gaps_ns: deque[int] = deque(maxlen=PERIODS_KEPT)
+        self.period_ns: int | None = None
+
+    def learn(self, gap_ns: int) -> None:
+        """Take in the time between two sweeps in a row, ns."""
+        self._gaps_ns.append(gap_ns)
+        if len(self._gaps_ns) >= PERIODS_NEEDED:
+            self.period_ns = max(round(statistics.median(self._gaps_ns)), 1)
+
+    def miss(self, sweeps: int) -> None:
+        """So many sweeps were made and never arrived."""
+        self.seq += sweeps
+        self.counters.missed_readings += sweeps
+
+    def make(
+        self, words: NDArray[np.uint16], marks: NDArray[np.uint8], t_ns: int
+    ) -> TactileReading:
+        """The reading of response words, shape (fingers, 24).
+
+        `marks`: `ElectrodeFault` bits that are known beforehand; a word under `MISSING` means
+        nothing and is not looked at.
+        """
+        counts, faults = decode_words(words)
+        absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
+        faults[absent] = 0
+        if faults.any():
+            self._count_words(faults)
+        faults |= marks
+        counts[absent] = 0
+        self.counters.readings += 1
+        self.counters.faulty_readings += bool(faults.any())
+        reading = TactileReading(t_ns, self.seq, counts, faults)
+        self.seq += 1
+        return reading
+
+    def _count_words(self, faults: NDArray[np.uint8]) -> None:
+        self.counters.parity_words += int((faults == ElectrodeFault.PARITY).sum())
+        self.counters.error_words += int((faults == ElectrodeFault.ERROR_WORD).sum())
+        self.counters.unplugged_words += int((faults == ElectrodeFault.MISSING).sum())

@@ -1,0 +1,173 @@
+"""What one CAN bus brings: frames in with their times, readings out. No I/O.
+
+See `deploy/can/PROTOCOL.md` for the two formats.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, TypedDict
+
+from drivers.base import Reading
+from drivers.can.decoders import make_decoder
+from drivers.can.formats import SWEEP_BASE_ID, CanFormat
+from drivers.can.frames import (
+    ERROR,
+    LOST,
+    REMOTE,
+    CanFrame,
+    Stamped,
+    describe_error,
+    is_bus_off,
+    is_overflow,
+)
+from drivers.can.readings import CanCounters
+from drivers.link import Link, LinkState
+
+NAME: Final = "can"
+SILENCE_PERIODS: Final = 10
+"""Readings that may be missing before the link is down."""
+SILENCE_MIN_NS: Final = 100_000_000
+"""Shortest silence that is one, ns: above what an adapter or a busy host holds back."""
+
+
+class BoardOptions(TypedDict, total=False):
+    """Arguments of a `CanStream` that say what the board sends."""
+
+    sensors: Sequence[str] | None
+    format: str
+    arbitration_id: int | None
+    sequence: str
+    data_length: int | None
+
+
+class CanStream:
+    """Decodes one bus, and says by `link` whether a board of ours is on it.
+
+    Whoever has the bus calls `link.greeting` when it is open, `receive` and then `watch` with what
+    comes, and `lost` when it is gone. All times are monotonic ns.
+    """
+
+    def __init__(
+        self,
+        bus: str,
+        fingers: Sequence[str],
+        *,
+        sensors: Sequence[str] | None = None,
+        format: str = CanFormat.SYNTOUCH,  # noqa: A002 (the key of the scene)
+        arbitration_id: int | None = None,
+        sequence: str = "interleaved",
+        data_length: int | None = None,
+    ) -> None:
+        """`bus` names it for people. Raises `ValueError` for arguments that do not fit each other.
+
+        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
+        three at most, the same unless given; a board may have more sensors than fingers are wanted
+        (`syntouch` only: sweep frames say whose they are). `format`: a `CanFormat`.
+        `arbitration_id`: of the samples, or of finger 0 (`ff`) of the sweep frames; above 0x7FF it
+        has 29 bits. None takes the id of the first sound sample until the link is lost, which is
+        for bring-up only, except with `sweep_fd`, where it stands for 0x5B0. `sequence`: a key of
+        `drivers.biotac.SEQUENCES` (`syntouch` only). `data_length`: bytes of a sample frame where
+        the board pads it.
+        """
+        frame_format = CanFormat(format)
+        if frame_format is CanFormat.SWEEP_FD and arbitration_id is None:
+            arbitration_id = SWEEP_BASE_ID
+        self.counters = CanCounters()
+        self.link = Link(NAME)
+        self.last_error: str | None = None
+        """The last failure of the bus or error frame, for people; None before the first."""
+        self._where = f"{bus}, {frame_format}"
+        self._accepted = 0
+        self._silent_at_ns = 0
+        self._decoder = make_decoder(
+            frame_format,
+            fingers,
+            counters=self.counters,
+            sensors=sensors,
+            arbitration_id=arbitration_id,
+            sequence=sequence,
+            data_length=data_length,
+        )
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between readings, ns, as measured; None until it is known."""
+        return self._decoder.period_ns
+
+    @property
+    def expected_ns(self) -> int | None:
+        """When the next reading should be complete, where many frames make one."""
+        return self._decoder.expected_ns
+
+    @property
+    def silent_at_ns(self) -> int | None:
+        """When silence is to be noticed; None while the link is not up."""
+        return self._silent_at_ns if self.link.state is LinkState.UP else None
+
+    def describe(self) -> dict[str, str]:
+        """Bus, link, and whose frames are taken, for people."""
+        known = {"bus": self._where, "link": str(self.link.state)}
+        if self.last_error is not None:
+            known["last error"] = self.last_error
+        if self._decoder.arbitration_id is not None:
+            known["arbitration id"] = f"{self._decoder.arbitration_id:#x}"
+        return known
+
+    def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], str | None]:
+        """The readings that frames complete, oldest first; and why the bus is lost, if it is."""
+        readings: list[Reading] = []
+        trouble = None
+        for frame, t_ns, until_ns in frames:
+            if not frame.flags & (ERROR | REMOTE | LOST):
+                readings += self._decoder.push(frame, t_ns, until_ns)
+                continue
+            trouble = self._take_special(frame) or trouble
+            if frame.flags & LOST or is_overflow(frame):
+                readings += self._decoder.cut()
+        return readings, trouble
+
+    def watch(self, now_ns: int, *, more: bool = False) -> None:
+        """Up with the first frame of ours, and down when there was none for too long.
+
+        Not with `more`: frames that have come and were not taken yet.
+        """
+        if self.counters.accepted_frames > self._accepted:
+            self._accepted = self.counters.accepted_frames
+            self._silent_at_ns = now_ns + self._silence_ns()
+            if self.link.state is LinkState.GREETING:
+                self.link.up(self._where, now_ns)
+        elif self.link.state is LinkState.UP and now_ns >= self._silent_at_ns and not more:
+            self._down(f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms", now_ns)
+            self.link.greeting()
+
+    def lost(self, why: str, now_ns: int) -> None:
+        """The bus is of no use any more, or could not be opened."""
+        self.counters.bus_faults += 1
+        self._down(why, now_ns)
+
+    def interrupt(self) -> None:
+        """Frames are missing from here on: a sweep that was cut through is dropped."""
+        self._decoder.interrupt()
+
+    def _down(self, why: str, now_ns: int) -> None:
+        self.last_error = why
+        self.interrupt()
+        self.link.failed(f"{self._where}: {why}", now_ns)
+        self.counters.link_losses = self.link.losses
+
+    def _silence_ns(self) -> int:
+        return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
+
+    def _take_special(self, frame: CanFrame) -> str | None:
+        """Count a remote or error frame; why the link is lost, if it is."""
+        if frame.flags & (REMOTE | LOST):
+            self.counters.remote_frames += bool(frame.flags & REMOTE)
+            return None
+        self.counters.error_frames += 1
+        self.counters.controller_overflows += is_overflow(frame)
+        self.last_error = describe_error(frame)
+        if not is_bus_off(frame):
+            return None
+        self.counters.bus_off += 1
+        return "bus-off"

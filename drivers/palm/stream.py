@@ -1,0 +1,112 @@
+"""What one palm sends: packets in with their times, tactile and joint readings out. No I/O.
+
+Palm packets have neither checksum nor sequence number. UDP's own checksum covers the way from the
+relay; what is damaged before it cannot be seen where it stays plausible, and two hands of one kind
+that share a relay's socket look like one: one port per hand. Checked are: length, command, which
+motors, finger bits, tactile type and its turn, sensors present, values in 0..4095, validity bits,
+the same packet again. See `drivers.palm.packet` and `drivers.palm.rounds`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from drivers.base import JointReading, Reading
+from drivers.palm.packet import CYCLE_NS, SENSORS, Palm, PalmCounters, PalmPacket, PalmParser
+from drivers.palm.rounds import RoundAssembler
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from drivers.palm.hall import Calibration
+
+JOINT_PERIOD_NS: Final = 10_000_000
+"""A joint reading at 100 Hz: the position of a hand has no more in it, and 1000 would be work."""
+
+
+class PalmStream:
+    """Makes a `TactileReading` of each round of 14 packets, and a `JointReading` every 10 ms.
+
+    Packets must come as the palm makes them, one a millisecond. Of a relay that sends them in
+    batches longer than 10 ms, rounds are flagged or counted as missed that were not.
+    """
+
+    def __init__(
+        self,
+        fingers: Sequence[str],
+        *,
+        calibration: Path | None = None,
+        heed_finger_bits: bool = True,
+    ) -> None:
+        """`fingers` picks the fingers and their order; raises `ValueError` for ones that are none.
+
+        Joint readings need the hand's `calibration` file; raises `CalibrationError` for one with
+        mistakes. Without `heed_finger_bits` the packet's `tactile_valid` is ignored, for a palm
+        that does not set it (Shadow's own driver ignores it).
+        """
+        self.counters = PalmCounters()
+        self.palm: Palm | None = None
+        """Which kind of palm is heard; None until a packet came, and after `interrupt`."""
+        self._parser = PalmParser(self.counters)
+        self._rounds = RoundAssembler(fingers, self.counters, heed_finger_bits=heed_finger_bits)
+        self._previous = b""
+        self._calibration: Calibration | None = None
+        self._uncalibrated = 0
+        self._joint_due_ns = 0
+        self._joint_seq = 0
+        if calibration is not None:
+            # Imported here: a scene without joints carries no joint code.
+            from drivers.palm.calibration import load_calibration
+
+            self._calibration = load_calibration(calibration)
+            middle = [2000] * SENSORS
+            self._uncalibrated = int(np.isnan(self._calibration.angles_rad(middle)).sum())
+
+    @property
+    def cycles_to_go(self) -> int:
+        """Packets until the round at hand can be complete; 0 while nothing is known."""
+        return self._rounds.cycles_to_go
+
+    def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
+        """Take a packet received at monotonic `t_ns`; the readings that it completes.
+
+        None for one that is dropped: no packet of this palm, or the same again.
+        """
+        packet = self._parser.parse(data)
+        if packet is None:
+            return None
+        self.palm = self.palm or packet.palm
+        if packet.palm is not self.palm:
+            self.counters.other_palms += 1
+            return None
+        if data == self._previous or self._rounds.repeats(packet):
+            self.counters.duplicate_packets += 1
+            return None
+        self._previous = data
+        readings = self._rounds.push(packet, t_ns)
+        joints = self._joint_reading(packet, t_ns)
+        return readings if joints is None else (joints, *readings)
+
+    def interrupt(self) -> None:
+        """The link broke: drop the round at hand; what comes next may be another palm."""
+        self._rounds.interrupt()
+        self.palm = None
+
+    def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
+        if self._calibration is None or t_ns < self._joint_due_ns - CYCLE_NS // 2:
+            return None
+        from drivers.palm.hall import JOINTS, impossible_angles
+
+        self._joint_due_ns += JOINT_PERIOD_NS
+        if self._joint_due_ns <= t_ns:
+            self._joint_due_ns = t_ns + JOINT_PERIOD_NS
+        angles = self._calibration.angles_rad(packet.sensors)
+        self.counters.joint_readings += 1
+        self.counters.bad_angles += int(np.isnan(angles).sum()) - self._uncalibrated
+        self.counters.impossible_angles += impossible_angles(angles)
+        reading = JointReading(t_ns, self._joint_seq, JOINTS, angles)
+        self._joint_seq += 1
+        return reading

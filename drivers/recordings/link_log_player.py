@@ -1,0 +1,101 @@
+"""What came over a link, decoded again: candump text and framed serial bytes as a driver.
+
+What was logged goes through the very decoders that live bytes and frames go through, at the times
+at which it came.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from drivers.base import DriverCounters, Reading, RecordingError
+from drivers.recordings.csv_rows import open_recording
+from drivers.recordings.player import RecordedDriver, Timeline
+
+CANDUMP, SERIAL = ".log", ".serial"
+"""Endings of the two kinds of files."""
+Record = TypeVar("Record")
+
+
+class Stream(Protocol):
+    """What makes readings of one link."""
+
+    @property
+    def counters(self) -> DriverCounters:
+        """What came, and every kind of damage."""
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between readings, ns, as recorded; None until it is known."""
+
+
+class LinkLog(Protocol[Record]):
+    """One kind of file, and the stream that its records go through."""
+
+    @property
+    def stream(self) -> Stream:
+        """The one that a driver of this link has."""
+
+    def records(self, path: Path) -> Iterator[tuple[int, Record]]:
+        """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
+
+    def begin(self) -> None:
+        """Forget all that came."""
+
+    def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
+        """The readings that a record of `t_ns` completes."""
+
+
+class LinkLogDriver(RecordedDriver[Record]):
+    """Plays link logs in a row, as one run. `recorded_ns` of a reading is its time on their clock.
+
+    Without `speed` as fast as possible. `open` raises `RecordingError`.
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        log: LinkLog[Record],
+        *,
+        speed: float | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """Nothing is opened yet. Raises `ValueError` without files or with a speed that is none."""
+        super().__init__(paths, Timeline(speed, clock))
+        self._log = log
+
+    @property
+    def counters(self) -> DriverCounters:
+        """Those of the decoder."""
+        return self._log.stream.counters
+
+    @property
+    def period_ns(self) -> int | None:
+        """Time between readings, ns, as played."""
+        recorded_ns = self._log.stream.period_ns
+        return None if recorded_ns is None else round(recorded_ns / (self.timeline.speed or 1.0))
+
+    def open(self) -> None:
+        """Start over with the first file."""
+        self.close()
+        for path in self.paths:
+            open_recording(path).close()
+        self._log.begin()
+        self.timeline.start(self._records())
+        if self.exhausted:
+            raise RecordingError(self.paths[0], "has nothing that came over a link")
+
+    def _records(self) -> Generator[tuple[int, Record], None, None]:
+        for path in self.paths:
+            yield from self._log.records(path)
+
+    def read_ready(self) -> Sequence[Reading]:
+        """The readings of the first record that completes any, as far as records are due."""
+        while (due := self.timeline.take()) is not None:
+            t_ns, record, _ = due
+            if readings := self._log.feed(t_ns, record):
+                return [self.timeline.hand_over(reading, t_ns) for reading in readings]
+        return ()

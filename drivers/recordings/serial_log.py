@@ -1,0 +1,106 @@
+"""The link log of a serial line: its bytes with their times, and what the bridge says in them.
+
+One record after the other, each a frame of `drivers.spi.framing`: type 1 for bytes from the device,
+2 for bytes to it, 3 for the port having been opened; payload `t: u64` (monotonic ns, little-endian)
+and the bytes. COBS and CRC-32 let a reader find the next record after any damage, also the end of
+a file that was cut off.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from drivers.base import Reading
+from drivers.link import LinkState
+from drivers.recordings.csv_rows import open_recording
+from drivers.spi.conversation import Conversation
+from drivers.spi.framing import FrameParser, encode_frame
+from drivers.spi.line import LineEvent
+
+PIECE_MAX_BYTES: Final = 960
+"""Bytes of one record: a frame has 1024 at most. What came at once is cut into several."""
+
+CHUNK_BYTES: Final = 65_536
+
+_TIME: Final = struct.Struct("<Q")
+_EVENTS: Final = frozenset(event.value for event in LineEvent)
+
+
+@dataclass(frozen=True, slots=True)
+class SerialRecord:
+    """Bytes that went over the line at once."""
+
+    event: LineEvent
+    t_ns: int
+    """Monotonic time, ns."""
+    data: bytes
+
+
+def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
+    """The records of some bytes. Raises `ValueError` for a time that is none."""
+    if not 0 <= t_ns < 1 << 64:
+        raise ValueError(f"time {t_ns} ns is out of range")
+    head = _TIME.pack(t_ns)
+    starts = range(0, max(len(data), 1), PIECE_MAX_BYTES)
+    return b"".join(
+        encode_frame(event, head + data[start : start + PIECE_MAX_BYTES]) for start in starts
+    )
+
+
+class SerialLogParser:
+    """Takes the bytes of a file and gives its records. Never raises, and holds back 1024 bytes."""
+
+    def __init__(self) -> None:
+        self._frames = FrameParser()
+
+    def feed(self, chunk: bytes) -> Iterator[SerialRecord]:
+        """Records that these bytes complete, oldest first."""
+        for kind, payload in self._frames.feed(chunk):
+            if kind not in _EVENTS or len(payload) < _TIME.size:
+                self._frames.counters.bad_crc += 1
+                continue
+            (t_ns,) = _TIME.unpack_from(payload)
+            yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
+
+
+class SerialLog:
+    """Serial link logs through the conversation that the driver has. A `LinkLog`.
+
+    What the daemon asked the bridge then is in the file, so nothing is asked now.
+    """
+
+    def __init__(self, fingers: Sequence[str], sensors: Sequence[str] | None = None) -> None:
+        """As those of a `Conversation`. Raises `ValueError`."""
+        self._fingers, self._sensors = fingers, sensors
+        self.begin()
+
+    def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
+        """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
+        parser = SerialLogParser()
+        with open_recording(path) as stream:
+            while chunk := stream.read(CHUNK_BYTES):
+                for record in parser.feed(chunk):
+                    yield record.t_ns, record
+
+    def begin(self) -> None:
+        """Forget all that came."""
+        self.stream = Conversation("link log", self._fingers, self._sensors)
+        self.stream.opened(0)
+        self._idle_ns = 0
+
+    def feed(self, t_ns: int, record: SerialRecord) -> Sequence[Reading]:
+        """The readings that one record completes."""
+        conversation, readings = self.stream, []
+        if record.event is LineEvent.SENT:
+            conversation.sent(record.data, t_ns)
+            return ()
+        if record.event is LineEvent.OPENED:
+            conversation.opened(t_ns)
+        elif conversation.link.state is not LinkState.WAITING:
+            readings = conversation.receive(record.data, t_ns, self._idle_ns)
+        self._idle_ns = t_ns
+        return readings

@@ -1,0 +1,114 @@
+"""What twins may feel in tests: an endless contact, or the noise of a recording played again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import COUNT_MAX, ELECTRODES
+from drivers.twins.grasps.grasp_script import Timetable
+from drivers.twins.grasps.grasps import (
+    DRIFT_COUNTS_PER_S,
+    NOISE_COUNTS,
+    SPIKE_COUNTS,
+    SPIKE_PROBABILITY,
+    Counts,
+)
+
+UNTOUCHED_COUNTS = (2400.0, 3400.0)
+"""Range in which untouched electrodes rest, counts."""
+CONTACT_COUNTS = 700.0
+"""Deepest fall of an electrode under the generated contact, counts."""
+CONTACT_PERIOD_S = 4.0
+"""A touch comes and goes this often, s."""
+
+PALM_ROWS = 7
+"""Rows of 10 ms in which a palm's rounds of 14 ms come round again, ..."""
+PALM_STALE_ROWS = 2
+"""... and how many of them repeat an electrode: 28.57 %, verified in the untouched recording."""
+
+
+class GeneratedContact:
+    """An endless, synthetic contact: rest, a touch that comes and goes, and the measured noise."""
+
+    def __init__(self, fingers: int = 3, rate_hz: float = 100.0, seed: int = 0) -> None:
+        """`rate_hz` is how many readings make a second; the same seed gives the same counts."""
+        self._random = np.random.default_rng(seed)
+        shape = (fingers, ELECTRODES)
+        self._rest = self._random.uniform(*UNTOUCHED_COUNTS, shape)
+        self._yielding = self._random.uniform(0.0, CONTACT_COUNTS, shape)
+        self._period_s = 1.0 / rate_hz
+        self._t_s = 0.0
+
+    def __iter__(self) -> Iterator[Counts]:
+        return self
+
+    def __next__(self) -> Counts:
+        touch = 0.5 - 0.5 * np.cos(2.0 * np.pi * self._t_s / CONTACT_PERIOD_S)
+        counts = self._rest - touch * self._yielding + DRIFT_COUNTS_PER_S * self._t_s
+        counts = counts + self._random.normal(0.0, NOISE_COUNTS, counts.shape)
+        spiked = self._random.random(counts.shape) < SPIKE_PROBABILITY
+        counts = counts - spiked * self._random.uniform(*SPIKE_COUNTS, counts.shape)
+        self._t_s += self._period_s
+        readable: Counts = np.clip(np.rint(counts), 1, COUNT_MAX - 1).astype(np.uint16)
+        return readable
+
+
+class PlayedNoise:
+    """Residuals played in a loop, one row per sweep, from a random start; nothing is added."""
+
+    def __init__(self, residuals: NDArray[np.float64], rng: np.random.Generator) -> None:
+        """`residuals`: counts, shape (rows, fingers, 24), at least one row."""
+        self._residuals = residuals
+        self._next = int(rng.integers(len(residuals)))
+
+    def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `TactileNoise`; the time does not matter."""
+        row: NDArray[np.float64] = self._residuals[self._next]
+        self._next = (self._next + 1) % len(self._residuals)
+        return row
+
+
+def played(residuals: NDArray[np.float64]) -> Callable[[int, np.random.Generator], PlayedNoise]:
+    """The noise of a stream of whole grasps: these residuals, shape (rows, fingers, 24)."""
+    return lambda _fingers, rng: PlayedNoise(residuals, rng)
+
+
+def fresh_residuals(held: NDArray[np.uint16]) -> NDArray[np.float64]:
+    """Noise of a palm's untouched recording: fresh samples only, without level and drift.
+
+    `held`: counts, shape (rows, fingers, 24), 100 Hz, five new values in seven rows. The result has
+    five rows for seven. Level and drift are the straight line through an electrode's samples, moved
+    so that the median residual is zero: the spikes, all downward, would pull a mean.
+    Raises `ValueError` for less than 70 rows, too few to tell which rows repeat.
+    """
+    rounds = len(held) // PALM_ROWS
+    if rounds < 10:
+        raise ValueError(f"{len(held)} rows are too few to tell which ones repeat")
+    rows = held[: rounds * PALM_ROWS].astype(np.float64)
+    # All fingers are sampled together, so that a row repeats an electrode on all of them at once.
+    repeats = (np.diff(rows, axis=0, prepend=np.nan) == 0.0).all(axis=1)
+    stale = repeats.reshape(rounds, PALM_ROWS, ELECTRODES).sum(axis=0)
+    fresh_places = np.sort(np.argsort(stale, axis=0, kind="stable")[:-PALM_STALE_ROWS], axis=0)
+    blocks = rows.reshape(rounds, PALM_ROWS, -1, ELECTRODES)
+    fresh = np.take_along_axis(blocks, fresh_places[np.newaxis, :, np.newaxis], axis=1)
+    samples = fresh.reshape(rounds * len(fresh_places), -1)
+    times = np.arange(len(samples))
+    slope, level = np.polyfit(times, samples, 1)
+    residuals = samples - np.outer(times, slope) - level
+    residuals -= np.median(residuals, axis=0)
+    return np.asarray(residuals.reshape(len(samples), -1, ELECTRODES), dtype=np.float64)
+
+
+def crept_s(timetable: Timetable, rate_counts_per_s: float) -> float:
+    """When the mean rate of the electrodes falls below this rate, s, leaving out the lift.
+
+    Never before `closed_s`; later than `lift_s` if the lift comes first.
+    """
+    rate = timetable.creep_counts_per_s
+    if rate <= rate_counts_per_s:
+        return timetable.closed_s
+    return timetable.closed_s + timetable.creep_tau_s * math.log(rate / rate_counts_per_s)
