@@ -8,45 +8,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from daemon.record.mcap import EVENTS, McapRecording, RecordedMessage, header_of
-from drivers.base import (
-    ELECTRODES,
-    DriverCounters,
-    JointReading,
-    Reading,
-    RecordingError,
-    TactileReading,
-)
+from daemon.record.mcap import McapReader, RecordedMessage, header_of
+from daemon.record.topics import EVENTS, Topic, joint_reading, tactile_reading
+from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import TimedDriver
 
 _log = logging.getLogger(__name__)
-
-
-class _Tactile(msgspec.Struct, frozen=True):
-    """What is needed of a message on `tactile.<hand>`."""
-
-    seq: int
-    t_mono_ns: int
-    fingers: tuple[str, ...]
-    counts: list[list[int]]
-    faults: list[list[int]]
-
-
-class _Joints(msgspec.Struct, frozen=True):
-    """What is needed of a recorded joint reading."""
-
-    seq: int
-    t_mono_ns: int
-    names: tuple[str, ...]
-    position_rad: list[float | None]
-
-
-_tactile_decoder = msgspec.json.Decoder(_Tactile)
-_joints_decoder = msgspec.json.Decoder(_Joints)
 
 
 @dataclass(slots=True)
@@ -137,7 +105,7 @@ class McapReplayDriver(TimedDriver[_Due]):
         told: tuple[str, ...] = ()
         for path in self._paths:
             with open_recording(path) as stream:
-                recording = McapRecording(path, stream)
+                recording = McapReader(path, stream)
                 for message in recording:
                     if message.kind in EVENTS and message.kind not in told:
                         told = (*told, message.kind)
@@ -152,31 +120,10 @@ class McapReplayDriver(TimedDriver[_Due]):
     def _reading(self, message: RecordedMessage) -> Reading | None:
         """The reading in a message; None for one of another kind, or that has none."""
         try:
-            if message.kind == "tactile":
+            if message.kind == Topic.TACTILE:
                 return tactile_reading(message.payload, self._fingers)
-            if message.kind == "joints":
-                return _joints(_joints_decoder.decode(message.payload))
-        except (msgspec.DecodeError, ValueError, OverflowError):
+            if message.kind == Topic.JOINTS:
+                return joint_reading(message.payload)
+        except (ValueError, OverflowError):
             self.counters.malformed += 1
         return None
-
-
-def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
-    """The reading in a `tactile` message, with these fingers, in their order.
-
-    Raises `msgspec.DecodeError`, `ValueError` or `OverflowError` for what is none.
-    """
-    message = _tactile_decoder.decode(payload)
-    rows = [message.fingers.index(finger) for finger in fingers]
-    shape = (len(message.fingers), ELECTRODES)
-    counts = np.array(message.counts, dtype=np.uint16).reshape(shape)
-    faults = np.array(message.faults, dtype=np.uint8).reshape(shape)
-    return TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
-
-
-def _joints(message: _Joints) -> JointReading:
-    """Raises `ValueError` for angles without names."""
-    if len(message.names) != len(message.position_rad):
-        raise ValueError("as many names as angles are needed")
-    angles = np.array(message.position_rad, dtype=np.float64)  # None becomes NaN
-    return JointReading(message.t_mono_ns, message.seq, message.names, angles)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
-from daemon.judge.pipeline import Pipeline
+from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.deadlines import Deadlines
@@ -88,6 +88,7 @@ class Service:
         on_joints: Callable[[JointReading], None] | None = None,
         on_asked: Callable[[], None] | None = None,
         on_skipped: Callable[[], None] | None = None,
+        on_judged: Callable[[Judgement], None] | None = None,
         sockets: Peers | None = None,
         watchdog: Watchdog | None = None,
         on_status: Callable[[Status], None] | None = None,
@@ -99,9 +100,9 @@ class Service:
 
         `chore` is done before readings are judged, and once a second. `on_joints` gets every joint
         reading, `on_asked` is done when somebody has asked, `on_skipped` before a reading is judged
-        if others before it were left out (`daemon.run.overload`). Questions that come by
-        `sockets` are answered with the next verdict, or if a grasp is judged on request only, when
-        it has been.
+        if others before it were left out (`daemon.run.overload`), `on_judged` once a verdict is out
+        for which the network judged the reading. Questions that come by `sockets` are answered with
+        the next verdict, or if a grasp is judged on request only, when it has been.
         `on_status` gets every status once it is sent. `reload` is done when a reload is asked for,
         and says whether the loop shall end for it. `sleep` says whether the computer has slept.
         """
@@ -115,6 +116,7 @@ class Service:
         self._on_joints = on_joints
         self._on_asked = on_asked
         self._on_skipped = on_skipped
+        self._on_judged = on_judged
         self._sockets = sockets
         self._questions = None if sockets is None else sockets.questions
         if self._questions is not None:
@@ -234,6 +236,8 @@ class Service:
             self._readings_since_status += 1
             taken = True
             self._answer(verdict, payload)
+            if judgement.judged and self._on_judged is not None:
+                self._on_judged(judgement)
             if self._listener is not None:
                 self._listener(verdict, payload, reading)
             judged_ns = self._clock()

@@ -192,6 +192,7 @@ class Runner:
                 on_joints=None if recorder is None else recorder.joints,
                 on_asked=None if recorder is None else recorder.asked,
                 on_skipped=None if recorder is None else recorder.skipped,
+                on_judged=None if recorder is None else recorder.judged,
                 sockets=output,
                 watchdog=self._manager,
                 on_status=self._on_status(sockets, hot),
