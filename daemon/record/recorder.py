@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from daemon.publish.sockets import Sockets
+from daemon.publish.companion import Companion
 from daemon.record.files import Retention
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapWriter
@@ -30,7 +30,6 @@ from daemon.scene import Record
 
 if TYPE_CHECKING:
     from daemon.judge.pipeline import Judgement
-    from daemon.publish.questions import Questions
     from drivers.base import JointReading
 
 log = logging.getLogger("graspd")
@@ -100,8 +99,8 @@ class _Open:
     """Entries taken for these files that the disk may not have."""
 
 
-class Recorder:
-    """Records one run of the daemon. What hands it something never blocks and never raises."""
+class Recorder(Companion):
+    """Records one run of the daemon. `send`, `raw` and the hooks never block and never raise."""
 
     def __init__(
         self,
@@ -155,17 +154,21 @@ class Recorder:
             self._wants_turn = False
             self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
-    def joints(self, reading: JointReading) -> None:
+    def wanted(self, topic: bytes) -> bool:
+        """Always: what nobody subscribes to is recorded all the same."""
+        return True
+
+    def on_joints(self, reading: JointReading) -> None:
         """Record joint angles."""
         self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
-    def judged(self, judgement: Judgement) -> None:
+    def on_judged(self, judgement: Judgement) -> None:
         """Record what a grasp was judged by, if it was judged by this judgement."""
         if judgement.judged_counts is not None:
             making = partial(Judged.of, self._header.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
-    def asked(self) -> None:
+    def on_asked(self) -> None:
         """Record that the controller asks for a judgement."""
         self._put(self._names[Topic.ASKED], EVENT)
 
@@ -173,7 +176,7 @@ class Recorder:
         """Record that a sensor is another one than before."""
         self._put(self._names[Topic.EXCHANGED], EVENT)
 
-    def skipped(self) -> None:
+    def on_skipped(self) -> None:
         """Record that readings were left out before the next one."""
         self._put(self._names[Topic.SKIPPED], EVENT)
 
@@ -193,6 +196,10 @@ class Recorder:
         """
         writing = self._open is not None
         return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
+
+    def counters_by_part(self) -> dict[str, dict[str, int]]:
+        """The same, as part of the status."""
+        return {"record": self.counters()}
 
     def close(self) -> None:
         """Write what waits and end the files; leave a disk that does not answer alone."""
@@ -338,38 +345,3 @@ class Recorder:
         say = log.warning if first else log.debug
         where = self._retention.directory
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)
-
-
-class Recorded:
-    """The sockets, with everything that is sent recorded too."""
-
-    def __init__(self, sockets: Sockets, recorder: Recorder) -> None:
-        self._sockets = sockets
-        self._recorder = recorder
-
-    @property
-    def questions(self) -> Questions | None:
-        """Who takes questions, if anybody."""
-        return self._sockets.questions
-
-    def filenos(self) -> list[int]:
-        """Become readable when a peer may want something."""
-        return self._sockets.filenos()
-
-    def take(self) -> None:
-        """See to peers that come."""
-        self._sockets.take()
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """What peers and the recorder did."""
-        return self._sockets.counters() | {"record": self._recorder.counters()}
-
-    def wanted(self, topic: bytes) -> bool:
-        """Always: what nobody subscribes to is recorded all the same."""
-        return True
-
-    def send(self, topic: bytes, payload: bytes) -> None:
-        """Publish and record one message; readings are published only if somebody wants them."""
-        if not topic.startswith(b"tactile.") or self._sockets.wanted(topic):
-            self._sockets.send(topic, payload)
-        self._recorder.send(topic, payload)

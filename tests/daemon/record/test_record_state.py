@@ -18,7 +18,7 @@ from daemon.assembly import assembly
 from daemon.assembly.recorder import build_recorder
 from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
-from daemon.publish.outbox import Reporter
+from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapWriter, header_of
@@ -143,7 +143,7 @@ class Daemon:
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)
         assert recorder is not None
         self.recorder = recorder
-        self._reporter = Reporter("right", wanted.hand.fingers, "any", BOOT, Output(recorder))
+        self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [recorder])
 
     def _clock(self) -> int:
         return self._now_ns
@@ -151,24 +151,14 @@ class Daemon:
     def judge(self, reading: TactileReading) -> Judgement:
         """And every second a status, if the thread has had time to look."""
         self._now_ns = reading.t_ns
-        self._reporter.tactile(reading, None)
+        self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
-        self.recorder.judged(judgement)
+        self.recorder.on_judged(judgement)
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)
             self.recorder.send(STATUS, b"{}")
         return judgement
-
-
-class Output:
-    """Everything is wanted."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self.send = recorder.send
-
-    def wanted(self, topic: bytes) -> bool:
-        return bool(topic)
 
 
 def sweeps() -> list[TactileReading]:

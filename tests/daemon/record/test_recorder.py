@@ -114,7 +114,7 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
 
 def test_an_angle_that_there_is_not_is_null(tmp_path: Path, make: Make) -> None:
     recorder = make()
-    recorder.joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
+    recorder.on_joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
     recorder.close()
     (path,) = (tmp_path / "record").iterdir()
     assert messages(path) == [
