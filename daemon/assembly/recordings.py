@@ -78,7 +78,7 @@ class RecordedRun:
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         if driver is not None:
-            driver.on_told = {
+            driver.on_event = {
                 Topic.ASKED: pipeline.ask,
                 Topic.EXCHANGED: pipeline.sensors_exchanged,
                 Topic.SKIPPED: pipeline.skip,

@@ -6,7 +6,7 @@ A row holds the very counts that the grasp was judged by last before its lift.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from daemon.publish.messages import decode_outcome
 from daemon.record.mcap import McapReader, RecordedMessage
-from daemon.record.topics import Judged, Topic, judged_counts
-from drivers.base import RecordingError
+from daemon.record.topics import Judged, Topic, decode_judged
+from drivers.base import ELECTRODES, RecordingError
 from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
 from drivers.recordings.csv_rows import open_recording
 
@@ -70,7 +70,7 @@ def collect(paths: Sequence[Path]) -> Export:
                 try:
                     joining.take(message)
                 except (ValueError, OverflowError) as error:
-                    raise RecordingError(path, f"a {message.kind} message: {error}") from error
+                    raise RecordingError(path, f"{message.kind} message: {error}") from error
             found.cut_off += recording.cut_off
     found.without_outcome = len(joining.judged.keys() - joining.told)
     return found
@@ -81,41 +81,38 @@ class _Joining:
 
     def __init__(self) -> None:
         self.found = Export()
-        self.judged: dict[GraspId, tuple[Judged, NDArray[np.uint16]]] = {}
+        self.judged: dict[GraspId, Judged] = {}
         self.told: set[GraspId] = set()
 
     def take(self, message: RecordedMessage) -> None:
         """Take in one message. Raises `ValueError` or `OverflowError` for what is none."""
         if message.kind == Topic.JUDGED:
-            judged, counts = judged_counts(message.payload, len(self.found.fingers))
-            self.judged[judged.boot_id, judged.grasp] = judged, counts
+            judgement = decode_judged(message.payload)
+            self.judged[judgement.boot_id, judgement.grasp] = judgement
         elif message.kind == Topic.OUTCOME:
             outcome = decode_outcome(message.payload)
             grasp = outcome.boot_id, outcome.grasp
             self.told.add(grasp)
-            if grasp not in self.judged:
+            judged = self.judged.get(grasp)
+            if judged is None:
                 self.found.unjoined += 1
-                return
-            judged, counts = self.judged[grasp]
-            if judged.repaired:
+            elif judged.repaired:
                 self.found.repaired += grasp not in self.found.grasps
             else:
+                shape = len(self.found.fingers), ELECTRODES
+                counts = np.array(judged.counts, dtype=np.uint16).reshape(shape)
                 slipped = outcome.outcome == "slip"
                 self.found.grasps[grasp] = Grasp(counts, slipped, outcome.object)
 
 
-def write(out: TextIO, found: Export, object_name: str) -> int:
-    """Write the table; how many rows. `object_name` is that of grasps without one."""
+def write(out: TextIO, found: Export, object_name: str) -> None:
+    """Write the table, one row a grasp: object, 1 for slip or 0 for stable, counts by finger.
+
+    `object_name` is for grasps of which no object was told. Raises `OSError`.
+    """
     writer = csv.writer(out, lineterminator="\n")
     names = [name for finger in found.fingers for name in electrode_columns(finger)]
     writer.writerow([OBJECT, SLIPPED, *names])
-    for row in rows(found, object_name):
-        writer.writerow(row)
-    return len(found.grasps)
-
-
-def rows(found: Export, object_name: str) -> Iterator[list[object]]:
-    """The cells of each grasp: object, 1 for slip or 0 for stable, counts finger by finger."""
     for grasp in found.grasps.values():
         name = object_name if grasp.object_name is None else grasp.object_name
-        yield [name, int(grasp.slipped), *grasp.counts.ravel().tolist()]
+        writer.writerow([name, int(grasp.slipped), *grasp.counts.ravel().tolist()])

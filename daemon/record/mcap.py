@@ -12,6 +12,8 @@ import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
@@ -41,6 +43,7 @@ _DAMAGE = (
 length that nothing has."""
 
 
+@cache
 def schemas() -> dict[str, tuple[str, bytes]]:
     """Name and JSON Schema, an object at the top, of each topic that is no event."""
     messages = {topic: topic.message for topic in Topic if topic.message is not None}
@@ -61,9 +64,8 @@ class McapWriter:
         self._stream = create(path)
         self._offset_ns = header.wall_minus_monotonic_ns
         self._writer = Writer(self._stream)
-        self._schemas = schemas()
-        self._channels: dict[bytes, int] = {}
-        self._numbers: dict[int, int] = {}
+        self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
+        """Number of each topic's channel, and the numbers of its messages."""
         try:
             self._writer.start(profile="", library="graspd")
             self._writer.add_metadata(METADATA, header.texts())
@@ -74,20 +76,18 @@ class McapWriter:
 
     def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
         """Take one message of monotonic time `at_ns`, ns."""
-        channel = self._channels.get(topic)
-        if channel is None:
-            channel = self._channels[topic] = self._register(topic.decode())
-            self._numbers[channel] = 0
+        if topic not in self._channels:
+            self._channels[topic] = self._register(topic.decode()), count()
+        channel, numbers = self._channels[topic]
         log_ns = max(at_ns + self._offset_ns, 0)
-        self._writer.add_message(channel, log_ns, payload, log_ns, self._numbers[channel])
-        self._numbers[channel] += 1
+        self._writer.add_message(channel, log_ns, payload, log_ns, next(numbers))
 
     def _register(self, topic: str) -> int:
-        described, known = self._schemas.get(_kind(topic)), 0
+        described = schemas().get(topic.partition(".")[0])
+        schema = 0
         if described is not None:
-            name, text = described
-            known = self._writer.register_schema(name, "jsonschema", text)
-        return self._writer.register_channel(topic, "json", known)
+            schema = self._writer.register_schema(described[0], "jsonschema", described[1])
+        return self._writer.register_channel(topic, "json", schema)
 
     def flush(self) -> int:
         """End the chunk at hand, and have the disk keep it; the file's size then, bytes."""
@@ -163,16 +163,12 @@ class McapReader:
         try:
             for record in self._records:
                 if isinstance(record, Channel):
-                    self._kinds[record.id] = _kind(record.topic)
+                    self._kinds[record.id] = record.topic.partition(".")[0]
                 elif isinstance(record, Message):
                     kind = self._kinds.get(record.channel_id, "")
                     yield RecordedMessage(kind, record.log_time - offset_ns, record.data)
         except _DAMAGE:
             self.cut_off = True
-
-
-def _kind(topic: str) -> str:
-    return topic.partition(".")[0]
 
 
 def header_of(path: Path) -> RecordingHeader:

@@ -29,16 +29,7 @@ class McapCounters(DriverCounters):
     """Files that end without an end, as those of a daemon that was killed do."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Due:
-    """A reading, and what was told between the one before it and this one."""
-
-    reading: Reading
-    told: tuple[str, ...] = ()
-    """Kinds of `EVENTS`, in their order."""
-
-
-class McapReplayDriver(TimedDriver[_Due]):
+class McapReplayDriver(TimedDriver[Reading | Topic]):
     """Plays MCAP files of graspd, one reading per call of `read_ready` at most.
 
     `recorded_ns` of a reading is its `t_ns` when it was recorded, counted from `axis_ns`; `t_ns`
@@ -59,8 +50,8 @@ class McapReplayDriver(TimedDriver[_Due]):
         super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
-        self.on_told: Mapping[str, Callable[[], None]] = {}
-        """What is done, by kind of `EVENTS`, where one stands."""
+        self.on_event: Mapping[Topic, Callable[[], None]] = {}
+        """What to call where one of `EVENTS` stands; nothing for those that are not in it."""
         self._reset()
 
     def _reset(self) -> None:
@@ -82,15 +73,16 @@ class McapReplayDriver(TimedDriver[_Due]):
         taken = self._take_due()
         if taken is None:
             return ()
-        at_ns, due, late_ns = taken
+        at_ns, item, late_ns = taken
+        if isinstance(item, Topic):
+            if item in self.on_event:
+                self.on_event[item]()
+            return ()
         if self._speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
-        for kind in due.told:
-            if kind in self.on_told:
-                self.on_told[kind]()
-        if isinstance(due.reading, TactileReading):
-            self._count(due.reading)
-        return [self._hand_over(due.reading, at_ns, self._axis_ns)]
+        if isinstance(item, TactileReading):
+            self._count(item)
+        return [self._hand_over(item, at_ns, self._axis_ns)]
 
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
@@ -101,24 +93,20 @@ class McapReplayDriver(TimedDriver[_Due]):
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 
-    def _play(self) -> Generator[tuple[int, _Due], None, None]:
-        told: tuple[str, ...] = ()
+    def _play(self) -> Generator[tuple[int, Reading | Topic], None, None]:
         for path in self._paths:
             with open_recording(path) as stream:
                 recording = McapReader(path, stream)
                 for message in recording:
-                    if message.kind in EVENTS and message.kind not in told:
-                        told = (*told, message.kind)
-                    reading = self._reading(message)
-                    if reading is not None:
-                        yield message.at_ns, _Due(reading, told)
-                        told = ()
+                    item = self._item(message)
+                    if item is not None:
+                        yield message.at_ns, item
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
-    def _reading(self, message: RecordedMessage) -> Reading | None:
-        """The reading in a message; None for one of another kind, or that has none."""
+    def _item(self, message: RecordedMessage) -> Reading | Topic | None:
+        """The reading or event that a message tells of; None if it tells of neither."""
         try:
             if message.kind == Topic.TACTILE:
                 return tactile_reading(message.payload, self._fingers)
@@ -126,4 +114,5 @@ class McapReplayDriver(TimedDriver[_Due]):
                 return joint_reading(message.payload)
         except (ValueError, OverflowError):
             self.counters.malformed += 1
-        return None
+            return None
+        return Topic(message.kind) if message.kind in EVENTS else None

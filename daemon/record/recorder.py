@@ -128,7 +128,7 @@ class Recorder(Companion):
         self._clock = clock
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
-        self._names = {topic: topic.name_for(retention.hand) for topic in Topic}
+        self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
         self._encoder = msgspec.json.Encoder()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0

@@ -8,7 +8,6 @@ from typing import Final, Literal, Self
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from daemon.judge.pipeline import Judgement
 from daemon.publish.messages import (
@@ -100,17 +99,13 @@ class Topic(StrEnum):
     EXCHANGED = "exchanged"  # read by replay: a sensor is another one than before
     SKIPPED = "skipped"  # read by replay: readings were left out before the next one
 
-    def name_for(self, hand: str) -> bytes:
-        """The topic's whole name."""
-        return f"{self}.{hand}".encode()
-
 
 EVENTS: Final = frozenset(topic for topic in Topic if topic.message is None)
 EVENT: Final = b"{}"
 """Payload of each of them."""
 
 _decode_joints = msgspec.json.Decoder(Joints).decode
-_decode_judged = msgspec.json.Decoder(Judged).decode
+decode_judged = msgspec.json.Decoder(Judged).decode
 
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
@@ -134,12 +129,3 @@ def joint_reading(payload: bytes) -> JointReading:
         raise ValueError("as many names as angles are needed")
     angles = np.array(message.position_rad, dtype=np.float64)  # None becomes NaN
     return JointReading(message.t_mono_ns, message.seq, message.names, angles)
-
-
-def judged_counts(payload: bytes, fingers: int) -> tuple[Judged, NDArray[np.uint16]]:
-    """A `judged` message, and its counts with shape (fingers, 24).
-
-    Raises `ValueError` or `OverflowError` for what is none.
-    """
-    message = _decode_judged(payload)
-    return message, np.array(message.counts, dtype=np.uint16).reshape(fingers, ELECTRODES)

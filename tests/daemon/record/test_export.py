@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -88,7 +88,7 @@ class Writer:
         self._file.write(b"verdict.right", encode(message), self._now_ns)
 
     def judged(
-        self, grasp: int, counts: NDArray[np.uint16], *, repaired: Sequence[str] = ()
+        self, grasp: int, counts: NDArray[np.integer[Any]], *, repaired: Sequence[str] = ()
     ) -> None:
         """A verdict, and what it was made of."""
         self.verdict(grasp, repaired=repaired)
@@ -269,11 +269,11 @@ def test_a_recording_that_does_not_say_what_it_judged_is_refused(
 def test_counts_of_another_shape_or_size_are_refused(
     tmp_path: Path, counts: list[list[int]]
 ) -> None:
-    message = Judged(boot_id=BOOT, t_mono_ns=1, grasp=1, counts=counts)
-    file = McapWriter(tmp_path / "a.mcap", HEADER)
-    file.write(b"judged.right", msgspec.json.encode(message), 1)
-    file.close()
-    with pytest.raises(RecordingError, match="a judged message"):
+    writer = Writer(tmp_path / "a.mcap")
+    writer.judged(1, np.array(counts))
+    writer.outcome(1, "slip")
+    writer.close()
+    with pytest.raises(RecordingError, match=r"a\.mcap: outcome message"):
         collect([tmp_path / "a.mcap"])
 
 
