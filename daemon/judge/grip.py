@@ -59,6 +59,8 @@ class Grip:
         must_touch = np.array([finger in required for finger in fingers])
         self._gate = Gate(must_touch, limits.gate, on_request=limits.on_request)
         self._last_ns: int | None = None
+        self._unsettled = 0
+        """Readings to come whose median may be of values from before some that are missing."""
 
     @property
     def state(self) -> GateState:
@@ -112,12 +114,12 @@ class Grip:
         """The sensors are others, or may be: where they rest is not known, nor what they hold."""
         self._contact.forget()
         self._fresh.reset()
-        self.interrupt()
+        if self._last_ns is not None:
+            self._gate.restart(self._last_ns)
 
     def interrupt(self) -> None:
         """Readings are missing before the next one: the grasp must settle anew."""
-        if self._last_ns is not None:
-            self._gate.restart(self._last_ns)
+        self._unsettled = MEDIAN_SWEEPS
 
     def take_changes(self) -> list[GateChange]:
         """Changes of the gate since the last call, oldest first."""
@@ -139,6 +141,9 @@ class Grip:
             if t_ns - self._last_ns > OUTAGE_NS:
                 self._contact.forget()
         self._last_ns = t_ns
+        if self._unsettled:
+            self._unsettled -= 1
+            self._gate.restart(t_ns)
         usable = ~watched.broken
         self._fresh.push(reading.counts, usable)
         median = self._fresh.counts

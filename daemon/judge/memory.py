@@ -165,6 +165,7 @@ class _Grip(_Memory):
     _gate: _Gate
     _joints: _Joints | None
     _last_ns: int | None
+    _unsettled: Number = 0
 
 
 class JudgeMemory(_Memory):

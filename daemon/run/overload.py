@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -19,10 +20,11 @@ from drivers.base import ElectrodeFault, TactileReading
 
 WAIT_MAX_NS: Final = 10_000_000
 """What is there at once is judged one by one if that takes so long at most, ns, or a period."""
-COST_SHARE: Final = 4
-"""What judging a reading takes is a mean that takes in a fourth of each newer time."""
-LASTING_NS: Final = 1_000_000_000
-"""Readings that are left out for so long, ns, are left out by overload, and not by a stall."""
+COSTS: Final = 4
+"""What judging a reading takes is the least of the last four times: a stall is none of it."""
+LASTING_NS: Final = 3_000_000_000
+APART_NS: Final = 1_000_000_000
+"""What leaves readings out for so long, ns, at most a second apart, is overload and no stall."""
 OVER_NS: Final = 5_000_000_000
 """So long without a reading left out, ns, and the overload is over."""
 REST_AFTER_NS: Final = 10_000_000
@@ -50,8 +52,8 @@ class Overload:
         self._sleep = sleep
         self._rest_after_ns = REST_AFTER_NS if live else REST_AFTER_RECORDED_NS
         self._rested_ns = now_ns
-        self._cost_ns = 0
-        self._skipping_since_ns = self._skipped_ns = now_ns - LASTING_NS
+        self._costs_ns: deque[int] = deque(maxlen=COSTS)
+        self._skipping_since_ns = self._skipped_ns = now_ns - APART_NS
         self.skipped_readings = 0
         """Tactile readings that were left out since the start."""
         self.overloaded = False
@@ -77,16 +79,17 @@ class Overload:
         """
         if waiting < 2 or not self._live:
             return False
-        return elapsed_ns + waiting * self._cost_ns > max(WAIT_MAX_NS, period_ns or 0)
+        cost_ns = min(self._costs_ns, default=0)
+        return elapsed_ns + waiting * cost_ns > max(WAIT_MAX_NS, period_ns or 0)
 
     def judged(self, took_ns: int) -> None:
         """A reading was judged and reported, which took so long."""
-        self._cost_ns += (took_ns - self._cost_ns) // COST_SHARE
+        self._costs_ns.append(took_ns)
 
     def skip(self, readings: int, now_ns: int) -> None:
         """Readings are left out."""
         self.skipped_readings += readings
-        if now_ns - self._skipped_ns >= LASTING_NS:
+        if now_ns - self._skipped_ns >= APART_NS:
             self._skipping_since_ns = now_ns
         self._skipped_ns = now_ns
         if not self.overloaded and now_ns - self._skipping_since_ns >= LASTING_NS:

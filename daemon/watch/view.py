@@ -43,6 +43,7 @@ AS_IT_SHOULD_BE = {
     Reason.NOT_ASKED,
 }
 """Reasons of a grasp that is on its way."""
+OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 NOTHING_CAME = "no message has come yet: is graspd running on this endpoint?"
 
 Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
@@ -256,7 +257,8 @@ def _names(fingers: Sequence[str] | None) -> list[str] | None:
 
 
 def _health(status: Status) -> list[Line]:
-    return [
+    found = [Line("overloaded", OVERLOADED)] if status.overloaded else []
+    return found + [
         Line(f"{part} {reason.value}", ADVICE[reason]) for part, reason in status.health.items()
     ]
 

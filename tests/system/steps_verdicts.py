@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import Final
 
 from tests.system.lab import CAN_RATE_HZ, LOOK_S, PATIENCE_S, PAYLOAD, Lab, Outcome, StepError
@@ -18,7 +20,16 @@ P_SLIP_ERROR_MAX: Final = 1e-5
 GRASPS: Final = 3
 SETTLING_S: Final = 2.0
 """After a twin's end: for what is on its way."""
-BURST_RATE_HZ: Final = 100.0
+BURST_RATES_HZ: Final = (100.0, 200.0, 400.0, 800.0)
+"""Sweeps/s, of which the first that is more than can be judged is the measure of what can be."""
+TRIAL_S: Final = 12.0
+TRIAL_STATUSES: Final = 3
+OVERLOAD_MIN: Final = 3.0
+"""By which a rate that is carried is below what is judged at most ..."""
+BURST_TIMES: Final = 10.0
+"""... and by which another one is above it, but for what a twin can."""
+TWIN_MAX_HZ: Final = 1000.0
+STEADY_S: Final = 10.0
 BURST_S: Final = 10.0
 
 
@@ -42,12 +53,22 @@ def _run_of_judged(lab: Lab, began_s: float) -> list[float]:
     deadline_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline_s:
         run: list[float] = []
-        for message in lab.verdicts("can", began_s, math.inf):
+        for message in lab.verdicts("can", *_whole(lab, began_s)):
             run = [*run, message.body["p_slip"]] if message.judged else []
             if len(run) == REPLAYED_ROWS:
                 return run
         time.sleep(LOOK_S)
     raise StepError(f"no {REPLAYED_ROWS} verdicts in a row: {lab.last('can', 'status')['reasons']}")
+
+
+def _whole(lab: Lab, began_s: float) -> tuple[float, float]:
+    """Between which times no reading was left out, as far as that has been told."""
+    skipped, from_s, to_s = -1, began_s, began_s
+    for status in lab.machine.messages.between("can", "status", began_s, math.inf):
+        if status.body["skipped_readings"] != skipped:
+            skipped, from_s = status.body["skipped_readings"], status.t_s
+        to_s = status.t_s
+    return from_s, to_s
 
 
 def _place(judged: list[float], expected: list[float]) -> int | None:
@@ -87,28 +108,110 @@ def judgement(message: Message) -> bool:
     return message.judged and bool(message.body["judged"])
 
 
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What has been sent so far, and where it is, while nothing is on its way."""
+
+    boot_id: str
+    sent: int
+    """Frames that the kernel has carried."""
+    taken: int
+    """Of these the daemon has taken in so many."""
+    dropped: int
+    """Of these the kernel could not keep so many."""
+    readings: int
+    judged: int
+    skipped: int
+
+
 def can_frames(lab: Lab) -> Outcome:
-    """The kernel's count of frames on the bus is the daemon's count of frames taken in."""
+    """No frame is lost at a rate that is carried, and all are accounted for at ten times that."""
+    restarts = lab.show("can", "NRestarts")
     try:
-        steady = _lossless(lab)
-        lab.twin("--rate", str(BURST_RATE_HZ))
+        carried_hz = _overloaded_hz(lab) / OVERLOAD_MIN
+        burst_hz = min(BURST_TIMES * carried_hz, TWIN_MAX_HZ)
+        before = _tally(lab)
+        began_s = lab.now_s()
+        lab.twin("--rate", f"{carried_hz:.3f}")
+        lab.await_message("can", began_s, "a verdict")
+        time.sleep(STEADY_S)
+        steady = _tally(lab)
+        if steady.dropped != before.dropped or steady.taken - before.taken != _sent(before, steady):
+            raise StepError(f"frames lost at {carried_hz:.1f} Hz: {before}, then {steady}")
+        began_s = lab.now_s()
+        lab.twin("--rate", f"{burst_hz:.3f}")
+        lab.await_message("can", began_s, "overloaded", _overloaded)
         time.sleep(BURST_S)
-        burst = _lossless(lab) - steady
+        burst = _tally(lab)
+        began_s = lab.now_s()
     finally:
         lab.twin("--rate", str(CAN_RATE_HZ))
-    return Outcome(f"{steady} frames steady, {burst} as fast as the twin can: none lost")
+    lab.await_message("can", began_s, "a verdict")
+    lab.await_message("can", began_s, "no longer overloaded", _calm)
+    if burst.boot_id != before.boot_id or lab.show("can", "NRestarts") != restarts:
+        raise StepError("was started anew")
+    sent, skipped = _sent(steady, burst), burst.skipped - steady.skipped
+    if not skipped:
+        raise StepError(f"nothing was left out at {burst_hz:.0f} Hz")
+    return Outcome(
+        f"{_sent(before, steady)} frames at {carried_hz:.0f} Hz: none lost; {sent} at "
+        f"{burst_hz:.0f} Hz: {burst.dropped - steady.dropped} dropped, {skipped} of "
+        f"{burst.readings - steady.readings} readings left out, overloaded, then well again"
+    )
 
 
-def _lossless(lab: Lab) -> int:
-    """Frames so far, after the twin was stopped. Raises `StepError` if one was lost."""
+def _overloaded_hz(lab: Lab) -> float:
+    """What is judged per second of what comes faster. Raises `StepError` if nothing is faster."""
+    for rate_hz in BURST_RATES_HZ:
+        began_s = lab.now_s()
+        lab.twin("--rate", str(rate_hz))
+        lab.await_message("can", began_s, "a verdict")
+        time.sleep(TRIAL_S)
+        statuses = lab.machine.messages.between("can", "status", began_s, math.inf)
+        judged: list[float] = [
+            status.body["readings_hz"] for status in statuses if _overloaded(status)
+        ]
+        if len(judged) >= TRIAL_STATUSES:
+            return statistics.median(judged)
+    raise StepError(f"not overloaded at {BURST_RATES_HZ[-1]} Hz")
+
+
+def _overloaded(message: Message) -> bool:
+    return message.kind == "status" and bool(message.body["overloaded"])
+
+
+def _calm(message: Message) -> bool:
+    return message.kind == "status" and not message.body["overloaded"]
+
+
+def _sent(former: Tally, later: Tally) -> int:
+    return later.sent - former.sent
+
+
+def _tally(lab: Lab) -> Tally:
+    """Stop the twin and count. Raises `StepError` if something is not accounted for."""
+    began_s = lab.now_s()
+    lab.twin("--rate", str(CAN_RATE_HZ))  # what was dropped is told with the frames after it
+    lab.await_message("can", began_s, "a verdict")
+    time.sleep(SETTLING_S)
     lab.sh("systemctl stop twin-can")
     time.sleep(SETTLING_S)
     now_s = lab.now_s()
-    status = lab.await_message("can", now_s, "a status", lambda m: m.kind == "status")
-    counters = status.body["drivers"]["can"]
-    interface = lab.interface()
-    sent, taken = interface["sent"], counters["accepted_frames"]
-    dropped = interface["dropped"] + counters["kernel_drops"]
-    if dropped or taken != sent:
-        raise StepError(f"{sent} frames sent, {taken} taken, {dropped} dropped")
-    return sent
+    status = lab.await_message("can", now_s, "silence", _silent).body
+    counters, interface = status["drivers"]["can"], lab.interface()
+    tally = Tally(
+        boot_id=status["boot_id"],
+        sent=interface["sent"],
+        taken=counters["accepted_frames"],
+        dropped=interface["dropped"] + counters["kernel_drops"],
+        readings=counters["readings"],
+        judged=lab.last("can", "verdict")["grasp"],
+        skipped=status["skipped_readings"],
+    )
+    if tally.taken + tally.dropped != tally.sent or tally.judged + tally.skipped != tally.readings:
+        raise StepError(f"not accounted for: {tally}")
+    return tally
+
+
+def _silent(message: Message) -> bool:
+    return message.kind == "status" and message.body["state"] == "silent"

@@ -18,6 +18,7 @@ from daemon.assembly import assembly
 from daemon.assembly.recorder import build_recorder
 from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
+from daemon.judge.reasons import GateCause
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import Known, RecordingHeader
@@ -235,6 +236,31 @@ def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_fil
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
     assert expected[1249].reasons != expected[1250].reasons
+    paths = files(tmp_path)
+    assert again(*paths) == expected
+    assert len(paths) > 3
+    for path in paths:
+        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
+        assert again(path) == [each for each in expected if each.t_ns in times]
+
+
+def test_where_readings_were_left_out_the_replay_knows_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also right before a new file begins, and in a grasp that had been judged."""
+    daemon = Daemon(tmp_path, monkeypatch)
+    expected = []
+    for reading in sweeps()[:2000]:
+        place = reading.seq % 100
+        if 93 <= place < 98 or reading.seq % 370 == 5:
+            continue
+        if place == 98 or reading.seq % 370 == 6:
+            daemon.pipeline.skip()
+            daemon.recorder.on_skipped()
+        expected.append(daemon.judge(reading))
+    daemon.recorder.close()
+    gaps = [each for each in expected for change in each.changes if change.cause is GateCause.GAP]
+    assert len(gaps) > 3
     paths = files(tmp_path)
     assert again(*paths) == expected
     assert len(paths) > 3

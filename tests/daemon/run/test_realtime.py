@@ -10,18 +10,19 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq
 
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Parts
 from daemon.judge.reasons import GateState
-from daemon.publish.messages import decode_status
+from daemon.publish.messages import State, Status, decode_status, decode_verdict
 from daemon.run.realtime import RealtimeMode
 from daemon.run.rehearsal import rehearse
 from daemon.run.runner import enter_realtime, prepare
@@ -29,6 +30,7 @@ from daemon.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.twins.grasps.grasps import Counts, recorded_counts
+from tests.daemon.processes import TIMEOUT_S, start
 
 WORLD = """
 import ctypes, os, resource, sys
@@ -203,3 +205,100 @@ def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
         ).p_slip
         for row in rows
     ]
+
+
+class Twin:
+    """An SPI bridge that sweeps as fast as it is told, and all that the daemon says of it."""
+
+    def __init__(self, folder: Path, listener: zmq.Socket[bytes]) -> None:
+        self._path = folder / "twin"
+        self._listener = listener
+        self._process: subprocess.Popen[str] | None = None
+        self.statuses: list[Status] = []
+        self.judged = 0
+        """Number of the last reading that was judged."""
+
+    def sweep(self, rate_hz: float) -> None:
+        self.stop()
+        play = ("--recording", DEMO_TABLE, "--loop")
+        self._process = start("twin", "spi", "--path", self._path, "--rate", rate_hz, *play)
+
+    def stop(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.terminate()
+            process.communicate(timeout=TIMEOUT_S)
+
+    def hear(self, seconds: float, until: Callable[[Status], bool]) -> bool:
+        """Listen until something is said; whether it was in time."""
+        deadline_s = time.monotonic() + seconds
+        while (left_s := deadline_s - time.monotonic()) > 0.0:
+            if self._listener.poll(round(left_s * 1e3)):
+                topic, payload = self._listener.recv_multipart()
+                if topic.startswith(b"verdict."):
+                    self.judged = decode_verdict(payload).grasp
+                    continue
+                self.statuses.append(decode_status(payload))
+                if until(self.statuses[-1]):
+                    return True
+        return False
+
+
+def thrice(former: Status, later: Status) -> bool:
+    """Whether, between two statuses, three times as many readings came as were judged."""
+    came = later.drivers["spi"]["readings"] - former.drivers["spi"]["readings"]
+    skipped = later.skipped_readings - former.skipped_readings
+    return came >= OVERLOAD * (came - skipped) > 0
+
+
+OVERLOAD = 3
+RATES_HZ = (2000, 4000, 8000, 16000)
+RTTIME_US = 1_000_000
+"""As `LimitRTTIME` of the unit, but a fifth: so long may it compute without sleeping."""
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_a_daemon_at_three_times_its_capacity_lives_on_and_accounts_for_all(
+    tmp_path: Path, realtime: bool
+) -> None:
+    if realtime and not fifo_may_be_had():
+        pytest.skip("SCHED_FIFO is refused here")
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "spi"\nport = "{tmp_path}/twin"\n[model]\nname = "cnn1"\n'
+        f'[gate]\nmode = "every"\n[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+        + ("[realtime]\npriority = 1\nlock_memory = false\n" if realtime else "")
+    )
+    limit = ("prlimit", f"--rttime={RTTIME_US}:{2 * RTTIME_US}")
+    with zmq.Context() as context, context.socket(zmq.SUB) as listener, ExitStack() as stack:
+        for topic in ("status.", "verdict."):
+            listener.subscribe(topic)
+        listener.connect(f"ipc://{tmp_path}/graspd")
+        twin = Twin(tmp_path, listener)
+        stack.callback(twin.stop)
+        daemon = stack.enter_context(start("run", path, before=limit))
+        stack.callback(daemon.terminate)
+        for rate_hz in RATES_HZ:
+            twin.sweep(rate_hz)
+            twin.hear(8.0, lambda status: status.overloaded)
+            former = twin.statuses[-1]
+            twin.hear(3.2, lambda status: False)
+            if former.overloaded and thrice(former, twin.statuses[-1]):
+                break
+        assert thrice(former, twin.statuses[-1])
+        assert all(status.overloaded for status in twin.statuses if status.seq > former.seq)
+        twin.sweep(20)
+        assert twin.hear(20.0, lambda status: not status.overloaded)
+        calm = twin.statuses[-1]
+        twin.stop()
+        assert twin.hear(5.0, lambda status: status.state is State.SILENT)
+        last = twin.statuses[-1]
+        daemon.terminate()
+        _, said = daemon.communicate(timeout=TIMEOUT_S)
+    assert daemon.returncode == 0, said
+    assert len({status.boot_id for status in twin.statuses}) == 1
+    times_ns = [status.t_mono_ns for status in twin.statuses]
+    assert max(b - a for a, b in itertools.pairwise(times_ns)) < 2_000_000_000
+    assert said.count("overloaded:") == said.count("overload is over") == 1
+    assert last.drivers["spi"]["readings"] == twin.judged + last.skipped_readings
+    assert last.skipped_readings == calm.skipped_readings

@@ -8,6 +8,7 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from daemon.judge.reasons import GateState, Outcome, Reason
@@ -151,4 +152,7 @@ def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None
     assert in_a_line(status) == (
         "running: 100.0 readings/s, 1 stable, 1 slip, 1 unknown, gate idle, 3 late, "
         "ff_7 saturated, mf not-tared"
+    )
+    assert "1 unknown, gate idle, overloaded, 4 readings left out, 3 late" in in_a_line(
+        msgspec.structs.replace(status, overloaded=True)
     )

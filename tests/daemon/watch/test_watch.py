@@ -338,6 +338,14 @@ def test_more_is_unwell_than_fits_and_the_rest_is_counted() -> None:
     assert "and 24 more" in "\n".join(lines)
 
 
+@pytest.mark.parametrize("overloaded", [False, True])
+def test_an_overloaded_daemon_is_not_well(overloaded: bool) -> None:
+    view = a_view()
+    view.take(b"status.right", status(0, overloaded=overloaded), 0)
+    view.take(b"verdict.right", verdict(0), 0)
+    assert ("overloaded" in [line.what for line in view.snapshot(0).health]) is overloaded
+
+
 def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     evil = "\x1b[2J\x1b]0;owned\x07"
     view = after(

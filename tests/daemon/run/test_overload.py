@@ -1,0 +1,374 @@
+"""Readings that come faster than they are judged: the newest counts, the others are counted."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from daemon.judge.contact import ContactLimits
+from daemon.judge.gate import GateLimits
+from daemon.judge.grip import GripLimits
+from daemon.judge.reasons import Outcome, Reason
+from daemon.process.signals import StopSignal
+from daemon.publish.companion import Companion
+from daemon.publish.messages import Status, Verdict, decode_status
+from daemon.publish.outbox import Outbox
+from daemon.run.loop import DRAINS_MAX, Loop, Timing
+from daemon.run.overload import REST_AFTER_NS, REST_MAX_NS, Overload, after
+from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
+from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
+from tests.daemon.judge.test_only_stable_if import POSES
+
+START_NS = Clock().now_ns
+PERIOD_NS = 10 * MS
+SECOND_NS = 1_000_000_000
+
+
+class LiveDriver(FakeDriver):
+    """Hands over what has come by now, `at_once` readings at most."""
+
+    live = True
+
+    def __init__(self, readings: Sequence[Reading], clock: Clock, at_once: int = 1000) -> None:
+        super().__init__(readings, clock)
+        self.at_once = at_once
+        self.calls = 0
+
+    def due_ns(self) -> int | None:
+        return self.queue[0].t_ns if self.queue else None  # type: ignore[union-attr]
+
+    def read_ready(self) -> list[Reading]:
+        self.calls += 1
+        came = [item for item in self.queue if item.t_ns <= self.clock()]  # type: ignore[union-attr]
+        taken = came[: self.at_once]
+        del self.queue[: len(taken)]
+        self.counters.readings += len(taken)
+        return taken  # type: ignore[return-value]
+
+
+class Bench(Companion):
+    """A loop on a clock of its own, which stands still but for what judging costs."""
+
+    def __init__(
+        self,
+        driver: FakeDriver,
+        clock: Clock,
+        cost_ns: Callable[[], int],
+        *,
+        grip: GripLimits | None = None,
+    ) -> None:
+        self.clock = clock
+        self.cost_ns = cost_ns
+        self.judged: list[tuple[Verdict, TactileReading]] = []
+        self.statuses: list[Status] = []
+        self.angles: list[int] = []
+        self.gaps = 0
+        self.rests_s: list[float] = []
+        self.rounds_ns: list[int] = []
+        """When the loop had gone round."""
+        self.driver = driver
+        with StopSignal() as stop:
+            loop = Loop(
+                [driver],
+                pipeline(FakeModel(), clock, grip=grip, max_age_ns=SECOND_NS),
+                Outbox("right", FINGERS, "fake", "ab" * 32, [self], clock, lambda: 1.79e9),
+                stop,
+                [self],
+                Timing(SECOND_NS, clock),
+            )
+            loop._overload._sleep = self._rest
+            loop._wait = self._wait  # type: ignore[assignment, method-assign]
+            self.loop = loop
+            with closing(loop):
+                loop.run()
+
+    def _wait(self, _selector: object) -> None:
+        """Move the clock instead of waiting."""
+        due_ns = self.driver.due_ns()
+        if due_ns is not None and due_ns > self.clock():
+            self.clock.now_ns = due_ns
+            self.loop._overload.waited(due_ns)
+        else:
+            self.loop._overload.rest(self.clock())
+
+    def _rest(self, seconds: float) -> None:
+        self.rests_s.append(seconds)
+        self.clock.now_ns += round(seconds * 1e9)
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        self.clock.now_ns += self.cost_ns()
+        if reading is not None:
+            self.judged.append((verdict, reading))
+
+    def on_joints(self, reading: JointReading) -> None:
+        self.angles.append(reading.seq)
+
+    def on_skipped(self) -> None:
+        self.gaps += 1
+
+    def after_round(self) -> None:
+        self.rounds_ns.append(self.clock())
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        if topic == b"status.right":
+            self.statuses.append(decode_status(payload))
+
+    def wanted(self, _topic: bytes) -> bool:
+        return False
+
+
+def stream(seconds: float, period_ns: int = PERIOD_NS) -> list[Reading]:
+    number = round(seconds * SECOND_NS / period_ns)
+    return [reading(START_NS + seq * period_ns, seq, seq) for seq in range(number)]
+
+
+def flood(cost_ns: int, seconds: float = 3.0, at_once: int = 1000) -> Bench:
+    clock = Clock()
+    return Bench(LiveDriver(stream(seconds), clock, at_once), clock, lambda: cost_ns)
+
+
+@pytest.mark.parametrize("times", [1.5, 3.0, 10.0, 50.0])
+def test_at_any_overload_the_newest_is_judged_and_all_are_accounted_for(times: float) -> None:
+    cost_ns = round(times * PERIOD_NS)
+    bench = flood(cost_ns, 4.0)
+    status = bench.statuses[-1]
+    assert len(bench.judged) + status.skipped_readings == 400
+    assert bench.driver.counters.readings == 400
+    assert status.skipped_readings == pytest.approx(400 * (1 - 1 / times), rel=0.25)
+    # From the second round on, which knows what judging takes, none has waited for another.
+    waited_ms = [v.age_ms - v.latency_us / 1e3 for v, _ in bench.judged[1:-1]]
+    assert max(waited_ms) < PERIOD_NS / MS
+    assert max(v.latency_us for v, _ in bench.judged) == 0.0
+    seqs = [seen.seq for _, seen in bench.judged]
+    assert seqs == sorted(set(seqs))
+    assert bench.gaps == sum(b - a > 1 for a, b in itertools.pairwise([-1, *seqs]))
+
+
+def test_what_can_be_judged_in_time_is_judged_whole() -> None:
+    bench = flood(PERIOD_NS * 9 // 10)
+    assert [seen.seq for _, seen in bench.judged] == list(range(300))
+    assert bench.statuses[-1].skipped_readings == 0
+    assert bench.gaps == 0
+
+
+def test_a_stall_that_can_be_caught_up_costs_no_reading() -> None:
+    clock = Clock()
+    costs = itertools.chain([0] * 20, [95 * MS], itertools.repeat(MS // 2))
+    bench = Bench(LiveDriver(stream(1.0), clock), clock, lambda: next(costs))
+    assert [seen.seq for _, seen in bench.judged] == list(range(100))
+    assert bench.statuses[-1].skipped_readings == 0
+
+
+def test_a_recording_is_judged_row_by_row_however_long_that_takes() -> None:
+    clock = Clock()
+    driver = LiveDriver(stream(1.0), clock)
+    driver.live = False
+    bench = Bench(driver, clock, lambda: 30 * MS)
+    assert [seen.seq for _, seen in bench.judged] == list(range(100))
+    assert bench.statuses[-1].skipped_readings == 0
+    assert not any(status.overloaded for status in bench.statuses)
+    assert bench.rests_s  # all the same: in realtime it would be ended
+
+
+def test_the_loop_sleeps_feeds_the_watchdog_and_tells_its_status_in_every_overload() -> None:
+    bench = flood(30 * MS, 10.0)
+    worked_ns = 10 * SECOND_NS
+    assert sum(bench.rests_s) * 1e9 == pytest.approx(worked_ns / 11, rel=0.2)
+    assert max(bench.rests_s) * 1e9 <= REST_MAX_NS
+    assert len(bench.rests_s) >= len(bench.judged) - 2
+    assert max(np.diff(bench.rounds_ns)) < 200 * MS
+    assert len(bench.statuses) == 10
+    assert max(np.diff([status.t_mono_ns for status in bench.statuses])) < 1.1 * SECOND_NS
+
+
+def test_it_is_said_once_when_it_begins_and_once_when_it_is_over(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    clock = Clock()
+
+    def cost_ns() -> int:
+        return 30 * MS if clock() < START_NS + 5 * SECOND_NS else 0
+
+    with caplog.at_level(logging.INFO, "graspd"):
+        bench = Bench(LiveDriver(stream(13.0), clock), clock, cost_ns)
+    times_s = [(status.t_mono_ns - START_NS) / SECOND_NS for status in bench.statuses]
+    said = [status.overloaded for status in bench.statuses]
+    assert said[:2] == [False, False]
+    assert all(over for t_s, over in zip(times_s, said, strict=True) if 3.2 < t_s < 10.0)
+    assert not any(over for t_s, over in zip(times_s, said, strict=True) if t_s > 10.5)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
+    assert f"{bench.statuses[-1].skipped_readings} readings" in caplog.text
+
+
+def test_a_single_stall_is_counted_and_no_overload(caplog: pytest.LogCaptureFixture) -> None:
+    clock = Clock()
+    costs = itertools.chain([MS] * 20, [SECOND_NS // 2], itertools.repeat(MS))
+    bench = Bench(LiveDriver(stream(3.0), clock), clock, lambda: next(costs))
+    assert bench.statuses[-1].skipped_readings == 49
+    assert not any(status.overloaded for status in bench.statuses)
+    assert not caplog.records
+
+
+def test_joints_are_all_followed_in_their_order() -> None:
+    clock = Clock()
+    angles = [
+        JointReading(item.t_ns, number, ("FFJ3",), np.array([0.5]))
+        for number, item in enumerate(stream(2.0))
+    ]
+    both = [item for pair in zip(angles, stream(2.0), strict=True) for item in pair]
+    bench = Bench(LiveDriver(both, clock), clock, lambda: 30 * MS)
+    assert bench.angles == list(range(200))
+    assert bench.statuses[-1].skipped_readings > 100
+
+
+def test_the_newest_is_that_of_all_that_the_driver_has() -> None:
+    """Also of one that hands over a few at a time."""
+    bench = flood(100 * MS, 3.0, at_once=3)
+    ages_ms = [verdict.age_ms for verdict, _ in bench.judged[3:-1]]
+    assert max(ages_ms) < 10.0
+
+
+def test_a_driver_that_always_has_more_does_not_hold_the_loop() -> None:
+    clock = Clock()
+    driver = LiveDriver(stream(2.0, PERIOD_NS // 200), clock, at_once=20)
+    bench = Bench(driver, clock, lambda: 30 * MS)
+    rounds = len(bench.rounds_ns)
+    assert driver.calls <= (DRAINS_MAX + 1) * rounds
+    assert max(np.diff(bench.rounds_ns)) < 200 * MS
+    assert bench.statuses[-1].skipped_readings + len(bench.judged) == driver.counters.readings
+
+
+def test_a_loop_at_work_sleeps_now_and_then_and_an_idle_one_is_left_alone() -> None:
+    slept: list[float] = []
+    overload = Overload(0, live=True, sleep=slept.append)
+    for now_ns in range(0, SECOND_NS, MS):
+        overload.waited(now_ns)
+        overload.rest(now_ns + MS)
+    assert slept == []
+    overload.rest(SECOND_NS + REST_AFTER_NS)
+    assert slept == [pytest.approx(REST_AFTER_NS / 10 / 1e9, rel=0.2)]
+
+
+def test_a_finger_that_repeats_what_was_left_out_is_held() -> None:
+    former, newest = reading(0, 1), reading(PERIOD_NS, 2, 1)
+    assert after(former, newest) is newest
+    newest.counts[1] = former.counts[1]
+    found = after(former, newest)
+    assert found.faults[1].tolist() == [ElectrodeFault.HELD] * 24
+    assert not found.faults[[0, 2]].any()
+    assert not newest.faults.any()
+    assert (found.t_ns, found.seq) == (newest.t_ns, newest.seq)
+
+
+def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
+    """Each reading is a grasp: the judge sees but the newest, and that differs from its last."""
+    clock = Clock()
+    came = stream(2.0)
+    for at in range(100, 200, 10):
+        for item in came[at + 1 : at + 9]:
+            assert isinstance(item, TactileReading)
+            item.counts[:] = came[at].counts  # type: ignore[union-attr]
+    first = {came[at].t_ns for at in range(100, 200, 10)}
+    bench = Bench(LiveDriver(came, clock), clock, lambda: 35 * MS)
+    frozen = [
+        (verdict, seen)
+        for verdict, seen in bench.judged
+        if seen.seq >= 100 and seen.seq % 10 and seen.seq % 10 != 9 and seen.t_ns not in first
+    ]
+    assert len(frozen) > 10
+    assert {verdict.verdict for verdict, _ in frozen} == {Outcome.UNKNOWN}
+    assert Outcome.STABLE in {verdict.verdict for verdict, _ in bench.judged}
+
+
+LIMITS = GripLimits(contact=ContactLimits(), gate=GateLimits())
+
+
+def grasps(seed: int) -> list[TactileReading]:
+    """Grasps, and in them what must not be taken for a hold: jerks, lost contact, faults."""
+    random = np.random.default_rng(seed)
+    poses = ["rest"] * 150
+    while len(poses) < 3000:
+        for _ in range(int(random.integers(1, 4))):
+            disturbed = random.choice(["lifted", "other", "light", "two", "frozen", "faulty"])
+            poses += ["grasp"] * int(random.integers(20, 90))
+            poses += [str(disturbed)] * int(random.integers(1, 12))
+        poses += ["rest"] * int(random.integers(20, 60))
+    readings: list[TactileReading] = []
+    for seq, pose in enumerate(poses):
+        counts = POSES["grasp" if pose in ("frozen", "faulty") else pose]
+        made = TactileReading(
+            START_NS + seq * PERIOD_NS,
+            seq,
+            (counts + random.integers(-2, 3, counts.shape)).astype(np.uint16),
+            np.zeros(counts.shape, dtype=np.uint8),
+        )
+        if pose == "frozen":
+            made.counts[1] = readings[-1].counts[1]
+        if pose == "faulty":
+            made.faults[2] = ElectrodeFault.PARITY
+        readings.append(made)
+    return readings
+
+
+def busy(seed: int, clock: Clock) -> Iterator[int]:
+    """What judging costs: now and then, for a while, far more than a period."""
+    random = np.random.default_rng(seed)
+    while True:
+        until_ns = clock() + int(random.integers(50, 1500)) * MS
+        while clock() < until_ns:
+            yield 0
+        until_ns = clock() + int(random.integers(30, 600)) * MS
+        cost_ns = int(random.integers(12, 60)) * MS
+        while clock() < until_ns:
+            yield cost_ns
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
+    judged = []
+    for live in (False, True):
+        clock = Clock()
+        costs = busy(seed, clock) if live else itertools.repeat(0)
+        driver = LiveDriver([dataclasses.replace(item) for item in grasps(seed)], clock)
+        driver.live = live
+        bench = Bench(driver, clock, costs.__next__, grip=LIMITS)
+        judged.append({seen.seq: verdict for verdict, seen in bench.judged})
+        skipped = bench.statuses[-1].skipped_readings
+    without, overloaded = judged
+    assert len(without) >= 3000
+    assert skipped > 300
+    stable = {seq for seq, verdict in overloaded.items() if verdict.verdict is Outcome.STABLE}
+    would = {seq for seq, verdict in without.items() if verdict.verdict is Outcome.STABLE}
+    assert len(stable) > 30
+    assert stable <= would, sorted(stable - would)
+
+
+def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
+    """A jerk there and back, none of it seen: the verdict that stood stands no longer."""
+    clock = Clock()
+    came = [item for item in grasps(3) if item.seq < 150]
+    for seq in range(150, 250):
+        pose = POSES["other" if 205 <= seq < 209 else "grasp"]
+        counts = (pose + np.random.default_rng(seq).integers(-2, 3, (3, 24))).astype(np.uint16)
+        came.append(dataclasses.replace(came[0], t_ns=START_NS + seq * PERIOD_NS, seq=seq))
+        came[-1] = dataclasses.replace(came[-1], counts=counts)
+
+    def cost_ns() -> int:
+        return 15 * MS if 200 * PERIOD_NS < clock() - START_NS < 215 * PERIOD_NS else 0
+
+    driver = LiveDriver(came, clock)
+    bench = Bench(driver, clock, cost_ns, grip=LIMITS)
+    said = {seen.seq: verdict for verdict, seen in bench.judged}
+    assert said[199].verdict is Outcome.STABLE
+    first_skipped = min(set(range(250)) - set(said))
+    assert 200 <= first_skipped < 210
+    after_it = [verdict for seq, verdict in said.items() if first_skipped < seq < 225]
+    assert {verdict.verdict for verdict in after_it} == {Outcome.UNKNOWN}
+    assert after_it[0].reasons == [Reason.SEQUENCE_GAP]
+    assert said[249].verdict is Outcome.STABLE
