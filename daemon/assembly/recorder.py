@@ -1,4 +1,4 @@
-"""From a scene to its recorder, and what a recording must say to be judged again the same way."""
+"""Builds the recorder of a scene, and the headers of its files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 def build_recorder(
     wanted: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
 ) -> Recorder | None:
-    """The recorder of a scene, at work; None if it wants none.
+    """The recorder of a scene, started; None if the scene does not record.
 
-    The session must be what it is at the start. `tap` holds what came over the link.
-    Raises `SceneError` without the package `mcap`.
+    Call it when `pipeline` has the session that it starts with. `tap` gives what comes over the
+    link, if that is recorded. Raises `SceneError` without the package `mcap`.
     """
     directory = wanted.record_directory
     if wanted.record is None or directory is None:
@@ -61,7 +61,7 @@ def build_recorder(
 
 
 def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
-    """What every file says of the run: fingers, the scene's way to judge, model."""
+    """The header of the run's files: fingers, scene and model, not yet what is known."""
     network = wanted.model.model_dump(mode="json", exclude_none=True)
     if wanted.model.path is not None:
         network["path"] = str(wanted.model.path.absolute())
@@ -85,9 +85,9 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
 
 
 def state_of(pipeline: Pipeline) -> Callable[[], Known]:
-    """What judge and session know, so that a file can be judged again without those before it.
+    """Copy the state of judge and session, in some 50 us; calling the result encodes it.
 
-    Takes some 50 us; what it returns encodes that, which takes longer.
+    Encoding takes longer, and may be done in another thread.
     """
     judge, session, axis_ns = JudgeMemory.of(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()

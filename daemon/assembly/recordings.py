@@ -1,4 +1,4 @@
-"""Recordings of graspd itself, judged again as they were judged: their scene, session and times."""
+"""Builds what judges recordings again as they were judged: scene, driver, judge and session."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ NOTHING_KNOWN: Final = (
 
 
 class RecordedRun:
-    """The files of one run, in their order."""
+    """The recordings of one run of the daemon, in the order of time."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        """Read the beginning of all. Raises `RecordingError`."""
+        """Read the headers; warn of files that are missing between. Raises `RecordingError`."""
         headers = [header_of(path) for path in paths]
         self.header = headers[0]
         """Of the first file."""
@@ -41,9 +41,10 @@ class RecordedRun:
                 log.warning("%s: does not go on where the file before it ends", path)
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """The scene that was recorded, with another model or gate mode if they are given.
+        """The scene that was recorded, playing the files.
 
-        Raises `SceneError`.
+        `publish` and `model` are sections of it; an empty `model` and `mode` None leave model and
+        gate mode as recorded. Raises `SceneError`.
         """
         names = ("hand", "model", "gate", "session")
         sections = {name: dict(self.header.scene.get(name, {})) for name in names}
@@ -54,16 +55,17 @@ class RecordedRun:
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
     def build_driver(self, wanted: Scene, speed: float | None) -> McapReplayDriver:
-        """The driver that plays the files."""
+        """The driver that plays the files, not yet open; `speed` None is as fast as possible."""
         self._driver = McapReplayDriver(
             self._paths, wanted.hand.fingers, speed=speed, axis_ns=self.header.known.axis_ns
         )
         return self._driver
 
     def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
-        """The judge of what the driver plays, which finds readings as old as they were then.
+        """The judge of what the driver plays, in the recorded state but for the session.
 
-        It knows what the daemon's judge knew where the recording begins, but for the session.
+        It finds readings as old as they were when they were recorded. `learns` says whether its
+        session learns from the grasps.
         """
         header, driver = self.header, self._driver
         same_model = model.sha256 == header.model_sha256
@@ -86,7 +88,7 @@ class RecordedRun:
         return pipeline
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Begin with the session that the daemon had where it begins. Raises `SceneError`."""
+        """Give `pipeline` the recorded session, if it has one. Raises `SceneError`."""
         session = self.header.known.session
         if pipeline.session is None or session is None:
             return

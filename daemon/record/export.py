@@ -1,7 +1,5 @@
-"""Recorded grasps whose lift is known, as a table in the layout of the BioTac SP Stability Set.
-
-A row holds the very counts that the grasp was judged by last before its lift.
-"""
+"""Makes a grasp table, in the layout of the BioTac SP Stability Set, of recorded grasps whose
+outcome is known: the counts by which each was judged last before it was told."""
 
 from __future__ import annotations
 
@@ -27,34 +25,38 @@ GraspId = tuple[str, int]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grasp:
-    """One grasp as it was judged last before its lift."""
+    """One grasp: a row of the table."""
 
     counts: NDArray[np.uint16]
-    """Shape (fingers, 24)."""
+    """Shape (fingers, 24), as judged last before the outcome was told."""
     slipped: bool
     object_name: str | None = None
-    """What was lifted, if the controller has told it."""
+    """What was lifted; None if the controller has not told it."""
 
 
 @dataclass(slots=True)
 class Export:
-    """What recordings hold."""
+    """The grasps of some recordings, and how many were left out."""
 
     fingers: tuple[str, ...] = ()
     grasps: dict[GraspId, Grasp] = field(default_factory=dict)
-    """In the order in which they were told of."""
+    """In the order of their outcomes."""
     without_outcome: int = 0
-    """Grasps that were judged, and of whose lift nobody told."""
+    """Left out: grasps that were judged and have no outcome."""
     repaired: int = 0
-    """Grasps with an outcome that are left out: electrodes had to be replaced for judging."""
+    """Left out: grasps with an outcome of which electrodes were repaired to judge them."""
     unjoined: int = 0
-    """Outcomes of grasps whose judgement is not in the recordings, or was by broken electrodes."""
+    """Outcomes of grasps without judged counts before them in the recordings."""
     cut_off: int = 0
-    """Files that end without an end."""
+    """Files that were cut off or are damaged."""
 
 
 def collect(paths: Sequence[Path]) -> Export:
-    """The grasps of recordings, given in the order of time. Raises `RecordingError`."""
+    """The grasps of recordings, given in the order of time.
+
+    Raises `RecordingError` for a file that cannot be read, has other fingers than the first, or
+    does not have the counts that were judged.
+    """
     joining = _Joining()
     found = joining.found
     for path in paths:
@@ -77,7 +79,7 @@ def collect(paths: Sequence[Path]) -> Export:
 
 
 class _Joining:
-    """Joins what was judged with how it ended."""
+    """Joins judged counts and outcomes by grasp."""
 
     def __init__(self) -> None:
         self.found = Export()
@@ -85,7 +87,7 @@ class _Joining:
         self.told: set[GraspId] = set()
 
     def take(self, message: RecordedMessage) -> None:
-        """Take in one message. Raises `ValueError` or `OverflowError` for what is none."""
+        """Take in the next message. Raises `ValueError` or `OverflowError` if it is malformed."""
         if message.kind == Topic.JUDGED:
             judgement = decode_judged(message.payload)
             self.judged[judgement.boot_id, judgement.grasp] = judgement

@@ -18,22 +18,27 @@ _STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """Where the files of one hand stand, and how many may."""
+    """Names the files of one run, and deletes the oldest of its hand."""
 
     directory: Path
     hand: str
     boot_id: str
     keep_files: int
+    """Recordings to keep at most, link logs with theirs."""
     keep_bytes: int
+    """Size to keep at most, bytes."""
     wall_clock: Callable[[], int] = time.time_ns
 
     def name(self, number: int) -> Path:
-        """Path of the next file, without its ending; sorts by time. `number` counts from 0."""
+        """Path of file `number` of the run, from 0, without its ending; names sort by time."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.wall_clock() // 1_000_000_000))
         return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}"
 
     def make_room(self, expected_bytes: int) -> int:
-        """Remove the oldest recordings, until one more may come; how many. Raises `OSError`."""
+        """Delete the oldest recordings until one more of `expected_bytes` may come.
+
+        Returns how many were deleted. Makes the directory if needed. Raises `OSError`.
+        """
         self.directory.mkdir(parents=True, exist_ok=True)
         found = self._recordings()
         total = sum(size for _, size in found.values())
@@ -50,7 +55,7 @@ class Retention:
         return removed
 
     def _recordings(self) -> dict[str, tuple[list[Path], int]]:
-        """Files and their size by time: the name without hand and ending."""
+        """Paths and total size, bytes, of each recording, by its name without hand and ending."""
         pattern = re.compile(rf"{re.escape(self.hand)}-({_STAMP})\.(mcap|can\.log|serial)")
         found: dict[str, tuple[list[Path], int]] = {}
         for path in self.directory.iterdir():
@@ -64,6 +69,6 @@ class Retention:
 
 
 def create(path: Path) -> BinaryIO:
-    """A new file to write; raises `OSError` if it cannot be made, or is there."""
+    """Create a file and open it for writing. Raises `OSError` also if `path` exists."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
     return open(os.open(path, flags, MODE), "wb")

@@ -1,4 +1,4 @@
-"""What stands in front of each file of a recording: how the run judges, and what it knew there."""
+"""The header of each file of a recording: which scene and model judge, and in which state."""
 
 from __future__ import annotations
 
@@ -16,40 +16,41 @@ from models.session import SessionState
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Known:
-    """What was known where a file begins, so that it is judged alike without those before it."""
+    """The state where a file begins: with it the file is judged alike without those before it."""
 
     judge: bytes = b""
-    """The judge's memory, by `daemon.judge.memory.encode`; empty: nothing is known."""
+    """The judge's state, as `daemon.judge.memory.encode` gives it; empty if it is not known."""
     axis_ns: int = 0
-    """`t_ns` less `made_ns` of the readings, ns; 0 of live ones."""
+    """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
     session: SessionState | None = None
-    """None of a model that needs none."""
+    """Statistics of the session; None if the model needs none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingHeader:
-    """What a file says about the daemon that wrote it."""
+    """What a file says about the run of the daemon that wrote it."""
 
     fingers: tuple[str, ...]
-    """Rows of a reading."""
+    """Fingers of a reading, in the order of its rows."""
     joints: bool
     """Whether the hand had joint angles."""
     boot_id: str
+    """As in the verdicts of the run."""
     scene: dict[str, dict[str, Any]]
-    """Those sections of the scene that say how readings are judged."""
+    """The scene's sections `hand`, `model`, `gate` and `session`, by name."""
     model: str
     """Name of the model that judged."""
     model_sha256: str
     file: int = 0
-    """Number of the file within its run, from 0; one is left out where the disk failed."""
+    """Number of the file within its run, from 0; skips one where the disk has failed."""
     wall_minus_monotonic_ns: int = 0
-    """Log times are wall time; less this they are the daemon's monotonic time, ns."""
+    """To subtract from the file's log times, wall time, for the daemon's monotonic time, ns."""
     known: Known = Known()
     says_judged: bool = True
-    """Whether the counts that were judged are recorded too."""
+    """Whether the file has `judged` messages."""
 
     def texts(self) -> dict[str, str]:
-        """The texts of the file's metadata record."""
+        """The fields as texts, for the metadata record of an MCAP file."""
         session = self.known.session
         return {
             "fingers": json.dumps(self.fingers),
@@ -68,7 +69,7 @@ class RecordingHeader:
 
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
-        """What `texts` has made texts of. Raises `KeyError` or `ValueError`."""
+        """The header of such texts. Raises `KeyError` or `ValueError` if they are not its."""
         fingers = msgspec.json.decode(texts["fingers"], type=tuple[str, ...])
         session = texts["session"]
         if not fingers or not set(fingers) <= set(FINGERS):

@@ -1,7 +1,6 @@
-"""MCAP files of the daemon: written chunk by chunk, read as far as they were written.
+"""Writes and reads the MCAP files of recordings. Needs the package `mcap` (extra `record`).
 
-A file that was cut off has no summary at its end, so the reader looks for none. Needs the package
-`mcap` (extra `record`).
+A file that was cut off has no summary at its end, so the reader looks for none.
 """
 
 from __future__ import annotations
@@ -33,19 +32,19 @@ from drivers.recordings.csv_rows import open_recording
 METADATA: Final = "graspd"
 """Name of the metadata record that every file of graspd begins with."""
 RECORD_MAX_BYTES: Final = 64 << 20
-"""graspd's chunks have a megabyte; what says to be far longer is damaged."""
+"""graspd's chunks have a megabyte; a record whose length is given as far more is damaged."""
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
 )
-"""What the library raises for bytes that are no MCAP, or that were cut off; the last two for a
-length that nothing has."""
+"""What the library raises for a file that is no MCAP, damaged or cut off; the last two for lengths
+beyond all memory."""
 
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """Name and JSON Schema, an object at the top, of each topic that is no event."""
+    """By topic, without events: name and JSON Schema of its messages."""
     messages = {topic: topic.message for topic in Topic if topic.message is not None}
     definitions = msgspec.json.schema_components(messages.values())[1]
     found = {}
@@ -56,10 +55,10 @@ def schemas() -> dict[str, tuple[str, bytes]]:
 
 
 class McapWriter:
-    """One file being written. All methods raise `OSError` when there is no room."""
+    """Writes one file. All methods raise `OSError` if the disk does not take it."""
 
     def __init__(self, path: Path, header: RecordingHeader) -> None:
-        """Make the file, which must not be there yet; `header` stands in front."""
+        """Create the file, which must not exist, with `header` at its beginning."""
         self._path = path
         self._stream = create(path)
         self._offset_ns = header.wall_minus_monotonic_ns
@@ -75,7 +74,7 @@ class McapWriter:
             raise
 
     def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
-        """Take one message of monotonic time `at_ns`, ns."""
+        """Add a message (JSON) on `topic`, such as `verdict.right`, of monotonic `at_ns`, ns."""
         if topic not in self._channels:
             self._channels[topic] = self._register(topic.decode()), count()
         channel, numbers = self._channels[topic]
@@ -90,13 +89,13 @@ class McapWriter:
         return self._writer.register_channel(topic, "json", schema)
 
     def flush(self) -> int:
-        """End the chunk at hand, and have the disk keep it; the file's size then, bytes."""
+        """Put all that was written on the disk; returns the file's size, bytes."""
         self._writer.flush()
         os.fdatasync(self._stream.fileno())
         return self._stream.tell()
 
     def close(self) -> None:
-        """Write the summary and close."""
+        """Write the summary, flush and close."""
         try:
             self._writer.finish()
             self.flush()
@@ -104,12 +103,12 @@ class McapWriter:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close as it is."""
-        with contextlib.suppress(OSError):  # what is buffered finds no room either
+        """Close without a summary, after an error; what is buffered may be lost."""
+        with contextlib.suppress(OSError):
             self._stream.close()
 
     def remove(self) -> None:
-        """Close, and remove the file: there is nothing in it."""
+        """Close and delete the file, which has nothing but a header."""
         self.abandon()
         with contextlib.suppress(OSError):
             self._path.unlink()
@@ -117,27 +116,27 @@ class McapWriter:
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """One message of a file."""
+    """One message of a recording."""
 
     kind: str
-    """First part of the topic's name: a `Topic`, or one of another version."""
+    """First part of its topic's name: a `Topic`, or one that is not known here."""
     at_ns: int
-    """The daemon's monotonic time when it was recorded, ns."""
+    """When it was recorded, ns, by the monotonic clock of the daemon that did."""
     payload: bytes
+    """JSON."""
 
 
 class McapReader:
-    """One file: iterate once, then `cut_off` says whether it ends as it should.
+    """Reads one file: its header at once, its messages by iterating, which can be done once.
 
-    The constructor raises `RecordingError` for a file that is none of graspd's. What is damaged
-    ends the iteration as if the file ended there.
+    The iteration ends where the file is damaged, as if it ended there.
     """
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
-        """Read the beginning of `stream`, the opened file."""
-        self.path = path
+        """`stream` is the opened file at `path`. Raises `RecordingError` if it is not graspd's."""
+        self._path = path
         self.cut_off = False
-        """After iterating: whether the file has no end, or is damaged."""
+        """After iterating: whether the file was cut off or is damaged."""
         reader = StreamReader(stream, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES)
         self._records = reader.records
         self._kinds: dict[int, str] = {}
@@ -151,12 +150,12 @@ class McapReader:
                 if isinstance(record, Channel | Message):
                     break
         except EndOfFile as error:
-            raise RecordingError(self.path, "is empty: nothing was recorded") from error
+            raise RecordingError(self._path, "is empty: nothing was recorded") from error
         except _DAMAGE as error:
-            raise RecordingError(self.path, f"is no MCAP file: {error}") from error
+            raise RecordingError(self._path, f"is no MCAP file: {error}") from error
         except (KeyError, ValueError) as error:
-            raise RecordingError(self.path, "is an MCAP file of another graspd") from error
-        raise RecordingError(self.path, "is an MCAP file, but not one of graspd's")
+            raise RecordingError(self._path, "is an MCAP file of another graspd") from error
+        raise RecordingError(self._path, "is an MCAP file, but not one of graspd's")
 
     def __iter__(self) -> Iterator[RecordedMessage]:
         offset_ns = self.header.wall_minus_monotonic_ns
@@ -172,6 +171,6 @@ class McapReader:
 
 
 def header_of(path: Path) -> RecordingHeader:
-    """What a file says about itself. Raises `RecordingError`."""
+    """The header of the file at `path`. Raises `RecordingError` if there is none."""
     with open_recording(path) as stream:
         return McapReader(path, stream).header

@@ -1,4 +1,4 @@
-"""The replay of the daemon's own recordings: its readings again, as old as they were then."""
+"""Plays recordings as a driver: the same readings, as old as they were when they were recorded."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class McapCounters(DriverCounters):
-    """What a replay of recordings counts."""
+    """What is counted while recordings are played."""
 
     late: int = 0
     """Readings handed over more than one period after they were due."""
     malformed: int = 0
-    """Messages that are no reading of these fingers."""
+    """Messages on the topics of readings that are no reading of these fingers."""
     cut_off: int = 0
-    """Files that end without an end, as those of a daemon that was killed do."""
+    """Files that were cut off, as by a daemon that was killed, or are damaged."""
 
 
 class McapReplayDriver(TimedDriver[Reading | Topic]):
-    """Plays MCAP files of graspd, one reading per call of `read_ready` at most.
+    """Plays the files of one run in a row, at most one reading per call of `read_ready`.
 
-    `recorded_ns` of a reading is its `t_ns` when it was recorded, counted from `axis_ns`; `t_ns`
-    makes it as old, when it is handed over, as it was then. Several files play in a row as the one
-    run that they are. Without `speed` as fast as possible. The constructor raises `ValueError`,
-    `open` `RecordingError`. Damage ends a file early, which is counted.
+    `t_ns` of a reading makes it as old, when it is handed over, as it was when it was recorded;
+    `recorded_ns` is its `t_ns` of then less `axis_ns`. `open` raises `RecordingError`. A file that
+    is damaged is played up to the damage, and counted.
     """
 
     def __init__(
@@ -47,11 +46,15 @@ class McapReplayDriver(TimedDriver[Reading | Topic]):
         axis_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        """`speed` is a factor of real time; None plays as fast as possible.
+
+        Raises `ValueError` without files or for a speed that is not positive.
+        """
         super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_event: Mapping[Topic, Callable[[], None]] = {}
-        """What to call where one of `EVENTS` stands; nothing for those that are not in it."""
+        """What to call at an event; events that are not in it are passed over."""
         self._reset()
 
     def _reset(self) -> None:
@@ -69,7 +72,7 @@ class McapReplayDriver(TimedDriver[Reading | Topic]):
                 raise RecordingError(path, f"has no finger {missing[0]}, only {recorded}")
 
     def read_ready(self) -> Sequence[Reading]:
-        """The next reading if it is due, else none."""
+        """The next reading if it is due. An event that is due is told, and gives none."""
         taken = self._take_due()
         if taken is None:
             return ()
@@ -106,7 +109,7 @@ class McapReplayDriver(TimedDriver[Reading | Topic]):
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
     def _item(self, message: RecordedMessage) -> Reading | Topic | None:
-        """The reading or event that a message tells of; None if it tells of neither."""
+        """The reading or event in a message; None if it is neither."""
         try:
             if message.kind == Topic.TACTILE:
                 return tactile_reading(message.payload, self._fingers)

@@ -1,7 +1,7 @@
-"""Keeps what comes and what is said of it in files, without ever holding the loop up.
+"""Records readings, published messages and events in files, without ever holding up the loop.
 
-The loop appends to a queue with a bound; a thread writes. Whatever the disk does, the loop does not
-notice: what finds no place is dropped and counted.
+The loop appends to a bounded queue and a thread writes: a slow or full disk costs entries, which
+are counted, and no time of the loop.
 """
 
 from __future__ import annotations
@@ -35,19 +35,21 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 QUEUE_MAX: Final = 20_000
-"""Entries that wait for the disk, some 12 MB: a minute of readings at 100 Hz, with verdicts and
-joints. The newest are dropped beyond."""
+"""Entries that may wait for the disk, some 12 MB: a minute of readings at 100 Hz, with verdicts
+and joints. Beyond, the newest are dropped."""
 RETRY_NS: Final = 60_000_000_000
-"""After a failure of the disk, ns."""
+"""From a failure of the disk to the next try, ns."""
 ROUNDS_PER_FLUSH: Final = 10
-"""How often the thread takes what waits, between two flushes: seldom, so that it hardly ever wants
+"""How often the thread empties the queue between two flushes: seldom, so that it hardly ever needs
 the interpreter when the loop does."""
 FLUSH_AFTER: Final = 0.8
-"""Of the flush interval: so that, with a round and the writing, nothing waits longer than that."""
+"""Part of the flush interval after which a flush is due: with a round and the writing, nothing
+waits longer than the interval."""
 SWITCH_S: Final = 0.0005
-"""How long the thread may go on while the loop wants to run, s; Python's own is ten times that."""
+"""Python's switch interval while recording, s: how long the thread may keep the loop waiting for
+the interpreter. A tenth of the default."""
 CLOSE_S: Final = 0.5
-"""How long the end waits for a disk that does not answer, s."""
+"""How long `close` waits for the thread, s."""
 
 
 class RawFile(Protocol):
@@ -70,24 +72,24 @@ MakeRaw = Callable[[Path], RawFile]
 """Makes a raw file by its name without ending."""
 
 MakeKnown = Callable[[], Known]
-"""Makes, in the thread, what was known when it was taken."""
+"""Encodes a state that the loop has copied; called in the thread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
-    """Stands in the queue between what belongs into one file and into the next."""
+    """Queued between the entries of one file and those of the next."""
 
     known: MakeKnown
 
 
 _Entry = tuple[int, bytes, object]
-"""When, monotonic ns; topic; payload, or what makes the message of it in the thread. Of what came
-over a link the topic is empty."""
+"""Monotonic ns; topic; payload, or a function that makes the message. The topic is empty for what
+came over a link, and for a `_Turn`."""
 
 
 @dataclass(slots=True, eq=False)
 class _Open:
-    """Files that are being written, and since when."""
+    """Files that are being written, and since when, monotonic ns."""
 
     messages: McapWriter
     raw: RawFile | None
@@ -96,7 +98,11 @@ class _Open:
     size: int = 0
     """At the last flush, bytes."""
     unflushed: int = 0
-    """Entries taken for these files that the disk may not have."""
+    """Entries that are written to these files, but perhaps not yet on the disk."""
+
+    def all(self) -> list[McapWriter | RawFile]:
+        """One or two files."""
+        return [self.messages] if self.raw is None else [self.messages, self.raw]
 
 
 class Recorder(Companion):
@@ -113,10 +119,11 @@ class Recorder(Companion):
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start the thread, which makes the first file. `header` stands in front of every file.
+        """Start the thread, which creates the first file.
 
-        So does what `take_state` gives. It is called in the loop, here and then where a file is to
-        end: after a status, when no reading is on its way to a verdict.
+        `header` is that of every file, but for `known` and what each file has of its own.
+        `take_state` copies what is known; it is called in the loop, here and where a file is to
+        end: after a status, when no reading is being judged. Without it files end anywhere.
         """
         self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
@@ -137,7 +144,7 @@ class Recorder(Companion):
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
         self._awaits_turn = take_state is not None
-        """Whether a `_Turn` is on its way, or will be when `_wants_turn` is seen."""
+        """Whether a `_Turn` is queued, or will be when the loop sees `_wants_turn`."""
         self._wants_turn = False
         if take_state is not None:
             self._queue.append((clock(), b"", _Turn(take_state())))
@@ -148,7 +155,7 @@ class Recorder(Companion):
         self._thread.start()
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Record one message."""
+        """Record a published message."""
         self._put(topic, payload)
         if self._wants_turn and self._take_state is not None and topic == self._names[Topic.STATUS]:
             self._wants_turn = False
@@ -163,7 +170,7 @@ class Recorder(Companion):
         self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
     def on_judged(self, judgement: Judgement) -> None:
-        """Record what a grasp was judged by, if it was judged by this judgement."""
+        """Record the counts that the network judged."""
         if judgement.judged_counts is not None:
             making = partial(Judged.of, self._header.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
@@ -181,7 +188,7 @@ class Recorder(Companion):
         self._put(self._names[Topic.SKIPPED], EVENT)
 
     def raw(self, entry: object, at_ns: int) -> None:
-        """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""
+        """Record what came over the link at monotonic `at_ns`, ns; `make_raw`'s file writes it."""
         self._put(b"", entry, at_ns)
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
@@ -191,8 +198,8 @@ class Recorder(Companion):
             self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
 
     def counters(self) -> dict[str, int]:
-        """Since the start: entries `recorded`, `dropped` because the disk was too slow, `lost` with
-        a failure of it; `files` begun and `removed`, `failures`; `writing`, 0 while there is none.
+        """Since the start: entries `recorded`, `dropped` because the disk was too slow, and `lost`
+        when it failed; `files` begun and `removed`, `failures`; `writing`, 1 while a file is open.
         """
         writing = self._open is not None
         return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
@@ -202,7 +209,7 @@ class Recorder(Companion):
         return {"record": self.counters()}
 
     def close(self) -> None:
-        """Write what waits and end the files; leave a disk that does not answer alone."""
+        """Write what is queued and end the files; give up if the disk does not answer in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -226,7 +233,7 @@ class Recorder(Companion):
             self._finish()
 
     def _go_round(self) -> None:
-        """Write what waits; after a failure let it go until it is time to try again."""
+        """Write what is queued; after a failure lose it until the next try is due."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
@@ -244,7 +251,7 @@ class Recorder(Companion):
             self._flush(self._open, now_ns)
 
     def _turn(self, now_ns: int) -> None:
-        """Go on in new files, now or where the loop says what is known there."""
+        """Go on in new files: now, or where the loop next copies its state."""
         if self._take_state is None:
             self._finish()
             self._begin(now_ns, Known())
@@ -252,14 +259,14 @@ class Recorder(Companion):
             self._awaits_turn = self._wants_turn = True
 
     def _take_turn(self, turn: _Turn, now_ns: int) -> None:
-        """Go on in new files, but not for the little that comes after the end."""
+        """Go on in new files, but not for the few entries that come after `close`."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
             self._begin(now_ns, turn.known())
 
     def _begin(self, now_ns: int, known: Known) -> None:
-        """Begin new files, if the disk lets us."""
+        """Create the next files, if the disk takes them."""
         offset_ns = self._wall_clock() - now_ns
         try:
             self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
@@ -285,7 +292,7 @@ class Recorder(Companion):
         self._open = _Open(messages, raw, offset_ns, now_ns)
 
     def _write(self, entries: list[_Entry]) -> None:
-        """Write entries, or count them as lost."""
+        """Write entries; count them as lost if there is no file."""
         files = self._open
         if files is None:
             self._counted["lost"] += len(entries)
@@ -304,9 +311,7 @@ class Recorder(Companion):
 
     def _flush(self, files: _Open, now_ns: int) -> None:
         try:
-            files.size = files.messages.flush()
-            if files.raw is not None:
-                files.size += files.raw.flush()
+            files.size = sum(file.flush() for file in files.all())
         except OSError as error:
             self._fail(error)
             return
@@ -321,9 +326,8 @@ class Recorder(Companion):
         if files is None:
             return
         try:
-            files.messages.close()
-            if files.raw is not None:
-                files.raw.close()
+            for file in files.all():
+                file.close()
         except OSError as error:
             self._fail(error)
             return
@@ -331,14 +335,13 @@ class Recorder(Companion):
         self._counted["recorded"] += files.unflushed
 
     def _fail(self, error: OSError) -> None:
-        """The disk does not take it: one warning, and another try in a minute."""
+        """After a failure of the disk: warn, the first time, and try again later."""
         files, self._open = self._open, None
         self._number += 1  # the next file does not go on where the last one ends
         if files is not None:
             self._counted["lost"] += files.unflushed
-            files.messages.abandon()
-            if files.raw is not None:
-                files.raw.abandon()
+            for file in files.all():
+                file.abandon()
         self._counted["failures"] += 1
         first = self._retry_due_ns is None
         self._retry_due_ns = self._clock() + RETRY_NS

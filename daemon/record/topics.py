@@ -1,4 +1,4 @@
-"""What a recording holds: its topics, and the messages that no socket sends."""
+"""The topics of a recording, and those of its messages that are not published."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from drivers.base import ELECTRODES, JointReading, TactileReading
 
 
 class Joints(msgspec.Struct, frozen=True, kw_only=True):
-    """Joint angles as they came."""
+    """A reading of joint angles."""
 
     v: Literal[1] = WIRE_VERSION
     seq: int
@@ -36,7 +36,7 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, reading: JointReading) -> Self:
-        """The message of a reading."""
+        """The message for `reading`."""
         angles = [None if angle != angle else angle for angle in reading.position_rad.tolist()]
         return cls(
             seq=reading.seq, t_mono_ns=reading.t_ns, names=reading.names, position_rad=angles
@@ -44,23 +44,23 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Judged(msgspec.Struct, frozen=True, kw_only=True):
-    """The counts that a grasp was judged by."""
+    """The counts by which the network judged a grasp, unless electrodes were broken."""
 
     v: Literal[1] = WIRE_VERSION
     boot_id: str
     t_mono_ns: Count
-    """As in the verdict."""
+    """Of the verdict."""
     grasp: Count
-    """As in the verdict; judged again, the later message counts."""
+    """Of the verdict. A grasp that is judged again has several messages; the last one holds."""
     counts: list[list[Count]]
-    """By finger of the header, electrodes 1 to 24: medians of fresh sweeps or one reading, as the
-    scene wants it; nothing repaired."""
+    """By finger, in the header's order, and electrode 1 to 24: medians of fresh sweeps or one
+    reading, as the scene says; before any repair."""
     repaired: list[str] = []
-    """Electrodes that were replaced before judging, as in the verdict."""
+    """Electrodes that the verdict names as replaced before judging."""
 
     @classmethod
     def of(cls, boot_id: str, judgement: Judgement) -> Self:
-        """The message of a judgement that has `judged_counts`."""
+        """The message for a judgement with `judged_counts`, in the run `boot_id`."""
         counts = judgement.judged_counts
         return cls(
             boot_id=boot_id,
@@ -72,46 +72,47 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Topic(StrEnum):
-    """First part of a topic's name, `<kind>.<hand>`, with the struct of its messages.
+    """First part of a topic's name, `<kind>.<hand>`, and the struct of its messages.
 
-    A topic without a struct is an event: all there is to say is that it happened.
+    A topic without a struct is an event: its messages are empty objects.
     """
 
     message: type[msgspec.Struct] | None
+    """None for an event."""
 
     def __new__(cls, kind: str, message: type[msgspec.Struct] | None = None) -> Self:
-        """Make a member that is equal to its kind."""
+        """A member is the string `kind`, with the attribute `message`."""
         topic = str.__new__(cls, kind)
         topic._value_ = kind
         topic.message = message
         return topic
 
-    # What the outbox sends, whoever subscribes:
+    # Written by the outbox:
     TACTILE = "tactile", Tactile  # read by replay
-    VERDICT = "verdict", Verdict  # for other tools, as is what follows
-    GATE = "gate", GateMessage
-    STATUS = "status", Status
+    VERDICT = "verdict", Verdict  # read by other tools
+    GATE = "gate", GateMessage  # read by other tools
+    STATUS = "status", Status  # read by other tools
     OUTCOME = "outcome", OutcomeMessage  # read by export
-    # What the recorder is told by the loop:
+    # Written by the recorder:
     JOINTS = "joints", Joints  # read by replay
     JUDGED = "judged", Judged  # read by export
-    ASKED = "asked"  # read by replay: the controller has asked for a judgement
-    EXCHANGED = "exchanged"  # read by replay: a sensor is another one than before
-    SKIPPED = "skipped"  # read by replay: readings were left out before the next one
+    ASKED = "asked"  # read by replay: somebody has asked for a judgement
+    EXCHANGED = "exchanged"  # read by replay: a sensor was exchanged
+    SKIPPED = "skipped"  # read by replay: readings before the next one were left out
 
 
 EVENTS: Final = frozenset(topic for topic in Topic if topic.message is None)
 EVENT: Final = b"{}"
-"""Payload of each of them."""
+"""Payload of an event."""
 
 _decode_joints = msgspec.json.Decoder(Joints).decode
 decode_judged = msgspec.json.Decoder(Judged).decode
 
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
-    """The reading in a `tactile` message, with these fingers, in their order.
+    """The reading of a `tactile` message, reduced to `fingers`, in their order.
 
-    Raises `ValueError` (`msgspec.DecodeError` is one) or `OverflowError` for what is none.
+    Raises `ValueError` or `OverflowError` if the payload is not such a message.
     """
     message = decode_tactile(payload)
     names: Sequence[str] = message.fingers
@@ -123,7 +124,7 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
 
 
 def joint_reading(payload: bytes) -> JointReading:
-    """The reading in a `joints` message; NaN where a joint has no angle. Raises `ValueError`."""
+    """The reading of a `joints` message. Raises `ValueError` if the payload is not one."""
     message = _decode_joints(payload)
     if len(message.names) != len(message.position_rad):
         raise ValueError("as many names as angles are needed")
