@@ -21,7 +21,6 @@ import msgspec
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.outbox import Outbox
 from drivers.base import JointReading, Reading
@@ -34,6 +33,7 @@ from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import recorded_counts
 from models.contract import Finger
+from tests.daemon.record.recorded import IGNORED_FIELDS
 
 FOLDER: Final = Path(__file__).parent / "references"
 FINGERS: Final[tuple[Finger, ...]] = ("ff", "mf", "th")

@@ -1,18 +1,14 @@
-"""From a scene to its recorder, and what a recording must say to be judged again the same way."""
+"""Builds the recorder of a scene, and the headers of its files."""
 
 from __future__ import annotations
 
-import base64
-import json
-import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING
-
-import msgspec
 
 from daemon.assembly import assembly
 from daemon.judge.memory import JudgeMemory, encode
 from daemon.judge.pipeline import Pipeline
+from daemon.record.header import Known, RecordingHeader
 from daemon.scene import Scene, SceneError
 from models.runtime import TactileModel
 
@@ -20,28 +16,20 @@ if TYPE_CHECKING:
     from daemon.record.link_log import Tap
     from daemon.record.recorder import Recorder
 
-log = logging.getLogger("graspd")
-
-IGNORED_FIELDS = frozenset(
-    {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}
-)
-"""Fields of a verdict that are of the run and not of the readings: a recording that is played again
-gives all others bit for bit."""
-
 
 def build_recorder(
     wanted: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
 ) -> Recorder | None:
-    """The recorder of a scene, at work; None if it wants none.
+    """The recorder of a scene, started; None if the scene does not record.
 
-    The session must be what it is at the start. `tap` holds what came over the link.
-    Raises `SceneError` without the package `mcap`.
+    Call it when `pipeline` has the session that it starts with. `tap` gives what comes over the
+    link, if that is recorded. Raises `SceneError` without the package `mcap`.
     """
     directory = wanted.record_directory
     if wanted.record is None or directory is None:
         return None
     try:
-        from daemon.record.files import Shelf
+        from daemon.record.files import Retention
         from daemon.record.recorder import Recorder
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -52,7 +40,7 @@ def build_recorder(
             "graspd's source"
         ) from error
     options = wanted.record
-    shelf = Shelf(
+    retention = Retention(
         directory,
         wanted.hand.name,
         boot_id,
@@ -60,7 +48,7 @@ def build_recorder(
         keep_bytes=round(options.keep_mb * 1e6),
     )
     recorder = Recorder(
-        shelf,
+        retention,
         options,
         header_of(wanted, model, boot_id),
         make_raw=None if tap is None else tap.make_file,
@@ -72,8 +60,8 @@ def build_recorder(
     return recorder
 
 
-def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> dict[str, str]:
-    """What stands in front of every file: fingers, the scene's way to judge, model."""
+def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
+    """The header of the run's files: fingers, scene and model, not yet what is known."""
     network = wanted.model.model_dump(mode="json", exclude_none=True)
     if wanted.model.path is not None:
         network["path"] = str(wanted.model.path.absolute())
@@ -86,29 +74,21 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> dict[str, str
         },
         "session": {"learn": wanted.session_learns, "required": wanted.session.required},
     }
-    return {
-        "fingers": json.dumps(wanted.hand.fingers),
-        "joints": json.dumps(assembly.joint_limits(wanted) is not None),
-        "boot_id": boot_id,
-        "scene": json.dumps(sections),
-        "model": model.contract.name,
-        "model_sha256": model.sha256,
-    }
+    return RecordingHeader(
+        fingers=wanted.hand.fingers,
+        joints=assembly.joint_limits(wanted) is not None,
+        boot_id=boot_id,
+        scene=sections,
+        model=model.contract.name,
+        model_sha256=model.sha256,
+    )
 
 
-def state_of(pipeline: Pipeline) -> Callable[[], dict[str, str]]:
-    """What judge and session know, so that a file can be judged again without those before it.
+def state_of(pipeline: Pipeline) -> Callable[[], Known]:
+    """Copy the state of judge and session, in some 50 us; calling the result encodes it.
 
-    Takes some 50 us, and what is given back puts it into words, which takes longer.
+    Encoding takes longer, and may be done in another thread.
     """
     judge, session, axis_ns = JudgeMemory.of(pipeline), pipeline.session, pipeline.axis_ns
-    known = None if session is None else session.state()
-
-    def texts() -> dict[str, str]:
-        return {
-            "judge": base64.b64encode(encode(judge)).decode(),
-            "axis_ns": str(axis_ns),
-            "session": "" if known is None else msgspec.json.encode(known).decode(),
-        }
-
-    return texts
+    state = None if session is None else session.state()
+    return lambda: Known(judge=encode(judge), axis_ns=axis_ns, session=state)

@@ -181,13 +181,13 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
 
         return LinkLogs(args.recordings, args.scene)
     try:
-        from daemon.assembly.playback import Playback
+        from daemon.assembly.recordings import RecordedRun
     except ModuleNotFoundError as error:
         raise SceneError(
             f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
             "folder of graspd's source"
         ) from error
-    return Playback(args.recordings)
+    return RecordedRun(args.recordings)
 
 
 def _pipeline(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,6 +49,9 @@ class Judgement:
     """Fingers that touch; None where nobody looks."""
     changes: tuple[GateChange, ...] = ()
     """What the gate did at this reading, oldest first."""
+    judged_counts: NDArray[np.uint16] | None = field(default=None, compare=False, repr=False)
+    """Shape (fingers, 24): what the network judged, before any repair; None if it did not judge
+    this very reading, or if electrodes of it are broken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,14 +161,17 @@ class Pipeline:
         watched = self._health.watch(reading)
         counts = self._counts_to_judge(reading, watched)
         judged = counts is not None or self.grip is None
-        grasp = None
+        grasp = judged_counts = None
         if counts is not None:
             self._opinion, grasp = self._consider(counts, watched)
+            judged_counts = None if np.count_nonzero(watched.broken) else counts
             if self.grip is not None:
                 self.grip.judged()
         elif self.grip is None or self.grip.state is not GateState.JUDGED:
             self._opinion = NO_OPINION
-        judgement = self._judgement(reading.t_ns, watched.reasons, self._opinion, judged=judged)
+        judgement = self._judgement(
+            reading.t_ns, watched.reasons, self._opinion, judged=judged, counts=judged_counts
+        )
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
             self._note(grasp, judgement.grasp)
         return judgement
@@ -231,7 +237,13 @@ class Pipeline:
             self._session.observe(counts)
 
     def _judgement(
-        self, t_ns: int, against: tuple[Reason, ...], opinion: Opinion, *, judged: bool
+        self,
+        t_ns: int,
+        against: tuple[Reason, ...],
+        opinion: Opinion,
+        *,
+        judged: bool,
+        counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
         grip = self.grip
         health = (*against, *opinion.reasons)
@@ -260,6 +272,7 @@ class Pipeline:
             gate=None if grip is None else grip.state,
             contact=None if grip is None else grip.touching,
             changes=() if grip is None else tuple(grip.take_changes()),
+            judged_counts=counts,
         )
 
     def _age_ns(self, t_ns: int) -> int:

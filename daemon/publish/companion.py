@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any, Concatenate, Literal, ParamSpec, Protocol, TypeVar
 
+from daemon.judge.pipeline import Judgement
 from daemon.publish.messages import Status, Verdict
 from drivers.base import JointReading, TactileReading
 
@@ -69,6 +70,9 @@ class Companion:
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """A verdict was published; `reading` is what it is about, None where nothing has come."""
+
+    def on_judged(self, judgement: Judgement) -> None:
+        """The network judged a reading, and the verdict was published."""
 
     def on_status(self, status: Status) -> None:
         """A status was published: once a second, and at the end."""

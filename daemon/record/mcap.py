@@ -1,132 +1,176 @@
-"""Recordings of the daemon: MCAP files, read from front to end, as far as they were written.
+"""Writes and reads the MCAP files of recordings. Needs the package `mcap` (extra `record`).
 
-A file of `graspd run` that was cut off has no summary at its end, so none is looked for. Needs the
-package `mcap` (extra `record`).
+A file that was cut off has no summary at its end, so the reader looks for none.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
+import msgspec
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import Writer
 
-from drivers.base import FINGERS, RecordingError
+from daemon.record.files import create
+from daemon.record.header import RecordingHeader
+from daemon.record.topics import Topic
+from drivers.base import RecordingError
 from drivers.recordings.csv_rows import open_recording
 
-METADATA = "graspd"
+METADATA: Final = "graspd"
 """Name of the metadata record that every file of graspd begins with."""
-ASKED: Final = "asked"
-"""Kind of the message that the controller has asked for a judgement."""
-EXCHANGED: Final = "exchanged"
-"""Kind of the message that a sensor is another one than before."""
-SKIPPED: Final = "skipped"
-"""Kind of the message that readings were left out before the next one."""
-EVENTS: Final = frozenset({ASKED, EXCHANGED, SKIPPED})
-"""Kinds of messages without content of their own, that matter to what is judged."""
-RECORD_MAX_BYTES = 64 << 20
-"""graspd's chunks have a megabyte; what says to be far longer is damaged."""
+RECORD_MAX_BYTES: Final = 64 << 20
+"""graspd's chunks have a megabyte; a record whose length is given as far more is damaged."""
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
 )
-"""What the library raises for bytes that are no MCAP, or that were cut off; the last two for a
-length that nothing has."""
+"""What the library raises for a file that is no MCAP, damaged or cut off; the last two for lengths
+beyond all memory."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordingHeader:
-    """What a file says about the daemon that wrote it."""
+@cache
+def schemas() -> dict[str, tuple[str, bytes]]:
+    """By topic, without events: name and JSON Schema of its messages."""
+    messages = {topic: topic.message for topic in Topic if topic.message is not None}
+    definitions = msgspec.json.schema_components(messages.values())[1]
+    found = {}
+    for topic, message in messages.items():
+        whole: dict[str, Any] = {**definitions[message.__name__], "$defs": definitions}
+        found[topic.value] = f"graspd.{message.__name__}", json.dumps(whole).encode()
+    return found
 
-    fingers: tuple[str, ...]
-    """Rows of a reading."""
-    joints: bool
-    """Whether the hand had joint angles."""
-    boot_id: str
-    wall_minus_monotonic_ns: int
-    """Log times are wall time; less this they are the daemon's monotonic time, ns."""
-    texts: Mapping[str, str]
-    """All that it says, as it stands there."""
+
+class McapWriter:
+    """Writes one file. All methods raise `OSError` if the disk does not take it."""
+
+    def __init__(self, path: Path, header: RecordingHeader) -> None:
+        """Create the file, which must not exist, with `header` at its beginning."""
+        self._path = path
+        self._stream = create(path)
+        self._offset_ns = header.wall_minus_monotonic_ns
+        self._writer = Writer(self._stream)
+        self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
+        """Number of each topic's channel, and the numbers of its messages."""
+        try:
+            self._writer.start(profile="", library="graspd")
+            self._writer.add_metadata(METADATA, header.texts())
+            self.flush()
+        except OSError:
+            self.remove()
+            raise
+
+    def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
+        """Add a message (JSON) on `topic`, such as `verdict.right`, of monotonic `at_ns`, ns."""
+        if topic not in self._channels:
+            self._channels[topic] = self._register(topic.decode()), count()
+        channel, numbers = self._channels[topic]
+        log_ns = max(at_ns + self._offset_ns, 0)
+        self._writer.add_message(channel, log_ns, payload, log_ns, next(numbers))
+
+    def _register(self, topic: str) -> int:
+        described = schemas().get(topic.partition(".")[0])
+        schema = 0
+        if described is not None:
+            schema = self._writer.register_schema(described[0], "jsonschema", described[1])
+        return self._writer.register_channel(topic, "json", schema)
+
+    def flush(self) -> int:
+        """Put all that was written on the disk; returns the file's size, bytes."""
+        self._writer.flush()
+        os.fdatasync(self._stream.fileno())
+        return self._stream.tell()
+
+    def close(self) -> None:
+        """Write the summary, flush and close."""
+        try:
+            self._writer.finish()
+            self.flush()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close without a summary, after an error; what is buffered may be lost."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def remove(self) -> None:
+        """Close and delete the file, which has nothing but a header."""
+        self.abandon()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """One message of a file."""
+    """One message of a recording."""
 
     kind: str
-    """First part of the topic, such as `tactile`."""
+    """First part of its topic's name: a `Topic`, or one that is not known here."""
     at_ns: int
-    """The daemon's monotonic time when it was recorded, ns."""
+    """When it was recorded, ns, by the monotonic clock of the daemon that did."""
     payload: bytes
+    """JSON."""
 
 
-class McapRecording:
-    """One file: iterate once, then `cut_off` says whether it ends as it should.
+class McapReader:
+    """Reads one file: its header at once, its messages by iterating, which can be done once.
 
-    The constructor raises `RecordingError` for a file that is none of graspd's. What is damaged
-    ends the iteration as if the file ended there.
+    The iteration ends where the file is damaged, as if it ended there.
     """
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
-        """Read the beginning of `stream`, the opened file."""
-        self.path = path
+        """`stream` is the opened file at `path`. Raises `RecordingError` if it is not graspd's."""
+        self._path = path
         self.cut_off = False
-        """After iterating: whether the file has no end, or is damaged."""
+        """After iterating: whether the file was cut off or is damaged."""
         reader = StreamReader(stream, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES)
         self._records = reader.records
-        self._topics: dict[int, str] = {}
+        self._kinds: dict[int, str] = {}
         self.header = self._read_header()
 
     def _read_header(self) -> RecordingHeader:
         try:
             for record in self._records:
                 if isinstance(record, Metadata) and record.name == METADATA:
-                    return _header(record.metadata)
+                    return RecordingHeader.of(record.metadata)
                 if isinstance(record, Channel | Message):
                     break
         except EndOfFile as error:
-            raise RecordingError(self.path, "is empty: nothing was recorded") from error
+            raise RecordingError(self._path, "is empty: nothing was recorded") from error
         except _DAMAGE as error:
-            raise RecordingError(self.path, f"is no MCAP file: {error}") from error
+            raise RecordingError(self._path, f"is no MCAP file: {error}") from error
         except (KeyError, ValueError) as error:
-            raise RecordingError(self.path, "is an MCAP file of another graspd") from error
-        raise RecordingError(self.path, "is an MCAP file, but not one of graspd's")
+            raise RecordingError(self._path, "is an MCAP file of another graspd") from error
+        raise RecordingError(self._path, "is an MCAP file, but not one of graspd's")
 
     def __iter__(self) -> Iterator[RecordedMessage]:
         offset_ns = self.header.wall_minus_monotonic_ns
         try:
             for record in self._records:
                 if isinstance(record, Channel):
-                    self._topics[record.id] = record.topic.partition(".")[0]
+                    self._kinds[record.id] = record.topic.partition(".")[0]
                 elif isinstance(record, Message):
-                    kind = self._topics.get(record.channel_id, "")
+                    kind = self._kinds.get(record.channel_id, "")
                     yield RecordedMessage(kind, record.log_time - offset_ns, record.data)
         except _DAMAGE:
             self.cut_off = True
 
 
 def header_of(path: Path) -> RecordingHeader:
-    """What a file says about itself. Raises `RecordingError`."""
+    """The header of the file at `path`. Raises `RecordingError` if there is none."""
     with open_recording(path) as stream:
-        return McapRecording(path, stream).header
-
-
-def _header(texts: Mapping[str, str]) -> RecordingHeader:
-    fingers = tuple(json.loads(texts["fingers"]))
-    if not fingers or not set(fingers) <= set(FINGERS):
-        raise ValueError(f"no fingers of a hand: {fingers}")
-    return RecordingHeader(
-        fingers=fingers,
-        joints=texts["joints"] == "true",
-        boot_id=texts["boot_id"],
-        wall_minus_monotonic_ns=int(texts["wall_minus_monotonic_ns"]),
-        texts=dict(texts),
-    )
+        return McapReader(path, stream).header

@@ -1,4 +1,4 @@
-"""The replay of the daemon's own recordings: its readings again, as old as they were then."""
+"""Plays recordings as a driver: the same readings, as old as they were when they were recorded."""
 
 from __future__ import annotations
 
@@ -8,75 +8,33 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from daemon.record.mcap import EVENTS, McapRecording, RecordedMessage, header_of
-from drivers.base import (
-    ELECTRODES,
-    DriverCounters,
-    JointReading,
-    Reading,
-    RecordingError,
-    TactileReading,
-)
+from daemon.record.mcap import McapReader, RecordedMessage, header_of
+from daemon.record.topics import EVENTS, Topic, joint_reading, tactile_reading
+from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import RecordedDriver, Timeline
 
 _log = logging.getLogger(__name__)
 
 
-class _Tactile(msgspec.Struct, frozen=True):
-    """What is needed of a message on `tactile.<hand>`."""
-
-    seq: int
-    t_mono_ns: int
-    fingers: tuple[str, ...]
-    counts: list[list[int]]
-    faults: list[list[int]]
-
-
-class _Joints(msgspec.Struct, frozen=True):
-    """What is needed of a recorded joint reading."""
-
-    seq: int
-    t_mono_ns: int
-    names: tuple[str, ...]
-    position_rad: list[float | None]
-
-
-_tactile_decoder = msgspec.json.Decoder(_Tactile)
-_joints_decoder = msgspec.json.Decoder(_Joints)
-
-
 @dataclass(slots=True)
 class McapCounters(DriverCounters):
-    """What a replay of recordings counts."""
+    """What is counted while recordings are played."""
 
     late: int = 0
     """Readings handed over more than one period after they were due."""
     malformed: int = 0
-    """Messages that are no reading of these fingers."""
+    """Messages on the topics of readings that are no reading of these fingers."""
     cut_off: int = 0
-    """Files that end without an end, as those of a daemon that was killed do."""
+    """Files that were cut off, as by a daemon that was killed, or are damaged."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Due:
-    """A reading, and what was told between the one before it and this one."""
+class McapReplayDriver(RecordedDriver[Reading | Topic]):
+    """Plays the files of one run in a row, at most one reading per call of `read_ready`.
 
-    reading: Reading
-    told: tuple[str, ...] = ()
-    """Kinds of `EVENTS`, in their order."""
-
-
-class McapReplayDriver(RecordedDriver[_Due]):
-    """Plays MCAP files of graspd, one reading per call of `read_ready` at most.
-
-    `recorded_ns` of a reading is its `t_ns` when it was recorded, counted from `axis_ns`; `t_ns`
-    makes it as old, when it is handed over, as it was then. Several files play in a row as the one
-    run that they are. Without `speed` as fast as possible. The constructor raises `ValueError`,
-    `open` `RecordingError`. Damage ends a file early, which is counted.
+    `t_ns` of a reading makes it as old, when it is handed over, as it was when it was recorded;
+    `recorded_ns` is its `t_ns` of then less `axis_ns`. `open` raises `RecordingError`. A file that
+    is damaged is played up to the damage, and counted.
     """
 
     def __init__(
@@ -88,11 +46,15 @@ class McapReplayDriver(RecordedDriver[_Due]):
         axis_ns: int = 0,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
+        """`speed` is a factor of real time; None plays as fast as possible.
+
+        Raises `ValueError` without files or for a speed that is not positive.
+        """
         super().__init__(paths, Timeline(speed, clock))
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
-        self.on_told: Mapping[str, Callable[[], None]] = {}
-        """What is done, by kind of `EVENTS`, where one stands."""
+        self.on_event: Mapping[Topic, Callable[[], None]] = {}
+        """What to call at an event; events that are not in it are passed over."""
         self._reset()
 
     def _reset(self) -> None:
@@ -113,19 +75,20 @@ class McapReplayDriver(RecordedDriver[_Due]):
         self.timeline.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """The next reading if it is due, else none."""
+        """The next reading if it is due. An event that is due is told, and gives none."""
         taken = self.timeline.take()
         if taken is None:
             return ()
-        at_ns, due, late_ns = taken
+        at_ns, item, late_ns = taken
+        if isinstance(item, Topic):
+            if item in self.on_event:
+                self.on_event[item]()
+            return ()
         if self.timeline.speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
-        for kind in due.told:
-            if kind in self.on_told:
-                self.on_told[kind]()
-        if isinstance(due.reading, TactileReading):
-            self._count(due.reading)
-        return [self.timeline.hand_over(due.reading, at_ns, self._axis_ns)]
+        if isinstance(item, TactileReading):
+            self._count(item)
+        return [self.timeline.hand_over(item, at_ns, self._axis_ns)]
 
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
@@ -136,50 +99,26 @@ class McapReplayDriver(RecordedDriver[_Due]):
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 
-    def _items(self) -> Generator[tuple[int, _Due], None, None]:
-        told: tuple[str, ...] = ()
+    def _items(self) -> Generator[tuple[int, Reading | Topic], None, None]:
         for path in self.paths:
             with open_recording(path) as stream:
-                recording = McapRecording(path, stream)
+                recording = McapReader(path, stream)
                 for message in recording:
-                    if message.kind in EVENTS and message.kind not in told:
-                        told = (*told, message.kind)
-                    reading = self._reading(message)
-                    if reading is not None:
-                        yield message.at_ns, _Due(reading, told)
-                        told = ()
+                    item = self._item(message)
+                    if item is not None:
+                        yield message.at_ns, item
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
-    def _reading(self, message: RecordedMessage) -> Reading | None:
-        """The reading in a message; None for one of another kind, or that has none."""
+    def _item(self, message: RecordedMessage) -> Reading | Topic | None:
+        """The reading or event in a message; None if it is neither."""
         try:
-            if message.kind == "tactile":
+            if message.kind == Topic.TACTILE:
                 return tactile_reading(message.payload, self._fingers)
-            if message.kind == "joints":
-                return _joints(_joints_decoder.decode(message.payload))
-        except (msgspec.DecodeError, ValueError, OverflowError):
+            if message.kind == Topic.JOINTS:
+                return joint_reading(message.payload)
+        except (ValueError, OverflowError):
             self.counters.malformed += 1
-        return None
-
-
-def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
-    """The reading in a `tactile` message, with these fingers, in their order.
-
-    Raises `msgspec.DecodeError`, `ValueError` or `OverflowError` for what is none.
-    """
-    message = _tactile_decoder.decode(payload)
-    rows = [message.fingers.index(finger) for finger in fingers]
-    shape = (len(message.fingers), ELECTRODES)
-    counts = np.array(message.counts, dtype=np.uint16).reshape(shape)
-    faults = np.array(message.faults, dtype=np.uint8).reshape(shape)
-    return TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
-
-
-def _joints(message: _Joints) -> JointReading:
-    """Raises `ValueError` for angles without names."""
-    if len(message.names) != len(message.position_rad):
-        raise ValueError("as many names as angles are needed")
-    angles = np.array(message.position_rad, dtype=np.float64)  # None becomes NaN
-    return JointReading(message.t_mono_ns, message.seq, message.names, angles)
+            return None
+        return Topic(message.kind) if message.kind in EVENTS else None

@@ -1,7 +1,7 @@
-"""Keeps what comes and what is said of it in files, without ever holding the loop up.
+"""Records readings, published messages and events in files, without ever holding up the loop.
 
-The loop appends to a queue with a bound; a thread writes. Whatever the disk does, the loop does not
-notice: what finds no place is dropped and counted.
+The loop appends to a bounded queue and a thread writes: a slow or full disk costs entries, which
+are counted, and no time of the loop.
 """
 
 from __future__ import annotations
@@ -13,35 +13,43 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
 from daemon.publish.companion import Companion
-from daemon.record.files import Joints, MessageFile, Shelf
-from daemon.record.mcap import ASKED, EXCHANGED, SKIPPED
+from daemon.record.files import Retention
+from daemon.record.header import Known, RecordingHeader
+from daemon.record.mcap import McapWriter
+from daemon.record.topics import EVENT, Joints, Judged, Topic
 from daemon.scene import Record
-from drivers.base import JointReading
+
+if TYPE_CHECKING:
+    from daemon.judge.pipeline import Judgement
+    from drivers.base import JointReading
 
 log = logging.getLogger("graspd")
 
 QUEUE_MAX: Final = 20_000
-"""Entries that wait for the disk, some 12 MB: a minute of readings at 100 Hz, with verdicts and
-joints. The newest are dropped beyond."""
+"""Entries that may wait for the disk, some 12 MB: a minute of readings at 100 Hz, with verdicts
+and joints. Beyond, the newest are dropped."""
 RETRY_NS: Final = 60_000_000_000
-"""After a failure of the disk, ns."""
+"""From a failure of the disk to the next try, ns."""
 ROUNDS_PER_FLUSH: Final = 10
-"""How often the thread takes what waits, between two flushes: seldom, so that it hardly ever wants
+"""How often the thread empties the queue between two flushes: seldom, so that it hardly ever needs
 the interpreter when the loop does."""
 FLUSH_AFTER: Final = 0.8
-"""Of the flush interval: so that, with a round and the writing, nothing waits longer than that."""
+"""Part of the flush interval after which a flush is due: with a round and the writing, nothing
+waits longer than the interval."""
 SWITCH_S: Final = 0.0005
-"""How long the thread may go on while the loop wants to run, s; Python's own is ten times that."""
+"""Python's switch interval while recording, s: how long the thread may keep the loop waiting for
+the interpreter. A tenth of the default."""
 CLOSE_S: Final = 0.5
-"""How long the end waits for a disk that does not answer, s."""
+"""How long `close` waits for the thread, s."""
 
 
 class RawFile(Protocol):
@@ -63,33 +71,38 @@ class RawFile(Protocol):
 MakeRaw = Callable[[Path], RawFile]
 """Makes a raw file by its name without ending."""
 
-Texts = Callable[[], Mapping[str, str]]
-"""Puts into words, in the thread, what was known when it was taken."""
+MakeKnown = Callable[[], Known]
+"""Encodes a state that the loop has copied; called in the thread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
-    """Stands in the queue between what belongs into one file and into the next."""
+    """Queued between the entries of one file and those of the next."""
 
-    texts: Texts
+    known: MakeKnown
 
 
 _Entry = tuple[int, bytes, object]
-"""When, monotonic ns; topic, none for what came over a link; content."""
+"""Monotonic ns; topic; payload, or a function that makes the message. The topic is empty for what
+came over a link, and for a `_Turn`."""
 
 
 @dataclass(slots=True, eq=False)
 class _Open:
-    """Files that are being written, and since when."""
+    """Files that are being written, and since when, monotonic ns."""
 
-    messages: MessageFile
+    messages: McapWriter
     raw: RawFile | None
     offset_ns: int
     since_ns: int
     size: int = 0
     """At the last flush, bytes."""
     unflushed: int = 0
-    """Entries taken for these files that the disk may not have."""
+    """Entries that are written to these files, but perhaps not yet on the disk."""
+
+    def all(self) -> list[McapWriter | RawFile]:
+        """One or two files."""
+        return [self.messages] if self.raw is None else [self.messages, self.raw]
 
 
 class Recorder(Companion):
@@ -97,35 +110,32 @@ class Recorder(Companion):
 
     def __init__(
         self,
-        shelf: Shelf,
+        retention: Retention,
         options: Record,
-        header: Mapping[str, str],
+        header: RecordingHeader,
         *,
         make_raw: MakeRaw | None = None,
-        take_state: Callable[[], Texts] | None = None,
+        take_state: Callable[[], MakeKnown] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start the thread, which makes the first file. `header` stands in front of every file.
+        """Start the thread, which creates the first file.
 
-        So does what `take_state` gives. It is called in the loop, here and then where a file is to
-        end: after a status, when no reading is on its way to a verdict.
+        `header` is that of every file, but for `known` and what each file has of its own.
+        `take_state` copies what is known; it is called in the loop, here and where a file is to
+        end: after a status, when no reading is being judged. Without it files end anywhere.
         """
-        self._shelf = shelf
+        self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
-        self._header = dict(header)
+        self._header = header
         self._make_raw = make_raw
         self._take_state = take_state
         self._clock = clock
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
-        self._joints_topic = f"joints.{shelf.hand}".encode()
-        self._asked_topic = f"{ASKED}.{shelf.hand}".encode()
-        self._exchanged_topic = f"{EXCHANGED}.{shelf.hand}".encode()
-        self._skipped_topic = f"{SKIPPED}.{shelf.hand}".encode()
-        self._status_topic = f"status.{shelf.hand}".encode()
+        self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
         self._encoder = msgspec.json.Encoder()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
@@ -134,7 +144,7 @@ class Recorder(Companion):
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
         self._awaits_turn = take_state is not None
-        """Whether a `_Turn` is on its way, or will be when `_wants_turn` is seen."""
+        """Whether a `_Turn` is queued, or will be when the loop sees `_wants_turn`."""
         self._wants_turn = False
         if take_state is not None:
             self._queue.append((clock(), b"", _Turn(take_state())))
@@ -145,9 +155,9 @@ class Recorder(Companion):
         self._thread.start()
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Record one message."""
+        """Record a published message."""
         self._put(topic, payload)
-        if self._wants_turn and self._take_state is not None and topic == self._status_topic:
+        if self._wants_turn and self._take_state is not None and topic == self._names[Topic.STATUS]:
             self._wants_turn = False
             self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
@@ -157,22 +167,28 @@ class Recorder(Companion):
 
     def on_joints(self, reading: JointReading) -> None:
         """Record joint angles."""
-        self._put(self._joints_topic, reading)
+        self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
+
+    def on_judged(self, judgement: Judgement) -> None:
+        """Record the counts that the network judged."""
+        if judgement.judged_counts is not None:
+            making = partial(Judged.of, self._header.boot_id, judgement)
+            self._put(self._names[Topic.JUDGED], making)
 
     def on_asked(self) -> None:
         """Record that the controller asks for a judgement."""
-        self._put(self._asked_topic, b"{}")
+        self._put(self._names[Topic.ASKED], EVENT)
 
     def exchanged(self) -> None:
         """Record that a sensor is another one than before."""
-        self._put(self._exchanged_topic, b"{}")
+        self._put(self._names[Topic.EXCHANGED], EVENT)
 
     def on_skipped(self) -> None:
         """Record that readings were left out before the next one."""
-        self._put(self._skipped_topic, b"{}")
+        self._put(self._names[Topic.SKIPPED], EVENT)
 
     def raw(self, entry: object, at_ns: int) -> None:
-        """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""
+        """Record what came over the link at monotonic `at_ns`, ns; `make_raw`'s file writes it."""
         self._put(b"", entry, at_ns)
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
@@ -182,8 +198,8 @@ class Recorder(Companion):
             self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
 
     def counters(self) -> dict[str, int]:
-        """Since the start: entries `recorded`, `dropped` because the disk was too slow, `lost` with
-        a failure of it; `files` begun and `removed`, `failures`; `writing`, 0 while there is none.
+        """Since the start: entries `recorded`, `dropped` because the disk was too slow, and `lost`
+        when it failed; `files` begun and `removed`, `failures`; `writing`, 1 while a file is open.
         """
         writing = self._open is not None
         return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
@@ -193,7 +209,7 @@ class Recorder(Companion):
         return {"record": self.counters()}
 
     def close(self) -> None:
-        """Write what waits and end the files; leave a disk that does not answer alone."""
+        """Write what is queued and end the files; give up if the disk does not answer in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -217,7 +233,7 @@ class Recorder(Companion):
             self._finish()
 
     def _go_round(self) -> None:
-        """Write what waits; after a failure let it go until it is time to try again."""
+        """Write what is queued; after a failure lose it until the next try is due."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
@@ -235,29 +251,31 @@ class Recorder(Companion):
             self._flush(self._open, now_ns)
 
     def _turn(self, now_ns: int) -> None:
-        """Go on in new files, now or where the loop says what is known there."""
+        """Go on in new files: now, or where the loop next copies its state."""
         if self._take_state is None:
             self._finish()
-            self._begin(now_ns, {})
+            self._begin(now_ns, Known())
         elif not self._awaits_turn:
             self._awaits_turn = self._wants_turn = True
 
     def _take_turn(self, turn: _Turn, now_ns: int) -> None:
-        """Go on in new files, but not for the little that comes after the end."""
+        """Go on in new files, but not for the few entries that come after `close`."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
-            self._begin(now_ns, turn.texts())
+            self._begin(now_ns, turn.known())
 
-    def _begin(self, now_ns: int, state: Mapping[str, str]) -> None:
-        """Begin new files, if the disk lets us."""
+    def _begin(self, now_ns: int, known: Known) -> None:
+        """Create the next files, if the disk takes them."""
         offset_ns = self._wall_clock() - now_ns
         try:
-            self._counted["removed"] += self._shelf.make_room(self._rotate_bytes)
-            name = self._shelf.name(self._number)
+            self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
+            name = self._retention.name(self._number)
             path = name.with_name(f"{name.name}.mcap")
-            header = {**self._header, **state, "file": str(self._number)}
-            messages = MessageFile(path, header, offset_ns)
+            header = replace(
+                self._header, file=self._number, known=known, wall_minus_monotonic_ns=offset_ns
+            )
+            messages = McapWriter(path, header)
             raw = None
             try:
                 raw = None if self._make_raw is None else self._make_raw(name)
@@ -274,7 +292,7 @@ class Recorder(Companion):
         self._open = _Open(messages, raw, offset_ns, now_ns)
 
     def _write(self, entries: list[_Entry]) -> None:
-        """Write entries, or count them as lost."""
+        """Write entries; count them as lost if there is no file."""
         files = self._open
         if files is None:
             self._counted["lost"] += len(entries)
@@ -282,8 +300,8 @@ class Recorder(Companion):
         files.unflushed += len(entries)  # all of them, wherever among them the disk fails
         try:
             for at_ns, topic, content in entries:
-                if isinstance(content, JointReading):
-                    content = self._encoder.encode(Joints.of(content))
+                if callable(content):
+                    content = self._encoder.encode(content())
                 if topic and isinstance(content, bytes):
                     files.messages.write(topic, content, at_ns)
                 elif files.raw is not None:
@@ -293,9 +311,7 @@ class Recorder(Companion):
 
     def _flush(self, files: _Open, now_ns: int) -> None:
         try:
-            files.size = files.messages.flush()
-            if files.raw is not None:
-                files.size += files.raw.flush()
+            files.size = sum(file.flush() for file in files.all())
         except OSError as error:
             self._fail(error)
             return
@@ -310,9 +326,8 @@ class Recorder(Companion):
         if files is None:
             return
         try:
-            files.messages.close()
-            if files.raw is not None:
-                files.raw.close()
+            for file in files.all():
+                file.close()
         except OSError as error:
             self._fail(error)
             return
@@ -320,16 +335,16 @@ class Recorder(Companion):
         self._counted["recorded"] += files.unflushed
 
     def _fail(self, error: OSError) -> None:
-        """The disk does not take it: one warning, and another try in a minute."""
+        """After a failure of the disk: warn, the first time, and try again later."""
         files, self._open = self._open, None
         self._number += 1  # the next file does not go on where the last one ends
         if files is not None:
             self._counted["lost"] += files.unflushed
-            files.messages.abandon()
-            if files.raw is not None:
-                files.raw.abandon()
+            for file in files.all():
+                file.abandon()
         self._counted["failures"] += 1
         first = self._retry_due_ns is None
         self._retry_due_ns = self._clock() + RETRY_NS
         say = log.warning if first else log.debug
-        say("record: %s: %s; nothing is recorded", self._shelf.directory, error.strerror or error)
+        where = self._retention.directory
+        say("record: %s: %s; nothing is recorded", where, error.strerror or error)

@@ -86,6 +86,7 @@ class Loop:
         self._on_outcome = overridden(companions, Companion.on_outcome)
         self._on_answer = overridden(companions, Companion.on_answer)
         self._on_verdict = overridden(companions, Companion.on_verdict)
+        self._on_judged = overridden(companions, Companion.on_judged)
         self._on_status = overridden(companions, Companion.on_status)
         self._after_round = overridden(companions, Companion.after_round)
         self._counters_by_part = overridden(companions, Companion.counters_by_part)
@@ -259,6 +260,9 @@ class Loop:
         self._silence_due_ns = received_ns + silence_ns
         self._readings_since_status += 1
         self._tell(verdict, payload, reading)
+        if judgement.judged:
+            for on_judged in self._on_judged:
+                on_judged(judgement)
         return True
 
     def _tell(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:

@@ -1,0 +1,98 @@
+"""Builds what judges recordings again as they were judged: scene, driver, judge and session."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from daemon.assembly import assembly
+from daemon.assembly.link_logs import changed
+from daemon.judge.memory import decode
+from daemon.judge.pipeline import Pipeline
+from daemon.record.mcap import header_of
+from daemon.record.player import McapReplayDriver
+from daemon.record.topics import Topic
+from daemon.scene import Scene, SceneError, parse
+from models.runtime import TactileModel
+
+log = logging.getLogger("graspd")
+
+NOTHING_KNOWN: Final = (
+    "%s: begins in the middle of a run and does not say what was known there: verdicts may differ "
+    "until the hand has been open and its grasps are known"
+)
+
+
+class RecordedRun:
+    """The recordings of one run of the daemon, in the order of time."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        """Read the headers; warn of files that are missing between. Raises `RecordingError`."""
+        headers = [header_of(path) for path in paths]
+        self.header = headers[0]
+        """Of the first file."""
+        self._paths = tuple(paths)
+        self._driver: McapReplayDriver | None = None
+        for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
+            if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
+                log.warning("%s: does not go on where the file before it ends", path)
+
+    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
+        """The scene that was recorded, playing the files.
+
+        `publish` and `model` are sections of it; an empty `model` and `mode` None leave model and
+        gate mode as recorded. Raises `SceneError`.
+        """
+        names = ("hand", "model", "gate", "session")
+        sections = {name: dict(self.header.scene.get(name, {})) for name in names}
+        sections["tactile"] = {
+            "driver": "replay",
+            "recordings": [path.absolute() for path in self._paths],
+        }
+        return parse(changed(sections, publish, model, mode), self._paths[0])
+
+    def build_driver(self, wanted: Scene, speed: float | None) -> McapReplayDriver:
+        """The driver that plays the files, not yet open; `speed` None is as fast as possible."""
+        self._driver = McapReplayDriver(
+            self._paths, wanted.hand.fingers, speed=speed, axis_ns=self.header.known.axis_ns
+        )
+        return self._driver
+
+    def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
+        """The judge of what the driver plays, in the recorded state but for the session.
+
+        It finds readings as old as they were when they were recorded. `learns` says whether its
+        session learns from the grasps.
+        """
+        header, driver = self.header, self._driver
+        same_model = model.sha256 == header.model_sha256
+        if not same_model:
+            log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
+        clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
+        pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
+        try:
+            decode(header.known.judge).give_judge(pipeline, same_model=same_model)
+        except ValueError:
+            pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
+            if header.file > 0:
+                log.warning(NOTHING_KNOWN, self._paths[0])
+        if driver is not None:
+            driver.on_event = {
+                Topic.ASKED: pipeline.ask,
+                Topic.EXCHANGED: pipeline.sensors_exchanged,
+                Topic.SKIPPED: pipeline.skip,
+            }
+        return pipeline
+
+    def restore(self, pipeline: Pipeline) -> None:
+        """Give `pipeline` the recorded session, if it has one. Raises `SceneError`."""
+        session = self.header.known.session
+        if pipeline.session is None or session is None:
+            return
+        try:
+            pipeline.session.restore(session)
+        except ValueError as error:
+            raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
