@@ -13,7 +13,6 @@ from models.training.arrays import Bools, Floats
 from models.training.fitting.calibration import (
     ECE_BINS,
     Reliability,
-    margins_of,
     p_slip,
     reliability,
 )
@@ -85,19 +84,18 @@ class CurvePoint:
     coverage: float
 
 
-def score(values: Floats, slipped: Bools, probability: Floats | None = None) -> Scores:
-    """Figures of margins (N,) or logits (N, 2) against labels (N,).
+def score(margins: Floats, slipped: Bools, probability: Floats | None = None) -> Scores:
+    """Figures of margins (N,) against labels (N,).
 
     Brier score, calibration error and log loss are those of `probability` (N,) of slip; without it
     of the uncalibrated one.
     """
-    margin = margins_of(values)
-    verdict = margin > 0.0
+    verdict = margins > 0.0
     precision, recall, f1, _ = precision_recall_fscore_support(
         slipped, verdict, average="binary", zero_division=0.0
     )
     both = len(np.unique(slipped)) == 2
-    reliable = reliability(p_slip(margin) if probability is None else probability, slipped)
+    reliable = reliability(p_slip(margins) if probability is None else probability, slipped)
     return Scores(
         **asdict(reliable),
         grasps=len(slipped),
@@ -105,7 +103,7 @@ def score(values: Floats, slipped: Bools, probability: Floats | None = None) -> 
         precision=float(precision),
         recall=float(recall),
         f1=float(f1),
-        auc=float(roc_auc_score(slipped, margin)) if both else math.nan,
+        auc=float(roc_auc_score(slipped, margins)) if both else math.nan,
     )
 
 

@@ -28,41 +28,36 @@ class Reliability:
     """Mean negative log-likelihood, nats: what the temperature is fitted to."""
 
 
-def margins_of(values: Floats) -> Floats:
-    """Log-odds of slip (N,) of logits (N, 2), order (stable, slip), or of margins (N,)."""
-    return values if values.ndim == 1 else values[:, 1] - values[:, 0]
+def fit_temperature(margins: Floats, slipped: Bools) -> float:
+    """The T that makes sigmoid(margin / T) most likely, of margins (N,) and labels (N,).
 
-
-def fit_temperature(values: Floats, slipped: Bools) -> float:
-    """The T that makes sigmoid(margin / T) most likely, of logits (N, 2) or margins (N,).
-
-    They must be of unseen data.
+    They must be of grasps that were not trained on.
     """
-    margin = margins_of(values)
     low, high = np.log(TEMPERATURE_RANGE)
     for _ in range(HALVINGS):
         middle = (low + high) / 2.0
         # The likelihood is concave in 1/T; its slope there says on which side of T the peak is.
-        slope = np.mean((slipped - _sigmoid(margin / np.exp(middle))) * margin)
+        slope = np.mean((slipped - p_slip(margins, np.exp(middle))) * margins)
         low, high = (low, middle) if slope > 0.0 else (middle, high)
     return float(np.exp((low + high) / 2.0))
 
 
-def p_slip(values: Floats, temperature: float = 1.0) -> Floats:
-    """Slip probability (N,) of logits (N, 2), order (stable, slip), or of margins (N,)."""
-    return _sigmoid(margins_of(values) / temperature)
+def p_slip(margins: Floats, temperature: float = 1.0) -> Floats:
+    """Slip probability (N,) of margins (N,): sigmoid(margin / temperature)."""
+    value = margins / temperature
+    # exp() of a negative number only: never overflows.
+    small = np.exp(-np.abs(value))
+    probability: Floats = np.where(value >= 0.0, 1.0, small) / (1.0 + small)
+    return probability
 
 
-def cross_fitted_p_slip(values: Floats, slipped: Bools, fold_of: Ints) -> Floats:
-    """Slip probability (N,), each fold's by the temperature that the other folds give.
-
-    Of logits (N, 2) or margins (N,).
-    """
-    probability = np.empty(len(values))
+def cross_fitted_p_slip(margins: Floats, slipped: Bools, fold_of: Ints) -> Floats:
+    """Slip probability (N,), each fold's by the temperature that the other folds give."""
+    probability = np.empty(len(margins))
     for fold in np.unique(fold_of):
         inside = fold_of == fold
-        temperature = fit_temperature(values[~inside], slipped[~inside])
-        probability[inside] = p_slip(values[inside], temperature)
+        temperature = fit_temperature(margins[~inside], slipped[~inside])
+        probability[inside] = p_slip(margins[inside], temperature)
     return probability
 
 
@@ -78,10 +73,3 @@ def reliability(probability: Floats, slipped: Bools) -> Reliability:
         brier=float(np.mean((probability - slipped) ** 2)),
         log_loss=float(-np.mean(np.log(np.maximum(of_truth, np.finfo(np.float64).tiny)))),
     )
-
-
-def _sigmoid(value: Floats) -> Floats:
-    # exp() of a negative number only: never overflows.
-    small = np.exp(-np.abs(value))
-    positive: Floats = np.where(value >= 0.0, 1.0, small) / (1.0 + small)
-    return positive

@@ -41,12 +41,6 @@ def test_scores_agree_with_scikit_learn() -> None:
     assert result.auc == pytest.approx(pairs.mean())
 
 
-def test_logits_score_as_their_margins_do() -> None:
-    random = np.random.default_rng(2)
-    logits, slipped = random.normal(size=(50, 2)), random.random(50) < 0.5
-    assert score(logits, slipped) == score(logits[:, 1] - logits[:, 0], slipped)
-
-
 def test_one_class_alone_has_no_auc() -> None:
     result = score(np.array([1.0, -1.0]), np.array([True, True]))
     assert math.isnan(result.auc)
@@ -171,3 +165,21 @@ def test_reliability_bins_hold_every_grasp_once() -> None:
     bins = reliability_bins(np.array([0.0, 0.01, 0.5, 1.0]), np.array([False, True, True, True]))
     assert [number for _, _, number in bins] == [2, 1, 1]
     assert bins[0][:2] == pytest.approx((0.005, 0.5))
+
+
+def test_scores_take_slip_for_positive() -> None:
+    # Verdicts slip, slip, slip, stable, stable against slip, slip, stable, slip, stable.
+    values = np.array([1.0, 2.0, 3.0, -1.0, -2.0])
+    slipped = np.array([True, True, False, True, False])
+    result = score(values, slipped)
+    assert result.grasps == 5
+    assert result.accuracy == pytest.approx(3 / 5)
+    assert result.precision == pytest.approx(2 / 3)
+    assert result.recall == pytest.approx(2 / 3)
+    assert result.f1 == pytest.approx(2 / 3)
+    assert result.auc == pytest.approx(3 / 6)  # pairs ranked right: (1, -2), (2, -2), (-1, -2)
+
+
+def test_a_model_that_never_says_slip_scores_zero_without_complaint() -> None:
+    result = score(np.array([-1.0] * 4), np.array([True, False, True, False]))
+    assert (result.precision, result.recall, result.f1, result.auc) == (0.0, 0.0, 0.0, 0.5)
