@@ -162,8 +162,6 @@ class Publish(Section):
     endpoint: Endpoint | None = None
     """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
     addresses."""
-    latest_endpoint: Endpoint | None = None
-    """Where verdicts are published as messages of one frame too, for `ZMQ_CONFLATE`."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000)] = 1000
     """Messages kept for a subscriber that is slow; those that come then are lost to it."""
     file_mode: Annotated[str, Field(pattern=r"^0?[0-7]{3}$")] | None = None
@@ -277,12 +275,11 @@ class Scene(Section):
     def _refuse_strangers(self) -> None:
         endpoints = {
             "publish.endpoint": self.publish.endpoint,
-            "publish.latest_endpoint": self.publish.latest_endpoint,
             "ask.endpoint": None if self.ask is None else self.ask.endpoint,
         }
         given = [endpoint for endpoint in endpoints.values() if endpoint is not None]
         if len(set(given)) != len(given):
-            raise ValueError("publish.endpoint, latest_endpoint and ask.endpoint must differ")
+            raise ValueError("publish.endpoint and ask.endpoint must differ")
         for key, endpoint in endpoints.items():
             if endpoint is not None and self.curve is None and not is_private(endpoint):
                 raise ValueError(
