@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +16,7 @@ from pydantic import (
     model_validator,
 )
 
+from daemon.process.files import read_regular
 from daemon.process.text import printable
 from daemon.scene.drivers import (
     CanTactile,
@@ -335,7 +334,7 @@ class Scene(Section):
 def load(path: Path) -> Scene:
     """Read a scene file. Raises `SceneError`, whose text has one line per mistake."""
     try:
-        text = _read(path).decode()
+        text = read_regular(path, SCENE_MAX_BYTES).decode()
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -349,17 +348,6 @@ def load(path: Path) -> Scene:
 
         raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error
     return parse(data, path)
-
-
-def _read(path: Path) -> bytes:
-    """The content of a regular file of bounded size, without waiting for anything else."""
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise SceneError(f"{path}: cannot read the scene: not a regular file")
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        content = file.read(SCENE_MAX_BYTES + 1)
-    if len(content) > SCENE_MAX_BYTES:
-        raise SceneError(f"{path}: larger than {SCENE_MAX_BYTES} bytes, not a scene")
-    return content
 
 
 def parse(data: Mapping[str, Any], path: Path) -> Scene:

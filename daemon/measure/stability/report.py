@@ -26,7 +26,8 @@ from daemon.measure.stability.repair import repair_row
 from daemon.measure.stability.session import session_rows
 from daemon.measure.stability.steps import StepRow
 from daemon.measure.stability.time import clock_rows, wrap_rows
-from daemon.process.text import complain, printable
+from daemon.process.extras import needs
+from daemon.process.text import complain, markdown_table, printable
 from drivers.base import RecordingError
 from models import zoo
 from models.contract import ModelError
@@ -111,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
         if args.markdown is not None:
             args.markdown.write_text("\n".join(_markdown(report)) + "\n", "utf-8")
     except ModuleNotFoundError as error:
-        complain(f"report stability needs the package '{error.name}': pip install '.[train]'")
+        complain(needs("report stability", "train", error))
         return WRONG
     except (ModelError, RecordingError, UnknownOperatorError, OSError) as error:
         complain(error)
@@ -190,10 +191,7 @@ def _text(report: StabilityReport) -> Iterator[str]:
 
 def _markdown(report: StabilityReport) -> Iterator[str]:
     for titles, rows in _tables(report):
-        yield "| " + " | ".join(titles) + " |"
-        yield "|" + "|".join(" ---: " if title in NUMBERS else " --- " for title in titles) + "|"
-        for row in rows:
-            yield "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+        yield from markdown_table(titles, rows, right=NUMBERS)
         yield ""
     for line in (*LEGEND, _verdict(report), f"Machine: {_machine()}."):
         yield line
