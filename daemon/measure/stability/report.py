@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daemon.measure.reference.trees import UnknownOperatorError
 from daemon.measure.stability.cases import StabilityCase, cases, recorded
 from daemon.measure.stability.model import Bounds, CaseRow, ModelStability, seasoned_session
 from daemon.measure.stability.motion import calibration_rows, gate_rows, joint_rows
@@ -114,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         complain(needs("report stability", "train", error))
         return WRONG
-    except (ModelError, RecordingError, UnknownOperatorError, OSError) as error:
+    except (ModelError, RecordingError, OSError) as error:
         complain(error)
         return WRONG
     if args.json:
@@ -127,8 +126,8 @@ def run(args: argparse.Namespace) -> int:
 def measured(names: Sequence[str], folder: Path | None, bounds: Bounds) -> StabilityReport:
     """Measure the models of these names, and all steps.
 
-    Raises `ModelError`, `RecordingError` for a missing table in `folder`, `UnknownOperatorError`,
-    and `ModuleNotFoundError` without the extra `train`.
+    Raises `ModelError`, `RecordingError` for a missing table in `folder`, and
+    `ModuleNotFoundError` without the extra `train`.
     """
     models = [TactileModel(zoo.find(name)) for name in names]
     # Imported here, for it takes onnx and PyTorch, and a wrong name should not wait for those.
