@@ -15,7 +15,6 @@ from daemon.assembly import assembly
 from daemon.process.text import complain, printable
 from daemon.scene import drivers as scene_drivers
 from drivers.base import DriverError
-from models import zoo
 from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
@@ -164,7 +163,6 @@ def _what_is_in(
         "model": (
             f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
             f"{wanted.model.slip_threshold:g} on{_rejects(wanted, model)}"
-            f"{_standing(model)}"
         ),
         "gate": _gate(wanted, limits),
         "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
@@ -212,18 +210,6 @@ def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
         f"{when}once per grasp: {fingers} touch, still below {gate.rate_counts_per_s:g} counts/s"
         f"{joints} for {gate.hold_ms:g} ms; {what}, {age}"
     )
-
-
-def _standing(model: TactileModel) -> str:
-    """Where the model stands among those that were compared; empty for one that was not."""
-    found = zoo.standing(model.sha256)
-    if found is None:
-        return ""
-    alone = found["models"] == 1
-    rank = "" if alone else f"number {found['f1_rank']} of {found['models']} on known objects"
-    speed = "" if found["speed"] is None else f"{found['speed']:.1f} times as fast as cnn1"
-    text = ", ".join(filter(None, (rank, speed)))
-    return f"; {text}" if text else ""
 
 
 def _rejects(wanted: scene.Scene, model: TactileModel) -> str:

@@ -10,8 +10,6 @@ from typing import Any, get_args
 from models.contract import Finger, ModelError
 
 ZOO = Path(__file__).parent
-STANDING = ZOO / "standing.json"
-"""Written by `graspd report error-vs-time --standing`."""
 
 
 def names() -> list[str]:
@@ -46,23 +44,6 @@ def card(name: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ModelError(f"{path}: is no card")
     return content
-
-
-def standing(sha256: str) -> dict[str, Any] | None:
-    """What `graspd report error-vs-time` found of the model file with this digest, if it was there.
-
-    `f1` on known objects, 0..1, `f1_rank` among the `models` of the same fingers that were
-    compared, `paced_p50_us` and `speed`, how many times as fast as `cnn1`. Raises `ModelError` if
-    the file is broken.
-    """
-    try:
-        content = json.loads(STANDING.read_bytes())
-        found: dict[str, Any] | None = content["models"].get(sha256)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, AttributeError) as error:
-        raise ModelError(f"{STANDING}: cannot read the standing: {error}") from error
-    return found
 
 
 def find(name: str) -> Path:

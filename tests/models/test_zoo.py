@@ -204,14 +204,3 @@ def test_a_model_is_found_by_name_and_an_unknown_name_lists_the_known() -> None:
     assert zoo.find("cnn1") == zoo.ZOO / "cnn1.onnx"
     with pytest.raises(ModelError, match=r"no model 'cnn9' in the zoo; there are: .*cnn1"):
         zoo.find("cnn9")
-
-
-def test_every_model_of_the_zoo_has_a_standing_and_others_have_none() -> None:
-    for name in zoo.names():
-        digest = hashlib.sha256(zoo.find(name).read_bytes()).hexdigest()
-        found = zoo.standing(digest)
-        assert found is not None, f"{name}: run graspd report error-vs-time --standing"
-        assert found["name"] == name
-        measured = zoo.card(name)["contract"]["measured"]
-        assert found["f1"] == next(m["f1_mean"] for m in measured if m["protocol"] == "cv")
-    assert zoo.standing("0" * 64) is None

@@ -45,30 +45,6 @@ def write(found: Found, folder: Path) -> None:
     base.with_suffix(".html").write_text(_page(found, picture))
 
 
-def standing(found: Found) -> dict[str, Any]:
-    """Where each model stands, by the digest of its file; see `models.zoo.standing`."""
-    groups = _by_fingers(found["rows"])
-    base = next((row for alike in groups for row in alike if row["name"] == "cnn1"), None)
-    return {
-        "machine": found["machine"],
-        "models": {
-            row["sha256"]: {
-                "name": row["name"],
-                "f1": row["error"][PROTOCOL]["f1"],
-                "f1_rank": rank,
-                "models": len(alike),
-                "paced_p50_us": row["time"]["paced_p50_us"],
-                "speed": None
-                if base is None
-                else base["time"]["paced_p50_us"] / row["time"]["paced_p50_us"],
-            }
-            for alike in groups
-            for rank, row in enumerate(alike, start=1)
-            if PROTOCOL in row["error"]
-        },
-    }
-
-
 def _by_fingers(rows: Sequence[Row]) -> list[list[Row]]:
     """The rows of models, those of the same fingers together: only between them is a choice.
 

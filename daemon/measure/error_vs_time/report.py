@@ -100,11 +100,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the page, the table, the picture and the figures",
     )
-    parser.add_argument(
-        "--standing",
-        action="store_true",
-        help="keep where each model stands beside the zoo, for `graspd check` to tell",
-    )
     parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
 
@@ -116,8 +111,6 @@ def run(args: argparse.Namespace) -> int:
         found = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
         args.out.mkdir(parents=True, exist_ok=True)
         page.write(found, args.out)
-        if args.standing:
-            zoo.STANDING.write_text(json.dumps(page.standing(found), indent=1) + "\n")
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2

@@ -110,7 +110,7 @@ def test_check_says_what_is_in_and_what_is_left_out() -> None:
     people = graspd("check", scene)
     assert people.returncode == 0, people.stderr
     assert "fine" in people.stdout
-    assert re.search(r"number \d+ of \d+ on known objects, [0-9.]+ times as fast", people.stdout)
+    assert re.search(r"F1 cv [0-9.]+ \+- [0-9.]+ %", people.stdout)
     content = json.loads(graspd("check", scene, "--json").stdout)
     assert "synthetic_stream.csv" in content["in"]["tactile"]
     assert "small-session" in content["in"]["model"]

@@ -115,7 +115,7 @@ def test_a_scene_with_fewer_fingers_judges_each_grasp_with_the_model_of_these(
     )
     content = json.loads(graspd("check", scene, "--json").stdout)
     assert content["in"]["model"].startswith(f"{name} (")
-    assert "times as fast as cnn1" in content["in"]["model"]
+    assert "F1 cv " in content["in"]["model"]
     assert f"{', '.join(HANDS[name])} touch" in content["in"]["gate"]
     left_out = content["left_out"]["fingers"].partition(":")[0].split(", ")
     assert sorted((*left_out, *HANDS[name])) == ["ff", "lf", "mf", "rf", "th"]

@@ -138,18 +138,6 @@ HANDS = [
 ]
 
 
-def test_models_stand_among_those_of_the_same_fingers() -> None:
-    found = page.standing({"machine": {}, "rows": HANDS})["models"]
-    ranks = {of["name"]: (of["f1_rank"], of["models"], of["speed"]) for of in found.values()}
-    assert ranks == {
-        "cnn1": (1, 2, 1.0),
-        "quick": (2, 2, 4.0),
-        "quick-ff": (1, 1, 8.0),
-        "quick-ff-th": (2, 2, 5.0),
-        "slow-ff-th": (1, 2, 2.0),
-    }
-
-
 def test_advice_for_a_hand_is_of_models_of_its_own_fingers() -> None:
     texts = list(page.advice(HANDS))
     assert texts[0].endswith("`cnn1`, F1 94.0 %.")
