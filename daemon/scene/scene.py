@@ -11,7 +11,6 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
-    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -67,17 +66,11 @@ class Model(Section):
     """A model of the zoo, `small-session` when neither name nor path is given; for a hand of fewer
     fingers in its form for these, where the zoo has one."""
     path: FilePath | None = None
-    """A model file of your own, relative to the scene file."""
+    """A model file of your own."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """`p_slip` from here on is slip."""
     min_accuracy: Annotated[float, Field(gt=0.5, lt=1.0)] | None = None
     """Verdicts must be right this often, by the model's card; less sure ones become `unknown`."""
-
-    @field_validator("path")
-    @classmethod
-    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
-        base: Path = (info.context or {}).get("base", Path())
-        return None if path is None else base / path
 
     @model_validator(mode="after")
     def _one_of_name_and_path(self) -> Self:
@@ -98,13 +91,7 @@ class Session(Section):
     required: bool = False
     """Whether nothing is judged before the session is calibrated."""
     file: FilePath | None = None
-    """`/var/lib/graspd/<hand>.session.json` unless given; relative to the scene file."""
-
-    @field_validator("file")
-    @classmethod
-    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
-        base: Path = (info.context or {}).get("base", Path())
-        return None if path is None else base / path
+    """`/var/lib/graspd/<hand>.session.json` unless given."""
 
 
 GateMode = Literal["settled", "every", "request"]
@@ -174,15 +161,9 @@ class Curve(Section):
     """`[curve]`: who may connect by `tcp://` (`graspd keys`). All that do need keys then."""
 
     secret_key: FilePath
-    """The daemon's own `.key_secret` file, of mode 0600; relative to the scene file."""
+    """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
     """Folder with the `.key` files of those who may connect; looked at once a second."""
-
-    @field_validator("secret_key", "clients")
-    @classmethod
-    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
-        base: Path = (info.context or {}).get("base", Path())
-        return base / path
 
 
 class Ask(Section):
@@ -207,9 +188,8 @@ class Realtime(Section):
 class Record(Section):
     """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
 
-    directory: Annotated[FilePath | None, Field(strict=False)] = None
-    """`/var/lib/graspd/record` unless given; relative to the scene file. Made if it is not there.
-    """
+    directory: FilePath | None = None
+    """`/var/lib/graspd/record` unless given. Made if it is not there."""
     flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0)] = 1000.0
     """What a killed daemon or a power cut may cost, ms."""
     rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0)] = 256.0
@@ -222,12 +202,6 @@ class Record(Section):
     """All files of this hand together, the one being written included, MB."""
     raw: bool = False
     """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
-
-    @field_validator("directory")
-    @classmethod
-    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
-        base: Path = (info.context or {}).get("base", Path())
-        return None if path is None else base / path
 
 
 class Scene(Section):
