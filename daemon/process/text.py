@@ -1,4 +1,4 @@
-"""Text from files and peers on its way to a terminal, which must not obey it."""
+"""Text for people: untrusted text made harmless for a terminal, errors, Markdown tables."""
 
 from __future__ import annotations
 

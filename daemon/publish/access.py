@@ -1,4 +1,4 @@
-"""Who may connect over TCP: peers are asked for keys (ZAP, RFC 27), and refusals are told."""
+"""Checks the keys of peers that connect by TCP (ZAP, RFC 27); counts and logs who is refused."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ goes. Who speaks another protocol, or notices first that the keys do not fit, ju
 
 @dataclass(slots=True, eq=False)
 class _Watched:
-    """A listening socket, and who is at its door."""
+    """A listening socket, and its connections that have not shown a key yet."""
 
     listening: zmq.Socket[bytes]
     monitor: zmq.Socket[bytes]
@@ -48,15 +48,16 @@ class _Watched:
 
 
 class Gatekeeper:
-    """Answers libzmq's questions whether a peer may connect, and watches who does not even ask.
+    """Answers libzmq whether a peer's key is known, and counts peers that show none.
 
-    Must be there before the sockets of its context are bound. Never blocks.
+    Make it before the sockets of its context are bound. Never blocks. The log has the address of
+    an unknown key; libzmq does not give those of peers that show no key.
     """
 
     def __init__(
         self, context: zmq.Context[zmq.Socket[bytes]], admitted: Mapping[bytes, str]
     ) -> None:
-        """`admitted` has names by public key, Z85."""
+        """`admitted` maps public keys (Z85, 40 bytes) to the names of who may connect."""
         self.counters = Counter(admitted=0, turned_away=0)
         self._admitted = dict(admitted)
         self._context = context
@@ -78,18 +79,18 @@ class Gatekeeper:
         self._watched.append(_Watched(listening, monitor))
 
     def admit(self, admitted: Mapping[bytes, str]) -> bool:
-        """Take another list; whether somebody is no longer on it."""
+        """Replace the list of known keys; True if a key was removed from it."""
         gone = self._admitted.keys() - admitted.keys()
         self._admitted = dict(admitted)
         return bool(gone)
 
     def filenos(self) -> list[int]:
-        """Become readable when there may be something; call `take` before waiting for them."""
+        """Readable when `take` has something to do; call that once before waiting for them."""
         monitors = (watched.monitor for watched in self._watched)
         return [int(each.fileno()) for each in (self._requests, *monitors)]
 
     def take(self) -> None:
-        """Answer who asks, and see who failed."""
+        """Answer what libzmq has asked, and count whose handshake has failed."""
         for _ in range(TAKEN_MAX):
             if not int(self._requests.get(zmq.EVENTS)) & zmq.POLLIN:
                 break
@@ -134,7 +135,7 @@ class Gatekeeper:
                 log.warning(why)
 
     def unwatch(self) -> None:
-        """Watch no socket any more: they are about to be closed."""
+        """Watch no socket any more. Call it before they are closed."""
         for watched in self._watched:
             if not watched.listening.closed:
                 watched.listening.disable_monitor()

@@ -1,4 +1,4 @@
-"""All sockets of a scene: where messages go, where questions come from, who is let in."""
+"""All sockets of a scene: for messages, for questions, and for the check of keys."""
 
 from __future__ import annotations
 

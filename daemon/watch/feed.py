@@ -1,4 +1,4 @@
-"""The subscriber: connects to a daemon like anybody else, and takes what has come."""
+"""The subscriber of `graspd watch`: connects to a daemon like any other, and takes messages."""
 
 from __future__ import annotations
 

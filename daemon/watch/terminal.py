@@ -22,7 +22,7 @@ LINES, LINES_LARGE = 23, 29
 WHY_MAX = 3
 """Reasons that are shown; a reading seldom has more."""
 BANNER_LINES, BANNER = 5, 24
-"""Lines and columns of the coloured field with the verdict in its middle."""
+"""Lines and columns of the coloured field that has the verdict in its middle."""
 NAME_MAX = 40
 """Characters of a name that came in a message."""
 GAP = 2
@@ -34,7 +34,7 @@ BOLD = Style(bold=True)
 
 
 def draw(seen: Snapshot, width: int, height: int, canvas: Canvas) -> RenderableType:
-    """Everything that fits, the most important on top."""
+    """The snapshot for a terminal of `width` x `height` characters, cut to what fits."""
     large = width >= LARGE[0] and height >= LARGE[1]
     rows: list[RenderableType] = [
         _header(seen),
