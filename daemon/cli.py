@@ -16,7 +16,8 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import version
 
 from daemon.process import logs
-from daemon.process.extras import EXTRAS
+from daemon.process.extras import needs
+from daemon.process.text import complain
 
 COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
@@ -48,7 +49,13 @@ COMMANDS = {
     ),
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
-
+EXTRAS = {
+    "export-grasps": "record",
+    "train": "train",
+    "evaluate": "train",
+    "report": "train,report",
+}
+"""Extras without which a command cannot be loaded."""
 WRONG = 2
 
 
@@ -89,13 +96,9 @@ def _load(
         loaded = importlib.import_module(module)
         loaded.add_arguments(parser)
     except ModuleNotFoundError as error:
-        package = (error.name or "").split(".")[0]
-        if command not in EXTRAS or package in {"daemon", "drivers", "models"}:
+        if command not in EXTRAS:
             raise
-        sys.stderr.write(
-            f"graspd: {command} needs the package '{package}': run pip install "
-            f"'.[{EXTRAS[command]}]' in the folder of graspd's source\n"
-        )
+        complain(needs(command, EXTRAS[command], error))
         raise SystemExit(WRONG) from None
     run: Callable[[argparse.Namespace], int] = loaded.run
     return run

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Pipeline
+from daemon.process.extras import needs
 from daemon.scene import GateMode, Scene, SceneError
 from daemon.scene.drivers import (
     CanTactile,
@@ -321,9 +322,6 @@ def _replay_mcap(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     try:
         from daemon.record.player import McapReplayDriver
     except ModuleNotFoundError as error:
-        raise ValueError(
-            f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
-            "folder of graspd's source"
-        ) from error
+        raise ValueError(needs("replaying MCAP", "record", error)) from error
     speed = options.speed if options.pace == "realtime" else None
     return McapReplayDriver(options.recordings, scene.hand.fingers, speed=speed, clock=clock)

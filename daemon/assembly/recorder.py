@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from daemon.assembly import assembly
 from daemon.judge.memory import JudgeMemory, encode
 from daemon.judge.pipeline import Pipeline
+from daemon.process.extras import needs
 from daemon.record.header import Known, RecordingHeader
 from daemon.scene import Scene, SceneError
 from models.runtime import TactileModel
@@ -32,13 +33,7 @@ def build_recorder(
         from daemon.record.files import Retention
         from daemon.record.recorder import Recorder
     except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in {"mcap", "zstandard", "lz4"}:
-            raise
-        raise SceneError(
-            f"[record] needs the package '{package}': run pip install '.[record]' in the folder of "
-            "graspd's source"
-        ) from error
+        raise SceneError(needs("[record]", "record", error)) from error
     options = wanted.record
     retention = Retention(
         directory,

@@ -175,8 +175,6 @@ def _what_is_in(
         parts["joints"] = "those of the recordings"
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
-    if wanted.publish.latest_endpoint is not None:
-        parts["latest"] = f"the latest verdict alone on {wanted.publish.latest_endpoint}"
     if wanted.record is not None:
         parts["record"] = _record(wanted.record)
     if wanted.curve is not None:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
+from daemon.process.files import write_atomically
 from daemon.process.text import complain, printable
 from models.bts3 import CITATIONS, LICENCE, TABLES, TableFile
 
@@ -66,7 +67,7 @@ def _get(args: argparse.Namespace, file: TableFile) -> str:
         if _digest(_read(target)) == file.sha256:
             return f"{target}: is there"
     content = _from_folder(args.folder, file) if args.folder else fetch(args.url, file)
-    _store(content, target)
+    write_atomically(target, content, mode=0o644)
     return f"{target}: {file.rows} grasps"
 
 
@@ -126,11 +127,3 @@ def _checked(content: bytes, file: TableFile, source: str) -> bytes:
 
 def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _store(content: bytes, target: Path) -> None:
-    partial = target.with_suffix(".partial")
-    partial.unlink(missing_ok=True)  # one of an earlier try, or something that cannot be written
-    with partial.open("xb") as file:
-        file.write(content)
-    partial.replace(target)

@@ -116,7 +116,7 @@ class ElectrodeStatistics:
             (moving, Level.WARNING, "restless", "leave the hand untouched while the doctor looks"),
         ]
         return [
-            Finding(level, f"{name}: {_names(which)} {what}", advice)
+            Finding(level, f"{_names(name, which)} {what}", advice)
             for which, level, what, advice in table
             if which.any()
         ]
@@ -151,8 +151,9 @@ def _faults_in_words(bits: int) -> str:
     return ", ".join(name.lower().replace("_", " ") for name in names) or "no fault"
 
 
-def _names(which: NDArray[np.bool_]) -> str:
+def _names(finger: str, which: NDArray[np.bool_]) -> str:
+    """Electrodes of a finger by name, such as `ff_7`, or their number where they are many."""
     numbers = np.flatnonzero(which) + 1
     if len(numbers) > NAMED_MAX:
-        return f"{len(numbers)} electrodes"
-    return ", ".join(f"E{number}" for number in numbers)
+        return f"{finger}: {len(numbers)} electrodes"
+    return ", ".join(f"{finger}_{number}" for number in numbers)

@@ -228,7 +228,7 @@ def _print(report: dict[str, Any], findings: list[Finding]) -> None:
         columns = [zip(*values.values(), strict=True) for values in electrodes.values()]
         for number, cells in enumerate(zip(*columns, strict=True), start=1):
             row = "".join(f"{mean:12.1f}{sd:7.1f}{faulty:7d}" for mean, sd, faulty in cells)
-            sys.stdout.write(f"E{number:<3d}{row}\n")
+            sys.stdout.write(f"{number:<4d}{row}\n")
     wrong = sum(finding.level is Level.ERROR for finding in findings)
     sys.stdout.write(f"\n{wrong} wrong, {_warnings(findings)} to look at\n")
 

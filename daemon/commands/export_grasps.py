@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
+import io
 import sys
-import tempfile
-from contextlib import suppress
 from pathlib import Path
 
+from daemon.process.files import write_atomically
 from daemon.process.text import complain
 from daemon.record.export import Export, collect, write
 from drivers.base import RecordingError
@@ -77,16 +76,9 @@ def _summary(found: Export) -> str:
 
 def _store(found: Export, target: Path, object_name: str) -> None:
     """Replace the table in one step. Raises `OSError`."""
-    handle, part = tempfile.mkstemp(dir=target.parent, prefix=f"{target.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            write(file, found, object_name)
-        os.chmod(part, 0o644)
-        os.replace(part, target)
-    except OSError:
-        with suppress(OSError):
-            os.unlink(part)
-        raise
+    table = io.StringIO(newline="")
+    write(table, found, object_name)
+    write_atomically(target, table.getvalue().encode(), mode=0o644)
 
 
 def _name(text: str) -> str:

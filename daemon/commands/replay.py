@@ -14,6 +14,7 @@ from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.commands.arguments import positive, within
 from daemon.judge.pipeline import Pipeline
+from daemon.process.extras import needs
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.process.text import complain
@@ -183,10 +184,7 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
     try:
         from daemon.assembly.recordings import RecordedRun
     except ModuleNotFoundError as error:
-        raise SceneError(
-            f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
-            "folder of graspd's source"
-        ) from error
+        raise SceneError(needs("replaying MCAP", "record", error)) from error
     return RecordedRun(args.recordings)
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import zmq
 
 from daemon import scene
-from daemon.process.extras import EXTRAS
+from daemon.process.extras import needs
 from daemon.process.text import complain
 from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
@@ -103,13 +103,8 @@ def _terminal(feed: Feed, view: View) -> int:
     try:
         from daemon.watch.screen import can_draw, show
     except ModuleNotFoundError as error:
-        package = (error.name or "").split(".")[0]
-        if package in {"daemon", "drivers", "models"}:
-            raise
-        raise UsageError(
-            f"watch needs the package '{package}': run pip install '.[{EXTRAS['watch']}]' in the "
-            "folder of graspd's source; or watch --web, which needs none"
-        ) from None
+        advice = needs("watch", "watch", error)
+        raise UsageError(f"{advice}; or watch --web, which needs none") from None
     if not can_draw():
         raise UsageError("watch cannot draw on this terminal (TERM); see --web")
     show(feed, view)

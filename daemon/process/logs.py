@@ -1,4 +1,4 @@
-"""The log, as people at a terminal and as the journal want it."""
+"""The log on stderr: plain for a terminal, with priorities for the journal, limited in rate."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def boottime_ns() -> int:
 
 
 class Sleep:
-    """Notices it."""
+    """Tells whether the computer has slept since this object was made."""
 
     def __init__(
         self,
@@ -33,7 +33,7 @@ class Sleep:
         self._apart_ns = max(self._look() for _ in range(LOOKS))
 
     def has_slept(self) -> bool:
-        """Whether it has since this was made. Takes a microsecond."""
+        """True once the computer has slept. Takes a microsecond."""
         return self._look() - self._apart_ns > SLEPT_NS
 
     def _look(self) -> int:

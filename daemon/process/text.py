@@ -1,9 +1,10 @@
-"""Text from files and peers on its way to a terminal, which must not obey it."""
+"""Text for people: untrusted text made harmless for a terminal, errors, Markdown tables."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from daemon.process.logs import JOURNAL_ERROR, is_journal
 
@@ -29,3 +30,17 @@ def complain(problem: object) -> None:
         sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
     else:
         sys.stderr.write("graspd: " + "\n".join(lines) + "\n")
+
+
+def markdown_table(
+    titles: Sequence[str], rows: Iterable[Sequence[str]], right: Collection[str] = ()
+) -> Iterator[str]:
+    """Lines of a Markdown table; each row has a cell per title.
+
+    Columns whose title is in `right` are aligned to the right.
+    """
+    yield f"| {' | '.join(titles)} |"
+    yield f"| {' | '.join('---:' if title in right else '---' for title in titles)} |"
+    for row in rows:
+        cells = (cell.replace("|", "\\|") for cell in row)
+        yield f"| {' | '.join(cells)} |"

@@ -1,4 +1,4 @@
-"""ZeroMQ sockets bound where nobody can miss what was there, and nobody else can connect."""
+"""Binds ZeroMQ sockets: never over another program's socket file, and on TCP for known keys."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ class PublishError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Binding:
-    """What sockets have in common, and who may connect to them."""
+    """What the sockets of a scene share: context, rights of their files, keys."""
 
     context: zmq.Context[zmq.Socket[bytes]]
-    """Theirs together: it has the threads."""
+    """Has libzmq's own threads."""
     file_mode: int | None = None
     """Of the file of an `ipc://` socket; as the process's umask has it if None."""
     group: str | None = None
@@ -55,7 +55,7 @@ def socket_file(endpoint: str, binding: Binding | None = None) -> SocketFile | N
 
 
 class Bound(ABC):
-    """One bound socket, and its file. Whoever derives opens it with `renew`."""
+    """One bound socket and, for `ipc://`, its file. A derived class opens it with `renew`."""
 
     def __init__(self, endpoint: str, binding: Binding | None = None) -> None:
         """Without a `binding`, in a context of its own, for whoever can reach the endpoint."""

@@ -59,6 +59,11 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
     return public, secret
 
 
+def load_public(path: Path, what: str = "the key") -> bytes:
+    """Public key, Z85, of a file that holds one; errors call it `what`. Raises `KeysError`."""
+    return _load(path, what)[0]
+
+
 def load_clients(folder: Path) -> dict[bytes, str]:
     """Names of those who may connect, by their public key, Z85. Raises `KeysError`."""
     try:
@@ -67,15 +72,15 @@ def load_clients(folder: Path) -> dict[bytes, str]:
         raise KeysError(f"{folder}: cannot list the keys: {error.strerror}") from error
     if len(paths) > CLIENTS_MAX:
         raise KeysError(f"{folder}: more than {CLIENTS_MAX} keys")
-    return {_load(path)[0]: path.stem for path in paths}
+    return {load_public(path): path.stem for path in paths}
 
 
-def _load(path: Path) -> tuple[bytes, bytes | None]:
+def _load(path: Path, what: str = "the key") -> tuple[bytes, bytes | None]:
     try:
         public, secret = zmq.auth.load_certificate(path)
     except OSError as error:
         reason = error.strerror or "there is no such file"
-        raise KeysError(f"{path}: cannot read the key: {reason}") from error
+        raise KeysError(f"{path}: cannot read {what}: {reason}") from error
     except ValueError as error:
         raise KeysError(f"{path}: has no public key") from error
     for key in (public, secret):

@@ -196,11 +196,6 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 
 MESSAGES = (Verdict, GateMessage, Tactile, OutcomeMessage, Status)
 
-_verdict_decoder = msgspec.json.Decoder(Verdict)
-_gate_decoder = msgspec.json.Decoder(GateMessage)
-_tactile_decoder = msgspec.json.Decoder(Tactile)
-_outcome_decoder = msgspec.json.Decoder(OutcomeMessage)
-_status_decoder = msgspec.json.Decoder(Status)
 _encoder = msgspec.json.Encoder()
 
 
@@ -209,29 +204,12 @@ def encode(message: Verdict | GateMessage | Tactile | OutcomeMessage | Status) -
     return _encoder.encode(message)
 
 
-def decode_verdict(payload: bytes) -> Verdict:
-    """Parse and check a verdict payload. Raises `msgspec.DecodeError`."""
-    return _verdict_decoder.decode(payload)
-
-
-def decode_gate(payload: bytes) -> GateMessage:
-    """Parse and check a gate payload. Raises `msgspec.DecodeError`."""
-    return _gate_decoder.decode(payload)
-
-
-def decode_tactile(payload: bytes) -> Tactile:
-    """Parse and check a tactile payload. Raises `msgspec.DecodeError`."""
-    return _tactile_decoder.decode(payload)
-
-
-def decode_outcome(payload: bytes) -> OutcomeMessage:
-    """Parse and check an outcome payload. Raises `msgspec.DecodeError`."""
-    return _outcome_decoder.decode(payload)
-
-
-def decode_status(payload: bytes) -> Status:
-    """Parse and check a status payload. Raises `msgspec.DecodeError`."""
-    return _status_decoder.decode(payload)
+decode_verdict = msgspec.json.Decoder(Verdict).decode
+decode_gate = msgspec.json.Decoder(GateMessage).decode
+decode_tactile = msgspec.json.Decoder(Tactile).decode
+decode_outcome = msgspec.json.Decoder(OutcomeMessage).decode
+decode_status = msgspec.json.Decoder(Status).decode
+"""Each parses and checks one kind of payload, bytes or text. Raises `msgspec.DecodeError`."""
 
 
 def schema() -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A Unix socket at a path, taken only where nobody can miss what is there."""
+"""A Unix socket file that replaces nothing but the socket of a process that has ended."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BACKLOG = 100
 
 
 class OccupiedError(Exception):
-    """Something else is there."""
+    """Another file, or a running program's socket, is at the path."""
 
 
 class SocketFile:

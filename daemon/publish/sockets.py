@@ -1,4 +1,4 @@
-"""All sockets of a scene: where messages go, where questions come from, who is let in."""
+"""All sockets of a scene: for messages, for questions, and for the check of keys."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ import zmq
 from daemon.publish.binding import Binding, PublishError
 from daemon.publish.companion import Companion, Requests
 from daemon.publish.messages import Status, Verdict
-from daemon.publish.publisher import VERDICT, Publisher
+from daemon.publish.publisher import Publisher
 from daemon.scene import Curve, Scene, SceneError
 from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Gatekeeper
-    from daemon.publish.latest import Latest
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
@@ -43,7 +42,6 @@ class Sockets(Companion):
         """Whether a port could not be had again."""
         self.gatekeeper: Gatekeeper | None = None
         self.publisher: Publisher
-        self.latest: Latest | None = None
         self.questions: Questions | None = None
         try:
             self._open(wanted)
@@ -59,10 +57,6 @@ class Sockets(Companion):
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
         binding = Binding(self._context, mode, publish.group, pair)
         self.publisher = Publisher(wanted.endpoint, publish.high_water_mark, binding)
-        if publish.latest_endpoint is not None:
-            from daemon.publish.latest import Latest
-
-            self.latest = Latest(publish.latest_endpoint, binding)
         if wanted.ask_endpoint is not None:
             from daemon.publish.questions import Questions
 
@@ -88,15 +82,13 @@ class Sockets(Companion):
                 if bound.endpoint.startswith("tcp://") and bound.is_open:
                     self.gatekeeper.watch(bound.socket)
 
-    def _bound(self) -> list[Publisher | Latest | Questions]:
-        wanted = (getattr(self, "publisher", None), self.latest, self.questions)
+    def _bound(self) -> list[Publisher | Questions]:
+        wanted = (getattr(self, "publisher", None), self.questions)
         return [each for each in wanted if each is not None]
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Publish one message."""
         self.publisher.send(topic, payload)
-        if self.latest is not None and topic.startswith(VERDICT):
-            self.latest.send(payload)
 
     def wanted(self, topic: bytes) -> bool:
         """Whether somebody subscribes to a topic."""

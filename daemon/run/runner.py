@@ -192,7 +192,5 @@ class Runner:
 def _announce(wanted: scene.Scene) -> None:
     """Say where everything is."""
     log.info("verdict.%s on %s", wanted.hand.name, wanted.endpoint)
-    if wanted.publish.latest_endpoint is not None:
-        log.info("the latest verdict alone on %s", wanted.publish.latest_endpoint)
     if wanted.ask_endpoint is not None:
         log.info("questions on %s", wanted.ask_endpoint)

@@ -27,10 +27,17 @@ def _without_nul(value: StrOrPath) -> StrOrPath:
     return value
 
 
+def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
+    base: Path = (info.context or {}).get("base", Path())
+    return base / path
+
+
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
-FilePath = Annotated[Path, Field(strict=False), AfterValidator(_without_nul)]
-"""TOML has no paths: a string is taken."""
+FilePath = Annotated[
+    Path, Field(strict=False), AfterValidator(_without_nul), AfterValidator(_beside_the_scene)
+]
+"""A path, relative to the folder of the scene file. TOML has no paths: a string is taken."""
 
 
 class Section(BaseModel):
@@ -76,7 +83,7 @@ class ReplayTactile(Section):
 
     driver: Literal["replay"]
     recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
-    """Grasp tables or streams, relative to the scene file."""
+    """Grasp tables or streams."""
     pace: Literal["realtime", "fast"] = "realtime"
     speed: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
     """Factor on real time."""
@@ -86,12 +93,6 @@ class ReplayTactile(Section):
     strict: bool = False
     """Stop at the first value that is not a 12-bit count."""
     faults: ReplayFaultsSection = ReplayFaultsSection()
-
-    @field_validator("recordings")
-    @classmethod
-    def _beside_the_scene(cls, paths: tuple[Path, ...], info: ValidationInfo) -> tuple[Path, ...]:
-        base: Path = (info.context or {}).get("base", Path())
-        return tuple(base / path for path in paths)
 
 
 class SpiTactile(Section):
@@ -148,8 +149,7 @@ class PalmTactile(Section):
     @field_validator("source")
     @classmethod
     def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
-        base: Path = (info.context or {}).get("base", Path())
-        return source if "://" in source else str(base / source)
+        return source if "://" in source else str(_beside_the_scene(Path(source), info))
 
     @field_validator("only_from")
     @classmethod
@@ -170,13 +170,7 @@ class PalmJoints(Section):
 
     driver: Literal["palm"]
     calibration: FilePath
-    """The hand's calibration (TOML), relative to the scene file."""
-
-    @field_validator("calibration")
-    @classmethod
-    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
-        base: Path = (info.context or {}).get("base", Path())
-        return base / path
+    """The hand's calibration (TOML)."""
 
 
 class StreamJoints(Section):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import stat
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,11 +11,11 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
-    ValidationInfo,
     field_validator,
     model_validator,
 )
 
+from daemon.process.files import read_regular
 from daemon.process.text import printable
 from daemon.scene.drivers import (
     CanTactile,
@@ -68,17 +66,11 @@ class Model(Section):
     """A model of the zoo, `small-session` when neither name nor path is given; for a hand of fewer
     fingers in its form for these, where the zoo has one."""
     path: FilePath | None = None
-    """A model file of your own, relative to the scene file."""
+    """A model file of your own."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
     """`p_slip` from here on is slip."""
     min_accuracy: Annotated[float, Field(gt=0.5, lt=1.0)] | None = None
     """Verdicts must be right this often, by the model's card; less sure ones become `unknown`."""
-
-    @field_validator("path")
-    @classmethod
-    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
-        base: Path = (info.context or {}).get("base", Path())
-        return None if path is None else base / path
 
     @model_validator(mode="after")
     def _one_of_name_and_path(self) -> Self:
@@ -99,13 +91,7 @@ class Session(Section):
     required: bool = False
     """Whether nothing is judged before the session is calibrated."""
     file: FilePath | None = None
-    """`/var/lib/graspd/<hand>.session.json` unless given; relative to the scene file."""
-
-    @field_validator("file")
-    @classmethod
-    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
-        base: Path = (info.context or {}).get("base", Path())
-        return None if path is None else base / path
+    """`/var/lib/graspd/<hand>.session.json` unless given."""
 
 
 GateMode = Literal["settled", "every", "request"]
@@ -162,8 +148,6 @@ class Publish(Section):
     endpoint: Endpoint | None = None
     """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
     addresses."""
-    latest_endpoint: Endpoint | None = None
-    """Where verdicts are published as messages of one frame too, for `ZMQ_CONFLATE`."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000)] = 1000
     """Messages kept for a subscriber that is slow; those that come then are lost to it."""
     file_mode: Annotated[str, Field(pattern=r"^0?[0-7]{3}$")] | None = None
@@ -177,15 +161,9 @@ class Curve(Section):
     """`[curve]`: who may connect by `tcp://` (`graspd keys`). All that do need keys then."""
 
     secret_key: FilePath
-    """The daemon's own `.key_secret` file, of mode 0600; relative to the scene file."""
+    """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
     """Folder with the `.key` files of those who may connect; looked at once a second."""
-
-    @field_validator("secret_key", "clients")
-    @classmethod
-    def _beside_the_scene(cls, path: Path, info: ValidationInfo) -> Path:
-        base: Path = (info.context or {}).get("base", Path())
-        return base / path
 
 
 class Ask(Section):
@@ -210,9 +188,8 @@ class Realtime(Section):
 class Record(Section):
     """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
 
-    directory: Annotated[FilePath | None, Field(strict=False)] = None
-    """`/var/lib/graspd/record` unless given; relative to the scene file. Made if it is not there.
-    """
+    directory: FilePath | None = None
+    """`/var/lib/graspd/record` unless given. Made if it is not there."""
     flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0)] = 1000.0
     """What a killed daemon or a power cut may cost, ms."""
     rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0)] = 256.0
@@ -225,12 +202,6 @@ class Record(Section):
     """All files of this hand together, the one being written included, MB."""
     raw: bool = False
     """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
-
-    @field_validator("directory")
-    @classmethod
-    def _beside_the_scene(cls, path: Path | None, info: ValidationInfo) -> Path | None:
-        base: Path = (info.context or {}).get("base", Path())
-        return None if path is None else base / path
 
 
 class Scene(Section):
@@ -277,12 +248,11 @@ class Scene(Section):
     def _refuse_strangers(self) -> None:
         endpoints = {
             "publish.endpoint": self.publish.endpoint,
-            "publish.latest_endpoint": self.publish.latest_endpoint,
             "ask.endpoint": None if self.ask is None else self.ask.endpoint,
         }
         given = [endpoint for endpoint in endpoints.values() if endpoint is not None]
         if len(set(given)) != len(given):
-            raise ValueError("publish.endpoint, latest_endpoint and ask.endpoint must differ")
+            raise ValueError("publish.endpoint and ask.endpoint must differ")
         for key, endpoint in endpoints.items():
             if endpoint is not None and self.curve is None and not is_private(endpoint):
                 raise ValueError(
@@ -338,7 +308,7 @@ class Scene(Section):
 def load(path: Path) -> Scene:
     """Read a scene file. Raises `SceneError`, whose text has one line per mistake."""
     try:
-        text = _read(path).decode()
+        text = read_regular(path, SCENE_MAX_BYTES).decode()
     except OSError as error:
         raise SceneError(f"{path}: cannot read the scene: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -352,17 +322,6 @@ def load(path: Path) -> Scene:
 
         raise SceneError(f"{path}: not TOML: {printable(str(error), MESSAGE_MAX)}") from error
     return parse(data, path)
-
-
-def _read(path: Path) -> bytes:
-    """The content of a regular file of bounded size, without waiting for anything else."""
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise SceneError(f"{path}: cannot read the scene: not a regular file")
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        content = file.read(SCENE_MAX_BYTES + 1)
-    if len(content) > SCENE_MAX_BYTES:
-        raise SceneError(f"{path}: larger than {SCENE_MAX_BYTES} bytes, not a scene")
-    return content
 
 
 def parse(data: Mapping[str, Any], path: Path) -> Scene:

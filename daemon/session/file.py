@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import fcntl
 import os
-import stat
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Literal, Self
 
 import msgspec
 
+from daemon.process.files import read_regular, write_atomically
 from models.session import SessionState
 
 VERSION: Final = 1
@@ -89,17 +87,7 @@ class SessionFile:
         kept = KeptSession(VERSION, tuple(fingers), dict(serials), time.time(), statistics)
         data = msgspec.json.format(msgspec.json.encode(kept), indent=1) + b"\n"
         try:
-            handle, part = tempfile.mkstemp(dir=self.path.parent, prefix=self.path.name + ".")
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    file.write(data)
-                    file.flush()
-                    os.fsync(file.fileno())
-                os.replace(part, self.path)
-            except OSError:
-                with suppress(OSError):
-                    os.unlink(part)
-                raise
+            write_atomically(self.path, data)
         except OSError as error:
             raise SessionFileError(
                 f"{self.path}: cannot keep the session: {error.strerror}"
@@ -119,16 +107,11 @@ class SessionFile:
 def load(path: Path) -> KeptSession | None:
     """What is kept at `path`, None if nothing is. Raises `SessionFileError`."""
     try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise SessionFileError(f"{path}: cannot read the session: not a regular file")
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            data = file.read(MAX_BYTES + 1)
+        data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise SessionFileError(f"{path}: cannot read the session: {error.strerror}") from error
-    if len(data) > MAX_BYTES:
-        raise SessionFileError(f"{path}: larger than {MAX_BYTES} bytes, not a session")
     try:
         return msgspec.json.decode(data, type=KeptSession)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

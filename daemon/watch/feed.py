@@ -1,4 +1,4 @@
-"""The subscriber: connects to a daemon like anybody else, and takes what has come."""
+"""The subscriber of `graspd watch`: connects to a daemon like any other, and takes messages."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Final, Self
 
 import zmq
-import zmq.auth
 from zmq.utils.monitor import recv_monitor_message
 
 from daemon.process.sleep import boottime_ns
-from daemon.publish.keys import Z85_KEY, KeysError, load_pair
+from daemon.publish.keys import load_pair, load_public
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
 WAITING_MAX = 2000
@@ -162,14 +161,4 @@ def load_keys(own: Path, daemon: Path) -> tuple[bytes, bytes, bytes]:
 
     `own` is a `.key_secret` file of mode 0600, `daemon` the daemon's `.key`. Raises `KeysError`.
     """
-    public, secret = load_pair(own)
-    try:
-        server, _ = zmq.auth.load_certificate(daemon)
-    except OSError as error:
-        reason = error.strerror or "there is no such file"
-        raise KeysError(f"{daemon}: cannot read the daemon's key: {reason}") from error
-    except ValueError as error:
-        raise KeysError(f"{daemon}: has no public key") from error
-    if not Z85_KEY.fullmatch(server):
-        raise KeysError(f"{daemon}: a key must have 40 characters of Z85")
-    return public, secret, server
+    return *load_pair(own), load_public(daemon, "the daemon's key")

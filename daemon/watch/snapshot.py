@@ -10,7 +10,7 @@ from daemon.watch.fingers import FingerImage
 
 
 class Tone(StrEnum):
-    """What an operator has to know in a second; it has a colour."""
+    """The verdict in five kinds, a colour each, that an operator tells apart at a glance."""
 
     STABLE = "stable"
     SLIP = "slip"
@@ -33,7 +33,7 @@ TONE_CODE = {
 
 
 class Line(msgspec.Struct, frozen=True):
-    """Something that is to be known, and what to do about it."""
+    """Something to know, and what to do about it."""
 
     what: str
     advice: str

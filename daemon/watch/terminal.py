@@ -11,7 +11,6 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.process.text import printable
-from daemon.watch.letters import big
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Snapshot, Tone
 from daemon.watch.view import HISTORY
@@ -22,8 +21,8 @@ LINES, LINES_LARGE = 23, 29
 """Lines of all but what is not well, with small and with large images."""
 WHY_MAX = 3
 """Reasons that are shown; a reading seldom has more."""
-BANNER = 46
-"""Columns of the big verdict: `UNKNOWN` has 36."""
+BANNER_LINES, BANNER = 5, 24
+"""Lines and columns of the coloured field that has the verdict in its middle."""
 NAME_MAX = 40
 """Characters of a name that came in a message."""
 GAP = 2
@@ -35,7 +34,7 @@ BOLD = Style(bold=True)
 
 
 def draw(seen: Snapshot, width: int, height: int, canvas: Canvas) -> RenderableType:
-    """Everything that fits, the most important on top."""
+    """The snapshot for a terminal of `width` x `height` characters, cut to what fits."""
     large = width >= LARGE[0] and height >= LARGE[1]
     rows: list[RenderableType] = [
         _header(seen),
@@ -73,12 +72,9 @@ def _footer(seen: Snapshot) -> Text:
 
 
 def _verdict(seen: Snapshot, canvas: Canvas, width: int) -> Table:
-    lines = big(seen.verdict, ascii_only=canvas.ascii_only)
-    padding = [] if canvas.ascii_only else [""]
-    banner = Text(
-        "\n".join(line.center(BANNER) for line in [*padding, *lines, *padding]),
-        canvas.banner(seen.tone),
-    )
+    lines = [" " * BANNER] * BANNER_LINES
+    lines[BANNER_LINES // 2] = seen.verdict.upper().center(BANNER)
+    banner = Text("\n".join(lines), canvas.banner(seen.tone))
     grid = Table.grid(padding=(0, 2))
     grid.add_column(width=BANNER, no_wrap=True)
     grid.add_column(no_wrap=True, overflow="ellipsis")

@@ -1,4 +1,4 @@
-"""What is known of one hand by its messages, and by their absence."""
+"""The state of one hand, by the messages that came and by how long none came."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ DECODERS: dict[str, Callable[[bytes], Message]] = {
 
 
 class View:
-    """Takes messages, and tells at any time what is to be seen. Constant memory, no socket."""
+    """Takes messages and gives a `Snapshot` at any time. Constant memory, no socket."""
 
     def __init__(
         self, endpoint: str, hand: str | None = None, wall: Callable[[], float] = time.time

@@ -1,4 +1,4 @@
-"""Snapshots as time goes by: takes what a feed has into a view, and looks at it."""
+"""Hands the messages of a feed to a view, and takes snapshots of it at a steady rate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ TICK_S = 0.02
 
 
 def snapshots(feed: Feed, view: View, is_over: Callable[[], bool]) -> Iterator[Snapshot]:
-    """Ten times a second what is to be seen, until `is_over`, which waits `TICK_S` each time."""
+    """Yield a snapshot ten times a second until `is_over()` is true; it must wait `TICK_S` s."""
     due_s = 0.0
     while not is_over():
         for topic, payload in feed.take():

@@ -26,6 +26,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from daemon.process.text import markdown_table
 from drivers.base import FINGERS
 from drivers.spi.messages import Message, Sweep
 from drivers.twins.can import CanTwin, Outgoing
@@ -388,9 +389,8 @@ def end_children_at_sigterm() -> None:
 
 def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Markdown; what is not in the first column is right-aligned."""
-    marks = ["---", *["--:"] * (len(head) - 1)]
-    lines = [head, marks, *rows]
-    return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
+    cells = [list(map(str, row)) for row in rows]
+    return "".join(f"{line}\n" for line in markdown_table(head, cells, right=head[1:]))
 
 
 def main() -> None:

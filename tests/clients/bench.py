@@ -36,21 +36,20 @@ class Daemon:
         `more` is what else there is in the scene, from `[tactile]` on.
         """
         self.endpoint = endpoint or f"ipc://{folder}/graspd"
-        self.latest_endpoint = f"ipc://{folder}/latest"
         self.ask_endpoint = f"ipc://{folder}/ask"
         self._folder = folder
         self._scene = folder / "scene.toml"
         recording = _one_grasp(folder / "grasp.csv") if whole_grasps else DEMO_TABLE
         self._scene.write_text(
             f'[publish]\nendpoint = "{self.endpoint}"\n'
-            f'latest_endpoint = "{self.latest_endpoint}"\n[ask]\nendpoint = "{self.ask_endpoint}"\n'
+            f'[ask]\nendpoint = "{self.ask_endpoint}"\n'
             f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\nloop = true\n{more}'
         )
         self.start()
 
     def start(self) -> None:
         """Start it, and wait until it can be heard."""
-        bound = self._folder / "latest"
+        bound = self._folder / "ask"
         bound.unlink(missing_ok=True)
         self._process = start("run", self._scene)
         wait_for(bound)

@@ -156,11 +156,6 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(tmp_path: Pat
         assert graspd.counts.malformed == 0
 
 
-def test_the_latest_endpoint_is_no_place_for_this_client(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Graspd(daemon.latest_endpoint) as graspd:
-        assert graspd.verdict(0.5).reasons == ("no-message",)
-
-
 def test_an_endpoint_that_is_none_leaves_nothing_behind() -> None:
     with pytest.raises(zmq.ZMQError):
         Graspd("nowhere")

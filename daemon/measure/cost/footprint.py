@@ -68,7 +68,7 @@ class Meter:
         self.take("interpreter")
 
     def take(self, name: str) -> None:
-        """All since the last call was this part's."""
+        """Count all that was added since the last call for the part `name`."""
         wall_ns, cpu_ns = time.monotonic_ns(), time.process_time_ns()
         now = _now()
         added: dict[str, object] = {key: now[key] - self._last[key] for key in now}
@@ -78,7 +78,7 @@ class Meter:
         self.skip()
 
     def skip(self) -> None:
-        """What came since the last call is nobody's."""
+        """Count what was added since the last call for no part."""
         self._last = _now()
         self._wall_ns, self._cpu_ns = time.monotonic_ns(), time.process_time_ns()
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from daemon.process.text import printable
+from daemon.process.text import markdown_table, printable
 
 TIMEOUT_S = 120.0
 """A scene takes a second; on a very busy machine a few."""
@@ -168,23 +168,36 @@ def _line(name: str, part: Part) -> str:
     )
 
 
+TITLES = (
+    "Scene",
+    "Modules",
+    "Memory, MiB (over Python's own)",
+    "Threads",
+    "Descriptors",
+    "Start, ms (CPU)",
+    "Per reading, us p50 / p99",
+    "Judged, us p50",
+)
+
+
 def markdown(found: Sequence[tuple[Path, Footprint]]) -> Iterator[str]:
     """One table of several scenes, a row each."""
-    yield (
-        "| Scene | Modules | Memory, MiB (over Python's own) | Threads | Descriptors "
-        "| Start, ms (CPU) | Per reading, us p50 / p99 | Judged, us p50 |"
+    rows = [_cells(printable(path.stem), footprint) for path, footprint in found]
+    return markdown_table(TITLES, rows, right=TITLES[1:])
+
+
+def _cells(name: str, found: Footprint) -> Sequence[str]:
+    whole, timed = found.whole, found.timed
+    return (
+        name,
+        str(whole.modules),
+        f"{whole.rss_kib / KIB_PER_MIB:.1f} ({found.rise_kib / KIB_PER_MIB:.1f})",
+        str(whole.threads),
+        str(whole.descriptors),
+        f"{found.start_wall_ms:.0f} ({found.start_cpu_ms:.0f})",
+        _both(timed.reading),
+        _median(timed.judged),
     )
-    yield "|---|--:|--:|--:|--:|--:|--:|--:|"
-    for path, footprint in found:
-        whole, timed = footprint.whole, footprint.timed
-        name = printable(path.stem).replace("|", "\\|")
-        yield (
-            f"| {name} | {whole.modules} "
-            f"| {whole.rss_kib / KIB_PER_MIB:.1f} ({footprint.rise_kib / KIB_PER_MIB:.1f}) "
-            f"| {whole.threads} | {whole.descriptors} "
-            f"| {footprint.start_wall_ms:.0f} ({footprint.start_cpu_ms:.0f}) "
-            f"| {_both(timed.reading)} | {_median(timed.judged)} |"
-        )
 
 
 def _both(quantiles: Quantiles | None) -> str:

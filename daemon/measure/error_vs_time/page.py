@@ -13,6 +13,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from daemon.process.text import markdown_table
+
 Found = dict[str, Any]
 Row = dict[str, Any]
 
@@ -55,7 +57,7 @@ def _by_fingers(rows: Sequence[Row]) -> list[list[Row]]:
 
 def table(found: Found) -> str:
     """All rows as Markdown, the most exact first, with the advice."""
-    lines = list(_lines(COLUMNS, [_cells(row) for row in _sorted(found["rows"])]))
+    lines = list(markdown_table(COLUMNS, [_cells(row) for row in _sorted(found["rows"])]))
     lines += ["", *_stages(found), "", *(f"- {text}" for text in advice(found["rows"]))]
     lines += ["", _made(found)]
     return "\n".join(lines)
@@ -120,7 +122,7 @@ def _sorted(rows: Sequence[Row]) -> list[Row]:
 def _stages(found: Found) -> Iterator[str]:
     yield f"Stages of a reading with `{found['stages']['model']}`, hot:"
     yield ""
-    yield from _lines(STAGE_COLUMNS, _stage_cells(found))
+    yield from markdown_table(STAGE_COLUMNS, _stage_cells(found))
 
 
 def _stage_cells(found: Found) -> list[list[str]]:
@@ -128,13 +130,6 @@ def _stage_cells(found: Found) -> list[list[str]]:
         [name, f"{took['p50']:.0f}", f"{took['p99']:.0f}"]
         for name, took in found["stages"]["us"].items()
     ]
-
-
-def _lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield "| " + " | ".join(titles) + " |"
-    yield "|" + "---|" * len(titles)
-    for row in rows:
-        yield "| " + " | ".join(row) + " |"
 
 
 def advice(rows: Sequence[Row]) -> Iterator[str]:

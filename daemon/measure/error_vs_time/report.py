@@ -24,7 +24,7 @@ from scipy import stats
 
 from daemon.measure.error_vs_time import page, stages
 from daemon.measure.error_vs_time.timing import Step, bandwidth_bytes_per_s, measure
-from daemon.measure.reference.reference import Reference, UnknownOperatorError
+from daemon.measure.reference.reference import Reference
 from daemon.process.text import complain
 from models import zoo
 from models.bts3 import FINGERS
@@ -206,7 +206,7 @@ def _numerical(model: TactileModel, counts: NDArray[np.uint16]) -> dict[str, Any
     """What rounding does, on real grasps: against the same file in float64."""
     try:
         reference = Reference(model.path)
-    except UnknownOperatorError as error:
+    except ModelError as error:
         return {"why_not": str(error)}
     inputs, _ = model.inputs.build_batch(counts)
     exact = reference.probabilities(inputs)[:, 1]

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daemon.measure.reference.trees import UnknownOperatorError
 from daemon.measure.stability.cases import StabilityCase, cases, recorded
 from daemon.measure.stability.model import Bounds, CaseRow, ModelStability, seasoned_session
 from daemon.measure.stability.motion import calibration_rows, gate_rows, joint_rows
@@ -26,7 +25,8 @@ from daemon.measure.stability.repair import repair_row
 from daemon.measure.stability.session import session_rows
 from daemon.measure.stability.steps import StepRow
 from daemon.measure.stability.time import clock_rows, wrap_rows
-from daemon.process.text import complain, printable
+from daemon.process.extras import needs
+from daemon.process.text import complain, markdown_table, printable
 from drivers.base import RecordingError
 from models import zoo
 from models.contract import ModelError
@@ -111,9 +111,9 @@ def run(args: argparse.Namespace) -> int:
         if args.markdown is not None:
             args.markdown.write_text("\n".join(_markdown(report)) + "\n", "utf-8")
     except ModuleNotFoundError as error:
-        complain(f"report stability needs the package '{error.name}': pip install '.[train]'")
+        complain(needs("report stability", "train", error))
         return WRONG
-    except (ModelError, RecordingError, UnknownOperatorError, OSError) as error:
+    except (ModelError, RecordingError, OSError) as error:
         complain(error)
         return WRONG
     if args.json:
@@ -126,8 +126,8 @@ def run(args: argparse.Namespace) -> int:
 def measured(names: Sequence[str], folder: Path | None, bounds: Bounds) -> StabilityReport:
     """Measure the models of these names, and all steps.
 
-    Raises `ModelError`, `RecordingError` for a missing table in `folder`, `UnknownOperatorError`,
-    and `ModuleNotFoundError` without the extra `train`.
+    Raises `ModelError`, `RecordingError` for a missing table in `folder`, and
+    `ModuleNotFoundError` without the extra `train`.
     """
     models = [TactileModel(zoo.find(name)) for name in names]
     # Imported here, for it takes onnx and PyTorch, and a wrong name should not wait for those.
@@ -190,10 +190,7 @@ def _text(report: StabilityReport) -> Iterator[str]:
 
 def _markdown(report: StabilityReport) -> Iterator[str]:
     for titles, rows in _tables(report):
-        yield "| " + " | ".join(titles) + " |"
-        yield "|" + "|".join(" ---: " if title in NUMBERS else " --- " for title in titles) + "|"
-        for row in rows:
-            yield "| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |"
+        yield from markdown_table(titles, rows, right=NUMBERS)
         yield ""
     for line in (*LEGEND, _verdict(report), f"Machine: {_machine()}."):
         yield line

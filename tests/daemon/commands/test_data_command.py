@@ -165,12 +165,6 @@ def test_what_is_no_file_is_not_replaced(tmp_path: Path, kind: str) -> None:
     assert not target.is_file()
 
 
-def test_a_fifo_in_the_way_of_the_partial_file_is_no_trap(bts3_dir: Path, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / f"{TABLES[0].name}.partial")
-    assert graspd("data", "--to", tmp_path, "--from", bts3_dir).returncode == 0
-    assert len(list(tmp_path.iterdir())) == len(TABLES)
-
-
 def test_a_target_that_is_no_folder_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     result = graspd("data", "--to", tmp_path / "file", "--from", tmp_path)

@@ -85,17 +85,17 @@ def restless(counts: Counts, _faults: object, number: int) -> None:
 @pytest.mark.parametrize(
     ("spoil", "level", "says"),
     [
-        (at(1, 7, 0.0), Level.ERROR, "mf: E8 stuck at a rail"),
-        (at(2, 23, 4095.0), Level.ERROR, "th: E24 stuck at a rail"),
-        (at(0, 0, 2500.0), Level.ERROR, "ff: E1 frozen"),
+        (at(1, 7, 0.0), Level.ERROR, "mf_8 stuck at a rail"),
+        (at(2, 23, 4095.0), Level.ERROR, "th_24 stuck at a rail"),
+        (at(0, 0, 2500.0), Level.ERROR, "ff_1 frozen"),
         (fault(2, slice(None), ElectrodeFault.MISSING, 1), Level.ERROR, "th: no electrode"),
-        (fault(1, 4, ElectrodeFault.MISSING, 1), Level.ERROR, "mf: E5 never or rarely sampled"),
+        (fault(1, 4, ElectrodeFault.MISSING, 1), Level.ERROR, "mf_5 never or rarely sampled"),
         (
             fault(0, 2, ElectrodeFault.PARITY, 10),
             Level.WARNING,
-            "ff: E3 now and then faulty (parity)",
+            "ff_3 now and then faulty (parity)",
         ),
-        (restless, Level.WARNING, "ff: E21 restless"),
+        (restless, Level.WARNING, "ff_21 restless"),
     ],
 )
 def test_a_fault_is_found_and_named(

@@ -30,7 +30,7 @@ NEVER = {
         "daemon.run.summary",
     ),
     *("daemon.scene.errors", "daemon.measure.cost.tables", "daemon.doctor"),
-    *("daemon.run.realtime", "daemon.run.systemd", "daemon.publish.latest", "daemon.watch"),
+    *("daemon.run.realtime", "daemon.run.systemd", "daemon.watch"),
     *(
         "daemon.judge.memory",
         "daemon.record",
@@ -53,7 +53,7 @@ NEVER = {
     ),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
-for a service, realtime, known keys or the latest verdict alone."""
+for a service, realtime or known keys."""
 BUSES = {
     "replay": {
         "drivers.recordings.csv_player",

@@ -43,14 +43,6 @@ class Peers:
         subscriber.subscribe(topic)
         return subscriber
 
-    def conflate(self, endpoint: str) -> zmq.Socket[bytes]:
-        made = self.context.socket(zmq.SUB)
-        self._sockets.append(made)
-        made.conflate = True
-        made.connect(endpoint)
-        made.subscribe("")
-        return made
-
     def close(self) -> None:
         for each in self._sockets:
             each.close(linger=0)

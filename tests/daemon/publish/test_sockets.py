@@ -1,9 +1,8 @@
-"""Who comes late, who wants only the newest, who may connect, and hostile peers at every door."""
+"""Who comes late, who may connect, and hostile peers at every door."""
 
 from __future__ import annotations
 
 import grp
-import json
 import os
 import random
 import stat
@@ -120,28 +119,6 @@ def test_many_who_come_at_once_do_not_make_a_storm(tmp_path: Path, peers: Peers)
         until(lambda: all(each.poll(0) for each in late), sockets)
         elapsed_ns = (time.monotonic() - start_s) * 1e9
         assert sockets.publisher.counters["repeated"] <= elapsed_ns / REPEAT_NS + 2
-
-
-def test_a_conflating_subscriber_gets_the_newest_verdict_alone(
-    tmp_path: Path, peers: Peers
-) -> None:
-    """Messages of one frame: of more than one, ZMQ_CONFLATE keeps only pieces."""
-    latest = f"ipc://{tmp_path}/latest"
-    with Sockets(wanted(tmp_path, latest_endpoint=latest)) as sockets:
-        newest = peers.conflate(latest)
-
-        def send() -> int:
-            sockets.send(b"verdict.right", b'{"seq":0}')
-            return newest.poll(5)
-
-        until(send, sockets)
-        newest.recv()  # asking whether there is one has taken it out of the queue
-        for number in range(1, 61):
-            sockets.send(b"status.right", b'{"status":true}')
-            sockets.send(b"verdict.right", b'{"seq":%d}' % number)
-        time.sleep(0.5)
-        assert json.loads(newest.recv()) == {"seq": 60}
-        assert not newest.poll(50)
 
 
 def test_files_of_sockets_have_the_mode_and_the_group_of_the_scene(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from rich.console import Console
 from daemon.judge.reasons import ADVICE, GateState, Outcome, Reason
 from daemon.publish.messages import OutcomeMessage, encode
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, Rest, image
-from daemon.watch.letters import big
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Line, Snapshot, Tone
 from daemon.watch.terminal import draw
@@ -358,14 +357,11 @@ def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     assert r"\x1b[2J" in text
 
 
-@pytest.mark.parametrize("word", [outcome.value for outcome in Outcome])
-def test_big_letters_say_the_verdict_in_three_lines_or_in_five_of_ascii(word: str) -> None:
-    blocks, ascii_lines = big(word, ascii_only=False), big(word, ascii_only=True)
-    assert (len(blocks), len(ascii_lines)) == (3, 5)
-    assert len({len(line) for line in blocks}) == len({len(line) for line in ascii_lines}) == 1
-    assert set("".join(ascii_lines)) == {"#", " "}
-    ink = {" ": 0, "▀": 1, "▄": 1, "█": 2}
-    assert sum(ink[mark] for mark in "".join(blocks)) == "".join(ascii_lines).count("#")
+@pytest.mark.parametrize("outcome", Outcome)
+def test_the_verdict_stands_alone_in_a_field_of_five_lines(outcome: Outcome) -> None:
+    seen = after((b"verdict.right", verdict(0, outcome))).snapshot(0)
+    field = [line[:24].strip() for line in text_of(seen, 80, 24, Canvas())[1:6]]
+    assert field == ["", "", outcome.value.upper(), "", ""]
 
 
 def mutated(rng: random.Random, golden: dict[str, object]) -> bytes:

@@ -1,0 +1,88 @@
+"""Files are replaced whole or not at all, and reading one never waits."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from daemon.process.extras import needs
+from daemon.process.files import read_regular, write_atomically
+from daemon.process.text import markdown_table
+
+
+def test_a_file_is_replaced_with_the_mode_that_is_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    write_atomically(path, b"former")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    write_atomically(path, b"new", mode=0o644)
+    assert (path.read_bytes(), stat.S_IMODE(path.stat().st_mode)) == (b"new", 0o644)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("step", ["fsync", "fchmod", "replace"])
+def test_a_step_that_fails_leaves_the_former_file_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    path = tmp_path / "kept"
+    write_atomically(path, b"former")
+
+    def full(*_arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, step, full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"former"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_content_and_then_the_name_are_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, synced = tmp_path / "kept", []
+    monkeypatch.setattr(os, "fsync", lambda handle: synced.append((_kind(handle), path.exists())))
+    write_atomically(path, b"new")
+    assert synced == [("file", False), ("folder", True)]
+
+
+def _kind(handle: int) -> str:
+    return "folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file"
+
+
+def test_a_regular_file_is_read_up_to_its_limit(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"12345")
+    assert read_regular(tmp_path / "file", 5) == b"12345"
+    with pytest.raises(OSError, match="larger than 4 bytes"):
+        read_regular(tmp_path / "file", 4)
+
+
+def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path, Path("/dev/zero")):
+        with pytest.raises(OSError, match="not a regular file"):
+            read_regular(path, 10)
+    with pytest.raises(FileNotFoundError):
+        read_regular(tmp_path / "nothing", 10)
+
+
+def test_a_missing_package_is_named_with_its_extra_and_a_missing_part_of_graspd_is_a_bug() -> None:
+    absent = ModuleNotFoundError("No module named 'rich.text'", name="rich.text")
+    assert needs("watch", "watch", absent) == (
+        "watch needs the package 'rich': run pip install '.[watch]' in the folder of graspd's "
+        "source"
+    )
+    with pytest.raises(ModuleNotFoundError, match=r"daemon\.nothing"):
+        needs("watch", "watch", ModuleNotFoundError("daemon.nothing", name="daemon.nothing"))
+
+
+def test_a_table_is_markdown_with_numbers_to_the_right_and_bars_escaped() -> None:
+    assert list(markdown_table(("name", "us"), [("a|b", "1"), ("c", "20")], right={"us"})) == [
+        "| name | us |",
+        "| --- | ---: |",
+        "| a\\|b | 1 |",
+        "| c | 20 |",
+    ]
