@@ -21,7 +21,7 @@ from daemon.record.player import McapReplayDriver
 from daemon.scene import Scene, SceneError, parse
 from drivers.base import RecordingError
 from models.runtime import TactileModel
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 

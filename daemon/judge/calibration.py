@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from drivers.base import COUNT_MAX
 from models.contract import SessionInput
 from models.inputs import SessionBuilder, raw_features
-from models.session import SessionState, SessionStatistics
+from models.session_statistics import SessionState, SessionStatistics
 
 SPREAD_RATIOS = (0.2, 3.0)
 """Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:

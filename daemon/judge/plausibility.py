@@ -13,7 +13,7 @@ from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import SeenCounts
 from models.electrodes import Electrodes
-from models.seen import SeenCheck
+from models.novelty import NoveltyCheck
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
@@ -51,7 +51,7 @@ class Plausibility:
         self, seen: SeenCounts, electrodes: Electrodes, session: SessionCalibration | None = None
     ) -> None:
         """`seen` is what the model was trained on, `session` how today's sensors differ from it."""
-        self._seen = SeenCheck(seen)
+        self._seen = NoveltyCheck(seen)
         self._electrodes = electrodes
         self._session = session
 

@@ -15,7 +15,7 @@ from typing import Final, Literal, Self
 
 import msgspec
 
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 VERSION: Final = 1
 MAX_BYTES = 1 << 20

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from daemon.judge.calibration import SessionCalibration
 from daemon.session.file import SessionFile, SessionFileError, exchanged, statistics_of
 from drivers.base import Driver
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 

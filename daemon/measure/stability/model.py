@@ -20,7 +20,7 @@ from drivers.base import TactileReading
 from models.contract import ModelContract, SessionInput
 from models.electrodes import Electrodes
 from models.runtime import TactileModel
-from models.session import HORIZON_GRASPS, SessionState
+from models.session_statistics import HORIZON_GRASPS, SessionState
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 
 if TYPE_CHECKING:

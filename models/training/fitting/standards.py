@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from models.session import SessionStatistics
+from models.session_statistics import SessionStatistics
 
 PRIOR_GRASPS = 1.0
 """Weight of the training's statistics in a new session, grasps."""

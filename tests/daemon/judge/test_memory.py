@@ -23,7 +23,7 @@ from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger
 from models.runtime import TactileModel
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 SECTIONS: dict[str, Any] = {

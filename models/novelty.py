@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from models.contract import SeenCounts
 
 
-class SeenCheck:
+class NoveltyCheck:
     """Tells readings that are far from all training data: for them a network's answer is noise.
 
     Two tests, each of which catches what the other lets through: every electrode must lie in its
