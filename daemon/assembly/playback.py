@@ -14,7 +14,7 @@ import msgspec
 
 from daemon.assembly import assembly
 from daemon.assembly.captures import changed
-from daemon.judge.memory import decode
+from daemon.judge.memory import recall
 from daemon.judge.pipeline import Pipeline
 from daemon.record.mcap import ASKED, EXCHANGED, RecordingHeader, header_of
 from daemon.record.player import McapReplayDriver
@@ -87,10 +87,9 @@ class Playback:
         clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
         pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
         try:
-            memory = decode(base64.b64decode(self.header.texts.get("judge", "")))
-            memory.give_judge(pipeline, same_model=same_model)
+            memory = base64.b64decode(self.header.texts.get("judge", ""))
+            recall(pipeline, memory, same_model=same_model)
         except ValueError:
-            pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
             if not self._is_first:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         if driver is not None:

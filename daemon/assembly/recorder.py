@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from daemon.assembly import assembly
-from daemon.judge.memory import JudgeMemory, encode
+from daemon.judge.memory import encode, remember
 from daemon.judge.pipeline import Pipeline
 from daemon.scene import Scene, SceneError
 from models.runtime import TactileModel
@@ -101,7 +101,7 @@ def state_of(pipeline: Pipeline) -> Callable[[], dict[str, str]]:
 
     Takes some 50 us, and what is given back puts it into words, which takes longer.
     """
-    judge, session, axis_ns = JudgeMemory.of(pipeline), pipeline.session, pipeline.axis_ns
+    judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     known = None if session is None else session.state()
 
     def texts() -> dict[str, str]:
