@@ -103,10 +103,10 @@ class Grip:
         """The sensors are others, or may be: where they rest is not known, nor what they hold."""
         self._contact.forget()
         self._fresh.reset()
-        self.restart()
+        self.interrupt()
 
-    def restart(self) -> None:
-        """The grasp at hand must settle and be judged anew."""
+    def interrupt(self) -> None:
+        """Readings are missing before the next one: the grasp must settle anew."""
         if self.memory.last_ns is not None:
             self._gate.restart(self.memory.last_ns)
 

@@ -143,7 +143,7 @@ class Pipeline:
         """What was said of the grasp at hand no longer counts: another model or gate goes on."""
         self.memory.opinion, self.memory.learnt_grasp = NO_OPINION, 0
         if self.grip is not None:
-            self.grip.restart()
+            self.grip.interrupt()
 
     def memories(self) -> dict[str, dict[str, Any]]:
         """What every part remembers between two readings, all that its next finding depends on.

@@ -139,7 +139,7 @@ class Gatekeeper:
     def _note(self, watched: _Watched, event: int, value: int) -> None:
         """`value` is a descriptor where somebody comes or goes."""
         if event == zmq.EVENT_ACCEPTED:
-            watched.waiting[value] = _peer(value)
+            watched.waiting[value] = peer_of(value)
         elif event in ANSWERED:
             self._let_pass(watched)
         elif event == zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL:
@@ -184,7 +184,7 @@ class Gatekeeper:
         self._requests.close(linger=0)
 
 
-def _peer(descriptor: int) -> str | None:
+def peer_of(descriptor: int) -> str | None:
     """Address of a connection that libzmq has; it may have gone already."""
     try:
         ours = os.dup(descriptor)

@@ -197,16 +197,16 @@ class Recorder:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
             while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
-                self._go_round()
+                self.go_round()
             self._flush_due_ns = 0
-            self._go_round()
+            self.go_round()
         except BaseException:
             self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
             raise
         finally:
             self._finish()
 
-    def _go_round(self) -> None:
+    def go_round(self) -> None:
         """Write what waits; after a failure let it go until it is time to try again."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()

@@ -150,8 +150,8 @@ def test_a_peer_that_is_gone_before_it_is_looked_at_costs_nobody_a_descriptor(
 
     with socket.socket() as unconnected, open(os.devnull) as no_socket:
         monkeypatch.setattr(os, "close", take_and_close)
-        assert gatekeeper._peer(unconnected.fileno()) is None
-        assert gatekeeper._peer(no_socket.fileno()) is None
+        assert gatekeeper.peer_of(unconnected.fileno()) is None
+        assert gatekeeper.peer_of(no_socket.fileno()) is None
         monkeypatch.undo()
         for descriptor in taken:
             os.fstat(descriptor)  # still open
