@@ -159,6 +159,10 @@ class Driver(Protocol):
         """True when no further reading can come: a recording has ended. Never for live links."""
 
     @property
+    def live(self) -> bool:
+        """Whether readings come when the sensor makes them; those of a recording wait for us."""
+
+    @property
     def period_ns(self) -> int | None:
         """Nominal time between tactile readings, ns, or None while it is not known."""
 

@@ -47,7 +47,7 @@ class NoveltyCheck:
         )
 
     def is_far(self, counts: NDArray[np.float64]) -> bool:
-        """Whether counts (fingers, 24) fit the training covariance; the ranges do not matter."""
+        """Whether counts (fingers, 24) do not fit the training covariance; ranges do not matter."""
         return not self._square(counts, 0) <= self._square_max
 
     def _square(self, values: NDArray[np.float64], repaired: int) -> float:

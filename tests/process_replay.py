@@ -21,9 +21,8 @@ import msgspec
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.outbox import Reporter
+from daemon.publish.outbox import Outbox
 from drivers.base import JointReading, Reading
 from drivers.can.decoders import CanCounters, make_decoder
 from drivers.can.formats import CanFormat
@@ -33,6 +32,7 @@ from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import recorded_counts
 from models.contract import Finger
+from tests.daemon.record.recorded import IGNORED_FIELDS
 
 FOLDER: Final = Path(__file__).parent / "references"
 FINGERS: Final[tuple[Finger, ...]] = ("ff", "mf", "th")
@@ -98,14 +98,14 @@ def judged(readings: Iterator[Reading], *, joints: bool) -> list[Entry]:
     """What the default model says of readings, with the default gate; equal ones put together."""
     now_ns = START_NS
     pipeline = _pipeline(lambda: now_ns, joints=joints)
-    reporter = Reporter("right", FINGERS, "replay", "0" * 64, None)
+    outbox = Outbox("right", FINGERS, "replay", "0" * 64, [])
     found: list[Entry] = []
     for reading in readings:
         now_ns = reading.t_ns
         if isinstance(reading, JointReading):
             pipeline.turn(reading)
             continue
-        verdict, _ = reporter.verdict(pipeline.judge(reading), now_ns, PERIOD_NS)
+        verdict, _ = outbox.verdict(pipeline.judge(reading), now_ns, PERIOD_NS)
         fields = cast(Entry, msgspec.to_builtins(verdict))
         kept = {name: value for name, value in fields.items() if name not in LEFT_OUT}
         kept |= {"model": None, "model_sha": None}

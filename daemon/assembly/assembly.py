@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import itertools
 import json
-import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,10 +29,7 @@ from models.contract import ModelError
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.session.keeper import SessionKeeper
     from drivers.recordings.csv_columns import Columns
-
-log = logging.getLogger("graspd")
 
 DEFAULT_MODEL = "small-session"
 MCAP = ".mcap"
@@ -223,30 +219,6 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
         with _section("joints"):
             drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
     return drivers
-
-
-def build_keeper(
-    wanted: Scene, pipeline: Pipeline, tactile: Driver, stack: ExitStack
-) -> SessionKeeper | None:
-    """Who keeps the session; None if model or scene need none, or if there is no place for it."""
-    if pipeline.session is None or not wanted.keeps_session:
-        return None
-    from daemon.session.file import SessionFile, SessionFileError
-    from daemon.session.keeper import SessionKeeper
-
-    try:
-        file = SessionFile(wanted.session_path)
-    except SessionFileError as error:
-        log.warning("%s; every start begins a new session", error)
-        return None
-    stack.callback(file.close)
-    return SessionKeeper(
-        pipeline.session,
-        wanted.hand.fingers,
-        tactile,
-        file,
-        on_exchange=pipeline.sensors_exchanged,
-    )
 
 
 def open_driver(driver: Driver) -> None:

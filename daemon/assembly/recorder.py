@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import base64
-import json
-import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING
-
-import msgspec
 
 from daemon.assembly import assembly
 from daemon.judge.memory import encode, remember
 from daemon.judge.pipeline import Pipeline
+from daemon.record.header import Known, RecordingHeader
 from daemon.scene import Scene, SceneError
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.record.raw import Tap
     from daemon.record.recorder import Recorder
-
-log = logging.getLogger("graspd")
-
-IGNORED_FIELDS = frozenset(
-    {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}
-)
-"""Fields of a verdict that are of the run and not of the readings: a recording that is played again
-gives all others bit for bit."""
 
 
 def build_recorder(
@@ -41,7 +29,7 @@ def build_recorder(
     if wanted.record is None or directory is None:
         return None
     try:
-        from daemon.record.files import Shelf
+        from daemon.record.files import Retention
         from daemon.record.recorder import Recorder
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
@@ -52,7 +40,7 @@ def build_recorder(
             "graspd's source"
         ) from error
     options = wanted.record
-    shelf = Shelf(
+    retention = Retention(
         directory,
         wanted.hand.name,
         boot_id,
@@ -60,7 +48,7 @@ def build_recorder(
         keep_bytes=round(options.keep_mb * 1e6),
     )
     recorder = Recorder(
-        shelf,
+        retention,
         options,
         header_of(wanted, model, boot_id),
         make_raw=None if tap is None else tap.make_file,
@@ -72,8 +60,8 @@ def build_recorder(
     return recorder
 
 
-def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> dict[str, str]:
-    """What stands in front of every file: fingers, the scene's way to judge, model."""
+def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
+    """What every file says of the run: fingers, the scene's way to judge, model."""
     network = wanted.model.model_dump(mode="json", exclude_none=True)
     if wanted.model.path is not None:
         network["path"] = str(wanted.model.path.absolute())
@@ -86,29 +74,21 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> dict[str, str
         },
         "session": {"learn": wanted.session_learns, "required": wanted.session.required},
     }
-    return {
-        "fingers": json.dumps(wanted.hand.fingers),
-        "joints": json.dumps(assembly.joint_limits(wanted) is not None),
-        "boot_id": boot_id,
-        "scene": json.dumps(sections),
-        "model": model.contract.name,
-        "model_sha256": model.sha256,
-    }
+    return RecordingHeader(
+        fingers=wanted.hand.fingers,
+        joints=assembly.joint_limits(wanted) is not None,
+        boot_id=boot_id,
+        scene=sections,
+        model=model.contract.name,
+        model_sha256=model.sha256,
+    )
 
 
-def state_of(pipeline: Pipeline) -> Callable[[], dict[str, str]]:
+def state_of(pipeline: Pipeline) -> Callable[[], Known]:
     """What judge and session know, so that a file can be judged again without those before it.
 
-    Takes some 50 us, and what is given back puts it into words, which takes longer.
+    Takes some 50 us; what it returns encodes that, which takes longer.
     """
     judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
-    known = None if session is None else session.state()
-
-    def texts() -> dict[str, str]:
-        return {
-            "judge": base64.b64encode(encode(judge)).decode(),
-            "axis_ns": str(axis_ns),
-            "session": "" if known is None else msgspec.json.encode(known).decode(),
-        }
-
-    return texts
+    state = None if session is None else session.state()
+    return lambda: Known(judge=encode(judge), axis_ns=axis_ns, session=state)

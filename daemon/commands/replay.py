@@ -11,16 +11,17 @@ from typing import Any, Protocol
 
 from daemon import scene
 from daemon.assembly import assembly
+from daemon.assembly.parts import Assembly, Parts
 from daemon.commands.arguments import positive, within
 from daemon.judge.pipeline import Pipeline
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.process.text import complain
 from daemon.publish.binding import PublishError
+from daemon.publish.companion import Companion
 from daemon.publish.messages import Verdict
-from daemon.publish.outbox import Reporter
 from daemon.publish.sockets import Sockets
-from daemon.run.loop import Listener, Service
+from daemon.run.loop import Loop, Timing
 from daemon.run.printer import Printer
 from daemon.scene import Scene, SceneError
 from daemon.scene.endpoints import check_endpoint, is_private
@@ -127,34 +128,26 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         drivers = [recorded.build_driver(wanted, args.speed)]
     pipeline = _pipeline(args, wanted, model, recorded)
     printer = Printer(as_json=args.json, prompt=args.speed is not None)
-    listener: Listener = printer.verdict
+    told: list[Companion] = [printer]
     if pipeline.session is not None and args.session != OFF:
-        listener = _Comparison(wanted, printer).verdict
+        told.append(_Comparison(wanted, printer))
+    timing = Timing(
+        wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
+        sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
+    )
     with ExitStack() as stack:
-        sockets = None
-        if args.publish is not None:
-            sockets = stack.enter_context(Sockets(wanted))
-        for driver in drivers:
-            stack.callback(driver.close)
-            assembly.open_driver(driver)
+        around = Assembly(Parts(wanted, model, pipeline, drivers), stack)
+        sockets = None if args.publish is None else stack.enter_context(Sockets(wanted))
+        if sockets is not None:
+            around.add_sockets(sockets)
+        around.open_drivers()
         if sockets is not None and args.wait is not None:
             _wait(sockets, args.wait, stop)
-        service = Service(
-            drivers,
-            pipeline,
-            Reporter(
-                wanted.hand.name, wanted.hand.fingers, model.contract.name, model.sha256, sockets
-            ),
-            stop,
-            max_age_ns=wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
-            listener=listener,
-            sockets=sockets,
-            sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
-        )
-        try:
-            service.run()
-        finally:
-            printer.summary()
+        companions = [*around.companions, *told]
+        loop = Loop(drivers, pipeline, around.build_outbox(), stop, companions, timing)
+        stack.callback(printer.summary)
+        stack.callback(loop.close)
+        loop.run()
     return 0 if stop.received is None else 128 + stop.received
 
 
@@ -188,13 +181,13 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
 
         return Captures(args.recordings, args.scene)
     try:
-        from daemon.assembly.playback import Playback
+        from daemon.assembly.recordings import RecordedRun
     except ModuleNotFoundError as error:
         raise SceneError(
             f"MCAP files need the package '{error.name}': run pip install '.[record]' in the "
             "folder of graspd's source"
         ) from error
-    return Playback(args.recordings)
+    return RecordedRun(args.recordings)
 
 
 def _pipeline(
@@ -226,7 +219,7 @@ def _pipeline(
     return pipeline
 
 
-class _Comparison:
+class _Comparison(Companion):
     """Judges every reading once more without session calibration, for the summary alone."""
 
     def __init__(self, wanted: Scene, printer: Printer) -> None:
@@ -236,9 +229,8 @@ class _Comparison:
         self._pipeline = assembly.build_pipeline(every, model, learns=False)
         self._printer = printer
 
-    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        """Print the verdict and count what it would have been."""
-        self._printer.verdict(verdict, payload, reading)
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Count what a verdict would have been."""
         if reading is not None and verdict.judged:
             self._printer.without_session(self._pipeline.judge(reading), reading, verdict.grasp)
 

@@ -252,7 +252,7 @@ class Contact:
         return np.array([touch.threshold for touch in self.memory.touches])
 
     def forget(self) -> None:
-        """The sensors may be others, or have been away: all fingers must be tared anew."""
+        """Forget every tare: the sensors may be others, or have been off."""
         for finger in range(len(self.memory.tares)):
             self._forget(finger)
 

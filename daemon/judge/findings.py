@@ -44,6 +44,8 @@ class Felt(NamedTuple):
     """Number of the grasp at hand."""
     counts: NDArray[np.uint16] | None
     """Shape (fingers, 24): what is to be judged; None if nothing is, for now."""
+    judged: bool = True
+    """Whether this very reading is one to judge, sound or not."""
     in_contact: bool = True
     """Whether all required fingers touch."""
     settled: bool = True

@@ -137,7 +137,7 @@ class Gate:
         return changes
 
     def skip(self, t_ns: int) -> None:
-        """A reading came that cannot be used."""
+        """Take in the time of a reading that cannot be used, ns."""
         last_ns = self.memory.last_ns
         if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gap_ns:
             self.restart(t_ns)
@@ -238,7 +238,7 @@ class Gate:
         return ()
 
     def restart(self, t_ns: int) -> None:
-        """Nobody knows what happened meanwhile, or time went back."""
+        """Have the grasp settle anew: readings are missing, or time went back."""
         memory = self.memory
         if memory.last_ns is not None and t_ns < memory.last_ns:
             memory.released_ns = t_ns

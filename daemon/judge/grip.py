@@ -27,14 +27,14 @@ OUTAGE_NS = 1_000_000_000
 
 @dataclass(slots=True)
 class GripMemory:
-    """What the hand's parts do not remember themselves."""
+    """What its parts do not remember themselves."""
 
     last_ns: int | None = None
     """Time of the last usable reading."""
 
 
 class Grip:
-    """Feels one hand."""
+    """Follows contact, joints and gate of one hand, and says when a grasp is to be judged."""
 
     def __init__(self, fingers: Sequence[Finger], limits: GripLimits) -> None:
         """`fingers` are those of the readings, in their order."""
@@ -96,11 +96,11 @@ class Grip:
         return joints.is_lost(last_ns) or joints.some_lost
 
     def ask(self) -> None:
-        """The controller wants the grasp at hand judged."""
+        """Have the grasp at hand judged once it has settled."""
         self._gate.ask()
 
     def forget(self) -> None:
-        """The sensors are others, or may be: where they rest is not known, nor what they hold."""
+        """Forget tare and grasp: the sensors are others, or may be."""
         self._contact.forget()
         self._fresh.reset()
         self.interrupt()
@@ -162,12 +162,13 @@ class Grip:
         if self.memory.last_ns is not None:
             self._gate.judged(self.memory.last_ns, self._fresh.counts)
 
-    def felt(self, counts: NDArray[np.uint16] | None = None) -> Felt:
+    def felt(self, counts: NDArray[np.uint16] | None) -> Felt:
         """How the hand holds now; `counts` are what is to be judged of it, shape (fingers, 24)."""
         gate = self._gate
         return Felt(
             gate.grasp,
             counts,
+            counts is not None,
             gate.in_contact,
             gate.settled,
             gate.reasons,

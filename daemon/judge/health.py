@@ -73,7 +73,7 @@ class HealthMemory:
 
 
 class Health:
-    """Watches one reading after the other; remembers what has not changed and what jumps."""
+    """Follows every electrode from reading to reading: faults, rails, jumps, counts that repeat."""
 
     def __init__(self, fingers: int) -> None:
         self._shape = shape = (fingers, ELECTRODES)
@@ -91,7 +91,7 @@ class Health:
         self._sound = Watched((), nothing)
 
     def watch(self, reading: TactileReading) -> Watched:
-        """Whether this reading can be used, and what of it."""
+        """What is wrong with a reading and its electrodes, by it and by those before it."""
         counts = reading.counts
         if counts.shape != self._shape:
             return Watched((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))

@@ -31,7 +31,7 @@ class JointMemory:
     """When each set was heard of last."""
     waits_since_ns: int | None = None
     """Since when no joint was heard of."""
-    lost: set[str] = field(default_factory=set)
+    lost: list[str] = field(default_factory=list)
     """Joints that came once, and no longer."""
 
     def __post_init__(self) -> None:
@@ -90,7 +90,7 @@ class JointMotion:
     @property
     def some_lost(self) -> bool:
         """Whether judging goes on without a joint that came once."""
-        return bool(self.memory.lost.difference(*self.memory.past))
+        return bool(set(self.memory.lost).difference(*self.memory.past))
 
     def is_lost(self, t_ns: int) -> bool:
         """Whether judging goes on without any joints at `t_ns`."""
@@ -110,7 +110,7 @@ class JointMotion:
             del memory.past[names], memory.latest_ns[names]
             memory.waits_since_ns = min(latest_ns, t_ns)
             if len(memory.lost) < LOST_MAX:
-                memory.lost.update(names)
+                memory.lost += [name for name in names if name not in memory.lost]
 
     def _is_still(self, past: list[tuple[int, NDArray[np.float64]]]) -> bool:
         now_ns, now = past[-1]

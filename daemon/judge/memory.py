@@ -7,7 +7,7 @@ encoding is not.
 from __future__ import annotations
 
 import zlib
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any, Final
 
 import msgspec
@@ -19,22 +19,15 @@ from daemon.judge.pipeline import Pipeline
 MAX_BYTES: Final = 1 << 20
 """Before it is compressed; three fingers take 37 kB."""
 
-JudgeMemory = dict[str, dict[str, Any]]
-"""The memories of all parts of a judge, as `Pipeline.memories` has them."""
 
-
-def remember(pipeline: Pipeline) -> JudgeMemory:
-    """What it knows now, with all that was judged learnt, but for its session.
-
-    What changes later does not change this.
-    """
+def remember(pipeline: Pipeline) -> object:
+    """A copy of what it knows now, with all that was judged learnt, but for its session."""
     pipeline.learn()
-    copied: JudgeMemory = _copied(pipeline.memories())
-    return copied
+    return _copied(pipeline.memories())
 
 
-def encode(memory: JudgeMemory) -> bytes:
-    """As `recall` wants it; some 15 kB."""
+def encode(memory: object) -> bytes:
+    """What `remember` gave, as `recall` wants it; some 15 kB."""
     return zlib.compress(_packed(memory))
 
 
@@ -79,33 +72,28 @@ def _shape(value: object) -> object:
         return value.dtype, value.shape
     if is_dataclass(value):
         return [_shape(getattr(value, each.name)) for each in fields(value)]
-    if isinstance(value, list):
-        return [_shape(each) for each in value if is_dataclass(each)]
-    return None
+    return [_shape(each) for each in value if is_dataclass(each)] if isinstance(value, list) else 0
 
 
 def _copied(value: Any) -> Any:  # noqa: ANN401
     """Copied as far as a judge changes it: what lies deeper is replaced, never changed."""
-    if isinstance(value, np.ndarray | set):
+    if isinstance(value, np.ndarray):
         return value.copy()
     if isinstance(value, list):
         return [_copied(each) for each in value]
     if isinstance(value, dict):
         return {key: _copied(each) for key, each in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        copies = {f.name: _copied(getattr(value, f.name)) for f in fields(value) if f.init}
-        return type(value)(**copies)
-    return value
+    if not is_dataclass(value):
+        return value
+    copies = {each.name: _copied(getattr(value, each.name)) for each in fields(value) if each.init}
+    return replace(value, **copies)  # type: ignore[type-var]
 
 
 def _packed(memory: object) -> bytes:
-    return msgspec.msgpack.encode(memory, enc_hook=_flat, order="deterministic")
+    def flat(array: Any) -> tuple[str, tuple[int, ...], bytes]:  # noqa: ANN401
+        return array.dtype.str, array.shape, array.tobytes()
 
-
-def _flat(value: object) -> tuple[str, tuple[int, ...], bytes]:
-    if not isinstance(value, np.ndarray):
-        raise NotImplementedError(f"{type(value)} is no part of a memory")
-    return value.dtype.str, value.shape, value.tobytes()
+    return msgspec.msgpack.encode(memory, enc_hook=flat)
 
 
 def _array(_kind: type, flat: Any) -> NDArray[Any]:  # noqa: ANN401 (whatever stands there)

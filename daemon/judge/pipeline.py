@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -50,6 +50,9 @@ class Judgement:
     """Fingers that touch; None where nobody looks."""
     changes: tuple[GateChange, ...] = ()
     """What the gate did at this reading, oldest first."""
+    judged_counts: NDArray[np.uint16] | None = field(default=None, compare=False, repr=False)
+    """Shape (fingers, 24): what the network judged, before any repair; None if it did not judge
+    this very reading, or if electrodes of it are broken."""
 
 
 @dataclass(slots=True, eq=False)
@@ -104,11 +107,11 @@ class Pipeline:
         self._to_learn: NDArray[np.generic] | None = None
         self._latest: TactileReading | None = None
         self.on_exchange: Callable[[], None] | None = None
-        """Done when the sensors were exchanged."""
+        """Called when the sensors were exchanged."""
 
     @property
     def session(self) -> SessionCalibration | None:
-        """With all that was judged; None for a model that needs none."""
+        """What is known of today's sensors, up to the grasp judged last; None if no model asks."""
         self.learn()
         return self._session
 
@@ -124,12 +127,12 @@ class Pipeline:
         return self.grip is not None and self.grip.on_request
 
     def ask(self) -> None:
-        """The controller wants to know."""
+        """Judge the grasp at hand once it has settled: the controller waits for the verdict."""
         if self.grip is not None:
             self.grip.ask()
 
     def sensors_exchanged(self) -> None:
-        """What is known of the sensors, and of what they hold, no longer counts."""
+        """Forget session, tare and grasp: the sensors are others."""
         self.memory.opinion = NO_OPINION
         self._to_learn = None
         if self._session is not None:
@@ -142,8 +145,7 @@ class Pipeline:
     def restart(self) -> None:
         """What was said of the grasp at hand no longer counts: another model or gate goes on."""
         self.memory.opinion, self.memory.learnt_grasp = NO_OPINION, 0
-        if self.grip is not None:
-            self.grip.interrupt()
+        self.skip()
 
     def memories(self) -> dict[str, dict[str, Any]]:
         """What every part remembers between two readings, all that its next finding depends on.
@@ -154,6 +156,11 @@ class Pipeline:
         judge = {"judge": {"judge": self.memory, "health": self._health.memory}}
         return judge if self.grip is None else judge | self.grip.memories()
 
+    def skip(self) -> None:
+        """Readings were left out before the next one: nobody knows what moved meanwhile."""
+        if self.grip is not None:
+            self.grip.interrupt()
+
     def turn(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self.grip is not None:
@@ -163,7 +170,7 @@ class Pipeline:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
         self.learn()
         self._latest = reading
-        memory, grasp = self.memory, None
+        memory, grasp, counts = self.memory, None, None
         memory.readings += 1
         watched = self._health.watch(reading)
         felt = self._feel(reading, watched)
@@ -172,18 +179,21 @@ class Pipeline:
             examined = self._plausibility.examine(felt.counts, watched.broken, session)
             memory.opinion = self._network.judge(examined, session)
             grasp = examined.grasp
+            counts = None if np.count_nonzero(watched.broken) else felt.counts
         elif felt.gate is not GateState.JUDGED:
             memory.opinion = NO_OPINION
-        judged = felt.counts is not None or felt.gate is None
-        judgement = self._decide(reading.t_ns, watched.reasons, felt, memory.opinion, judged=judged)
+        judgement = self._decide(reading.t_ns, watched.reasons, felt, memory.opinion, counts)
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
             self._note(grasp, judgement.grasp)
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
-        felt = Felt(self.memory.readings, None) if self.grip is None else self.grip.felt()
-        return self._decide(last_t_ns, (Reason.STALE,), felt, NO_OPINION, judged=False)
+        if self.grip is None:
+            felt = Felt(self.memory.readings, None, judged=False)
+        else:
+            felt = self.grip.felt(None)
+        return self._decide(last_t_ns, (Reason.STALE,), felt, NO_OPINION)
 
     def health(self) -> dict[str, Reason]:
         """What is not well now: electrodes such as `ff_7`, fingers, joints, model, session."""
@@ -215,7 +225,7 @@ class Pipeline:
             self._session.observe(counts)
 
     def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
-        """Remember to learn a grasp, as it was before the lift and not as it changed since."""
+        """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
         if self._session is not None and grasp != self.memory.learnt_grasp:
             self.memory.learnt_grasp = grasp
             self._to_learn = counts
@@ -238,8 +248,7 @@ class Pipeline:
         against: tuple[Reason, ...],
         felt: Felt,
         opinion: Opinion,
-        *,
-        judged: bool,
+        counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
         health = (*against, *opinion.reasons)
         calibrated = None if self._session is None else self._session.calibrated
@@ -261,12 +270,13 @@ class Pipeline:
             outcome=outcome,
             p_slip=None if outcome is Outcome.UNKNOWN else opinion.p_slip,
             reasons=tuple(dict.fromkeys(reasons)),
-            judged=judged,
+            judged=felt.judged,
             repaired=opinion.repaired,
             session_calibrated=calibrated,
             gate=felt.gate,
             contact=felt.touching,
             changes=felt.changes,
+            judged_counts=counts,
         )
 
     def _age_ns(self, t_ns: int) -> int:

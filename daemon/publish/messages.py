@@ -185,6 +185,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     """Readings since start whose verdict came more than a period after their last byte."""
     worst_age_ms: Duration = 0.0
     """Longest time since start from a reading's last byte to its verdict, ms."""
+    skipped_readings: Count = 0
+    """Readings since start that were not judged because newer ones were there already."""
+    overloaded: bool = False
+    """Whether readings come faster than they are judged, or did within the last five seconds."""
     model: str
     model_sha: str
     versions: dict[str, str]

@@ -38,7 +38,7 @@ every reading is one."""
 
 
 class Output(Protocol):
-    """Takes finished messages; a `Publisher` is one."""
+    """Takes finished messages: sockets, a recorder."""
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Pass one message on, without blocking."""
@@ -47,7 +47,7 @@ class Output(Protocol):
         """Whether anybody gets what is sent on a topic."""
 
 
-class Reporter:
+class Outbox:
     """Makes the verdict and status messages of one run of the daemon."""
 
     def __init__(
@@ -56,15 +56,16 @@ class Reporter:
         fingers: Sequence[Finger],
         model: str,
         model_sha256: str,
-        output: Output | None,
+        outputs: Sequence[Output],
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], float] = time.time,
         *,
         boot_id: str | None = None,
     ) -> None:
-        """`hand` is its name; `clock` gives monotonic ns, `wall_clock` seconds since 1970.
+        """`hand` is its name; each output gets every message, readings only if it wants them.
 
-        `boot_id` is a new one unless given.
+        `clock` gives monotonic ns, `wall_clock` seconds since 1970. `boot_id` is a new one unless
+        given.
         """
         self.latency = LatencyHistogram()
         self.outcomes: Counter[Outcome] = Counter()
@@ -77,7 +78,7 @@ class Reporter:
         self._status_topic = f"status.{hand}".encode()
         self._model = model
         self._model_sha = model_sha256[:SHA_DIGITS]
-        self._output = output
+        self._outputs = tuple(outputs)
         self._clock = clock
         self._wall_clock = wall_clock
         self._boot_id = uuid.uuid4().hex if boot_id is None else boot_id
@@ -130,8 +131,7 @@ class Reporter:
             model_sha=self._model_sha,
         )
         payload = encode(message)
-        if self._output is not None:
-            self._output.send(self._verdict_topic, payload)
+        self._send(self._verdict_topic, payload)
         self._verdict_seq += 1
         self.latency.add(latency_us)
         self.outcomes[judgement.outcome] += 1
@@ -140,6 +140,10 @@ class Reporter:
         if judgement.judged:
             self._remember(judgement.grasp)
         return message, payload
+
+    def _send(self, topic: bytes, payload: bytes) -> None:
+        for output in self._outputs:
+            output.send(topic, payload)
 
     def _remember(self, grasp: int) -> None:
         self._judged[grasp] = None
@@ -168,13 +172,13 @@ class Reporter:
             object=object_name,
         )
         self._outcome_seq += 1
-        if self._output is not None:
-            self._output.send(self._outcome_topic, encode(message))
+        self._send(self._outcome_topic, encode(message))
         return None
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
         """Send one reading, with the newest joint angles, if somebody wants it."""
-        if self._output is None or not self._output.wanted(self._tactile_topic):
+        wanting = [output for output in self._outputs if output.wanted(self._tactile_topic)]
+        if not wanting:
             return
         message = Tactile(
             boot_id=self._boot_id,
@@ -187,7 +191,9 @@ class Reporter:
             joints={} if joints is None else _angles(joints),
         )
         self._tactile_seq += 1
-        self._output.send(self._tactile_topic, encode(message))
+        payload = encode(message)
+        for output in wanting:
+            output.send(self._tactile_topic, payload)
 
     def _gate_change(self, t_ns: int, change: GateChange) -> None:
         message = GateMessage(
@@ -201,8 +207,7 @@ class Reporter:
             cause=change.cause,
         )
         self._gate_seq += 1
-        if self._output is not None:
-            self._output.send(self._gate_topic, encode(message))
+        self._send(self._gate_topic, encode(message))
 
     def status(
         self,
@@ -211,6 +216,9 @@ class Reporter:
         drivers: dict[str, dict[str, int]],
         pipeline: Pipeline,
         deadlines: Deadlines,
+        *,
+        skipped_readings: int = 0,
+        overloaded: bool = False,
     ) -> Status:
         """Send one status message."""
         session, grip = pipeline.session, pipeline.grip
@@ -237,13 +245,14 @@ class Reporter:
             jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
             late_readings=deadlines.late,
             worst_age_ms=deadlines.worst_age_ms,
+            skipped_readings=skipped_readings,
+            overloaded=overloaded,
             model=self._model,
             model_sha=self._model_sha,
             versions=self._versions,
         )
         self._status_seq += 1
-        if self._output is not None:
-            self._output.send(self._status_topic, encode(message))
+        self._send(self._status_topic, encode(message))
         return message
 
 

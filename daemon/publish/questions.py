@@ -59,7 +59,6 @@ class Questions(Bound):
         self.counters: Counter[str] = Counter()
         """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken and
         `outcomes_refused`."""
-        self.on_outcome: TakeOutcome | None = None
         self._patience_ns = patience_ns
         self._waiting: deque[_Question] = deque()
         self._frames: list[bytes] = []
@@ -87,8 +86,8 @@ class Questions(Bound):
         """When the oldest question must be answered, monotonic ns."""
         return self._waiting[0].due_ns if self._waiting else None
 
-    def take(self, now_ns: int) -> int:
-        """Take in what has come; how many questions it was."""
+    def take(self, now_ns: int, outcome: TakeOutcome | None = None) -> int:
+        """Take in what has come; how many questions it was. Outcomes go to `outcome`."""
         taken = 0
         if not self.is_open:
             return taken
@@ -99,16 +98,16 @@ class Questions(Bound):
             if len(self._frames) <= FRAMES_MAX:
                 self._frames.append(frame)
             if not self.socket.get(zmq.RCVMORE):
-                taken += self._take_message(now_ns)
+                taken += self._take_message(now_ns, outcome)
                 self._frames.clear()
         self.counters["asked"] += taken
         return taken
 
-    def _take_message(self, now_ns: int) -> bool:
+    def _take_message(self, now_ns: int, outcome: TakeOutcome | None) -> bool:
         *envelope, question = self._frames
         well = len(self._frames) <= FRAMES_MAX and envelope[1:] in ([], [b""])
         if well and question.partition(b" ")[0] == TELLING:
-            self._tell(envelope, question)
+            self._tell(envelope, question, outcome)
             return False
         if question != QUESTION or not well:
             self.counters["malformed"] += 1
@@ -119,17 +118,19 @@ class Questions(Bound):
         self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
         return True
 
-    def _tell(self, envelope: list[bytes], question: bytes) -> None:
+    def _tell(
+        self, envelope: list[bytes], question: bytes, take_outcome: TakeOutcome | None
+    ) -> None:
         """Pass on how a lift ended, and say at once whether that was of use."""
         told = _TOLD.fullmatch(question)
         if told is None:
             why: str | None = MALFORMED
-        elif self.on_outcome is None:
+        elif take_outcome is None:
             why = NOBODY
         else:
             outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
             named = None if told[4] is None else told[4].decode()
-            why = self.on_outcome(told[1].decode(), int(told[2]), outcome, named)
+            why = take_outcome(told[1].decode(), int(told[2]), outcome, named)
         refused = "malformed" if why == MALFORMED else "outcomes_refused"
         self.counters["outcomes" if why is None else refused] += 1
         said = {"v": 1, "ok": True} if why is None else {"v": 1, "ok": False, "why": why}

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import logging
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 import zmq
 
 from daemon.publish.binding import Binding, PublishError
+from daemon.publish.companion import Companion, Requests
+from daemon.publish.messages import Status, Verdict
 from daemon.publish.publisher import VERDICT, Publisher
 from daemon.scene import Curve, Scene, SceneError
+from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Gatekeeper
@@ -21,12 +26,16 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 
-class Sockets:
+class Sockets(Companion):
     """Open from the start until `close`."""
 
-    def __init__(self, wanted: Scene) -> None:
-        """Raises `PublishError`, and `SceneError` for keys that are wrong."""
+    def __init__(self, wanted: Scene, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        """`clock` gives monotonic ns.
+
+        Raises `PublishError`, and `SceneError` for keys that are wrong.
+        """
         self.plan = plan(wanted)
+        self._clock = clock
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
         self._curve = wanted.curve
         self._keys_seen: object = None
@@ -94,19 +103,39 @@ class Sockets:
         return self.publisher.wanted(topic)
 
     def filenos(self) -> list[int]:
-        """Become readable when a peer may want something; call `take` before waiting for them."""
+        """Become readable when a peer may want something, as long as `before_wait` is called."""
         asked = [each for each in (self.publisher, self.questions) if each is not None]
         found = [each.fileno() for each in asked if each.is_open]
         return found if self.gatekeeper is None else found + self.gatekeeper.filenos()
 
+    def before_wait(self, requests: Requests) -> None:
+        """See to peers that come; pass on what they ask and tell."""
+        self.take()
+        if self.questions is not None and self.questions.take(self._clock(), requests.outcome):
+            requests.ask()
+
     def take(self) -> None:
-        """See to peers that come; questions are taken by themselves."""
+        """See to peers that come; questions are taken by `before_wait`."""
         if self.publisher.is_open:
             self.publisher.take()
         if self.gatekeeper is not None:
             self.gatekeeper.take()
 
-    def counters(self) -> dict[str, dict[str, int]]:
+    def on_answer(self, payload: bytes) -> None:
+        """Answer all who have asked."""
+        if self.questions is not None:
+            self.questions.answer(payload)
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Answer those who have waited too long for a better answer."""
+        if self.questions is not None:
+            self.questions.answer(payload, self._clock())
+
+    def on_status(self, status: Status) -> None:
+        """Take the list of those who may connect, if it has changed."""
+        self.mind_keys()
+
+    def counters_by_part(self) -> dict[str, dict[str, int]]:
         """What peers did, by the part that counted it."""
         parts = {"publish": self.publisher, "ask": self.questions, "keys": self.gatekeeper}
         return {name: dict(part.counters) for name, part in parts.items() if part is not None}

@@ -1,35 +1,38 @@
-"""Recordings of the daemon: MCAP files, read from front to end, as far as they were written.
+"""MCAP files of the daemon: written chunk by chunk, read as far as they were written.
 
-A file of `graspd run` that was cut off has no summary at its end, so none is looked for. Needs the
-package `mcap` (extra `record`).
+A file that was cut off has no summary at its end, so the reader looks for none. Needs the package
+`mcap` (extra `record`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
+import msgspec
 import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import Writer
 
-from drivers.base import FINGERS, RecordingError
+from daemon.record.files import create
+from daemon.record.header import RecordingHeader
+from daemon.record.topics import Topic
+from drivers.base import RecordingError
 from drivers.recordings.csv_rows import open_recording
 
-METADATA = "graspd"
+METADATA: Final = "graspd"
 """Name of the metadata record that every file of graspd begins with."""
-ASKED: Final = "asked"
-"""Kind of the message that the controller has asked for a judgement."""
-EXCHANGED: Final = "exchanged"
-"""Kind of the message that a sensor is another one than before."""
-EVENTS: Final = frozenset({ASKED, EXCHANGED})
-"""Kinds of messages without content of their own, that matter to what is judged."""
-RECORD_MAX_BYTES = 64 << 20
+RECORD_MAX_BYTES: Final = 64 << 20
 """graspd's chunks have a megabyte; what says to be far longer is damaged."""
 
 _DAMAGE = (
@@ -40,19 +43,76 @@ _DAMAGE = (
 length that nothing has."""
 
 
-@dataclass(frozen=True, slots=True)
-class RecordingHeader:
-    """What a file says about the daemon that wrote it."""
+@cache
+def schemas() -> dict[str, tuple[str, bytes]]:
+    """Name and JSON Schema, an object at the top, of each topic that is no event."""
+    messages = {topic: topic.message for topic in Topic if topic.message is not None}
+    definitions = msgspec.json.schema_components(messages.values())[1]
+    found = {}
+    for topic, message in messages.items():
+        whole: dict[str, Any] = {**definitions[message.__name__], "$defs": definitions}
+        found[topic.value] = f"graspd.{message.__name__}", json.dumps(whole).encode()
+    return found
 
-    fingers: tuple[str, ...]
-    """Rows of a reading."""
-    joints: bool
-    """Whether the hand had joint angles."""
-    boot_id: str
-    wall_minus_monotonic_ns: int
-    """Log times are wall time; less this they are the daemon's monotonic time, ns."""
-    texts: Mapping[str, str]
-    """All that it says, as it stands there."""
+
+class McapWriter:
+    """One file being written. All methods raise `OSError` when there is no room."""
+
+    def __init__(self, path: Path, header: RecordingHeader) -> None:
+        """Make the file, which must not be there yet; `header` stands in front."""
+        self._path = path
+        self._stream = create(path)
+        self._offset_ns = header.wall_minus_monotonic_ns
+        self._writer = Writer(self._stream)
+        self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
+        """Number of each topic's channel, and the numbers of its messages."""
+        try:
+            self._writer.start(profile="", library="graspd")
+            self._writer.add_metadata(METADATA, header.texts())
+            self.flush()
+        except OSError:
+            self.remove()
+            raise
+
+    def write(self, topic: bytes, payload: bytes, at_ns: int) -> None:
+        """Take one message of monotonic time `at_ns`, ns."""
+        if topic not in self._channels:
+            self._channels[topic] = self._register(topic.decode()), count()
+        channel, numbers = self._channels[topic]
+        log_ns = max(at_ns + self._offset_ns, 0)
+        self._writer.add_message(channel, log_ns, payload, log_ns, next(numbers))
+
+    def _register(self, topic: str) -> int:
+        described = schemas().get(topic.partition(".")[0])
+        schema = 0
+        if described is not None:
+            schema = self._writer.register_schema(described[0], "jsonschema", described[1])
+        return self._writer.register_channel(topic, "json", schema)
+
+    def flush(self) -> int:
+        """End the chunk at hand, and have the disk keep it; the file's size then, bytes."""
+        self._writer.flush()
+        os.fdatasync(self._stream.fileno())
+        return self._stream.tell()
+
+    def close(self) -> None:
+        """Write the summary and close."""
+        try:
+            self._writer.finish()
+            self.flush()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close as it is."""
+        with contextlib.suppress(OSError):  # what is buffered finds no room either
+            self._stream.close()
+
+    def remove(self) -> None:
+        """Close, and remove the file: there is nothing in it."""
+        self.abandon()
+        with contextlib.suppress(OSError):
+            self._path.unlink()
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,13 +120,13 @@ class RecordedMessage:
     """One message of a file."""
 
     kind: str
-    """First part of the topic, such as `tactile`."""
+    """First part of the topic's name: a `Topic`, or one of another version."""
     at_ns: int
     """The daemon's monotonic time when it was recorded, ns."""
     payload: bytes
 
 
-class McapRecording:
+class McapReader:
     """One file: iterate once, then `cut_off` says whether it ends as it should.
 
     The constructor raises `RecordingError` for a file that is none of graspd's. What is damaged
@@ -80,14 +140,14 @@ class McapRecording:
         """After iterating: whether the file has no end, or is damaged."""
         reader = StreamReader(stream, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES)
         self._records = reader.records
-        self._topics: dict[int, str] = {}
+        self._kinds: dict[int, str] = {}
         self.header = self._read_header()
 
     def _read_header(self) -> RecordingHeader:
         try:
             for record in self._records:
                 if isinstance(record, Metadata) and record.name == METADATA:
-                    return _header(record.metadata)
+                    return RecordingHeader.of(record.metadata)
                 if isinstance(record, Channel | Message):
                     break
         except EndOfFile as error:
@@ -103,9 +163,9 @@ class McapRecording:
         try:
             for record in self._records:
                 if isinstance(record, Channel):
-                    self._topics[record.id] = record.topic.partition(".")[0]
+                    self._kinds[record.id] = record.topic.partition(".")[0]
                 elif isinstance(record, Message):
-                    kind = self._topics.get(record.channel_id, "")
+                    kind = self._kinds.get(record.channel_id, "")
                     yield RecordedMessage(kind, record.log_time - offset_ns, record.data)
         except _DAMAGE:
             self.cut_off = True
@@ -114,17 +174,4 @@ class McapRecording:
 def header_of(path: Path) -> RecordingHeader:
     """What a file says about itself. Raises `RecordingError`."""
     with open_recording(path) as stream:
-        return McapRecording(path, stream).header
-
-
-def _header(texts: Mapping[str, str]) -> RecordingHeader:
-    fingers = tuple(json.loads(texts["fingers"]))
-    if not fingers or not set(fingers) <= set(FINGERS):
-        raise ValueError(f"no fingers of a hand: {fingers}")
-    return RecordingHeader(
-        fingers=fingers,
-        joints=texts["joints"] == "true",
-        boot_id=texts["boot_id"],
-        wall_minus_monotonic_ns=int(texts["wall_minus_monotonic_ns"]),
-        texts=dict(texts),
-    )
+        return McapReader(path, stream).header

@@ -8,45 +8,13 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
-import numpy as np
-
-from daemon.record.mcap import EVENTS, McapRecording, RecordedMessage, header_of
-from drivers.base import (
-    ELECTRODES,
-    DriverCounters,
-    JointReading,
-    Reading,
-    RecordingError,
-    TactileReading,
-)
+from daemon.record.mcap import McapReader, RecordedMessage, header_of
+from daemon.record.topics import EVENTS, Topic, joint_reading, tactile_reading
+from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import TimedDriver
 
 _log = logging.getLogger(__name__)
-
-
-class _Tactile(msgspec.Struct, frozen=True):
-    """What is needed of a message on `tactile.<hand>`."""
-
-    seq: int
-    t_mono_ns: int
-    fingers: tuple[str, ...]
-    counts: list[list[int]]
-    faults: list[list[int]]
-
-
-class _Joints(msgspec.Struct, frozen=True):
-    """What is needed of a recorded joint reading."""
-
-    seq: int
-    t_mono_ns: int
-    names: tuple[str, ...]
-    position_rad: list[float | None]
-
-
-_tactile_decoder = msgspec.json.Decoder(_Tactile)
-_joints_decoder = msgspec.json.Decoder(_Joints)
 
 
 @dataclass(slots=True)
@@ -61,16 +29,7 @@ class McapCounters(DriverCounters):
     """Files that end without an end, as those of a daemon that was killed do."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Due:
-    """A reading, and what was told between the one before it and this one."""
-
-    reading: Reading
-    told: tuple[str, ...] = ()
-    """Kinds of `EVENTS`, in their order."""
-
-
-class McapReplayDriver(TimedDriver[_Due]):
+class McapReplayDriver(TimedDriver[Reading | Topic]):
     """Plays MCAP files of graspd, one reading per call of `read_ready` at most.
 
     `recorded_ns` of a reading is its `t_ns` when it was recorded, counted from `axis_ns`; `t_ns`
@@ -91,8 +50,8 @@ class McapReplayDriver(TimedDriver[_Due]):
         super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
-        self.on_told: Mapping[str, Callable[[], None]] = {}
-        """What is done, by kind of `EVENTS`, where one stands."""
+        self.on_event: Mapping[Topic, Callable[[], None]] = {}
+        """What to call where one of `EVENTS` stands; nothing for those that are not in it."""
         self._reset()
 
     def _reset(self) -> None:
@@ -114,15 +73,16 @@ class McapReplayDriver(TimedDriver[_Due]):
         taken = self._take_due()
         if taken is None:
             return ()
-        at_ns, due, late_ns = taken
+        at_ns, item, late_ns = taken
+        if isinstance(item, Topic):
+            if item in self.on_event:
+                self.on_event[item]()
+            return ()
         if self._speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
-        for kind in due.told:
-            if kind in self.on_told:
-                self.on_told[kind]()
-        if isinstance(due.reading, TactileReading):
-            self._count(due.reading)
-        return [self._hand_over(due.reading, at_ns, self._axis_ns)]
+        if isinstance(item, TactileReading):
+            self._count(item)
+        return [self._hand_over(item, at_ns, self._axis_ns)]
 
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
@@ -133,50 +93,26 @@ class McapReplayDriver(TimedDriver[_Due]):
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 
-    def _play(self) -> Generator[tuple[int, _Due], None, None]:
-        told: tuple[str, ...] = ()
+    def _play(self) -> Generator[tuple[int, Reading | Topic], None, None]:
         for path in self._paths:
             with open_recording(path) as stream:
-                recording = McapRecording(path, stream)
+                recording = McapReader(path, stream)
                 for message in recording:
-                    if message.kind in EVENTS and message.kind not in told:
-                        told = (*told, message.kind)
-                    reading = self._reading(message)
-                    if reading is not None:
-                        yield message.at_ns, _Due(reading, told)
-                        told = ()
+                    item = self._item(message)
+                    if item is not None:
+                        yield message.at_ns, item
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
-    def _reading(self, message: RecordedMessage) -> Reading | None:
-        """The reading in a message; None for one of another kind, or that has none."""
+    def _item(self, message: RecordedMessage) -> Reading | Topic | None:
+        """The reading or event that a message tells of; None if it tells of neither."""
         try:
-            if message.kind == "tactile":
+            if message.kind == Topic.TACTILE:
                 return tactile_reading(message.payload, self._fingers)
-            if message.kind == "joints":
-                return _joints(_joints_decoder.decode(message.payload))
-        except (msgspec.DecodeError, ValueError, OverflowError):
+            if message.kind == Topic.JOINTS:
+                return joint_reading(message.payload)
+        except (ValueError, OverflowError):
             self.counters.malformed += 1
-        return None
-
-
-def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
-    """The reading in a `tactile` message, with these fingers, in their order.
-
-    Raises `msgspec.DecodeError`, `ValueError` or `OverflowError` for what is none.
-    """
-    message = _tactile_decoder.decode(payload)
-    rows = [message.fingers.index(finger) for finger in fingers]
-    shape = (len(message.fingers), ELECTRODES)
-    counts = np.array(message.counts, dtype=np.uint16).reshape(shape)
-    faults = np.array(message.faults, dtype=np.uint8).reshape(shape)
-    return TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
-
-
-def _joints(message: _Joints) -> JointReading:
-    """Raises `ValueError` for angles without names."""
-    if len(message.names) != len(message.position_rad):
-        raise ValueError("as many names as angles are needed")
-    angles = np.array(message.position_rad, dtype=np.float64)  # None becomes NaN
-    return JointReading(message.t_mono_ns, message.seq, message.names, angles)
+            return None
+        return Topic(message.kind) if message.kind in EVENTS else None

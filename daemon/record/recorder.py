@@ -13,21 +13,24 @@ import sys
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 import msgspec
 
-from daemon.publish.sockets import Sockets
-from daemon.record.files import Joints, MessageFile, Shelf
-from daemon.record.mcap import ASKED, EXCHANGED
+from daemon.publish.companion import Companion
+from daemon.record.files import Retention
+from daemon.record.header import Known, RecordingHeader
+from daemon.record.mcap import McapWriter
+from daemon.record.topics import EVENT, Joints, Judged, Topic
 from daemon.scene import Record
-from drivers.base import JointReading
 
 if TYPE_CHECKING:
-    from daemon.publish.questions import Questions
+    from daemon.judge.pipeline import Judgement
+    from drivers.base import JointReading
 
 log = logging.getLogger("graspd")
 
@@ -66,26 +69,27 @@ class RawFile(Protocol):
 MakeRaw = Callable[[Path], RawFile]
 """Makes a raw file by its name without ending."""
 
-Texts = Callable[[], Mapping[str, str]]
-"""Puts into words, in the thread, what was known when it was taken."""
+MakeKnown = Callable[[], Known]
+"""Makes, in the thread, what was known when it was taken."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
     """Stands in the queue between what belongs into one file and into the next."""
 
-    texts: Texts
+    known: MakeKnown
 
 
 _Entry = tuple[int, bytes, object]
-"""When, monotonic ns; topic, none for what came over a link; content."""
+"""When, monotonic ns; topic; payload, or what makes the message of it in the thread. Of what came
+over a link the topic is empty."""
 
 
 @dataclass(slots=True, eq=False)
 class _Open:
     """Files that are being written, and since when."""
 
-    messages: MessageFile
+    messages: McapWriter
     raw: RawFile | None
     offset_ns: int
     since_ns: int
@@ -95,17 +99,17 @@ class _Open:
     """Entries taken for these files that the disk may not have."""
 
 
-class Recorder:
-    """Records one run of the daemon. `send`, `joints` and `raw` never block and never raise."""
+class Recorder(Companion):
+    """Records one run of the daemon. `send`, `raw` and the hooks never block and never raise."""
 
     def __init__(
         self,
-        shelf: Shelf,
+        retention: Retention,
         options: Record,
-        header: Mapping[str, str],
+        header: RecordingHeader,
         *,
         make_raw: MakeRaw | None = None,
-        take_state: Callable[[], Texts] | None = None,
+        take_state: Callable[[], MakeKnown] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -114,20 +118,17 @@ class Recorder:
         So does what `take_state` gives. It is called in the loop, here and then where a file is to
         end: after a status, when no reading is on its way to a verdict.
         """
-        self._shelf = shelf
+        self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
-        self._header = dict(header)
+        self._header = header
         self._make_raw = make_raw
         self._take_state = take_state
         self._clock = clock
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
-        self._joints_topic = f"joints.{shelf.hand}".encode()
-        self._asked_topic = f"{ASKED}.{shelf.hand}".encode()
-        self._exchanged_topic = f"{EXCHANGED}.{shelf.hand}".encode()
-        self._status_topic = f"status.{shelf.hand}".encode()
+        self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
         self._encoder = msgspec.json.Encoder()
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
@@ -149,21 +150,35 @@ class Recorder:
     def send(self, topic: bytes, payload: bytes) -> None:
         """Record one message."""
         self._put(topic, payload)
-        if self._wants_turn and self._take_state is not None and topic == self._status_topic:
+        if self._wants_turn and self._take_state is not None and topic == self._names[Topic.STATUS]:
             self._wants_turn = False
             self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
-    def joints(self, reading: JointReading) -> None:
-        """Record joint angles."""
-        self._put(self._joints_topic, reading)
+    def wanted(self, topic: bytes) -> bool:
+        """Always: what nobody subscribes to is recorded all the same."""
+        return True
 
-    def asked(self) -> None:
+    def on_joints(self, reading: JointReading) -> None:
+        """Record joint angles."""
+        self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
+
+    def on_judged(self, judgement: Judgement) -> None:
+        """Record what a grasp was judged by, if it was judged by this judgement."""
+        if judgement.judged_counts is not None:
+            making = partial(Judged.of, self._header.boot_id, judgement)
+            self._put(self._names[Topic.JUDGED], making)
+
+    def on_asked(self) -> None:
         """Record that the controller asks for a judgement."""
-        self._put(self._asked_topic, b"{}")
+        self._put(self._names[Topic.ASKED], EVENT)
 
     def exchanged(self) -> None:
         """Record that a sensor is another one than before."""
-        self._put(self._exchanged_topic, b"{}")
+        self._put(self._names[Topic.EXCHANGED], EVENT)
+
+    def on_skipped(self) -> None:
+        """Record that readings were left out before the next one."""
+        self._put(self._names[Topic.SKIPPED], EVENT)
 
     def raw(self, entry: object, at_ns: int) -> None:
         """Record what came over the link at monotonic `at_ns`, ns, in the form of the raw file."""
@@ -181,6 +196,10 @@ class Recorder:
         """
         writing = self._open is not None
         return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
+
+    def counters_by_part(self) -> dict[str, dict[str, int]]:
+        """The same, as part of the status."""
+        return {"record": self.counters()}
 
     def close(self) -> None:
         """Write what waits and end the files; leave a disk that does not answer alone."""
@@ -228,7 +247,7 @@ class Recorder:
         """Go on in new files, now or where the loop says what is known there."""
         if self._take_state is None:
             self._finish()
-            self._begin(now_ns, {})
+            self._begin(now_ns, Known())
         elif not self._awaits_turn:
             self._awaits_turn = self._wants_turn = True
 
@@ -237,17 +256,19 @@ class Recorder:
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
-            self._begin(now_ns, turn.texts())
+            self._begin(now_ns, turn.known())
 
-    def _begin(self, now_ns: int, state: Mapping[str, str]) -> None:
+    def _begin(self, now_ns: int, known: Known) -> None:
         """Begin new files, if the disk lets us."""
         offset_ns = self._wall_clock() - now_ns
         try:
-            self._counted["removed"] += self._shelf.make_room(self._rotate_bytes)
-            name = self._shelf.name(self._number)
+            self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
+            name = self._retention.name(self._number)
             path = name.with_name(f"{name.name}.mcap")
-            header = {**self._header, **state, "file": str(self._number)}
-            messages = MessageFile(path, header, offset_ns)
+            header = replace(
+                self._header, file=self._number, known=known, wall_minus_monotonic_ns=offset_ns
+            )
+            messages = McapWriter(path, header)
             raw = None
             try:
                 raw = None if self._make_raw is None else self._make_raw(name)
@@ -272,8 +293,8 @@ class Recorder:
         files.unflushed += len(entries)  # all of them, wherever among them the disk fails
         try:
             for at_ns, topic, content in entries:
-                if isinstance(content, JointReading):
-                    content = self._encoder.encode(Joints.of(content))
+                if callable(content):
+                    content = self._encoder.encode(content())
                 if topic and isinstance(content, bytes):
                     files.messages.write(topic, content, at_ns)
                 elif files.raw is not None:
@@ -322,39 +343,5 @@ class Recorder:
         first = self._retry_due_ns is None
         self._retry_due_ns = self._clock() + RETRY_NS
         say = log.warning if first else log.debug
-        say("record: %s: %s; nothing is recorded", self._shelf.directory, error.strerror or error)
-
-
-class Recorded:
-    """The sockets, with everything that is sent recorded too."""
-
-    def __init__(self, sockets: Sockets, recorder: Recorder) -> None:
-        self._sockets = sockets
-        self._recorder = recorder
-
-    @property
-    def questions(self) -> Questions | None:
-        """Who takes questions, if anybody."""
-        return self._sockets.questions
-
-    def filenos(self) -> list[int]:
-        """Become readable when a peer may want something."""
-        return self._sockets.filenos()
-
-    def take(self) -> None:
-        """See to peers that come."""
-        self._sockets.take()
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """What peers and the recorder did."""
-        return self._sockets.counters() | {"record": self._recorder.counters()}
-
-    def wanted(self, topic: bytes) -> bool:
-        """Always: what nobody subscribes to is recorded all the same."""
-        return True
-
-    def send(self, topic: bytes, payload: bytes) -> None:
-        """Publish and record one message; readings are published only if somebody wants them."""
-        if not topic.startswith(b"tactile.") or self._sockets.wanted(topic):
-            self._sockets.send(topic, payload)
-        self._recorder.send(topic, payload)
+        where = self._retention.directory
+        say("record: %s: %s; nothing is recorded", where, error.strerror or error)

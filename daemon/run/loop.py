@@ -5,28 +5,28 @@ from __future__ import annotations
 import selectors
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Protocol
+from typing import Literal
 
 from daemon.judge.pipeline import Pipeline
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
+from daemon.publish.companion import Companion, overridden
 from daemon.publish.deadlines import Deadlines
-from daemon.publish.messages import State, Status, Verdict
-from daemon.publish.outbox import Reporter
-from drivers.base import Driver, JointReading, TactileReading
-
-if TYPE_CHECKING:
-    from daemon.publish.questions import Questions
+from daemon.publish.messages import State, Verdict
+from daemon.publish.outbox import Outbox
+from daemon.run.overload import Overload, after
+from drivers.base import Driver, JointReading, Reading, TactileReading
 
 STATUS_PERIOD_NS = 1_000_000_000
 """Status goes out this often, ns, even when nothing happens."""
 SILENCE_PERIODS = 10
 """Readings that may be missing before the daemon says so, as long as that is longer than the age
 limit. Consumers apply the same rule to the daemon."""
-
-Listener = Callable[[Verdict, bytes, TactileReading | None], None]
-"""Gets every verdict after it was published, with its payload and the reading it is about."""
+DRAINS_MAX = 8
+"""How often the driver is asked for more in one round when there is too much: what the kernel keeps
+is taken in fewer, and a flood cannot hold the loop."""
 
 
 class Ended(Enum):
@@ -36,94 +36,68 @@ class Ended(Enum):
     EXHAUSTED = "exhausted"
     """The recording is over."""
     RELOAD = "reload"
-    """Another scene is ready to take over."""
+    """The scene is to be read again."""
     SLEPT = "slept"
     """The computer has: what is known of the hand is from before it, however fresh it looks."""
 
 
-class Watchdog(Protocol):
-    """Who wants to hear, now and then, that the loop goes round."""
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What the loop knows of time."""
 
-    def due_ns(self) -> int | None:
-        """When next, monotonic ns; None if never."""
-
-    def feed(self) -> None:
-        """The loop has gone round: drivers, timers and messages have been seen to."""
-
-
-class Peers(Protocol):
-    """The sockets, as far as others than the publisher's caller come to them."""
-
-    @property
-    def questions(self) -> Questions | None:
-        """Who takes questions, if anybody."""
-
-    def filenos(self) -> list[int]:
-        """Become readable when a peer may want something."""
-
-    def take(self) -> None:
-        """See to peers that come."""
-
-    def counters(self) -> dict[str, dict[str, int]]:
-        """What peers did, by the part that counted it."""
+    max_age_ns: int
+    """Age limit of readings, ns."""
+    clock: Callable[[], int] = time.monotonic_ns
+    """Gives monotonic ns."""
+    sleep: Sleep = field(default_factory=Sleep)
+    """Says whether the computer has slept."""
 
 
-class Service:
+class Loop:
     """Runs one hand in one thread until told to stop or until a recording ends."""
 
     def __init__(
         self,
         drivers: Sequence[Driver],
         pipeline: Pipeline,
-        reporter: Reporter,
+        outbox: Outbox,
         stop: StopSignal,
-        *,
-        max_age_ns: int,
-        listener: Listener | None = None,
-        chore: Callable[[], None] | None = None,
-        on_joints: Callable[[JointReading], None] | None = None,
-        on_asked: Callable[[], None] | None = None,
-        sockets: Peers | None = None,
-        watchdog: Watchdog | None = None,
-        on_status: Callable[[Status], None] | None = None,
-        reload: Callable[[], bool] | None = None,
-        clock: Callable[[], int] = time.monotonic_ns,
-        sleep: Sleep | None = None,
+        companions: Sequence[Companion],
+        timing: Timing,
     ) -> None:
-        """`drivers` are open, the tactile one first; `max_age_ns` is the age limit, ns.
-
-        `chore` is done before readings are judged, and once a second. `on_joints` gets every joint
-        reading, `on_asked` is done when somebody has asked. Questions that come by
-        `sockets` are answered with the next verdict, or if a grasp is judged on request only, when
-        it has been.
-        `on_status` gets every status once it is sent. `reload` is done when a reload is asked for,
-        and says whether the loop shall end for it. `sleep` says whether the computer has slept.
-        """
+        """`drivers` are open, the tactile one first; `companions` are told in their order."""
         self._drivers = drivers
         self._tactile = drivers[0]
         self._pipeline = pipeline
-        self._reporter = reporter
+        self._outbox = outbox
         self._stop = stop
-        self._listener = listener
-        self._chore = chore
-        self._on_joints = on_joints
-        self._on_asked = on_asked
-        self._sockets = sockets
-        self._questions = None if sockets is None else sockets.questions
-        if self._questions is not None:
-            self._questions.on_outcome = reporter.outcome
-        self._watchdog = watchdog
-        self._on_status = on_status
-        self._reload = reload
-        self._clock = clock
-        self._sleep = Sleep() if sleep is None else sleep
+        self._clock = timing.clock
+        self._sleep = timing.sleep
+        self._max_age_ns = timing.max_age_ns
+
+        self._filenos = overridden(companions, Companion.filenos)
+        drivers_due_ns = (driver.due_ns for driver in drivers)
+        self._due_ns = (*drivers_due_ns, *overridden(companions, Companion.due_ns))
+        self._before_wait = overridden(companions, Companion.before_wait)
+        self._before_readings = overridden(companions, Companion.before_readings)
+        self._on_joints = overridden(companions, Companion.on_joints)
+        self._on_skipped = overridden(companions, Companion.on_skipped)
+        self._on_asked = overridden(companions, Companion.on_asked)
+        self._on_outcome = overridden(companions, Companion.on_outcome)
+        self._on_answer = overridden(companions, Companion.on_answer)
+        self._on_verdict = overridden(companions, Companion.on_verdict)
+        self._on_judged = overridden(companions, Companion.on_judged)
+        self._on_status = overridden(companions, Companion.on_status)
+        self._after_round = overridden(companions, Companion.after_round)
+        self._counters_by_part = overridden(companions, Companion.counters_by_part)
+
         self._deadlines = Deadlines()
         self._joints: JointReading | None = None
         self._watched: set[int] = set()
-        """Descriptors of drivers and questions that the selector has."""
-        self._max_age_ns = max_age_ns
+        """Descriptors of drivers and companions that the selector has."""
         self._state = State.RUNNING
-        now_ns = clock()
+        now_ns = self._clock()
+        self._overload = Overload(now_ns, live=self._tactile.live)
         self._last_t_ns = now_ns
         self._silence_due_ns = now_ns + self._silence_ns()
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
@@ -131,50 +105,74 @@ class Service:
         self._readings_since_status = 0
 
     def run(self) -> Ended:
-        """Run. Raises `DriverError` if the driver gives up; sends a last status in any case."""
-        try:
-            with selectors.SelectSelector() as selector:
-                selector.register(self._stop, selectors.EVENT_READ)
-                while self._stop.received is None:
-                    if self._tactile.exhausted:
-                        return Ended.EXHAUSTED
-                    if self._stop.take_reload() and self._reload is not None and self._reload():
-                        return Ended.RELOAD
-                    if self._sleep.has_slept():  # before anything is repeated for who comes late
-                        return self._wake()
-                    self._go_round(selector)
-            if self._tactile.fileno() is not None:
-                self._take_readings()  # what had come before the signal
-            return Ended.STOPPED
-        finally:
-            self._state = State.STOPPING
-            self._send_status()
+        """Run until something ends it; after `RELOAD`, being called again, go on as if it had not.
+
+        Raises `DriverError` if the driver gives up.
+        """
+        self._watched = set()
+        with selectors.SelectSelector() as selector:
+            selector.register(self._stop, selectors.EVENT_READ)
+            while self._stop.received is None:
+                if self._tactile.exhausted:
+                    return Ended.EXHAUSTED
+                if self._stop.take_reload():
+                    return Ended.RELOAD
+                if self._sleep.has_slept():  # before anything is repeated for who comes late
+                    return self._wake()
+                self._go_round(selector)
+        if self._tactile.fileno() is not None:
+            self._take_readings()  # what had come before the signal
+        return Ended.STOPPED
+
+    def close(self) -> None:
+        """Send the last status, which says that the daemon stops."""
+        self._state = State.STOPPING
+        self._send_status()
+
+    def ask(self) -> None:
+        """Have a settled grasp judged, if that is done on request only."""
+        self._pipeline.ask()
+        for on_asked in self._on_asked:
+            on_asked()
+
+    def outcome(
+        self,
+        boot_id: str,
+        grasp: int,
+        outcome: Literal["stable", "slip"],
+        object_name: str | None = None,
+    ) -> str | None:
+        """Publish how the lift of a judged grasp has ended; None, or why that is of no use."""
+        refused = self._outbox.outcome(boot_id, grasp, outcome, object_name)
+        if refused is None:
+            for on_outcome in self._on_outcome:
+                on_outcome(grasp, outcome, object_name)
+        return refused
 
     def _go_round(self, selector: selectors.BaseSelector) -> None:
         # Now, and not when the descriptors say so: sending quietens them.
-        if self._sockets is not None:
-            self._sockets.take()
-            self._take_questions()
+        for before_wait in self._before_wait:
+            before_wait(self)
         self._wait(selector)
         if not self._take_readings():
-            self._mind_silence()
+            self._check_silence()
         if self._clock() >= self._status_due_ns:
             self._send_status()
-        if self._watchdog is not None:
-            self._watchdog.feed()
+        for after_round in self._after_round:
+            after_round()
 
     def _wake(self) -> Ended:
         """Say that nothing is known, also to who waits for an answer."""
         payload = self._tell_silence(self._clock())
-        if self._questions is not None:
-            self._questions.answer(payload)
+        for on_answer in self._on_answer:
+            on_answer(payload)
         return Ended.SLEPT
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
-        """Sleep until a driver, a timer or a signal wants attention."""
+        """Sleep until a driver, a timer, a companion or a signal wants attention."""
         wanted = {fd for driver in self._drivers if (fd := driver.fileno()) is not None}
-        if self._sockets is not None:
-            wanted.update(self._sockets.filenos())
+        for filenos in self._filenos:
+            wanted.update(filenos())
         if wanted != self._watched:
             for former in self._watched - wanted:
                 selector.unregister(former)
@@ -182,60 +180,100 @@ class Service:
                 selector.register(descriptor, selectors.EVENT_READ)
             self._watched = wanted
         due_ns = min(self._silence_due_ns, self._status_due_ns)
-        for timer in (*self._drivers, self._watchdog):
-            timer_ns = None if timer is None else timer.due_ns()
+        for timer in self._due_ns:
+            timer_ns = timer()
             if timer_ns is not None and timer_ns < due_ns:
                 due_ns = timer_ns
-        selector.select(max(due_ns - self._clock(), 0) / 1e9)
+        now_ns = self._clock()
+        if now_ns < due_ns and not selector.select(0):
+            selector.select((due_ns - now_ns) / 1e9)
+            self._overload.waited(self._clock())
+        else:  # there is work already
+            self._overload.rest(now_ns)
 
     def _take_readings(self) -> bool:
         """Judge and report what the drivers have; False if there was no tactile reading."""
         taken = False
-        readings = [reading for driver in self._drivers for reading in driver.read_ready()]
-        received_ns = self._clock()
-        if readings and self._chore is not None:
-            self._chore()
+        readings, waiting = self._read()
+        received_ns = began_ns = self._clock()
+        if readings:
+            for before_readings in self._before_readings:
+                before_readings()
+        skipped: list[TactileReading] = []
         for reading in readings:
             if isinstance(reading, JointReading):
                 self._pipeline.turn(reading)
                 self._joints = reading
-                if self._on_joints is not None:
-                    self._on_joints(reading)
+                for on_joints in self._on_joints:
+                    on_joints(reading)
                 continue
-            self._reporter.tactile(reading, self._joints)
-            judgement = self._pipeline.judge(reading)
-            if self._sleep.has_slept():
-                return taken  # it was read before
-            verdict, payload = self._reporter.verdict(judgement, received_ns, self._silence_ns())
-            self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
-            self._state = State.RUNNING
-            self._last_t_ns = reading.t_ns
-            self._silence_due_ns = received_ns + self._silence_ns()
-            self._readings_since_status += 1
+            waiting -= 1
+            if waiting and (skipped or self._is_too_much(waiting + 1, began_ns - received_ns)):
+                skipped.append(reading)
+                continue
+            if skipped:
+                reading = self._after(skipped, reading)
+            if not self._judge(reading, received_ns):
+                return taken
             taken = True
-            self._answer(verdict, payload)
-            if self._listener is not None:
-                self._listener(verdict, payload, reading)
+            judged_ns = self._clock()
+            self._overload.judged(judged_ns - began_ns)
+            began_ns = judged_ns
         if taken:
             self._pipeline.learn()  # what there is time for only now
         return taken
 
-    def _take_questions(self) -> None:
-        if self._questions is not None and self._questions.take(self._clock()):
-            self._pipeline.ask()
-            if self._on_asked is not None:
-                self._on_asked()
+    def _read(self) -> tuple[list[Reading], int]:
+        """What the drivers have, and how many are tactile; if that is too much, to the newest."""
+        readings = [reading for driver in self._drivers for reading in driver.read_ready()]
+        waiting = _tactile(readings)
+        for _ in range(DRAINS_MAX if self._is_too_much(waiting) else 0):
+            more = self._tactile.read_ready()
+            if not more:
+                break
+            readings += more
+            waiting += _tactile(more)
+        return readings, waiting
 
-    def _answer(self, verdict: Verdict, payload: bytes) -> None:
-        """Answer who asked, if this verdict is what they wait for or they have waited too long."""
-        if self._questions is None:
-            return
+    def _is_too_much(self, waiting: int, elapsed_ns: int = 0) -> bool:
+        return self._overload.is_too_much(waiting, elapsed_ns, self._tactile.period_ns)
+
+    def _after(self, skipped: Sequence[TactileReading], newest: TactileReading) -> TactileReading:
+        """The newest reading, as it is to be judged after those that were left out."""
+        self._overload.skip(len(skipped), self._clock())
+        self._pipeline.skip()
+        for on_skipped in self._on_skipped:
+            on_skipped()
+        return after(skipped[-1], newest)
+
+    def _judge(self, reading: TactileReading, received_ns: int) -> bool:
+        """Judge and report one reading; False if it is of before a sleep of the computer."""
+        self._outbox.tactile(reading, self._joints)
+        judgement = self._pipeline.judge(reading)
+        if self._sleep.has_slept():
+            return False
+        silence_ns = self._silence_ns()
+        verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
+        self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
+        self._state = State.RUNNING
+        self._last_t_ns = reading.t_ns
+        self._silence_due_ns = received_ns + silence_ns
+        self._readings_since_status += 1
+        self._tell(verdict, payload, reading)
+        if judgement.judged:
+            for on_judged in self._on_judged:
+                on_judged(judgement)
+        return True
+
+    def _tell(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Tell companions a verdict, and whether it is what those who ask wait for."""
         if verdict.judged or not self._pipeline.on_request:
-            self._questions.answer(payload)
-        else:
-            self._questions.answer(payload, self._clock())
+            for on_answer in self._on_answer:
+                on_answer(payload)
+        for on_verdict in self._on_verdict:
+            on_verdict(verdict, payload, reading)
 
-    def _mind_silence(self) -> None:
+    def _check_silence(self) -> None:
         now_ns = self._clock()
         if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
             self._tell_silence(now_ns)
@@ -243,12 +281,10 @@ class Service:
     def _tell_silence(self, now_ns: int) -> bytes:
         self._state = State.SILENT
         self._silence_due_ns = now_ns + self._silence_ns()
-        verdict, payload = self._reporter.verdict(
+        verdict, payload = self._outbox.verdict(
             self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
         )
-        self._answer(verdict, payload)
-        if self._listener is not None:
-            self._listener(verdict, payload, None)
+        self._tell(verdict, payload, None)
         return payload
 
     def _silence_ns(self) -> int:
@@ -256,23 +292,29 @@ class Service:
         return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
 
     def _send_status(self) -> None:
-        if self._chore is not None:
-            self._chore()
+        for before_readings in self._before_readings:
+            before_readings()
         now_ns = self._clock()
         elapsed_s = max(now_ns - self._status_at_ns, 1) / 1e9
-        status = self._reporter.status(
+        counters = {driver.name: driver.counters.as_dict() for driver in self._drivers}
+        for counters_by_part in self._counters_by_part:
+            counters |= counters_by_part()
+        status = self._outbox.status(
             self._state,
             self._readings_since_status / elapsed_s,
-            self._counters(),
+            counters,
             self._pipeline,
             self._deadlines,
+            skipped_readings=self._overload.skipped_readings,
+            overloaded=self._overload.overloaded,
         )
         self._readings_since_status = 0
         self._status_at_ns = now_ns
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
-        if self._on_status is not None:
-            self._on_status(status)
+        for on_status in self._on_status:
+            on_status(status)
 
-    def _counters(self) -> dict[str, dict[str, int]]:
-        counters = {driver.name: driver.counters.as_dict() for driver in self._drivers}
-        return counters if self._sockets is None else counters | self._sockets.counters()
+
+def _tactile(readings: Sequence[Reading]) -> int:
+    """How many of them are tactile."""
+    return sum(isinstance(reading, TactileReading) for reading in readings)

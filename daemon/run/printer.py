@@ -9,6 +9,7 @@ import time
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateState
 from daemon.process.text import printable
+from daemon.publish.companion import Companion
 from daemon.publish.messages import Verdict
 from daemon.run.summary import Summary
 from drivers.base import Annotation, TactileReading
@@ -17,7 +18,7 @@ NAME_MAX = 80
 """Characters of an object's name that are shown."""
 
 
-class Printer:
+class Printer(Companion):
     """Writes verdicts as they come, and a summary at the end."""
 
     def __init__(self, *, as_json: bool, prompt: bool) -> None:
@@ -31,7 +32,7 @@ class Printer:
         self._start_s = time.monotonic()
         self._gate: GateState | None = None
 
-    def verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Write one verdict; `reading` is None where the verdict is about silence."""
         annotation = reading.annotation if reading else None
         self._summary.add(verdict, annotation.slipped if annotation else None)

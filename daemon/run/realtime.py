@@ -11,6 +11,8 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Self
 
+from daemon.publish.companion import Companion
+from daemon.publish.messages import Status
 from daemon.scene import Realtime
 
 log = logging.getLogger("graspd")
@@ -21,7 +23,7 @@ CAP_IPC_LOCK = 14
 """Bit of the capability to lock any amount of memory (linux/capability.h)."""
 
 
-class Hot:
+class RealtimeMode(Companion):
     """A process that runs in realtime from `__enter__` to `__exit__`.
 
     What cannot be had is left out, and told in one warning that says what to grant.
@@ -64,8 +66,8 @@ class Hot:
                 os.sched_setaffinity(thread, self._processors)
         _libc().munlockall()
 
-    def tidy(self) -> None:
-        """Collect garbage, for which there is time after a status, once a second."""
+    def on_status(self, status: Status) -> None:
+        """Collect garbage: once a second there is time for it."""
         gc.collect()
 
     def _pin(self, processors: set[int]) -> None:

@@ -8,6 +8,7 @@ import socket
 import time
 from collections.abc import Callable, Mapping
 
+from daemon.publish.companion import Companion
 from daemon.publish.messages import Status
 
 log = logging.getLogger("graspd")
@@ -19,7 +20,7 @@ RELOAD_PATIENCE_US = 60_000_000
 NS_PER_US = 1000
 
 
-class Systemd:
+class Systemd(Companion):
     """Messages to the service manager that started this process.
 
     A manager that does not listen costs one warning and nothing else: it is not what graspd is for.
@@ -72,7 +73,7 @@ class Systemd:
         """The process is about to end."""
         self._send("STOPPING=1", "STATUS=stopping")
 
-    def status(self, status: Status) -> None:
+    def on_status(self, status: Status) -> None:
         """Show in `systemctl status` how it goes."""
         self._send(f"STATUS={in_a_line(status)}")
 
@@ -80,8 +81,8 @@ class Systemd:
         """When the watchdog wants to be fed next, monotonic ns; None if nobody watches."""
         return None if self._watchdog_us is None else self._due_ns
 
-    def feed(self) -> None:
-        """Say that the loop has gone round, if it is time to."""
+    def after_round(self) -> None:
+        """Feed the watchdog, if it is time to."""
         if self._watchdog_us is not None and self._clock() >= self._due_ns:
             self._due_ns = self._clock() + self._period_ns
             self._send("WATCHDOG=1")
@@ -105,6 +106,8 @@ def in_a_line(status: Status) -> str:
     parts += [f"{number} {outcome}" for outcome, number in status.verdicts.items() if number]
     if status.gate is not None:
         parts.append(f"gate {status.gate}")
+    if status.overloaded:
+        parts.append(f"overloaded, {status.skipped_readings} readings left out")
     if status.late_readings:
         parts.append(f"{status.late_readings} late")
     parts += [f"{part} {reason}" for part, reason in list(status.health.items())[:4]]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from daemon.judge.calibration import SessionCalibration
+from daemon.publish.companion import Companion
 from daemon.session.file import SessionFile, SessionFileError, exchanged, statistics_of
 from drivers.base import Driver
 from models.session_statistics import SessionState
@@ -22,7 +23,7 @@ SAVE_PERIOD_NS = 10_000_000_000
 """What a power cut may cost: the grasps of ten seconds."""
 
 
-class SessionKeeper:
+class SessionKeeper(Companion):
     """Looks after one session from time to time; never raises for a file that cannot be had."""
 
     def __init__(
@@ -52,9 +53,9 @@ class SessionKeeper:
         self._warned = False
         self._thread: threading.Thread | None = None
 
-    def mind(self) -> None:
-        """Before readings are judged: has a sensor been exchanged? And save if it is time."""
-        self._mind_serials()
+    def before_readings(self) -> None:
+        """Drop the session if a sensor has been exchanged; save it if it is time."""
+        self._check_serials()
         if self._clock() >= self._save_due_ns and not self._saving():
             self._begin_to_save()
 
@@ -113,7 +114,7 @@ class SessionKeeper:
         self._serials = dict(kept.serials)
         log.info("session of %d grasps restored from %s", self._session.grasps, self._file.path)
 
-    def _mind_serials(self) -> None:
+    def _check_serials(self) -> None:
         serials = self._tactile.serials
         changed = exchanged(self._serials, serials)
         if changed:

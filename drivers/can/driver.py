@@ -60,6 +60,7 @@ class CanBridgeDriver(Opened):
     name = "can"
     exhausted = False
     """A live link never is."""
+    live = True
 
     def __init__(
         self,

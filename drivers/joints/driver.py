@@ -41,6 +41,7 @@ class JointStreamDriver(Opened):
     name = "joints"
     period_ns: int | None = None
     exhausted = False
+    live = True
 
     def __init__(
         self,

@@ -130,6 +130,11 @@ class PalmDriver(Opened):
         self._attention_ns = self._next_packet_ns
 
     @property
+    def live(self) -> bool:
+        """Whether it is a palm, and no file."""
+        return self._endpoint is not None
+
+    @property
     def link_state(self) -> LinkState | None:
         """What the link is doing; None for a file."""
         return None if self._link is None else self._link.state

@@ -17,6 +17,7 @@ class TimelineDriver(Opened, Generic[Item]):
     """Plays the items of its files, one after the other. Whoever derives says what items are."""
 
     name = "replay"
+    live = False
 
     def __init__(self, paths: Sequence[Path], clock: Callable[[], int]) -> None:
         """Nothing is opened yet. Raises `ValueError` without files.

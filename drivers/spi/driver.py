@@ -75,6 +75,7 @@ class SpiBridgeDriver(Opened):
     name = "spi"
     exhausted = False
     """False: a link may always come back."""
+    live = True
 
     def __init__(
         self,

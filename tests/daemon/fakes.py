@@ -120,6 +120,7 @@ class FakeDriver:
     """Hands over what the test has queued, one reading per call."""
 
     name = "fake"
+    live = False
     period_ns: int | None = 10 * MS
 
     def __init__(self, readings: Sequence[Reading | DriverError], clock: Clock) -> None:

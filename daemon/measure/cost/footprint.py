@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from daemon.assembly.parts import Parts
     from daemon.judge.pipeline import Pipeline
-    from daemon.publish.outbox import Reporter
+    from daemon.publish.outbox import Outbox
     from daemon.scene import Scene
     from drivers.base import Driver, Reading
     from models.contract import ModelContract
@@ -120,6 +121,7 @@ def main(arguments: list[str]) -> int:
 def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[str, object]:
     from daemon import scene
     from daemon.assembly import assembly
+    from daemon.assembly.parts import Parts
 
     wanted = _apart(scene.load(path), folder)
     meter.take("scene")
@@ -127,12 +129,12 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
     meter.take("model")
     drivers = _drivers(wanted, meter, stack)
     pipeline = _pipeline(wanted, model, meter)
-    reporter = _around(wanted, model, pipeline, drivers, meter, stack)
+    outbox = _around(Parts(wanted, model, pipeline, drivers), meter, stack)
     feed = _feed(wanted, drivers[0], model.contract)
     meter.skip()
-    _judge(next(feed), pipeline, reporter)
+    _judge(next(feed), pipeline, outbox)
     meter.take("first reading")
-    timed = _timed(feed, pipeline, reporter)
+    timed = _timed(feed, pipeline, outbox)
     meter.take("readings")
     whole, modules = _now(), sorted(sys.modules)
     return {
@@ -197,33 +199,26 @@ def _pipeline(wanted: Scene, model: TactileModel, meter: Meter) -> Pipeline:
     return pipeline
 
 
-def _around(
-    wanted: Scene,
-    model: TactileModel,
-    pipeline: Pipeline,
-    drivers: list[Driver],
-    meter: Meter,
-    stack: ExitStack,
-) -> Reporter:
+def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     """What `graspd run` puts around the judge."""
-    from daemon.assembly import assembly
-    from daemon.publish.outbox import Reporter
+    from daemon.assembly.parts import Assembly
     from daemon.publish.sockets import Sockets
 
-    if assembly.build_keeper(wanted, pipeline, drivers[0], stack) is not None:
+    around = Assembly(parts, stack)
+    around.keep_session()
+    if around.companions:
         meter.take("session file")
-    sockets = stack.enter_context(Sockets(wanted))
-    reporter = Reporter(
-        wanted.hand.name, wanted.hand.fingers, model.contract.name, model.sha256, sockets
-    )
+    around.add_sockets(stack.enter_context(Sockets(parts.scene)))
+    outbox = around.build_outbox()
     meter.take("sockets")
     from daemon.process.signals import StopSignal
-    from daemon.run.loop import Service
+    from daemon.run.loop import Loop, Timing
 
     stop = stack.enter_context(StopSignal())
-    Service(drivers, pipeline, reporter, stop, max_age_ns=wanted.max_age_ns)
+    timing = Timing(parts.scene.max_age_ns)
+    Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")
-    return reporter
+    return outbox
 
 
 def _feed(wanted: Scene, driver: Driver, contract: ModelContract) -> Iterator[Reading]:
@@ -260,9 +255,7 @@ def _synthetic(counts: list[NDArray[np.uint16]], *, joints: bool) -> Iterator[Re
         yield TactileReading(now_ns, number, values, sound, recorded_ns=made_ns)
 
 
-def _judge(
-    reading: Reading, pipeline: Pipeline, reporter: Reporter
-) -> tuple[int, int, bool] | None:
+def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, int, bool] | None:
     """CPU time, ns, of judging and of reporting, and whether the network ran; None for joints.
 
     What else runs on the machine counts for nothing.
@@ -275,12 +268,12 @@ def _judge(
     begun_ns = time.thread_time_ns()
     judgement = pipeline.judge(reading)
     judged_ns = time.thread_time_ns()
-    reporter.verdict(judgement, judgement.t_ns, SILENCE_NS)
+    outbox.verdict(judgement, judgement.t_ns, SILENCE_NS)
     return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, judgement.judged
 
 
 def _timed(
-    feed: Iterator[Reading], pipeline: Pipeline, reporter: Reporter
+    feed: Iterator[Reading], pipeline: Pipeline, outbox: Outbox
 ) -> dict[str, dict[str, float]]:
     """CPU time of the readings, us: all of them, those that were judged, and reporting them."""
     judge: list[int] = []
@@ -289,7 +282,7 @@ def _timed(
     for reading in feed:
         if pipeline.on_request and len(judge) % ASK_EVERY == 0:
             pipeline.ask()
-        times = _judge(reading, pipeline, reporter)
+        times = _judge(reading, pipeline, outbox)
         if times is None:
             continue
         judge.append(times[0])

@@ -16,7 +16,7 @@ from daemon.judge.health import Health
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.plausibility import Plausibility
-from daemon.publish.outbox import Reporter
+from daemon.publish.outbox import Outbox
 from daemon.publish.publisher import Publisher
 from drivers.base import TactileReading
 from drivers.recordings.csv_columns import electrode_columns
@@ -59,8 +59,8 @@ def _stages(
     electrodes = Electrodes(model.contract.seen)
     plausibility = Plausibility(fingers, model.contract.seen, electrodes)
     pipeline = Pipeline(model, fingers, limits, time.monotonic_ns, learns=False)
-    reporter = Reporter(
-        "report", model.contract.fingers, model.contract.name, model.sha256, publisher
+    outbox = Outbox(
+        "report", model.contract.fingers, model.contract.name, model.sha256, [publisher]
     )
     readings = [
         TactileReading(now[0] + i * PERIOD_NS, i, row, np.zeros(row.shape, dtype=np.uint8))
@@ -86,5 +86,5 @@ def _stages(
         "image or features": lambda index: model.inputs.build(counts[index], model.input),
         "session (the network)": lambda _: model.run(),
         "decision": lambda _: decide(case, limits),
-        "message and socket": lambda _: reporter.verdict(judgement, now[0], PERIOD_NS),
+        "message and socket": lambda _: outbox.verdict(judgement, now[0], PERIOD_NS),
     }

@@ -33,15 +33,12 @@ NEVER = {
     *("daemon.run.realtime", "daemon.run.systemd", "daemon.publish.latest", "daemon.watch"),
     *(
         "daemon.judge.memory",
-        "daemon.record.recorder",
-        "daemon.record.files",
+        "daemon.record",
         "daemon.assembly.recorder",
-        "daemon.assembly.playback",
+        "daemon.assembly.recordings",
         "daemon.assembly.captures",
     ),
     *(
-        "daemon.record.mcap",
-        "daemon.record.player",
         "drivers.recordings.candump",
         "drivers.recordings.capture_player",
     ),

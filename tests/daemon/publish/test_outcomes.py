@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Outcome, Reason
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
-from daemon.publish.outbox import JUDGED_MAX, Reporter
-from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions
+from daemon.publish.outbox import JUDGED_MAX, Outbox
+from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
 from tests.daemon.fakes import FINGERS, Clock
 
 BOOT = "0123456789abcdef" * 2
@@ -40,22 +40,22 @@ class Output:
         return True
 
 
-def reporter(output: Output) -> Reporter:
-    return Reporter(
-        "right", FINGERS, "fake", "0" * 64, output, Clock(NOW_NS), lambda: 5.0, boot_id=BOOT
+def outbox(output: Output) -> Outbox:
+    return Outbox(
+        "right", FINGERS, "fake", "0" * 64, [output], Clock(NOW_NS), lambda: 5.0, boot_id=BOOT
     )
 
 
-def judge(reporter: Reporter, grasp: int, *, judged: bool = True) -> None:
+def judge(outbox: Outbox, grasp: int, *, judged: bool = True) -> None:
     outcome = Outcome.SLIP if judged else Outcome.UNKNOWN
     reasons = () if judged else (Reason.MOVING,)
     p_slip = 0.9 if judged else None
-    reporter.verdict(Judgement(NOW_NS, grasp, outcome, p_slip, reasons, judged), NOW_NS, 10**8)
+    outbox.verdict(Judgement(NOW_NS, grasp, outcome, p_slip, reasons, judged), NOW_NS, 10**8)
 
 
 def test_an_outcome_of_a_judged_grasp_is_published_as_the_schema_says() -> None:
     output = Output()
-    sender = reporter(output)
+    sender = outbox(output)
     judge(sender, 3)
     assert sender.outcome(BOOT, 3, "stable") is None
     assert sender.outcome(BOOT, 3, "slip") is None
@@ -71,7 +71,7 @@ def test_an_outcome_of_a_judged_grasp_is_published_as_the_schema_says() -> None:
 
 def test_an_outcome_names_the_object_if_the_controller_does() -> None:
     output = Output()
-    sender = reporter(output)
+    sender = outbox(output)
     judge(sender, 3)
     assert sender.outcome(BOOT, 3, "slip", "mug") is None
     payload = json.loads(output.sent[-1][1])
@@ -81,7 +81,7 @@ def test_an_outcome_names_the_object_if_the_controller_does() -> None:
 
 def test_an_outcome_of_another_start_or_of_a_grasp_that_was_not_judged_is_refused() -> None:
     output = Output()
-    sender = reporter(output)
+    sender = outbox(output)
     judge(sender, 3)
     judge(sender, 4, judged=False)
     for boot_id, grasp, why in (
@@ -97,7 +97,7 @@ def test_an_outcome_of_another_start_or_of_a_grasp_that_was_not_judged_is_refuse
 
 
 def test_only_so_many_grasps_are_remembered() -> None:
-    sender = reporter(Output())
+    sender = outbox(Output())
     for grasp in range(1, JUDGED_MAX + 2):
         judge(sender, grasp)
         judge(sender, grasp)  # a grasp that is judged twice is one
@@ -109,8 +109,11 @@ def test_only_so_many_grasps_are_remembered() -> None:
 @pytest.fixture
 def questions(tmp_path: Path) -> Iterator[Questions]:
     with Questions(f"ipc://{tmp_path}/ask", 10**9) as taker:
-        taker.on_outcome = lambda boot, grasp, *_: None if (boot, grasp) == (BOOT, 7) else "no such"
         yield taker
+
+
+def takes_the_seventh(boot_id: str, grasp: int, *_told: object) -> str | None:
+    return None if (boot_id, grasp) == (BOOT, 7) else "no such"
 
 
 @pytest.fixture
@@ -121,11 +124,16 @@ def teller(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
         yield socket
 
 
-def told(questions: Questions, teller: zmq.Socket[bytes], *frames: bytes) -> dict[str, Any]:
+def told(
+    questions: Questions,
+    teller: zmq.Socket[bytes],
+    *frames: bytes,
+    outcome: TakeOutcome | None = takes_the_seventh,
+) -> dict[str, Any]:
     teller.send_multipart(frames)
     deadline_s = time.monotonic() + 10.0
     while not teller.poll(1):
-        assert questions.take(0) == 0  # it is no question: nobody is judged for it
+        assert questions.take(0, outcome) == 0  # it is no question: nobody is judged for it
         assert time.monotonic() < deadline_s
     answer: dict[str, Any] = json.loads(teller.recv_multipart()[-1])
     return answer
@@ -148,9 +156,9 @@ def test_the_object_arrives_as_it_was_told(
     questions: Questions, teller: zmq.Socket[bytes], name: str | None
 ) -> None:
     heard: list[tuple[object, ...]] = []
-    questions.on_outcome = lambda *told: heard.append(told)
     text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
-    assert told(questions, teller, text.encode()) == {"v": 1, "ok": True}
+    answer = told(questions, teller, text.encode(), outcome=lambda *told: heard.append(told))
+    assert answer == {"v": 1, "ok": True}
     assert heard == [(BOOT, 7, "slip", name)]
 
 
@@ -197,8 +205,8 @@ def test_the_longest_outcome_fits_into_a_message() -> None:
 def test_without_anybody_who_takes_outcomes_the_controller_hears_so(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
-    questions.on_outcome = None
-    assert told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"] is False
+    text = f"outcome {BOOT} 7 slip".encode()
+    assert told(questions, teller, text, outcome=None)["ok"] is False
 
 
 @settings(max_examples=20)
@@ -210,10 +218,9 @@ def test_whatever_follows_the_word_nothing_breaks(texts: list[bytes]) -> None:
         zmq.Context() as context,
         context.socket(zmq.DEALER) as socket,
     ):
-        taker.on_outcome = lambda *_told: None
         socket.linger = 0
         socket.connect(taker.endpoint)
         for text in texts:
-            answer = told(taker, socket, b"outcome " + text)
+            answer = told(taker, socket, b"outcome " + text, outcome=lambda *_told: None)
             assert answer["v"] == 1
         assert taker.counters["malformed"] + taker.counters["outcomes"] == len(texts)

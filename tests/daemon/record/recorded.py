@@ -11,10 +11,16 @@ from typing import Any
 import zmq
 
 from daemon.publish.messages import Verdict, decode_verdict
-from daemon.record.mcap import McapRecording
+from daemon.record.mcap import McapReader
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+
+IGNORED_FIELDS = frozenset(
+    {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}
+)
+"""Fields of a verdict that are of the run and not of the readings: a recording that is played again
+gives all others bit for bit."""
 
 
 @dataclass
@@ -48,7 +54,7 @@ def scene(folder: Path, record: str = "", more: str = "") -> Path:
 def messages(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """Kind and content of each message of a recording."""
     with open_recording(path) as stream:
-        recording = McapRecording(path, stream)
+        recording = McapReader(path, stream)
         return [(message.kind, json.loads(message.payload)) for message in recording]
 
 

@@ -5,18 +5,24 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon import scene
+from daemon.assembly import assembly
 from daemon.judge.reasons import GateState, Outcome
 from daemon.publish.messages import OutcomeMessage, Tactile, Verdict, encode
 from daemon.record.export import collect
-from daemon.record.files import MessageFile
-from drivers.base import RecordingError
+from daemon.record.header import RecordingHeader
+from daemon.record.mcap import McapWriter
+from daemon.record.topics import Judged
+from drivers.base import ElectrodeFault, RecordingError, TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
@@ -24,27 +30,29 @@ from tests.daemon.processes import graspd
 BOOT = "0123456789abcdef" * 2
 PERIOD_NS = 10_000_000
 Ending = Literal["stable", "slip"]
+HEADER = RecordingHeader(
+    fingers=("ff", "mf", "th"),
+    joints=False,
+    boot_id=BOOT,
+    scene={},
+    model="fake",
+    model_sha256="0" * 64,
+    wall_minus_monotonic_ns=10**18,
+)
 
 
 class Writer:
     """Writes a recording message by message."""
 
-    def __init__(self, path: Path, mode: str = "settled", boot_id: str = BOOT) -> None:
-        scene = {"gate": {"mode": mode, "gap_ms": 100.0}}
-        header = {
-            "fingers": '["ff", "mf", "th"]',
-            "joints": "false",
-            "boot_id": boot_id,
-            "scene": json.dumps(scene),
-        }
-        self._file = MessageFile(path, header, 10**18)
+    def __init__(self, path: Path, boot_id: str = BOOT) -> None:
+        self._file = McapWriter(path, replace(HEADER, boot_id=boot_id))
         self._boot_id = boot_id
         self._now_ns = 10**12
         self._seq = 0
 
-    def tactile(self, counts: NDArray[np.uint16], *, lost: int = 0) -> None:
-        self._seq += 1 + lost
-        self._now_ns += PERIOD_NS * (1 + lost)
+    def tactile(self, counts: NDArray[np.uint16]) -> None:
+        self._seq += 1
+        self._now_ns += PERIOD_NS
         message = Tactile(
             boot_id=self._boot_id,
             seq=self._seq,
@@ -79,6 +87,20 @@ class Writer:
         )
         self._file.write(b"verdict.right", encode(message), self._now_ns)
 
+    def judged(
+        self, grasp: int, counts: NDArray[np.integer[Any]], *, repaired: Sequence[str] = ()
+    ) -> None:
+        """A verdict, and what it was made of."""
+        self.verdict(grasp, repaired=repaired)
+        message = Judged(
+            boot_id=self._boot_id,
+            t_mono_ns=self._now_ns,
+            grasp=grasp,
+            counts=counts.tolist(),
+            repaired=list(repaired),
+        )
+        self._file.write(b"judged.right", msgspec.json.encode(message), self._now_ns)
+
     def outcome(self, grasp: int, outcome: Ending, name: str | None = None) -> None:
         message = OutcomeMessage(
             boot_id=self._boot_id,
@@ -107,47 +129,75 @@ def sweeps(number: int, seed: int = 0) -> list[NDArray[np.uint16]]:
     return [(base + 7 * step * (-1) ** step).astype(np.uint16) for step in range(number)]
 
 
-def recorded(
-    path: Path, *, lost: int = 0, mode: str = "settled", seed: int = 0
-) -> NDArray[np.uint16]:
-    """One grasp of six sweeps that is judged with the fifth, and slips; the five sweeps."""
+def recorded(path: Path, *, seed: int = 0) -> NDArray[np.float64]:
+    """One grasp of six sweeps, judged with the fifth by the median of three; it slips. The median.
+
+    The sweep before the fifth is not in the recording.
+    """
     rows = sweeps(6, seed)
-    writer = Writer(path, mode)
+    median: NDArray[np.float64] = np.median(rows[2:5], axis=0)
+    writer = Writer(path)
     for step, counts in enumerate(rows):
-        writer.tactile(counts, lost=lost if step == 4 else 0)
-        writer.verdict(1, judged=step == 4)
+        if step != 3:
+            writer.tactile(counts)
+        if step == 4:
+            writer.judged(1, median.astype(np.uint16))
+        else:
+            writer.verdict(1, judged=False)
     writer.outcome(1, "slip")
     writer.close()
-    return np.array(rows[:5])
+    return median
 
 
-def test_a_row_is_the_median_of_the_three_sweeps_that_were_judged(tmp_path: Path) -> None:
-    rows = recorded(tmp_path / "a.mcap")
+def test_a_row_is_what_was_judged_whichever_sweeps_are_in_the_recording(tmp_path: Path) -> None:
+    median = recorded(tmp_path / "a.mcap")
     (grasp,) = collect([tmp_path / "a.mcap"]).grasps.values()
-    assert np.array_equal(grasp.counts, np.median(rows[2:5], axis=0))
+    assert np.array_equal(grasp.counts, median)
     assert grasp.slipped
 
 
-def test_where_every_reading_is_a_grasp_a_row_is_the_reading(tmp_path: Path) -> None:
-    rows = recorded(tmp_path / "a.mcap", mode="every")
-    (grasp,) = collect([tmp_path / "a.mcap"]).grasps.values()
-    assert np.array_equal(grasp.counts, rows[4])
-
-
-def test_a_judgement_whose_sweeps_were_not_all_recorded_is_none_to_learn_from(
-    tmp_path: Path,
-) -> None:
-    recorded(tmp_path / "a.mcap", lost=1)
+def test_a_judgement_whose_counts_were_not_recorded_is_none_to_learn_from(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.mcap")
+    for counts in sweeps(5):
+        writer.tactile(counts)
+    writer.verdict(1)
+    writer.outcome(1, "slip")
+    writer.close()
     found = collect([tmp_path / "a.mcap"])
     assert not found.grasps
     assert found.unjoined == 1
+
+
+def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_are_broken(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n[model]\nname = "cnn1"\n'
+    )
+    wanted = scene.load(path)
+    pipeline = assembly.build_pipeline(wanted, assembly.load_model(wanted), lambda: 10**12)
+    counts, sound = read_table(DEMO_TABLE).counts[0], np.zeros((3, 24), dtype=np.uint8)
+    broken = sound.copy()
+    broken[1, 3] = ElectrodeFault.MISSING
+    late = np.full_like(sound, ElectrodeFault.CUT_OFF)
+    well, repaired, unusable = (
+        pipeline.judge(TactileReading(10**12, seq, counts + seq, faults))
+        for seq, faults in enumerate((sound, broken, late))
+    )
+    assert well.judged_counts is not None
+    assert np.array_equal(well.judged_counts, counts)
+    assert repaired.repaired == ("mf_4",)
+    assert repaired.judged_counts is None
+    assert unusable.judged_counts is None
 
 
 def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
     writer = Writer(tmp_path / "a.mcap")
     for grasp, counts in enumerate(sweeps(8)):
         writer.tactile(counts)
-        writer.verdict(grasp, judged=grasp >= 4, repaired=["ff_7"] if grasp == 5 else ())
+        if grasp >= 4:
+            writer.judged(grasp, counts, repaired=["ff_7"] if grasp == 5 else ())
     writer.outcome(4, "stable")
     writer.outcome(4, "slip")
     writer.outcome(5, "slip")
@@ -161,10 +211,9 @@ def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
 def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
     tmp_path: Path,
 ) -> None:
-    writer = Writer(tmp_path / "a.mcap", mode="every")
+    writer = Writer(tmp_path / "a.mcap")
     for grasp, counts in enumerate(sweeps(6), 1):
-        writer.tactile(counts)
-        writer.verdict(grasp)
+        writer.judged(grasp, counts)
     writer.outcome(1, "slip", "mug")
     writer.outcome(2, "stable", "ball")
     writer.outcome(3, "stable")
@@ -189,9 +238,7 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
 def test_grasps_of_two_starts_are_told_apart(tmp_path: Path) -> None:
     recorded(tmp_path / "a.mcap")
     writer = Writer(tmp_path / "b.mcap", boot_id="f" * 32)
-    for counts in sweeps(4, seed=1):
-        writer.tactile(counts)
-    writer.verdict(1)
+    writer.judged(1, sweeps(1, seed=1)[0])
     writer.outcome(1, "stable")
     writer.close()
     found = collect([tmp_path / "a.mcap", tmp_path / "b.mcap"])
@@ -200,21 +247,34 @@ def test_grasps_of_two_starts_are_told_apart(tmp_path: Path) -> None:
 
 def test_a_judgement_and_its_outcome_may_stand_in_two_files(tmp_path: Path) -> None:
     first, second = Writer(tmp_path / "a.mcap"), Writer(tmp_path / "b.mcap")
-    for counts in sweeps(4):
-        first.tactile(counts)
-    first.verdict(1)
+    first.judged(1, sweeps(1)[0])
     second.outcome(1, "slip")
     first.close()
     second.close()
     assert len(collect([tmp_path / "a.mcap", tmp_path / "b.mcap"]).grasps) == 1
 
 
-def test_a_recording_that_does_not_say_how_it_judged_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    header = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT, "scene": "{}"}
-    MessageFile(path, header, 0).close()
-    with pytest.raises(RecordingError, match="how it was judged"):
-        collect([path])
+def test_a_recording_that_does_not_say_what_it_judged_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    texts = HEADER.texts()
+    del texts["says_judged"]
+    monkeypatch.setattr(RecordingHeader, "texts", lambda _: texts)
+    McapWriter(tmp_path / "a.mcap", HEADER).close()
+    with pytest.raises(RecordingError, match=r"a\.mcap: does not say which counts were judged"):
+        collect([tmp_path / "a.mcap"])
+
+
+@pytest.mark.parametrize("counts", [[[1] * 24] * 2, [[1] * 23] * 3, [[70_000] * 24] * 3, []])
+def test_counts_of_another_shape_or_size_are_refused(
+    tmp_path: Path, counts: list[list[int]]
+) -> None:
+    writer = Writer(tmp_path / "a.mcap")
+    writer.judged(1, np.array(counts))
+    writer.outcome(1, "slip")
+    writer.close()
+    with pytest.raises(RecordingError, match=r"a\.mcap: outcome message"):
+        collect([tmp_path / "a.mcap"])
 
 
 def test_without_any_outcome_nothing_is_written(tmp_path: Path) -> None:
@@ -234,10 +294,9 @@ def test_what_was_recorded_of_a_table_is_that_table_and_a_network_learns_from_it
     with DEMO_TABLE.open(newline="") as file:
         table = list(csv.DictReader(file))
     known = read_table(DEMO_TABLE)
-    writer = Writer(tmp_path / "a.mcap", mode="every")
+    writer = Writer(tmp_path / "a.mcap")
     for grasp, row in enumerate(table, 1):
-        writer.tactile(known.counts[grasp - 1])
-        writer.verdict(grasp)
+        writer.judged(grasp, known.counts[grasp - 1])
         writer.outcome(grasp, "slip" if row["slipped"] == "1" else "stable")
     writer.close()
     out = tmp_path / "lab.csv"

@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.record.files import Joints, MessageFile
-from daemon.record.mcap import McapRecording, RecordedMessage
+from daemon.publish.messages import Tactile, encode
+from daemon.record.header import Known, RecordingHeader
+from daemon.record.mcap import McapReader, McapWriter, RecordedMessage, header_of
 from daemon.record.player import McapReplayDriver
-from drivers.base import JointReading, RecordingError, TactileReading
+from daemon.record.topics import Joints
+from drivers.base import FINGERS, JointReading, RecordingError, TactileReading
+from models.session_statistics import SessionState
 
 BOOT = "0123456789abcdef" * 2
 OFFSET_NS = 10**18
@@ -31,24 +35,37 @@ def counts_of(number: int) -> list[list[int]]:
     return counts
 
 
+def header(*fingers: str, joints: bool) -> RecordingHeader:
+    return RecordingHeader(
+        fingers=fingers,
+        joints=joints,
+        boot_id=BOOT,
+        scene={"gate": {"mode": "settled"}},
+        model="any",
+        model_sha256="0" * 64,
+        wall_minus_monotonic_ns=OFFSET_NS,
+    )
+
+
 def write(path: Path, first: int = 0) -> None:
     """Readings of two fingers, 2 ms old when they were recorded, flushed after every fifth."""
-    header = {"fingers": '["ff", "th"]', "joints": "true", "boot_id": BOOT}
-    file = MessageFile(path, header, OFFSET_NS)
+    file = McapWriter(path, header("ff", "th", joints=True))
     for number in range(first, first + READINGS):
         t_ns = START_NS + number * PERIOD_NS
         angles = JointReading(t_ns - 1000, number, ("FFJ3",), np.array([number / 100]))
-        tactile = {
-            "seq": number,
-            "t_mono_ns": t_ns,
-            "fingers": ["ff", "th"],
-            "counts": counts_of(number),
-            "faults": np.zeros((2, 24), dtype=int).tolist(),
-        }
+        tactile = Tactile(
+            boot_id=BOOT,
+            seq=number,
+            t=0.0,
+            t_mono_ns=t_ns,
+            fingers=["ff", "th"],
+            counts=counts_of(number),
+            faults=np.zeros((2, 24), dtype=int).tolist(),
+        )
         joints = Joints.of(angles)
         fields = {name: getattr(joints, name) for name in joints.__struct_fields__}
         file.write(b"joints.right", json.dumps(fields).encode(), t_ns + 2_000_000)
-        file.write(b"tactile.right", json.dumps(tactile).encode(), t_ns + 2_000_000)
+        file.write(b"tactile.right", encode(tactile), t_ns + 2_000_000)
         if number % 5 == 4:
             file.flush()
     file.close()
@@ -62,10 +79,43 @@ def whole() -> bytes:
 
 
 WHOLE = whole()
+STATES = st.builds(
+    Known,
+    judge=st.binary(max_size=50),
+    axis_ns=st.integers(0, 1 << 62),
+    session=st.none()
+    | st.just(SessionState(weight=2.5, grasps=3, mean=(0.1, 1e-9), squares=(4.0, 0.0))),
+)
 
 
 def read(data: bytes) -> list[RecordedMessage]:
-    return list(McapRecording(Path("a.mcap"), io.BytesIO(data)))
+    return list(McapReader(Path("a.mcap"), io.BytesIO(data)))
+
+
+@given(STATES, st.integers(0, 99), st.sets(st.sampled_from(FINGERS), min_size=1))
+def test_a_header_comes_back_as_it_was_written(known: Known, file: int, fingers: set[str]) -> None:
+    written = replace(header(*fingers, joints=True), known=known, file=file)
+    assert RecordingHeader.of(written.texts()) == written
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *[(name, None) for name in header("ff", joints=False).texts() if name != "says_judged"],
+        *[("fingers", "[]"), ("fingers", '["toe"]'), ("fingers", "5"), ("scene", "[]")],
+        *[("session", "{}"), ("judge", "A"), ("axis_ns", ""), ("file", "first")],
+    ],
+)
+def test_a_file_with_another_header_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str | None
+) -> None:
+    texts = header("ff", joints=False).texts() | ({} if text is None else {name: text})
+    if text is None:
+        del texts[name]
+    monkeypatch.setattr(RecordingHeader, "texts", lambda _: texts)
+    McapWriter(tmp_path / "a.mcap", header("ff", joints=False)).close()
+    with pytest.raises(RecordingError, match=r"a\.mcap: is an MCAP file of another graspd"):
+        header_of(tmp_path / "a.mcap")
 
 
 def test_readings_come_back_as_old_as_they_were(tmp_path: Path) -> None:
@@ -140,9 +190,11 @@ def test_no_bytes_after_the_magic_make_it_raise_anything_else(data: bytes) -> No
 
 
 def test_messages_that_are_no_readings_are_counted(tmp_path: Path) -> None:
-    header = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT}
-    file = MessageFile(tmp_path / "a.mcap", header, OFFSET_NS)
-    good = {"seq": 1, "t_mono_ns": 5, "fingers": ["ff"], "counts": [[1] * 24], "faults": [[0] * 24]}
+    file = McapWriter(tmp_path / "a.mcap", header("ff", joints=False))
+    good = {
+        **{"v": 1, "boot_id": BOOT, "seq": 1, "t": 0.0, "t_mono_ns": 5},
+        **{"fingers": ["ff"], "counts": [[1] * 24], "faults": [[0] * 24]},
+    }
     wrong = [
         b"",
         b"{}",

@@ -10,14 +10,13 @@ from typing import Any
 
 import can
 
-from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.record.mcap import header_of
 from drivers.base import TactileReading
 from drivers.recordings.can_capture import CanCapture, frames_of
 from drivers.recordings.capture_player import CaptureReplayDriver
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import IGNORED_FIELDS, messages
 
 GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
 LINKS = {

@@ -11,11 +11,10 @@ import jsonschema
 import pytest
 from mcap.reader import make_reader
 
-from daemon.assembly.recorder import IGNORED_FIELDS
 from daemon.publish.messages import encode
 from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
-from tests.daemon.record.recorded import Lab, messages, work
+from tests.daemon.record.recorded import IGNORED_FIELDS, Lab, messages, work
 
 GRASPS = 4
 
@@ -53,7 +52,7 @@ def again(*arguments: object) -> list[dict[str, Any]]:
 def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None:
     (path,) = lab.files
     kinds = [kind for kind, _ in messages(path)]
-    assert set(kinds) == {"tactile", "joints", "verdict", "gate", "outcome", "status"}
+    assert set(kinds) == {"tactile", "joints", "verdict", "gate", "outcome", "status", "judged"}
     assert kinds.count("tactile") == kinds.count("joints") == len(of_readings(path)) > 0
     recorded = {content["seq"]: content for content in of_kind(path, "verdict")}
     published = {verdict.seq: json.loads(encode(verdict)) for verdict in lab.verdicts}

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.assembly.playback import Playback
 from daemon.assembly.recorder import build_recorder
+from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
-from daemon.publish.outbox import Reporter
-from daemon.record import mcap as mcap_recording
-from daemon.record.files import MessageFile, Shelf
+from daemon.publish.outbox import Outbox
+from daemon.record.files import Retention
+from daemon.record.header import Known, RecordingHeader
+from daemon.record.mcap import McapWriter, header_of
 from daemon.record.recorder import Recorder
 from daemon.scene import Record
 from drivers.base import TactileReading
@@ -43,9 +46,9 @@ class Loop:
     def __init__(self) -> None:
         self.sent = 0
 
-    def state(self) -> Callable[[], Mapping[str, str]]:
-        known = str(self.sent)
-        return lambda: {"known": known}
+    def state(self) -> Callable[[], Known]:
+        known = Known(axis_ns=self.sent)
+        return lambda: known
 
     def send(self, recorder: Recorder, topic: bytes) -> None:
         payload = json.dumps({"number": self.sent}).encode()
@@ -54,10 +57,12 @@ class Loop:
 
 
 def make(folder: Path, loop: Loop, **options: float) -> Recorder:
-    shelf = Shelf(folder / "record", "right", BOOT, 100, 10**9)
-    header = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT}
+    retention = Retention(folder / "record", "right", BOOT, 100, 10**9)
+    header = RecordingHeader(
+        fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
+    )
     wanted = Record(**{"flush_ms": 100.0, **options})  # type: ignore[arg-type]
-    return Recorder(shelf, wanted, header, take_state=loop.state)
+    return Recorder(retention, wanted, header, take_state=loop.state)
 
 
 def files(folder: Path) -> list[Path]:
@@ -77,7 +82,7 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
     recorder.close()
     number = 7
     for path in files(tmp_path):
-        assert mcap_recording.header_of(path).texts["known"] == str(number)
+        assert header_of(path).known.axis_ns == number
         found = messages(path)
         assert [content["number"] for _, content in found] == [*range(number, number + len(found))]
         assert found[-1][0] == "status"
@@ -96,7 +101,7 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     loop.send(recorder, STATUS)
     wait_until(lambda: recorder.counters()["files"] == 2)
     recorder.close()
-    assert mcap_recording.header_of(files(tmp_path)[1]).texts["known"] == str(loop.sent)
+    assert header_of(files(tmp_path)[1]).known.axis_ns == loop.sent
 
 
 def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_then(
@@ -116,7 +121,7 @@ def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_th
     loop.send(recorder, VERDICT)
     recorder.close()
     (path,) = files(tmp_path)
-    known = int(mcap_recording.header_of(path).texts["known"])
+    known = header_of(path).known.axis_ns
     assert [content["number"] for _, content in messages(path)] == [*range(known, loop.sent)]
     assert recorder.counters()["lost"] == known > 0
 
@@ -138,7 +143,7 @@ class Daemon:
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)
         assert recorder is not None
         self.recorder = recorder
-        self._reporter = Reporter("right", wanted.hand.fingers, "any", BOOT, Output(recorder))
+        self._outbox = Outbox("right", wanted.hand.fingers, "any", BOOT, [recorder])
 
     def _clock(self) -> int:
         return self._now_ns
@@ -146,23 +151,14 @@ class Daemon:
     def judge(self, reading: TactileReading) -> Judgement:
         """And every second a status, if the thread has had time to look."""
         self._now_ns = reading.t_ns
-        self._reporter.tactile(reading, None)
+        self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
+        self.recorder.on_judged(judgement)
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)
             self.recorder.send(STATUS, b"{}")
         return judgement
-
-
-class Output:
-    """Everything is wanted."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self.send = recorder.send
-
-    def wanted(self, topic: bytes) -> bool:
-        return bool(topic)
 
 
 def sweeps() -> list[TactileReading]:
@@ -179,11 +175,11 @@ def sweeps() -> list[TactileReading]:
 
 def again(*paths: Path) -> list[Judgement]:
     """What is judged in a replay, at the times of then."""
-    playback = Playback(paths)
-    wanted = playback.scene({}, {}, None)
-    driver = playback.build_driver(wanted, None)
-    pipeline = playback.pipeline(wanted, assembly.load_model(wanted), learns=True)
-    playback.restore(pipeline)
+    run = RecordedRun(paths)
+    wanted = run.scene({}, {}, None)
+    driver = run.build_driver(wanted, None)
+    pipeline = run.pipeline(wanted, assembly.load_model(wanted), learns=True)
+    run.restore(pipeline)
     found = []
     with driver:
         while not driver.exhausted:
@@ -192,6 +188,38 @@ def again(*paths: Path) -> list[Judgement]:
                 found.append(replace(pipeline.judge(reading), t_ns=reading.made_ns))
                 pipeline.learn()
     return found
+
+
+def fresh_median(values: Sequence[int]) -> float:
+    """Median of an electrode's last three values, but for those that only repeat the one before."""
+    fresh, held = [values[0]], False
+    for former, value in pairwise(values):
+        held = value == former and not held
+        if not held:
+            fresh.append(value)
+    return float(np.median(fresh[-3:]))
+
+
+def test_what_a_settled_grasp_was_judged_by_is_recorded_with_its_number(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon, readings = Daemon(tmp_path, monkeypatch), sweeps()[:1000]
+    judged = {
+        judgement.t_ns: (judgement.grasp, place + 1)
+        for place, judgement in enumerate(map(daemon.judge, readings))
+        if judgement.judged
+    }
+    daemon.recorder.close()
+    found = [
+        content for path in files(tmp_path) for kind, content in messages(path) if kind == "judged"
+    ]
+    assert len(found) == len(judged) > 1
+    for content in found:
+        grasp, upto = judged[content["t_mono_ns"]]
+        history = np.array([reading.counts for reading in readings[:upto]]).reshape(upto, -1)
+        expected = [fresh_median(values) for values in history.T.tolist()]
+        assert (content["grasp"], content["boot_id"]) == (grasp, BOOT)
+        assert np.ravel(content["counts"]).tolist() == expected
 
 
 def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_file(
@@ -215,27 +243,27 @@ def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_fil
         assert again(path) == [each for each in expected if each.t_ns in times]
 
 
-def rewritten(path: Path, texts: Mapping[str, str], to: Path) -> Path:
-    """A recording with other words in front."""
-    header = mcap_recording.header_of(path)
-    file = MessageFile(to, {**header.texts, **texts}, header.wall_minus_monotonic_ns)
+def rewritten(path: Path, to: Path, judge: bytes, number: int) -> Path:
+    """A recording with another header."""
+    header = header_of(path)
+    file = McapWriter(to, replace(header, known=replace(header.known, judge=judge), file=number))
     for kind, content in messages(path):
         file.write(f"{kind}.right".encode(), json.dumps(content).encode(), content["t_mono_ns"])
     file.close()
     return to
 
 
-@pytest.mark.parametrize("judge", ["", "AAAA", "no base 64"])
+@pytest.mark.parametrize("judge", [b"", bytes(3), b"\x9e\x8ab\x0b\xde"])
 def test_a_file_from_within_a_run_that_does_not_say_what_was_known_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, judge: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, judge: bytes
 ) -> None:
     daemon = Daemon(tmp_path, monkeypatch)
     for reading in sweeps()[:50]:
         daemon.judge(reading)
     daemon.recorder.close()
     (path,) = files(tmp_path)
-    first = rewritten(path, {"judge": judge}, tmp_path / "first.mcap")
-    later = rewritten(path, {"judge": judge, "file": "3"}, tmp_path / "later.mcap")
+    first = rewritten(path, tmp_path / "first.mcap", judge, 0)
+    later = rewritten(path, tmp_path / "later.mcap", judge, 3)
     assert len(again(first)) == 50
     assert not caplog.records
     assert len(again(later)) == 50

@@ -19,8 +19,9 @@ import pytest
 
 from daemon import scene
 from daemon.record import recorder as recorder_module
-from daemon.record.files import MessageFile, Shelf, schemas
-from daemon.record.mcap import McapRecording
+from daemon.record.files import Retention
+from daemon.record.header import RecordingHeader
+from daemon.record.mcap import McapReader, McapWriter, schemas
 from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.scene import Record, SceneError
 from drivers.base import JointReading
@@ -30,12 +31,14 @@ from tests.bench import kill_recorder
 from tests.daemon.record.recorded import messages
 
 BOOT = "0123456789abcdef" * 2
-HEADER = {"fingers": '["ff"]', "joints": "false", "boot_id": BOOT}
+HEADER = RecordingHeader(
+    fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
+)
 TOPIC = b"verdict.right"
 
 
-def shelf(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Shelf:
-    return Shelf(folder / "record", "right", BOOT, keep_files, keep_bytes)
+def retention(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Retention:
+    return Retention(folder / "record", "right", BOOT, keep_files, keep_bytes)
 
 
 Make = Callable[..., Recorder]
@@ -45,9 +48,9 @@ Make = Callable[..., Recorder]
 def make(tmp_path: Path) -> Iterator[Make]:
     made: list[Recorder] = []
 
-    def new(where: Shelf | None = None, **options: Any) -> Recorder:  # noqa: ANN401
+    def new(where: Retention | None = None, **options: Any) -> Recorder:  # noqa: ANN401
         wanted = Record(**{"flush_ms": 100.0, **options})
-        made.append(Recorder(where or shelf(tmp_path), wanted, HEADER))
+        made.append(Recorder(where or retention(tmp_path), wanted, HEADER))
         return made[-1]
 
     yield new
@@ -100,7 +103,7 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     recorder.close()
     (path,) = (tmp_path / "record").iterdir()
     with open_recording(path) as stream:
-        recording = McapRecording(path, stream)
+        recording = McapReader(path, stream)
         (message,) = recording
     assert recording.header.fingers == ("ff",)
     assert recording.header.boot_id == BOOT
@@ -111,7 +114,7 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
 
 def test_an_angle_that_there_is_not_is_null(tmp_path: Path, make: Make) -> None:
     recorder = make()
-    recorder.joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
+    recorder.on_joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
     recorder.close()
     (path,) = (tmp_path / "record").iterdir()
     assert messages(path) == [
@@ -130,8 +133,8 @@ def test_an_angle_that_there_is_not_is_null(tmp_path: Path, make: Make) -> None:
 
 def test_every_kind_of_message_has_a_schema_that_is_an_object() -> None:
     found = schemas()
-    assert set(found) == {"verdict", "gate", "tactile", "outcome", "status", "joints"}
-    for text in found.values():
+    assert set(found) == {"verdict", "gate", "tactile", "outcome", "status", "joints", "judged"}
+    for _, text in found.values():
         assert json.loads(text)["type"] == "object"
 
 
@@ -177,7 +180,7 @@ def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) 
     strangers = [folder / "right-notes.mcap", folder / "left-20200101T000000Z-00000000-0000.mcap"]
     for path in strangers:
         path.write_bytes(b"")
-    assert shelf(tmp_path, keep_files=4).make_room(0) == 2
+    assert retention(tmp_path, keep_files=4).make_room(0) == 2
     assert not files[0].exists()
     assert not beside.exists()
     assert not files[1].exists()
@@ -187,9 +190,9 @@ def test_the_oldest_files_make_room_and_nothing_else_is_removed(tmp_path: Path) 
 def test_all_files_together_keep_within_their_size(tmp_path: Path) -> None:
     for hour in range(5):
         old(tmp_path / "record", hour, 1000)
-    assert shelf(tmp_path, keep_bytes=4500).make_room(1000) == 2
-    assert shelf(tmp_path, keep_bytes=10).make_room(1000) == 3
-    assert shelf(tmp_path, keep_bytes=10).make_room(1000) == 0
+    assert retention(tmp_path, keep_bytes=4500).make_room(1000) == 2
+    assert retention(tmp_path, keep_bytes=10).make_room(1000) == 3
+    assert retention(tmp_path, keep_bytes=10).make_room(1000) == 0
 
 
 class StalledDisk:
@@ -205,7 +208,7 @@ class StalledDisk:
             self.answers.wait(20)
             real(descriptor)
 
-        monkeypatch.setattr("daemon.record.files.os.fdatasync", stall)
+        monkeypatch.setattr("daemon.record.mcap.os.fdatasync", stall)
 
 
 def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
@@ -267,15 +270,15 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
     The test goes the rounds itself: with this interval the thread's first one comes after 6 s.
     """
     recorder = make(flush_ms=60_000.0)
-    real, written = MessageFile.write, list[int]()
+    real, written = McapWriter.write, list[int]()
 
-    def write(file: MessageFile, topic: bytes, payload: bytes, at_ns: int) -> None:
+    def write(file: McapWriter, topic: bytes, payload: bytes, at_ns: int) -> None:
         if len(written) == 14:
             raise OSError(errno.ENOSPC, "No space left on device")
         written.append(at_ns)
         real(file, topic, payload, at_ns)
 
-    monkeypatch.setattr(MessageFile, "write", write)
+    monkeypatch.setattr(McapWriter, "write", write)
     for number in range(10):
         recorder.send(TOPIC, payload(number))
     recorder.go_round()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ import pytest
 from daemon.judge.reasons import Outcome, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
+from daemon.publish.companion import Companion
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_tactile
-from daemon.publish.outbox import Reporter
-from daemon.run.loop import Ended, Service, Watchdog
+from daemon.publish.outbox import Outbox
+from daemon.run.loop import Ended, Loop, Timing
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 
@@ -45,8 +47,8 @@ def stop() -> Iterator[StopSignal]:
         yield stop
 
 
-class Bench:
-    """A service with everything around it replaced, and what came out of it."""
+class Bench(Companion):
+    """A loop with everything around it replaced, and what came out of it."""
 
     def __init__(
         self,
@@ -54,29 +56,28 @@ class Bench:
         clock: Clock,
         stop: StopSignal,
         model: FakeModel | None = None,
-        watchdog: Watchdog | None = None,
-        reload: Callable[[], bool] | None = None,
+        companions: Sequence[Companion] = (),
         sleep: Sleep | None = None,
     ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
         self.payloads: list[bytes] = []
         self.clock = clock
-        reporter = Reporter("right", FINGERS, "fake", "ab" * 32, self.output, clock, lambda: 1.79e9)
-        self.service = Service(
+        outputs = [self.output]
+        self.loop = Loop(
             [driver],
             pipeline(model or FakeModel(), clock),
-            reporter,
+            Outbox("right", FINGERS, "fake", "ab" * 32, outputs, clock, lambda: 1.79e9),
             stop,
-            max_age_ns=100 * MS,
-            listener=self._listen,
-            watchdog=watchdog,
-            reload=reload,
-            clock=clock,
-            sleep=sleep,
+            [self, *companions],
+            Timing(100 * MS, clock, Sleep() if sleep is None else sleep),
         )
 
-    def _listen(self, verdict: Verdict, payload: bytes, _reading: TactileReading | None) -> None:
+    def run(self) -> Ended:
+        with closing(self.loop):
+            return self.loop.run()
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         self.verdicts.append(verdict)
         self.payloads.append(payload)
 
@@ -84,7 +85,7 @@ class Bench:
 def test_every_reading_gets_one_verdict_in_order(stop: StopSignal) -> None:
     clock = Clock()
     bench = Bench(FakeDriver([reading(clock(), seed) for seed in range(20)], clock), clock, stop)
-    bench.service.run()
+    bench.run()
     assert [verdict.seq for verdict in bench.verdicts] == list(range(20))
     assert [verdict.grasp for verdict in bench.verdicts] == list(range(1, 21))
     assert {verdict.verdict for verdict in bench.verdicts} == {Outcome.STABLE}
@@ -100,14 +101,14 @@ def test_joint_readings_are_no_verdicts(stop: StopSignal) -> None:
     clock = Clock()
     joints = JointReading(clock(), 0, ("FFJ3",), np.array([0.5]))
     bench = Bench(FakeDriver([joints, reading(clock())], clock), clock, stop)
-    bench.service.run()
+    bench.run()
     assert len(bench.verdicts) == 1
 
 
 def test_the_last_message_is_a_status_that_says_stopping(stop: StopSignal) -> None:
     clock = Clock()
     bench = Bench(FakeDriver([reading(clock())], clock), clock, stop)
-    bench.service.run()
+    bench.run()
     status = bench.output.statuses()[-1]
     assert bench.output.sent[-1][0] == b"status.right"
     assert status.state is State.STOPPING
@@ -145,7 +146,7 @@ def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading(
     clock = Clock()
     start_ns = clock()
     bench = Bench(ScriptedDriver([10, 400], clock, 450), clock, stop)
-    bench.service.run()
+    bench.run()
     said = [(round((v.t_mono_ns - start_ns) / MS), v.verdict, v.reasons) for v in bench.verdicts]
     assert said == [
         (10, Outcome.STABLE, []),
@@ -161,7 +162,7 @@ def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading(
 def test_a_sensor_that_never_speaks_is_unknown(stop: StopSignal) -> None:
     clock = Clock()
     bench = Bench(ScriptedDriver([], clock, 250), clock, stop)
-    bench.service.run()
+    bench.run()
     assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN] * 2
 
 
@@ -171,7 +172,7 @@ def test_a_slow_driver_may_be_silent_for_ten_of_its_periods(stop: StopSignal) ->
     driver = ScriptedDriver([10, 400], clock, 1000)
     driver.period_ns = 50 * MS
     bench = Bench(driver, clock, stop)
-    bench.service.run()
+    bench.run()
     assert [verdict.reasons for verdict in bench.verdicts] == [[], [], [Reason.STALE]]
     assert {verdict.silence_ms for verdict in bench.verdicts} == {500.0}
     assert bench.verdicts[-1].t_mono_ns == start_ns + 400 * MS
@@ -196,7 +197,7 @@ def test_latency_counts_the_wait_behind_other_readings_of_the_same_moment(
 
     driver = BatchDriver([reading(clock(), seed) for seed in range(3)], clock)
     bench = Bench(driver, clock, stop, SlowModel())
-    bench.service.run()
+    bench.run()
     assert [verdict.latency_us for verdict in bench.verdicts] == [3000.0, 6000.0, 9000.0]
     assert bench.output.statuses()[-1].latency_us["max"] == 9000.0
 
@@ -205,7 +206,7 @@ def test_status_tells_when_readings_come_again(stop: StopSignal) -> None:
     clock = Clock()
     start_ns = clock()
     bench = Bench(ScriptedDriver([1950], clock, 2100), clock, stop)
-    bench.service.run()
+    bench.run()
     silent, running, _ = bench.output.statuses()
     assert (silent.state, running.state) == (State.SILENT, State.RUNNING)
     assert silent.t_mono_ns - start_ns == 1000 * MS
@@ -214,7 +215,7 @@ def test_status_tells_when_readings_come_again(stop: StopSignal) -> None:
 def test_status_comes_every_second_even_when_idle(stop: StopSignal) -> None:
     clock = Clock()
     bench = Bench(ScriptedDriver([], clock, 3500), clock, stop)
-    bench.service.run()
+    bench.run()
     statuses = bench.output.statuses()
     assert [status.seq for status in statuses] == [0, 1, 2, 3]
     assert [status.state for status in statuses[:3]] == [State.SILENT] * 3
@@ -224,7 +225,7 @@ def test_status_comes_every_second_even_when_idle(stop: StopSignal) -> None:
 def test_status_tells_the_rate(stop: StopSignal) -> None:
     clock = Clock()
     bench = Bench(ScriptedDriver(list(range(10, 2010, 10)), clock, 2100), clock, stop)
-    bench.service.run()
+    bench.run()
     assert [round(status.readings_hz) for status in bench.output.statuses()[:2]] == [100, 100]
 
 
@@ -235,7 +236,7 @@ def test_a_driver_that_gives_up_ends_the_loop_with_a_last_status(
     clock = Clock()
     bench = Bench(FakeDriver([reading(clock()), error], clock), clock, stop)
     with pytest.raises(DriverError):
-        bench.service.run()
+        bench.run()
     assert bench.output.statuses()[-1].state is State.STOPPING
 
 
@@ -249,7 +250,7 @@ def test_a_signal_ends_an_idle_loop(number: signal.Signals) -> None:
         bench = Bench(driver, clock, stop)
         timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
         timer.start()
-        bench.service.run()
+        bench.run()
         timer.join()
         assert stop.received is number
     assert signal.getsignal(number) is before
@@ -271,7 +272,7 @@ def test_a_driver_with_a_descriptor_is_read_when_bytes_are_there(stop: StopSigna
 
     bench = Bench(PipeDriver([reading(clock(), 1), reading(clock(), 2)], clock), clock, stop)
     os.write(write, b"12")
-    bench.service.run()
+    bench.run()
     os.close(read)
     os.close(write)
     assert len(bench.verdicts) == 2
@@ -293,25 +294,20 @@ def test_what_had_come_before_the_signal_is_still_judged(stop: StopSignal) -> No
             return [self.queue.pop(0)] if self.queue else []  # type: ignore[list-item]
 
     bench = Bench(Last([reading(clock())], clock), clock, stop)
-    assert bench.service.run() is Ended.STOPPED
+    assert bench.run() is Ended.STOPPED
     os.close(bytes_there)
     os.close(write)
     assert len(bench.verdicts) == 1
     assert bench.output.statuses()[-1].state is State.STOPPING
 
 
-class TestWatchdog:
+class Watchdog(Companion):
     """Counts how often it is fed."""
-
-    __test__ = False
 
     def __init__(self) -> None:
         self.fed = 0
 
-    def due_ns(self) -> int | None:
-        return None
-
-    def feed(self) -> None:
+    def after_round(self) -> None:
         self.fed += 1
 
 
@@ -321,29 +317,60 @@ def test_the_watchdog_is_fed_after_each_round_and_not_after_a_failed_one(stop: S
         *(reading(clock(), seed) for seed in (1, 2)),
         LinkError("gone"),
     ]
-    watchdog = TestWatchdog()
-    bench = Bench(FakeDriver(queue, clock), clock, stop, watchdog=watchdog)
+    watchdog = Watchdog()
+    bench = Bench(FakeDriver(queue, clock), clock, stop, companions=[watchdog])
     with pytest.raises(LinkError):
-        bench.service.run()
+        bench.run()
     assert watchdog.fed == 2
 
 
 @pytest.mark.parametrize("fine", [True, False])
 def test_a_hangup_reads_the_scene_again_and_a_wrong_one_changes_nothing(fine: bool) -> None:
     clock = Clock()
-    asked = []
+    with StopSignal(reloads=True) as stop:
+        bench = Bench(FakeDriver([reading(clock())], clock), clock, stop)
+        os.kill(os.getpid(), signal.SIGHUP)
+        with closing(bench.loop):
+            asked = [bench.loop.run()]
+            if not fine:
+                asked.append(bench.loop.run())
+        assert asked == ([Ended.RELOAD] if fine else [Ended.RELOAD, Ended.EXHAUSTED])
+        assert not stop.take_reload()
+    assert len(bench.verdicts) == (0 if fine else 1)
 
-    def reload() -> bool:
-        asked.append(True)
-        return fine
+
+def test_a_loop_that_goes_on_after_a_wrong_scene_has_lost_nothing() -> None:
+    """Descriptors are watched again, grasps and messages counted on, nobody is told of an end."""
+    clock = Clock()
+    bytes_there, write = os.pipe()
+
+    class PipeDriver(FakeDriver):
+        def fileno(self) -> int | None:
+            return bytes_there
+
+        def due_ns(self) -> int | None:
+            return None
+
+        def read_ready(self) -> Sequence[Reading]:
+            os.read(bytes_there, 1)
+            if len(self.queue) == 2:
+                os.kill(os.getpid(), signal.SIGHUP)
+            return super().read_ready()
 
     with StopSignal(reloads=True) as stop:
-        bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, reload=reload)
-        os.kill(os.getpid(), signal.SIGHUP)
-        assert bench.service.run() is (Ended.RELOAD if fine else Ended.EXHAUSTED)
-        assert not stop.take_reload()
-    assert asked == [True]
-    assert len(bench.verdicts) == (0 if fine else 1)
+        queue = [reading(clock(), seed) for seed in range(2)]
+        bench = Bench(PipeDriver(queue, clock), clock, stop)
+        os.write(write, b"12")
+        with closing(bench.loop):
+            assert bench.loop.run() is Ended.RELOAD
+            assert len(bench.verdicts) == 1
+            assert bench.output.statuses() == []
+            assert bench.loop.run() is Ended.EXHAUSTED
+    os.close(bytes_there)
+    os.close(write)
+    assert [(verdict.seq, verdict.grasp) for verdict in bench.verdicts] == [(0, 1), (1, 2)]
+    assert len({verdict.boot_id for verdict in bench.verdicts}) == 1
+    assert [status.state for status in bench.output.statuses()] == [State.STOPPING]
 
 
 def test_every_status_tells_jitter_late_readings_and_the_worst_age(stop: StopSignal) -> None:
@@ -352,7 +379,7 @@ def test_every_status_tells_jitter_late_readings_and_the_worst_age(stop: StopSig
     came = [reading(start_ns + t * MS, seq=seq) for seq, t in enumerate((0, 10, 22))]
     clock.now_ns += 25 * MS
     bench = Bench(FakeDriver(came, clock), clock, stop)
-    bench.service.run()
+    bench.run()
     status = bench.output.statuses()[-1]
     assert status.jitter_us["max"] == pytest.approx(2000.0)
     assert status.late_readings == 2  # 25 and 15 ms old, of a period of 10 ms
@@ -374,7 +401,7 @@ def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it(
         bench.output.wants = len(bench.output.sent) == 1
 
     bench.output.send = wants_from_the_second_verdict_on  # type: ignore[method-assign]
-    bench.service.run()
+    bench.run()
     topics = [topic for topic, _ in bench.output.sent[:-1]]
     assert topics == [b"verdict.right", b"tactile.right", b"verdict.right", b"verdict.right"]
     message = decode_tactile(bench.output.sent[1][1])

@@ -19,11 +19,12 @@ import pytest
 
 from daemon import scene
 from daemon.assembly import assembly
+from daemon.assembly.parts import Parts
 from daemon.judge.reasons import GateState
-from daemon.process.signals import StopSignal
-from daemon.run.realtime import Hot
+from daemon.publish.messages import decode_status
+from daemon.run.realtime import RealtimeMode
 from daemon.run.rehearsal import rehearse
-from daemon.run.runner import Parts, Runner, prepare
+from daemon.run.runner import enter_realtime, prepare
 from daemon.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
@@ -31,10 +32,11 @@ from drivers.twins.grasps.grasps import Counts, recorded_counts
 
 WORLD = """
 import ctypes, os, resource, sys
-from daemon.run.realtime import Hot
+from daemon.run.realtime import RealtimeMode
 from daemon.scene import Realtime
 """
 NOBODY = 65534
+STATUS = Path(__file__).parents[1] / "publish" / "golden" / "status.json"
 
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root to have and to lose rights")
 
@@ -76,8 +78,8 @@ def test_every_thread_gets_priority_and_processor_and_gives_them_back(as_before:
     if not fifo_may_be_had():
         pytest.skip("SCHED_FIFO is refused here")
     processor = max(os.sched_getaffinity(0))
-    with Hot(Realtime(priority=7, cpus=(processor,), lock_memory=False)) as hot:
-        assert hot.lacking == []
+    with RealtimeMode(Realtime(priority=7, cpus=(processor,), lock_memory=False)) as mode:
+        assert mode.lacking == []
         for thread in map(int, os.listdir("/proc/self/task")):
             assert os.sched_getscheduler(thread) == os.SCHED_FIFO
             assert os.sched_getparam(thread).sched_priority == 7
@@ -91,9 +93,9 @@ def test_every_thread_gets_priority_and_processor_and_gives_them_back(as_before:
 def test_memory_is_locked_where_that_is_allowed(tmp_path: Path) -> None:
     said = in_a_process(
         """
-with Hot(Realtime(priority=None)) as hot:
+with RealtimeMode(Realtime(priority=None)) as mode:
     kib = [int(line.split()[1]) for line in open("/proc/self/status") if "VmLck" in line]
-    print(len(hot.lacking), *kib)
+    print(len(mode.lacking), *kib)
 """,
         tmp_path,
     )
@@ -106,8 +108,8 @@ with Hot(Realtime(priority=None)) as hot:
 def test_a_processor_that_is_not_there_is_named(
     as_before: None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with Hot(Realtime(priority=None, cpus=(1000,), lock_memory=False)) as hot:
-        assert len(hot.lacking) == 1
+    with RealtimeMode(Realtime(priority=None, cpus=(1000,), lock_memory=False)) as mode:
+        assert len(mode.lacking) == 1
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert "realtime.cpus" in caplog.text
 
@@ -122,7 +124,7 @@ resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
 resource.setrlimit(resource.RLIMIT_MEMLOCK, (65536, 65536))
 os.setgroups([]); os.setresgid({NOBODY}, {NOBODY}, {NOBODY})
 os.setresuid({NOBODY}, {NOBODY}, {NOBODY})
-with Hot(Realtime(priority=50)) as hot:
+with RealtimeMode(Realtime(priority=50)) as mode:
     hold = bytearray(1 << 26)  # far above the limit: must not be refused
 print("lives on")
 """,
@@ -144,10 +146,10 @@ def test_tidying_collects_what_the_stopped_collector_would_have(as_before: None)
         def __del__(self) -> None:
             collected.append(True)
 
-    with Hot(Realtime(priority=None, lock_memory=False)) as hot:
+    with RealtimeMode(Realtime(priority=None, lock_memory=False)) as mode:
         Loop()
         assert collected == []
-        hot.tidy()
+        mode.on_status(decode_status(STATUS.read_bytes()))
         assert collected == [True]
 
 
@@ -188,8 +190,8 @@ def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Pat
         parts = prepare(path)
         judged.append(p_slips(parts, rows[:40]))
         if rehearsed:
-            with StopSignal() as stop, ExitStack() as stack:
-                assert Runner(path, stop)._hot(parts, stack) is not None
+            with ExitStack() as stack:
+                assert enter_realtime(parts, stack) is not None
         judged[-1] += p_slips(parts, rows[40:])
     assert judged[0] == judged[1]
 

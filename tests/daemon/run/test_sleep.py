@@ -33,7 +33,7 @@ def test_a_reading_of_before_a_sleep_gives_no_verdict_however_fresh_it_looks() -
     driver = FakeDriver([reading(clock(), seed) for seed in range(9)], clock)
     with StopSignal() as stop:
         bench = Bench(driver, clock, stop, Sleeper(boot), sleep=Sleep(clock, boot))
-        assert bench.service.run() is Ended.SLEPT
+        assert bench.run() is Ended.SLEPT
     *before, last = bench.verdicts
     assert [verdict.verdict for verdict in before] == [Outcome.STABLE] * 2
     assert (last.verdict, last.reasons) == (Outcome.UNKNOWN, [Reason.STALE])
@@ -46,7 +46,7 @@ def test_who_comes_late_after_a_sleep_is_told_nothing_of_before_it() -> None:
     boot.now_ns += HOUR_NS
     with StopSignal() as stop:
         bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, sleep=sleep)
-        assert bench.service.run() is Ended.SLEPT  # before it has looked who has come
+        assert bench.run() is Ended.SLEPT  # before it has looked who has come
     assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN]
 
 

@@ -72,7 +72,7 @@ def test_the_watchdog_is_fed_four_times_within_its_timeout(ears: socket.socket) 
     ears.setblocking(False)
     fed_ms = []
     for elapsed_ms in range(0, 2000, 10):
-        manager.feed()
+        manager.after_round()
         try:
             assert heard(ears) == ["WATCHDOG=1"]
         except BlockingIOError:
@@ -88,7 +88,7 @@ def test_without_a_watchdog_nothing_is_fed_and_nothing_is_due(ears: socket.socke
     manager = Systemd.of({"NOTIFY_SOCKET": ears.getsockname()})
     assert manager is not None
     assert manager.due_ns() is None
-    manager.feed()
+    manager.after_round()
     manager.stopping()
     assert heard(ears) == ["STOPPING=1", "STATUS=stopping"]
     manager.close()

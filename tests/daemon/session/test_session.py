@@ -98,10 +98,10 @@ def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(first, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
         observe(first, 30)
-        keeper.mind()
+        keeper.before_readings()
         assert load(file.path) is None  # not every second
         clock.now_ns += SAVE_PERIOD_NS
-        keeper.mind()
+        keeper.before_readings()
         keeper.wait()
     second = calibration()
     with SessionFile(tmp_path / "right.json") as file:
@@ -116,20 +116,20 @@ def test_an_exchanged_sensor_ends_the_session(
     clock, session = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(session, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
-        keeper.mind()
+        keeper.before_readings()
         observe(session, 30)
         keeper.save()
     again = calibration()
     driver = sensors()
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(again, FINGERS, driver, file, clock)
-        keeper.mind()
+        keeper.before_readings()
         assert again.grasps == 30  # nothing is known of the sensors yet
         driver.known = {"ff": "A", "mf": "B", "th": "C"}
-        keeper.mind()
+        keeper.before_readings()
         assert again.grasps == 30
         driver.known = {"ff": "A", "mf": "X", "th": "C"}
-        keeper.mind()
+        keeper.before_readings()
         keeper.wait()
         assert again.grasps == 0
         assert "new sensor on mf" in caplog.text
@@ -224,7 +224,7 @@ def test_a_full_disk_is_one_warning_and_no_crash(
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
-            keeper.mind()
+            keeper.before_readings()
             keeper.wait()
         assert caplog.text.count("No space left on device") == 1
         monkeypatch.undo()
@@ -249,7 +249,7 @@ def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.M
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
-            keeper.mind()  # comes back, though nothing is on the disk yet
+            keeper.before_readings()  # comes back, though nothing is on the disk yet
         assert file.load() is None
         hangs.set()
         keeper.save()
@@ -424,14 +424,14 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
     with SessionFile(tmp_path / "right.json") as file:
         file.save(seeded.state(), FINGERS, {})
         keeper = SessionKeeper(calibration(), FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
-        keeper.mind()
+        keeper.before_readings()
         keeper.save()
         kept = file.load()
         assert kept is not None
         assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
         later = calibration()
         keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
-        keeper.mind()
+        keeper.before_readings()
         keeper.wait()
     assert later.grasps == 0
 

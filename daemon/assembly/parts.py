@@ -1,0 +1,133 @@
+"""How the parts of a scene go together: once, for running, for replaying and for what they cost."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from daemon.assembly import assembly
+from daemon.judge.pipeline import Pipeline
+from daemon.publish.companion import Companion
+from daemon.publish.outbox import Outbox, Output
+from daemon.publish.sockets import Sockets
+from daemon.scene import Scene
+from drivers.base import Driver
+from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.record.raw import Tap
+
+log = logging.getLogger("graspd")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """What reads and judges in a scene, nothing of it open yet."""
+
+    scene: Scene
+    model: TactileModel
+    pipeline: Pipeline
+    drivers: list[Driver]
+    """The tactile one first."""
+
+    @classmethod
+    def of(cls, scene: Scene, model: TactileModel) -> Parts:
+        """Those of a scene and its model. Raises `SceneError`, `ModelError` or `RecordingError`."""
+        pipeline = assembly.build_pipeline(scene, model, learns=scene.session_learns)
+        return cls(scene, model, pipeline, assembly.build_drivers(scene))
+
+
+class Assembly:
+    """Opens the parts of one run and puts around them what the scene wants, one call a part.
+
+    `graspd run` makes the calls in this order. A part that the scene does not want is not imported.
+    """
+
+    def __init__(self, parts: Parts, stack: ExitStack) -> None:
+        """`stack` closes what is opened."""
+        self.companions: list[Companion] = []
+        """Sockets, session keeper and recorder, as far as there are."""
+        self._outputs: list[Output] = []
+        self._parts = parts
+        self._stack = stack
+        self._boot_id = uuid.uuid4().hex
+        self._tap: Tap | None = None
+
+    def add_sockets(self, sockets: Sockets) -> None:
+        """Send messages to `sockets`, which whoever opened them closes."""
+        self._outputs.append(sockets)
+        self.companions.append(sockets)
+
+    def open_drivers(self) -> None:
+        """Open the drivers, keeping all that comes over the link if the scene wants that recorded.
+
+        Raises `LinkError` where a later try may succeed, and `SceneError` where none can.
+        """
+        record, drivers = self._parts.scene.record, self._parts.drivers
+        if record is not None and record.raw:
+            from daemon.record.raw import tap_of
+
+            self._tap = tap_of(drivers[0], self._parts.scene.tactile)
+        for driver in drivers:
+            self._stack.callback(driver.close)
+            assembly.open_driver(driver)
+
+    def keep_session(self) -> None:
+        """Restore and keep the session, if model and scene want that and there is a place for it.
+
+        The file is saved for the last time when the stack closes.
+        """
+        scene, pipeline = self._parts.scene, self._parts.pipeline
+        if pipeline.session is None or not scene.keeps_session:
+            return
+        from daemon.session.file import SessionFile, SessionFileError
+        from daemon.session.keeper import SessionKeeper
+
+        try:
+            file = SessionFile(scene.session_path)
+        except SessionFileError as error:
+            log.warning("%s; every start begins a new session", error)
+            return
+        self._stack.callback(file.close)
+        keeper = SessionKeeper(
+            pipeline.session,
+            scene.hand.fingers,
+            self._parts.drivers[0],
+            file,
+            on_exchange=pipeline.sensors_exchanged,
+        )
+        self._stack.callback(keeper.save)
+        self.companions.append(keeper)
+
+    def record(self) -> None:
+        """Record, if the scene wants that; the session is by now what it is at the start.
+
+        Raises `SceneError` without the packages that recording needs.
+        """
+        parts = self._parts
+        if parts.scene.record is None:
+            return
+        from daemon.assembly.recorder import build_recorder
+
+        recorder = build_recorder(
+            parts.scene, parts.model, parts.pipeline, self._boot_id, self._tap
+        )
+        if recorder is not None:
+            self._stack.callback(recorder.close)
+            self._outputs.append(recorder)
+            self.companions.append(recorder)
+
+    def build_outbox(self) -> Outbox:
+        """What sends the messages of this run to sockets and recorder, as far as there are."""
+        hand, model = self._parts.scene.hand, self._parts.model
+        return Outbox(
+            hand.name,
+            hand.fingers,
+            model.contract.name,
+            model.sha256,
+            self._outputs,
+            boot_id=self._boot_id,
+        )
