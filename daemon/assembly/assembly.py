@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.judge.decision import Limits
+from daemon.judge.limits import ContactLimits, GateLimits, GripLimits, JointLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
 from daemon.scene import GateMode, Scene, SceneError
@@ -29,8 +30,6 @@ from models.contract import ModelError
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.grip import GripLimits
-    from daemon.judge.joint_motion import JointLimits
     from drivers.recordings.csv_columns import Columns
 
 DEFAULT_MODEL = "small-session"
@@ -136,13 +135,9 @@ def grip_limits(scene: Scene) -> GripLimits | None:
         if gate.sweeps == 3:
             raise SceneError("gate.sweeps 3: readings that are each a grasp have no median")
         return None
-    from daemon.judge.contact import ContactLimits
-    from daemon.judge.gate import GateLimits
-    from daemon.judge.grip import MEDIAN_SWEEPS, GripLimits
-
     return GripLimits(
         on_request=mode == "request",
-        sweeps=MEDIAN_SWEEPS if gate.sweeps is None else gate.sweeps,
+        sweeps=GripLimits.sweeps if gate.sweeps is None else gate.sweeps,
         required=gate.fingers,
         contact=ContactLimits(counts=gate.contact_counts, sigmas=gate.contact_sigmas),
         gate=GateLimits(
@@ -184,8 +179,6 @@ def joint_limits(scene: Scene) -> JointLimits | None:
     recorded = isinstance(tactile, ReplayTactile) and _has_joints(scene, tactile)
     if scene.joints is None and not recorded:
         return None
-    from daemon.judge.joint_motion import JointLimits
-
     return JointLimits(
         rad_per_s=scene.gate.joint_rad_per_s, lost_ns=round(scene.gate.joints_lost_ms * 1e6)
     )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from daemon.assembly import assembly
-from daemon.judge.memory import JudgeMemory, encode
+from daemon.judge.memory import encode, remember
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
 from daemon.record.header import Known, RecordingHeader
@@ -84,6 +84,6 @@ def state_of(pipeline: Pipeline) -> Callable[[], Known]:
 
     Encoding takes longer, and may be done in another thread.
     """
-    judge, session, axis_ns = JudgeMemory.of(pipeline), pipeline.session, pipeline.axis_ns
+    judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()
     return lambda: Known(judge=encode(judge), axis_ns=axis_ns, session=state)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from daemon.assembly import assembly
 from daemon.assembly.link_logs import changed
-from daemon.judge.memory import decode
+from daemon.judge.memory import recall
 from daemon.judge.pipeline import Pipeline
 from daemon.record.mcap import header_of
 from daemon.record.player import McapReplayDriver
@@ -74,9 +74,8 @@ class RecordedRun:
         clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
         pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
         try:
-            decode(header.known.judge).give_judge(pipeline, same_model=same_model)
+            recall(pipeline, header.known.judge, same_model=same_model)
         except ValueError:
-            pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         if driver is not None:

@@ -19,7 +19,7 @@ from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.grip import GripLimits
+    from daemon.judge.limits import GripLimits
     from daemon.measure.cost.tables import Footprint
 
 TACTILE_SECTIONS = (

@@ -22,7 +22,7 @@ from daemon.session.file import KeptSession, SessionFile, SessionFileError, load
 from drivers.base import DriverError, JointReading
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX
 from models.contract import SessionInput
-from models.inputs import SessionBuilder, raw_features
-from models.session import SessionState, SessionStatistics
+from models.inputs import raw_features
+from models.session_statistics import SessionState, SessionStatistics
 
 SPREAD_RATIOS = (0.2, 3.0)
 """Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
@@ -16,19 +18,52 @@ by 0.7 to 1.3 times from twenty grasps of the published tables on; those of a de
 times."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """What is known of a session at one moment; what it learns later is in the next one."""
+
+    features_mean: NDArray[np.float64]
+    """Of what a session model takes, shape (fingers * 26,), before standardising."""
+    features_spread: NDArray[np.float64]
+    """Standard deviation of the same."""
+    counts_mean: NDArray[np.float64]
+    """Of each electrode in this session, shape (fingers, 24)."""
+    counts_spread: NDArray[np.float64]
+    """Standard deviation of each electrode in this session, shape (fingers, 24)."""
+    training_mean: NDArray[np.float64]
+    """Of each electrode in the training, shape (fingers, 24)."""
+    scale: NDArray[np.float64]
+    """Spread in the training over that of the session, shape (fingers, 24)."""
+    calibrated: bool
+    """Whether the grasps are enough for what the model's card says, and can have been grasps."""
+    odd: bool
+    """Whether what came cannot have been grasps: a finger that is dead or sees only noise."""
+    temperature: float
+    """What the margin of a verdict must be divided by, with so few grasps."""
+
+    def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
+        """What counts (fingers, 24) would have been with the training's sensors."""
+        deviation = counts.astype(np.float64) - self.counts_mean
+        values: NDArray[np.float64] = self.training_mean + deviation * self.scale
+        return values
+
+    def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The inverse of `to_training`."""
+        counts: NDArray[np.float64] = self.counts_mean + (values - self.training_mean) / self.scale
+        return counts
+
+
 class SessionCalibration:
-    """Keeps the statistics of the session's unlabelled grasps, and a model's input up to them."""
+    """Takes in the session's unlabelled grasps; `now` is what is known by them."""
 
     def __init__(
         self,
         wanted: SessionInput,
-        inputs: SessionBuilder,
         counts_mean: NDArray[np.float64],
         counts_spread: NDArray[np.float64],
     ) -> None:
         """Start with the training's statistics: `wanted`, and of the counts (fingers, 24)."""
         self._wanted = wanted
-        self._inputs = inputs
         self._training_mean = counts_mean
         self._training_spread = counts_spread
         self._statistics = SessionStatistics(
@@ -36,7 +71,7 @@ class SessionCalibration:
             np.concatenate((wanted.spread, counts_spread.ravel())),
             wanted.prior_grasps,
         )
-        self._settle()
+        self.now = self._calibration()
 
     @property
     def grasps(self) -> int:
@@ -46,37 +81,18 @@ class SessionCalibration:
     @property
     def calibrated(self) -> bool:
         """Whether they are enough for what the model's card says, and can have been grasps."""
-        return self.grasps >= self._wanted.calibrated_from and not self.odd
-
-    @property
-    def temperature(self) -> float:
-        """What the margin of a verdict must be divided by, with so few grasps."""
-        steps, grasps = self._wanted.sharpness, 0 if self.odd else self.grasps
-        return next(step.temperature for step in reversed(steps) if step.grasps <= grasps)
+        return self.now.calibrated
 
     def observe(self, counts: NDArray[np.generic]) -> None:
         """Take in the counts (fingers, 24) of a grasp that was judged, or could have been."""
         values = np.concatenate((raw_features(counts), counts.ravel()))
         if self._statistics.observe(values):
-            self._settle()
-
-    def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
-        """What counts (fingers, 24) would have been with the training's sensors."""
-        deviation = counts.astype(np.float64) - self.counts_mean
-        values: NDArray[np.float64] = self._training_mean + deviation * self._scale
-        return values
-
-    def from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of `to_training`."""
-        counts: NDArray[np.float64] = (
-            self.counts_mean + (values - self._training_mean) / self._scale
-        )
-        return counts
+            self.now = self._calibration()
 
     def reset(self) -> None:
         """A sensor was exchanged: start again."""
         self._statistics.reset()
-        self._settle()
+        self.now = self._calibration()
 
     def state(self) -> SessionState:
         """To be kept for `restore`."""
@@ -88,19 +104,25 @@ class SessionCalibration:
         if ((counts < 0.0) | (counts > COUNT_MAX)).any():
             raise ValueError("holds means that no counts have")
         self._statistics.restore(state)
-        self._settle()
+        self.now = self._calibration()
 
-    def _settle(self) -> None:
-        features = len(self._wanted.mean)
+    def _calibration(self) -> Calibration:
+        features, shape = len(self._wanted.mean), self._training_mean.shape
         mean, spread = self._statistics.mean, self._statistics.spread
-        self._inputs.use(mean[:features], spread[:features])
-        self.counts_mean = mean[features:].reshape(self._training_mean.shape)
-        """Of each electrode in this session, shape (fingers, 24)."""
-        self.counts_spread = spread[features:].reshape(self._training_mean.shape)
-        """Standard deviation of each electrode in this session, shape (fingers, 24)."""
+        counts_spread = spread[features:].reshape(shape)
+        ratio = np.median(counts_spread / self._training_spread, axis=1)
         least, most = SPREAD_RATIOS
-        self._scale = self._training_spread / self.counts_spread
-        ratio = np.median(self.counts_spread / self._training_spread, axis=1)
         enough = self.grasps >= self._wanted.calibrated_from
-        self.odd = enough and not bool(((ratio >= least) & (ratio <= most)).all())
-        """Whether what came cannot have been grasps: a finger that is dead or sees only noise."""
+        odd = enough and not bool(((ratio >= least) & (ratio <= most)).all())
+        steps, grasps = self._wanted.sharpness, 0 if odd else self.grasps
+        return Calibration(
+            features_mean=mean[:features],
+            features_spread=spread[:features],
+            counts_mean=mean[features:].reshape(shape),
+            counts_spread=counts_spread,
+            training_mean=self._training_mean,
+            scale=self._training_spread / counts_spread,
+            calibrated=enough and not odd,
+            odd=odd,
+            temperature=next(s.temperature for s in reversed(steps) if s.grasps <= grasps),
+        )

@@ -7,11 +7,14 @@ the finger as a whole: what moves all electrodes alike is the supply or the temp
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.findings import Number
+from daemon.judge.limits import ContactLimits
 from drivers.base import COUNT_MAX, ELECTRODES
 
 WINDOW = 100
@@ -54,55 +57,203 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation of a Gaussian over its median absolute deviation."""
 
 
-@dataclass(frozen=True, slots=True)
-class ContactLimits:
-    """What a touch is: the larger of both, for the third deepest electrode of a finger."""
+@dataclass(slots=True, eq=False)
+class Touch:
+    """Whether one finger touches, by how far it has fallen and how it came there."""
 
-    counts: float = 20.0
-    """Fall below the baseline, counts. In 9.8 s of three untouched sensors it was 10 at most; from
-    24 on a touch of three electrodes was always seen there (thresholds were 20 to 22)."""
-    sigmas: float = 5.0
-    """The same in standard deviations of the finger's median electrode."""
+    threshold: float
+    """Fall that makes a touch, counts."""
+    touching: bool = False
+    fall: float = 0.0
+    """Counts by which the third deepest electrode is below its baseline, and below the finger's
+    median electrode: the smaller of both, and the latter alone where the finger touches already,
+    for in a long hold the sensors drift. Zero without a baseline."""
+    depth: float = 0.0
+    """How deep it was held, counts, fading."""
+    lowest: float = 0.0
+    """Smallest fall since it let go: a new touch falls from there, not from zero."""
+    let_go_ns: int | None = None
+    since_ns: int | None = None
+    """Since when it touches."""
+    alone_since_ns: int | None = None
+    """Since when it touches without all the others."""
+    held_long: bool = False
+    """Whether it has just let go after a long hold."""
+
+    def end(self) -> None:
+        """Where the finger rests is not known."""
+        self.touching = False
+        self.fall = self.depth = self.lowest = 0.0
+        self.since_ns = self.alone_since_ns = None
+
+    def follow(self, t_ns: int, elapsed_s: float, deep: float, relative: float) -> None:
+        """Take in the fall of the third deepest electrode, below its baseline and relative."""
+        touched = self.touching
+        self.fall = relative if touched else min(deep, relative)
+        if touched:
+            self.touching = self.fall >= self._hold_ends_at(t_ns)
+        else:
+            apart = self.let_go_ns is None or not 0 <= t_ns - self.let_go_ns < APART_NS
+            self.touching = apart and self.fall >= self.threshold + self.lowest
+        self.held_long = False
+        if self.touching:
+            self.since_ns = t_ns if self.since_ns is None else self.since_ns
+            self.depth = max(self.fall, self.depth - DEPTH_FADES_COUNTS_PER_S * elapsed_s)
+            self.lowest = 0.0
+            return
+        if touched:
+            self.let_go_ns = t_ns
+            self.held_long = self._is_long(t_ns)
+            self.lowest = self.fall
+        self.since_ns = None
+        self.depth = 0.0
+        self.lowest = min(self.lowest, max(self.fall, 0.0))
+
+    def must_be_tared_anew(self, t_ns: int, middle: float, *, accompanied: bool) -> bool:
+        """Whether what is known of where the finger rests is to be trusted no longer.
+
+        `middle` is the fall of its median electrode, `accompanied` whether all fingers touch.
+        """
+        if not self.touching:
+            self.alone_since_ns = None
+            # One that rests higher as a whole was tared while it touched, or has drifted far.
+            return self.held_long or middle < -self.threshold
+        if accompanied:
+            self.alone_since_ns = None
+        elif self.alone_since_ns is None:
+            self.alone_since_ns = t_ns
+        return self.alone_since_ns is not None and t_ns - self.alone_since_ns > ALONE_NS
+
+    def _hold_ends_at(self, t_ns: int) -> float:
+        """Fall from which on a finger that touches still does."""
+        share = RELEASED_LONG if self._is_long(t_ns) else RELEASED
+        return max(LET_GO * self.threshold, share * self.depth)
+
+    def _is_long(self, t_ns: int) -> bool:
+        return self.since_ns is not None and t_ns - self.since_ns > LONG_HOLD_NS
+
+
+def _window(dtype: type[np.generic]) -> NDArray[Any]:
+    return np.zeros((WINDOW, ELECTRODES), dtype=dtype)
+
+
+@dataclass(slots=True, eq=False)
+class Tare:
+    """The last untouched sweeps of one finger."""
+
+    window: NDArray[np.uint16] = field(default_factory=lambda: _window(np.uint16))
+    usable: NDArray[np.bool_] = field(default_factory=lambda: _window(np.bool_))
+    number: Number = 0
+    """Sweeps since something touched; the window is written round and round."""
+    settled_ns: int | None = None
+    """When a baseline was last taken from it."""
+
+    def clear(self) -> None:
+        """Something touches: begin again afterwards."""
+        self.number = 0
+
+    def add(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> bool:
+        """Take in a sweep, shape (24,); True when it is time to look at the window."""
+        place = self.number % WINDOW
+        self.window[place] = counts
+        self.usable[place] = usable
+        self.number += 1
+        return self.number >= WINDOW and self.number % TARE_EVERY == 0
+
+    def rest(self) -> tuple[NDArray[np.float64], float, NDArray[np.bool_]] | None:
+        """Baseline (24,), median electrode's sigma and which are known; None if it moved."""
+        known: NDArray[np.bool_] = np.logical_and.reduce(self.usable, axis=0)
+        if np.count_nonzero(known) < SOUND_MIN:
+            return None
+        oldest = self.number % WINDOW
+        window = np.concatenate((self.window[oldest:], self.window[:oldest]))
+        baseline = _median(window)
+        sigmas = MAD_TO_SIGMA * _median(np.abs(window - baseline))
+        halves = _median(window[WINDOW // 2 :]) - _median(window[: WINDOW // 2])
+        sigma = max(float(_median(sigmas[known])), SIGMA_MIN_COUNTS)
+        if sigma > SIGMA_MAX_COUNTS or abs(_median(halves[known])) > TREND_MAX_COUNTS:
+            return None
+        known &= (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
+        return (baseline, sigma, known) if np.count_nonzero(known) >= SOUND_MIN else None
+
+
+@dataclass(slots=True, eq=False)
+class ContactMemory:
+    """What is known of the fingers' rest and touch; arrays of shape (fingers, 24) or (fingers,)."""
+
+    tares: list[Tare]
+    touches: list[Touch]
+    baseline: NDArray[np.float64]
+    """Where each electrode rests, counts; 0 without a tare."""
+    known: NDArray[np.bool_]
+    """Of which electrodes that is known."""
+    touching: NDArray[np.bool_]
+    """Which fingers touch."""
+    tared: NDArray[np.bool_]
+    """Whether each finger has a baseline. Without one, nobody knows whether it touches."""
+    last_ns: int | None = None
+    """Time of the last sweep."""
+    rest: NDArray[np.float64] = field(init=False)
+    """The baseline, and infinity where it is not known: nothing falls further."""
+    numbers: list[int] = field(init=False)
+    """Electrodes of each finger whose baseline is known."""
+
+    def __post_init__(self) -> None:
+        """Work out what follows from the other fields."""
+        self.rest = np.where(self.known, self.baseline, np.inf)
+        self.numbers = np.count_nonzero(self.known, axis=1).tolist()
+
+    def know(self, finger: int, known: NDArray[np.bool_]) -> None:
+        """From now on the baselines of these electrodes of a finger, shape (24,), are known."""
+        self.known[finger] = known
+        self.rest[finger] = np.where(known, self.baseline[finger], np.inf)
+        self.numbers[finger] = int(np.count_nonzero(known))
 
 
 class Contact:
     """Follows the baselines of all fingers and says which touch. Constant memory, no clock."""
 
-    def __init__(self, fingers: int, limits: ContactLimits = ContactLimits()) -> None:
+    def __init__(self, fingers: int, limits: ContactLimits) -> None:
         """Start without a baseline."""
         shape = (fingers, ELECTRODES)
         self._limits = limits
-        self._tares = [_Tare() for _ in range(fingers)]
-        self._touches = [_Touch(limits.counts) for _ in range(fingers)]
-        self._baseline = np.zeros(shape)
-        self._known = np.zeros(shape, dtype=np.bool_)
-        self._rest = np.full(shape, np.inf)
-        """The baseline, and infinity where it is not known: nothing falls further."""
-        self._numbers = [0] * fingers
-        """Electrodes of each finger whose baseline is known."""
-        self._last_ns: int | None = None
-        self.touching = np.zeros(fingers, dtype=np.bool_)
-        self.tared = np.zeros(fingers, dtype=np.bool_)
-        """Whether each finger has a baseline. Without one, nobody knows whether it touches."""
+        self.memory = ContactMemory(
+            tares=[Tare() for _ in range(fingers)],
+            touches=[Touch(limits.counts) for _ in range(fingers)],
+            baseline=np.zeros(shape),
+            known=np.zeros(shape, dtype=np.bool_),
+            touching=np.zeros(fingers, dtype=np.bool_),
+            tared=np.zeros(fingers, dtype=np.bool_),
+        )
+
+    @property
+    def touching(self) -> NDArray[np.bool_]:
+        """Which fingers touch, shape (fingers,)."""
+        return self.memory.touching
+
+    @property
+    def tared(self) -> NDArray[np.bool_]:
+        """Whether it is known where each finger rests, shape (fingers,)."""
+        return self.memory.tared
 
     @property
     def baseline(self) -> NDArray[np.float64]:
         """Where each electrode rests, counts, shape (fingers, 24); 0 without a tare."""
-        return self._baseline
+        return self.memory.baseline
 
     @property
     def fall(self) -> NDArray[np.float64]:
-        """How deep each finger is pressed, counts, shape (fingers,); see `_Touch.fall`."""
-        return np.array([touch.fall for touch in self._touches])
+        """How deep each finger is pressed, counts, shape (fingers,); see `Touch.fall`."""
+        return np.array([touch.fall for touch in self.memory.touches])
 
     @property
     def threshold(self) -> NDArray[np.float64]:
         """Fall that makes a touch, counts, shape (fingers,)."""
-        return np.array([touch.threshold for touch in self._touches])
+        return np.array([touch.threshold for touch in self.memory.touches])
 
     def forget(self) -> None:
-        """The sensors may be others, or have been away: all fingers must be tared anew."""
-        for finger in range(len(self._tares)):
+        """Forget every tare: the sensors may be others, or have been off."""
+        for finger in range(len(self.memory.tares)):
             self._forget(finger)
 
     def observe(
@@ -116,12 +267,13 @@ class Contact:
 
         Electrodes that are not `usable` count for nothing.
         """
+        memory = self.memory
         falls, numbers = self._falls(median, usable)
-        elapsed_s = 0.0 if self._last_ns is None else max(t_ns - self._last_ns, 0) / 1e9
-        self._last_ns = t_ns
+        elapsed_s = 0.0 if memory.last_ns is None else max(t_ns - memory.last_ns, 0) / 1e9
+        memory.last_ns = t_ns
         middles = [0.0] * len(numbers)
-        tared = self.tared.tolist()
-        for finger, touch in enumerate(self._touches):
+        tared, touches = memory.tared.tolist(), memory.touches
+        for finger, touch in enumerate(touches):
             number = numbers[finger]
             if tared[finger] and number >= SOUND_MIN:
                 deep = falls.item(finger, number - FALLEN)
@@ -129,13 +281,13 @@ class Contact:
                 touch.follow(t_ns, elapsed_s, deep, deep - middles[finger])
             else:
                 # With too few electrodes nobody knows any more, until it is tared again.
-                self.tared[finger] = False
+                memory.tared[finger] = False
                 touch.end()
-        all_touch = all(touch.touching for touch in self._touches)
-        for finger, touch in enumerate(self._touches):
+        all_touch = all(touch.touching for touch in touches)
+        for finger, touch in enumerate(touches):
             anew = touch.must_be_tared_anew(t_ns, middles[finger], accompanied=all_touch)
-            self.touching[finger] = touch.touching
-            if anew and self.tared[finger]:
+            memory.touching[finger] = touch.touching
+            if anew and memory.tared[finger]:
                 self._forget(finger)
             self._tare(finger, t_ns, counts, usable)
 
@@ -143,11 +295,11 @@ class Contact:
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], list[int]]:
         """Falls of each finger's electrodes, ascending, and how many of them count, the first."""
-        falls, numbers = median.astype(np.float64), self._numbers
-        np.subtract(self._rest, falls, out=falls)
+        falls, numbers = median.astype(np.float64), self.memory.numbers
+        np.subtract(self.memory.rest, falls, out=falls)
         if np.count_nonzero(usable) != usable.size:
             falls[~usable] = np.inf
-            numbers = (usable & self._known).sum(axis=1).tolist()
+            numbers = (usable & self.memory.known).sum(axis=1).tolist()
         falls.sort(axis=1)
         return falls, numbers
 
@@ -155,152 +307,38 @@ class Contact:
         self, finger: int, t_ns: int, counts: NDArray[np.uint16], usable: NDArray[np.bool_]
     ) -> None:
         """Take a finger's sweep into its window, unless it may be the beginning of a touch."""
-        tare, touch = self._tares[finger], self._touches[finger]
-        if touch.fall >= SUSPECT * touch.threshold and self.tared[finger]:
+        memory = self.memory
+        tare, touch = memory.tares[finger], memory.touches[finger]
+        if touch.fall >= SUSPECT * touch.threshold and memory.tared[finger]:
             tare.clear()
         elif tare.add(counts[finger], usable[finger]):
             self._settle(finger, tare, t_ns)
 
     def _forget(self, finger: int) -> None:
-        self.tared[finger] = self.touching[finger] = False
-        self._know(finger, np.zeros(ELECTRODES, dtype=np.bool_))
-        self._touches[finger] = _Touch(self._touches[finger].threshold)
-        self._tares[finger] = _Tare()
+        memory = self.memory
+        memory.tared[finger] = memory.touching[finger] = False
+        memory.know(finger, np.zeros(ELECTRODES, dtype=np.bool_))
+        memory.touches[finger] = Touch(memory.touches[finger].threshold)
+        memory.tares[finger] = Tare()
 
-    def _settle(self, finger: int, tare: _Tare, t_ns: int) -> None:
+    def _settle(self, finger: int, tare: Tare, t_ns: int) -> None:
         """Take over what a finger's window says, if it was at rest."""
         rest = tare.rest()
         if rest is None:
             return
+        memory = self.memory
         baseline, sigma, known = rest
         elapsed_s = 0.0 if tare.settled_ns is None else max(t_ns - tare.settled_ns, 0) / 1e9
         tare.settled_ns = t_ns
-        step = baseline - self._baseline[finger]
-        if self.tared[finger]:
+        step = baseline - memory.baseline[finger]
+        if memory.tared[finger]:
             limited = np.clip(step, -DOWN_COUNTS_PER_S * elapsed_s, UP_COUNTS_PER_S * elapsed_s)
             # An electrode that was not known before is taken as it is.
-            step = np.where(self._known[finger], limited, step)
-        self._baseline[finger] += step
-        self._know(finger, known)
-        self._touches[finger].threshold = max(self._limits.counts, self._limits.sigmas * sigma)
-        self.tared[finger] = True
-
-    def _know(self, finger: int, known: NDArray[np.bool_]) -> None:
-        """From now on the baselines of these electrodes of a finger, shape (24,), are known."""
-        self._known[finger] = known
-        self._rest[finger] = np.where(known, self._baseline[finger], np.inf)
-        self._numbers[finger] = int(np.count_nonzero(known))
-
-
-class _Touch:
-    """Whether one finger touches, by how far it has fallen and how it came there."""
-
-    def __init__(self, threshold: float) -> None:
-        self.threshold = threshold
-        """Fall that makes a touch, counts."""
-        self.touching = False
-        self.fall = 0.0
-        """Counts by which the third deepest electrode is below its baseline, and below the finger's
-        median electrode: the smaller of both, and the latter alone where the finger touches
-        already, for in a long hold the sensors drift. Zero without a baseline."""
-        self._depth = 0.0
-        self._lowest = 0.0
-        """Smallest fall since it let go: a new touch falls from there, not from zero."""
-        self._let_go_ns: int | None = None
-        self._since_ns: int | None = None
-        self._alone_since_ns: int | None = None
-        self._held_long = False
-
-    def end(self) -> None:
-        """Where the finger rests is not known."""
-        self.touching = False
-        self.fall = self._depth = self._lowest = 0.0
-        self._since_ns = self._alone_since_ns = None
-
-    def follow(self, t_ns: int, elapsed_s: float, deep: float, relative: float) -> None:
-        """Take in the fall of the third deepest electrode, below its baseline and relative."""
-        touched = self.touching
-        self.fall = relative if touched else min(deep, relative)
-        if touched:
-            self.touching = self.fall >= self._held(t_ns)
-        else:
-            apart = self._let_go_ns is None or not 0 <= t_ns - self._let_go_ns < APART_NS
-            self.touching = apart and self.fall >= self.threshold + self._lowest
-        self._held_long = False
-        if self.touching:
-            self._since_ns = t_ns if self._since_ns is None else self._since_ns
-            self._depth = max(self.fall, self._depth - DEPTH_FADES_COUNTS_PER_S * elapsed_s)
-            self._lowest = 0.0
-            return
-        if touched:
-            self._let_go_ns = t_ns
-            self._held_long = self._is_long(t_ns)
-            self._lowest = self.fall
-        self._since_ns = None
-        self._depth = 0.0
-        self._lowest = min(self._lowest, max(self.fall, 0.0))
-
-    def must_be_tared_anew(self, t_ns: int, middle: float, *, accompanied: bool) -> bool:
-        """Whether what is known of where the finger rests is to be trusted no longer.
-
-        `middle` is the fall of its median electrode, `accompanied` whether all fingers touch.
-        """
-        if not self.touching:
-            self._alone_since_ns = None
-            # One that rests higher as a whole was tared while it touched, or has drifted far.
-            return self._held_long or middle < -self.threshold
-        if accompanied:
-            self._alone_since_ns = None
-        elif self._alone_since_ns is None:
-            self._alone_since_ns = t_ns
-        return self._alone_since_ns is not None and t_ns - self._alone_since_ns > ALONE_NS
-
-    def _held(self, t_ns: int) -> float:
-        """Fall from which on a finger that touches still does."""
-        share = RELEASED_LONG if self._is_long(t_ns) else RELEASED
-        return max(LET_GO * self.threshold, share * self._depth)
-
-    def _is_long(self, t_ns: int) -> bool:
-        return self._since_ns is not None and t_ns - self._since_ns > LONG_HOLD_NS
-
-
-class _Tare:
-    """The last untouched sweeps of one finger."""
-
-    def __init__(self) -> None:
-        self._window = np.zeros((WINDOW, ELECTRODES), dtype=np.uint16)
-        self._usable = np.zeros((WINDOW, ELECTRODES), dtype=np.bool_)
-        self.settled_ns: int | None = None
-        """When a baseline was last taken from it."""
-        self.clear()
-
-    def clear(self) -> None:
-        """Something touches: begin again afterwards."""
-        self._number = 0
-
-    def add(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> bool:
-        """Take in a sweep, shape (24,); True when it is time to look at the window."""
-        place = self._number % WINDOW
-        self._window[place] = counts
-        self._usable[place] = usable
-        self._number += 1
-        return self._number >= WINDOW and self._number % TARE_EVERY == 0
-
-    def rest(self) -> tuple[NDArray[np.float64], float, NDArray[np.bool_]] | None:
-        """Baseline (24,), median electrode's sigma and which are known; None if it moved."""
-        known: NDArray[np.bool_] = np.logical_and.reduce(self._usable, axis=0)
-        if np.count_nonzero(known) < SOUND_MIN:
-            return None
-        oldest = self._number % WINDOW
-        window = np.concatenate((self._window[oldest:], self._window[:oldest]))
-        baseline = _median(window)
-        sigmas = MAD_TO_SIGMA * _median(np.abs(window - baseline))
-        halves = _median(window[WINDOW // 2 :]) - _median(window[: WINDOW // 2])
-        sigma = max(float(_median(sigmas[known])), SIGMA_MIN_COUNTS)
-        if sigma > SIGMA_MAX_COUNTS or abs(_median(halves[known])) > TREND_MAX_COUNTS:
-            return None
-        known &= (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
-        return (baseline, sigma, known) if np.count_nonzero(known) >= SOUND_MIN else None
+            step = np.where(memory.known[finger], limited, step)
+        memory.baseline[finger] += step
+        memory.know(finger, known)
+        memory.touches[finger].threshold = max(self._limits.counts, self._limits.sigmas * sigma)
+        memory.tared[finger] = True
 
 
 def _median(values: NDArray[np.generic]) -> NDArray[np.float64]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from daemon.judge.reasons import Outcome, Reason
 
 
-@dataclass(frozen=True, slots=True)
+# Without slots, so that a default can be read from the class.
+@dataclass(frozen=True)
 class Limits:
     """What a verdict other than `unknown` must keep to."""
 

@@ -3,46 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.contact import Contact, ContactLimits
-from daemon.judge.gate import Gate, GateChange, GateLimits
-from daemon.judge.health import Watched
+from daemon.judge.contact import Contact
+from daemon.judge.findings import Felt, Watched
+from daemon.judge.gate import Gate, GateChange
+from daemon.judge.limits import MEDIAN_SWEEPS, GripLimits, JointLimits
 from daemon.judge.median import FreshMedian
 from daemon.judge.reasons import GateState, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.judge.joint_motion import JointLimits, JointMotion
+    from daemon.judge.joint_motion import JointMotion
 
-MEDIAN_SWEEPS = 3
 OUTAGE_NS = 1_000_000_000
 """After so long without a usable reading the sensors may have been exchanged or powered anew."""
 
 
-@dataclass(frozen=True, slots=True)
-class GripLimits:
-    """All conditions of the moment before the lift."""
+@dataclass(slots=True)
+class GripMemory:
+    """What its parts do not remember themselves."""
 
-    on_request: bool = False
-    """Whether a settled grasp is judged only when somebody asks."""
-    sweeps: int = MEDIAN_SWEEPS
-    """What is judged: 1, the reading at hand; 3, the median of three fresh sweeps."""
-    required: tuple[Finger, ...] | None = None
-    """Fingers that must touch; all unless given."""
-    contact: ContactLimits = field(default_factory=ContactLimits)
-    gate: GateLimits = field(default_factory=GateLimits)
-    joints: JointLimits | None = None
-    """None for a hand without joint angles."""
+    last_ns: int | None = None
+    """Time of the last usable reading."""
+    unsettled: int = 0
+    """Readings to come whose median may be of values from before some that are missing."""
 
 
 class Grip:
-    """Feels one hand."""
+    """Follows contact, joints and gate of one hand, and says when a grasp is to be judged."""
 
     def __init__(self, fingers: Sequence[Finger], limits: GripLimits) -> None:
         """`fingers` are those of the readings, in their order."""
@@ -58,9 +52,7 @@ class Grip:
         self._joints = None if limits.joints is None else _joint_motion(limits.joints)
         must_touch = np.array([finger in required for finger in fingers])
         self._gate = Gate(must_touch, limits.gate, on_request=limits.on_request)
-        self._last_ns: int | None = None
-        self._unsettled = 0
-        """Readings to come whose median may be of values from before some that are missing."""
+        self.memory = GripMemory()
 
     @property
     def state(self) -> GateState:
@@ -100,26 +92,41 @@ class Grip:
     @property
     def joints_lost(self) -> bool:
         """Whether judging goes on without joint angles that should be there."""
-        return (
-            self._joints is not None
-            and self._last_ns is not None
-            and (self._joints.is_lost(self._last_ns) or self._joints.some_lost)
-        )
+        joints, last_ns = self._joints, self.memory.last_ns
+        if joints is None or last_ns is None:
+            return False
+        return joints.is_lost(last_ns) or joints.some_lost
 
     def ask(self) -> None:
-        """The controller wants the grasp at hand judged."""
+        """Have the grasp at hand judged once it has settled."""
         self._gate.ask()
 
     def forget(self) -> None:
-        """The sensors are others, or may be: where they rest is not known, nor what they hold."""
+        """Forget tare and grasp: the sensors are others, or may be."""
         self._contact.forget()
         self._fresh.reset()
-        if self._last_ns is not None:
-            self._gate.restart(self._last_ns)
+        self.restart()
+
+    def restart(self) -> None:
+        """Let the grasp at hand settle anew, from the last reading on."""
+        if self.memory.last_ns is not None:
+            self._gate.restart(self.memory.last_ns)
 
     def interrupt(self) -> None:
         """Readings are missing before the next one: the grasp must settle anew."""
-        self._unsettled = MEDIAN_SWEEPS
+        self.memory.unsettled = MEDIAN_SWEEPS
+
+    def memories(self) -> dict[str, dict[str, Any]]:
+        """What the hand's parts remember, by the name of the part; see `Pipeline.memories`."""
+        hand: dict[str, Any] = {
+            "grip": self.memory,
+            "fresh": self._fresh.memory,
+            "contact": self._contact.memory,
+            "gate": self._gate.memory,
+            "stillness": self._gate.stillness.memory,
+        }
+        joints = {} if self._joints is None else {"joints": {"joints": self._joints.memory}}
+        return {"hand": hand, **joints}
 
     def take_changes(self) -> list[GateChange]:
         """Changes of the gate since the last call, oldest first."""
@@ -132,17 +139,17 @@ class Grip:
 
     def feel(self, reading: TactileReading, watched: Watched) -> None:
         """Take in a reading of these fingers and what was found in it."""
-        t_ns = reading.made_ns
+        t_ns, last_ns = reading.made_ns, self.memory.last_ns
         if watched.reasons:
             self._gate.skip(t_ns)
             return
-        if self._last_ns is not None and not 0 <= t_ns - self._last_ns <= self._gap_ns:
+        if last_ns is not None and not 0 <= t_ns - last_ns <= self._gap_ns:
             self._fresh.reset()
-            if t_ns - self._last_ns > OUTAGE_NS:
+            if t_ns - last_ns > OUTAGE_NS:
                 self._contact.forget()
-        self._last_ns = t_ns
-        if self._unsettled:
-            self._unsettled -= 1
+        self.memory.last_ns = t_ns
+        if self.memory.unsettled:
+            self.memory.unsettled -= 1
             self._gate.restart(t_ns)
         usable = ~watched.broken
         self._fresh.push(reading.counts, usable)
@@ -161,8 +168,23 @@ class Grip:
 
     def judged(self) -> None:
         """The grasp was judged by the last reading."""
-        if self._last_ns is not None:
-            self._gate.judged(self._last_ns, self._fresh.counts)
+        if self.memory.last_ns is not None:
+            self._gate.judged(self.memory.last_ns, self._fresh.counts)
+
+    def felt(self, counts: NDArray[np.uint16] | None) -> Felt:
+        """How the hand holds now; `counts` are what is to be judged of it, shape (fingers, 24)."""
+        gate = self._gate
+        return Felt(
+            gate.grasp,
+            counts,
+            counts is not None,
+            gate.in_contact,
+            gate.settled,
+            gate.reasons,
+            gate.state,
+            self.touching,
+            tuple(gate.take_changes()),
+        )
 
     def _against(self, t_ns: int) -> tuple[Reason, ...]:
         against: list[Reason] = []

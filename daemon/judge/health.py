@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.findings import Number, Watched
 from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
@@ -53,42 +54,48 @@ NO_COUNT = 0x8000
 """In place of a count: far from every one of 12 bits, upwards and, modulo 2**16, downwards."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Watched:
-    """What was found in one reading."""
+@dataclass(slots=True, eq=False)
+class HealthMemory:
+    """What was found in the readings so far; arrays have shape (fingers, 24)."""
 
-    reasons: tuple[Reason, ...]
-    """Against using it at all."""
-    broken: NDArray[np.bool_]
-    """Shape (fingers, 24): electrodes that mean nothing in it."""
+    previous: NDArray[np.uint16]
+    """Counts of the last reading."""
+    number: Number
+    """Of the last reading."""
+    changed: NDArray[np.int64]
+    """Number of the reading in which each electrode changed last."""
+    jumps: NDArray[np.float64]
+    """Recent jumps of each electrode, fading."""
+    has_jumped: bool
+    """Whether there are any."""
+    faults: NDArray[np.uint8]
+    """What the driver flagged in the last reading."""
 
 
 class Health:
-    """Watches one reading after the other; remembers what has not changed and what jumps."""
+    """Follows every electrode from reading to reading: faults, rails, jumps, counts that repeat."""
 
     def __init__(self, fingers: int) -> None:
-        self._shape = (fingers, ELECTRODES)
-        self._previous = np.full(self._shape, NO_COUNT, dtype=np.uint16)
-        self._number = 0
-        """Of the last reading."""
-        self._changed = np.zeros(self._shape, dtype=np.int64)
-        """Number of the reading in which each electrode changed last."""
-        self._jumps = np.zeros(self._shape)
-        """Recent jumps of each electrode, fading."""
-        self._has_jumped = False
-        """Whether there are any."""
-        self._faults = np.zeros(self._shape, dtype=np.uint8)
-        self._no_faults = self._faults.tobytes()
-        nothing = np.zeros(self._shape, dtype=np.bool_)
+        self._shape = shape = (fingers, ELECTRODES)
+        self.memory = HealthMemory(
+            previous=np.full(shape, NO_COUNT, dtype=np.uint16),
+            number=0,
+            changed=np.zeros(shape, dtype=np.int64),
+            jumps=np.zeros(shape),
+            has_jumped=False,
+            faults=np.zeros(shape, dtype=np.uint8),
+        )
+        self._no_faults = self.memory.faults.tobytes()
+        nothing = np.zeros(shape, dtype=np.bool_)
         nothing.flags.writeable = False  # one for all sound readings
         self._sound = Watched((), nothing)
 
     def watch(self, reading: TactileReading) -> Watched:
-        """Whether this reading can be used, and what of it."""
+        """What is wrong with a reading and its electrodes, by it and by those before it."""
         counts = reading.counts
         if counts.shape != self._shape:
             return Watched((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
-        self._faults = reading.faults
+        self.memory.faults = reading.faults
         # Nearly all readings are sound, and that is seen with a few cheap operations: comparing
         # bytes and counting take a tenth of the time of a reduction such as `any`.
         if reading.faults.tobytes() != self._no_faults:
@@ -109,7 +116,7 @@ class Health:
         """
         sound = flags == 0
         differs = self._compare(counts)
-        self._changed[~sound] = self._number
+        self.memory.changed[~sound] = self.memory.number
         railed = _railed(counts) & sound
         broken = ~sound | railed | self._worn_out()
         faults = int(np.bitwise_or.reduce(flags, axis=None))
@@ -135,42 +142,46 @@ class Health:
     def electrodes(self) -> dict[tuple[int, int], Reason]:
         """What is wrong with which electrode, (finger, 0..23), by the last reading."""
         found: dict[tuple[int, int], Reason] = {}
+        memory = self.memory
         for where, reason in (
-            (self._jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
-            (self._changed <= self._number - UNCHANGED_MAX, Reason.ELECTRODE_DEAD),
-            (_railed(self._previous) & (self._previous != NO_COUNT), Reason.SATURATED),
+            (memory.jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
+            (memory.changed <= memory.number - UNCHANGED_MAX, Reason.ELECTRODE_DEAD),
+            (_railed(memory.previous) & (memory.previous != NO_COUNT), Reason.SATURATED),
         ):
             found |= dict.fromkeys(_places(where), reason)
-        for finger, electrode in _places(self._faults != 0):
-            found[finger, electrode] = _fault_reasons(int(self._faults[finger, electrode]))[0]
+        for finger, electrode in _places(memory.faults != 0):
+            found[finger, electrode] = _fault_reasons(int(memory.faults[finger, electrode]))[0]
         return found
 
     def _compare(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
         """Take in how the counts have changed; which differ from before, (fingers, 24)."""
-        self._number += 1
-        differs: NDArray[np.bool_] = counts != self._previous
-        np.copyto(self._changed, self._number, where=differs)
-        if self._has_jumped:
-            self._jumps *= JUMPS_FADE
-            self._jumps[self._jumps < JUMPS_FORGOTTEN] = 0.0
-            self._has_jumped = bool(np.count_nonzero(self._jumps))
+        memory = self.memory
+        previous = memory.previous
+        memory.number += 1
+        differs: NDArray[np.bool_] = counts != previous
+        np.copyto(memory.changed, memory.number, where=differs)
+        if memory.has_jumped:
+            memory.jumps *= JUMPS_FADE
+            memory.jumps[memory.jumps < JUMPS_FORGOTTEN] = 0.0
+            memory.has_jumped = bool(np.count_nonzero(memory.jumps))
         # Modulo 2**16: what is added makes steps down as far as that small numbers, too.
-        steps = counts - self._previous
+        steps = counts - previous
         far = steps + JUMP_COUNTS > 2 * JUMP_COUNTS
         if np.count_nonzero(far):
             near = steps + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still
                 jumps = far & (near.sum(axis=1, keepdims=True) >= STILL)
-                self._has_jumped |= bool(np.count_nonzero(jumps))
-                self._jumps += jumps
-        self._previous = counts
+                memory.has_jumped |= bool(np.count_nonzero(jumps))
+                memory.jumps += jumps
+        memory.previous = counts
         return differs
 
     def _worn_out(self) -> NDArray[np.bool_]:
         """Electrodes that are broken by what they did in the last readings, (fingers, 24)."""
-        worn_out: NDArray[np.bool_] = self._changed <= self._number - UNCHANGED_MAX
-        if self._has_jumped:
-            worn_out |= self._jumps > JUMPS_MAX
+        memory = self.memory
+        worn_out: NDArray[np.bool_] = memory.changed <= memory.number - UNCHANGED_MAX
+        if memory.has_jumped:
+            worn_out |= memory.jumps > JUMPS_MAX
         return worn_out
 
 

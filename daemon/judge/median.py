@@ -7,6 +7,8 @@ out, and costs one sweep of delay.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,25 +17,54 @@ from daemon.judge.health import NO_COUNT
 VALUES = 3
 
 
+@dataclass(slots=True, eq=False)
+class MedianMemory:
+    """The values of every electrode; arrays have shape (fingers, 24)."""
+
+    oldest: NDArray[np.uint16]
+    middle: NDArray[np.uint16]
+    newest: NDArray[np.uint16]
+    last: NDArray[np.uint16]
+    """The last one, fresh or not."""
+    held: NDArray[np.bool_]
+    """Whether that repeated the one before."""
+    number: NDArray[np.uint8]
+    """How many are fresh, up to three."""
+    all_full: bool
+    """Whether it is three of each."""
+    counts: NDArray[np.uint16]
+    """Median of the three; 0 where there is none."""
+
+
 class FreshMedian:
     """Keeps three fresh values per electrode; constant memory, no clock."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         """`shape` is (fingers, 24)."""
-        self._oldest, self._middle, self._newest = np.zeros((3, *shape), dtype=np.uint16)
-        self._last = np.zeros(shape, dtype=np.uint16)
-        self._held = np.zeros(shape, dtype=np.bool_)
-        self._number = np.zeros(shape, dtype=np.uint8)
-        self.counts = np.zeros(shape, dtype=np.uint16)
+        oldest, middle, newest, counts = np.zeros((4, *shape), dtype=np.uint16)
+        self.memory = MedianMemory(
+            oldest=oldest,
+            middle=middle,
+            newest=newest,
+            last=np.full(shape, NO_COUNT, dtype=np.uint16),
+            held=np.zeros(shape, dtype=np.bool_),
+            number=np.zeros(shape, dtype=np.uint8),
+            all_full=False,
+            counts=counts,
+        )
+
+    @property
+    def counts(self) -> NDArray[np.uint16]:
         """Median of the last three fresh values, shape (fingers, 24); 0 where there is none."""
-        self.reset()
+        return self.memory.counts
 
     def reset(self) -> None:
         """Forget everything: what comes next does not continue what came before."""
-        self._last.fill(NO_COUNT)
-        self._held.fill(False)
-        self._number.fill(0)
-        self._all_full = False
+        memory = self.memory
+        memory.last.fill(NO_COUNT)
+        memory.held.fill(False)
+        memory.number.fill(0)
+        memory.all_full = False
 
     def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
         """Take in one sweep, shape (fingers, 24); what is not `usable` is forgotten.
@@ -42,33 +73,37 @@ class FreshMedian:
         again: a held value of 71.43 Hz data is never held twice, and a quiet electrode repeats
         itself in one sweep of ten without being held.
         """
-        self._held = (counts == self._last) & ~self._held
-        fresh = ~self._held
+        memory = self.memory
+        oldest, middle, newest = memory.oldest, memory.middle, memory.newest
+        memory.held = (counts == memory.last) & ~memory.held
+        fresh = ~memory.held
         all_usable = np.count_nonzero(usable) == usable.size
         if not all_usable:
             fresh &= usable
-        np.copyto(self._oldest, self._middle, where=fresh)
-        np.copyto(self._middle, self._newest, where=fresh)
-        np.copyto(self._newest, counts, where=fresh)
-        if not (all_usable and self._all_full):
+        np.copyto(oldest, middle, where=fresh)
+        np.copyto(middle, newest, where=fresh)
+        np.copyto(newest, counts, where=fresh)
+        if not (all_usable and memory.all_full):
             self._fill(counts, usable, fresh)
-        np.copyto(self._last, counts, where=usable)
+        np.copyto(memory.last, counts, where=usable)
         # A new array each time: what was handed out stays.
-        low = np.minimum(self._oldest, self._middle)
-        high = np.maximum(self._oldest, self._middle)
-        self.counts = np.maximum(low, np.minimum(high, self._newest))
+        low = np.minimum(oldest, middle)
+        high = np.maximum(oldest, middle)
+        memory.counts = np.maximum(low, np.minimum(high, newest))
 
     def _fill(
         self, counts: NDArray[np.uint16], usable: NDArray[np.bool_], fresh: NDArray[np.bool_]
     ) -> None:
         """Count the fresh values; until there are three, the first stands for those missing."""
-        self._number[~usable] = 0
-        first = fresh & (self._number == 0)
-        np.copyto(self._oldest, counts, where=first)
-        np.copyto(self._middle, counts, where=first)
-        self._number += fresh & (self._number < VALUES)
-        self._all_full = bool((self._number == VALUES).all())
+        memory = self.memory
+        memory.number[~usable] = 0
+        first = fresh & (memory.number == 0)
+        np.copyto(memory.oldest, counts, where=first)
+        np.copyto(memory.middle, counts, where=first)
+        memory.number += fresh & (memory.number < VALUES)
+        memory.all_full = bool((memory.number == VALUES).all())
 
     def is_full(self, usable: NDArray[np.bool_]) -> bool:
         """Whether each `usable` electrode, shape (fingers, 24), has three fresh values."""
-        return self._all_full or bool((self._number[usable] == VALUES).all())
+        memory = self.memory
+        return memory.all_full or bool((memory.number[usable] == VALUES).all())

@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.findings import Examined, Opinion
 from daemon.judge.reasons import Reason
 from models.contract import ModelError
+from models.inputs import SessionBuilder
 from models.runtime import TactileModel
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 
 if TYPE_CHECKING:
-    from daemon.judge.calibration import SessionCalibration
+    from daemon.judge.calibration import Calibration
 
 TINY = 1e-12
 """Stands for a probability of zero, whose logarithm there is not."""
@@ -23,27 +25,38 @@ TINY = 1e-12
 class Network:
     """Runs one model, softened as far as its session is known."""
 
-    def __init__(
-        self, model: TactileModel, session: SessionCalibration | None, slip_threshold: float
-    ) -> None:
+    def __init__(self, model: TactileModel, slip_threshold: float) -> None:
         """`slip_threshold` is the probability, 0..1, that softening must not cross."""
         self._model = model
-        self._session = session
         self._threshold = slip_threshold
 
-    def judge(self, counts: NDArray[np.generic]) -> tuple[float | None, tuple[Reason, ...]]:
-        """Probability of slip of counts (fingers, 24), or None and why there is none."""
-        spread = self._model.inputs.build(counts, self._model.input)
+    def judge(self, examined: Examined, session: Calibration | None = None) -> Opinion:
+        """Probability of slip of what was examined, or None and why there is none.
+
+        `session` is what is known of it, for a model that needs one.
+        """
+        if examined.reasons:
+            return Opinion(None, examined.reasons, examined.repaired)
+        p_slip, reasons = self._ask(examined.counts, session)
+        return Opinion(p_slip, reasons, examined.repaired)
+
+    def _ask(
+        self, counts: NDArray[np.generic], session: Calibration | None
+    ) -> tuple[float | None, tuple[Reason, ...]]:
+        model = self._model
+        if session is not None and isinstance(model.inputs, SessionBuilder):
+            model.inputs.use(session.features_mean, session.features_spread)
+        spread = model.inputs.build(counts, model.input)
         if np.count_nonzero(spread >= SPREAD_FLOOR_COUNTS) < len(spread):
             return None, (Reason.FLAT,)
         try:
-            p_stable, p_slip = self._model.run()
+            p_stable, p_slip = model.run()
         except ModelError:
             return None, (Reason.MODEL_FAILED,)
         if not abs(p_stable + p_slip - 1.0) < 1e-3:  # also true for NaN
             return None, (Reason.MODEL_FAILED,)
-        if self._session is not None:
-            p_slip = _softened(p_stable, p_slip, self._session.temperature, self._threshold)
+        if session is not None:
+            p_slip = _softened(p_stable, p_slip, session.temperature, self._threshold)
         return p_slip, ()
 
 

@@ -4,26 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.health import Health, Watched
+from daemon.judge.findings import NO_OPINION, Felt, Number, Opinion, Watched, electrode_name
+from daemon.judge.health import Health
+from daemon.judge.limits import GripLimits
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
 from daemon.judge.reasons import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
-from models.contract import Finger, ModelError, SessionInput
+from models.contract import Finger, ModelContract, ModelError, SessionInput
 from models.electrodes import Electrodes
-from models.inputs import SessionBuilder
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
     from daemon.judge.gate import GateChange
-    from daemon.judge.grip import Grip, GripLimits
+    from daemon.judge.grip import Grip
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +55,15 @@ class Judgement:
     this very reading, or if electrodes of it are broken."""
 
 
-@dataclass(frozen=True, slots=True)
-class Opinion:
-    """What the network said of a grasp, and what stands against its being asked."""
+@dataclass(slots=True, eq=False)
+class PipelineMemory:
+    """What is known of the grasps judged so far."""
 
-    p_slip: float | None
-    reasons: tuple[Reason, ...]
-    repaired: tuple[str, ...] = ()
-
-
-NO_OPINION = Opinion(None, ())
+    readings: Number = 0
+    learnt_grasp: Number = 0
+    """The grasp that the session took in last, or is about to."""
+    opinion: Opinion = NO_OPINION
+    """Of the grasp at hand."""
 
 
 class Pipeline:
@@ -90,29 +90,28 @@ class Pipeline:
                 f"{model.path}: judges the fingers {', '.join(model.contract.fingers)} "
                 f"in this order, the hand has {', '.join(fingers)}"
             )
-        electrodes = Electrodes(model.contract.seen)
-        self._session = _session(model, electrodes)
+        contract = model.contract
+        electrodes = Electrodes(contract.seen)
+        self._session = _session(contract, electrodes)
         self._limits = limits
         self._clock = clock
         self._learns = learns
         self._needs_session = needs_session
-        self._fingers = tuple(fingers)
+        self._fingers = contract.fingers
         self._health = Health(len(fingers))
-        self._plausibility = Plausibility(model.contract.seen, electrodes, self._session)
-        self._network = Network(model, self._session, limits.slip_threshold)
+        self._plausibility = Plausibility(fingers, contract.seen, electrodes)
+        self._network = Network(model, limits.slip_threshold)
         self.grip = None if grip is None else _grip(fingers, grip)
         """None where each reading is a grasp."""
-        self._readings = 0
-        self._learnt_grasp = 0
+        self.memory = PipelineMemory()
         self._to_learn: NDArray[np.generic] | None = None
-        self._opinion = NO_OPINION
         self._latest: TactileReading | None = None
         self.on_exchange: Callable[[], None] | None = None
-        """Done when the sensors were exchanged."""
+        """Called when the sensors were exchanged."""
 
     @property
     def session(self) -> SessionCalibration | None:
-        """With all that was judged; None for a model that needs none."""
+        """What is known of today's sensors, up to the grasp judged last; None if no model asks."""
         self.learn()
         return self._session
 
@@ -128,13 +127,13 @@ class Pipeline:
         return self.grip is not None and self.grip.on_request
 
     def ask(self) -> None:
-        """The controller wants to know."""
+        """Judge the grasp at hand once it has settled: the controller waits for the verdict."""
         if self.grip is not None:
             self.grip.ask()
 
     def sensors_exchanged(self) -> None:
-        """What is known of the sensors, and of what they hold, no longer counts."""
-        self._opinion = NO_OPINION
+        """Forget session, tare and grasp: the sensors are others."""
+        self.memory.opinion = NO_OPINION
         self._to_learn = None
         if self._session is not None:
             self._session.reset()
@@ -142,6 +141,21 @@ class Pipeline:
             self.grip.forget()
         if self.on_exchange is not None:
             self.on_exchange()
+
+    def restart(self) -> None:
+        """What was said of the grasp at hand no longer counts: another model or gate goes on."""
+        self.memory.opinion, self.memory.learnt_grasp = NO_OPINION, 0
+        if self.grip is not None:
+            self.grip.restart()
+
+    def memories(self) -> dict[str, dict[str, Any]]:
+        """What every part remembers between two readings, all that its next finding depends on.
+
+        By the name of the part, in groups that a judge has wholly or, but for `judge`, not at all.
+        The session is not among it.
+        """
+        judge = {"judge": {"judge": self.memory, "health": self._health.memory}}
+        return judge if self.grip is None else judge | self.grip.memories()
 
     def skip(self) -> None:
         """Readings were left out before the next one: nobody knows what moved meanwhile."""
@@ -156,75 +170,50 @@ class Pipeline:
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
         self.learn()
-        self._readings += 1
         self._latest = reading
+        memory, grasp, counts = self.memory, None, None
+        memory.readings += 1
         watched = self._health.watch(reading)
-        counts = self._counts_to_judge(reading, watched)
-        judged = counts is not None or self.grip is None
-        grasp = judged_counts = None
-        if counts is not None:
-            self._opinion, grasp = self._consider(counts, watched)
-            judged_counts = None if np.count_nonzero(watched.broken) else counts
-            if self.grip is not None:
-                self.grip.judged()
-        elif self.grip is None or self.grip.state is not GateState.JUDGED:
-            self._opinion = NO_OPINION
-        judgement = self._judgement(
-            reading.t_ns, watched.reasons, self._opinion, judged=judged, counts=judged_counts
-        )
+        felt = self._feel(reading, watched)
+        if felt.counts is not None:
+            session = None if self._session is None else self._session.now
+            examined = self._plausibility.examine(felt.counts, watched.broken, session)
+            memory.opinion = self._network.judge(examined, session)
+            grasp = examined.grasp
+            counts = None if np.count_nonzero(watched.broken) else felt.counts
+        elif felt.gate is not GateState.JUDGED:
+            memory.opinion = NO_OPINION
+        judgement = self._decide(reading.t_ns, watched.reasons, felt, memory.opinion, counts)
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
             self._note(grasp, judgement.grasp)
         return judgement
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
-        return self._judgement(last_t_ns, (Reason.STALE,), NO_OPINION, judged=False)
+        if self.grip is None:
+            felt = Felt(self.memory.readings, None, judged=False)
+        else:
+            felt = self.grip.felt(None)
+        return self._decide(last_t_ns, (Reason.STALE,), felt, NO_OPINION)
 
     def health(self) -> dict[str, Reason]:
         """What is not well now: electrodes such as `ff_7`, fingers, joints, model, session."""
         self.learn()
         broken = self._health.electrodes()
-        found = dict.fromkeys(self._opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
-        found |= {self._name(*place): reason for place, reason in broken.items()}
+        opinion = self.memory.opinion
+        found = dict.fromkeys(opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
+        for (finger, place), reason in broken.items():
+            found[electrode_name(self._fingers[finger], place)] = reason
         if self.grip is not None:
             untared = [finger for finger in self._fingers if finger not in self.grip.tared]
             found |= dict.fromkeys(untared, Reason.NOT_TARED)
             if self.grip.joints_lost:
                 found["joints"] = Reason.JOINTS_LATE
-        if Reason.MODEL_FAILED in self._opinion.reasons:
+        if Reason.MODEL_FAILED in opinion.reasons:
             found["model"] = Reason.MODEL_FAILED
         if self._session is not None and not self._session.calibrated:
             found["session"] = Reason.NOT_CALIBRATED
         return found
-
-    def _counts_to_judge(
-        self, reading: TactileReading, watched: Watched
-    ) -> NDArray[np.uint16] | None:
-        """The counts, if this reading is one to judge."""
-        if self.grip is None:
-            return None if watched.reasons else reading.counts
-        self.grip.feel(reading, watched)
-        if watched.reasons or not 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
-            return None
-        return self.grip.counts_to_judge(reading, watched)
-
-    def _consider(
-        self, counts: NDArray[np.uint16], watched: Watched
-    ) -> tuple[Opinion, NDArray[np.generic] | None]:
-        """What the network says of counts (fingers, 24), and what the session may learn."""
-        findings = self._plausibility.examine(counts, watched.broken)
-        p_slip, reasons = None, findings.reasons
-        if not reasons:
-            p_slip, reasons = self._network.judge(findings.counts)
-        repaired = [] if findings.repaired is None else np.argwhere(findings.repaired).tolist()
-        names = tuple(self._name(finger, place) for finger, place in repaired)
-        return Opinion(p_slip, reasons, names), findings.grasp
-
-    def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
-        """Remember to learn a grasp, as it was before the lift and not as it changed since."""
-        if self._session is not None and grasp != self._learnt_grasp:
-            self._learnt_grasp = grasp
-            self._to_learn = counts
 
     def learn(self) -> None:
         """Take what was judged last into the session; at the latest the next reading does it.
@@ -236,16 +225,32 @@ class Pipeline:
             counts, self._to_learn = self._to_learn, None
             self._session.observe(counts)
 
-    def _judgement(
+    def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
+        """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
+        if self._session is not None and grasp != self.memory.learnt_grasp:
+            self.memory.learnt_grasp = grasp
+            self._to_learn = counts
+
+    def _feel(self, reading: TactileReading, watched: Watched) -> Felt:
+        grip = self.grip
+        if grip is None:
+            return Felt(self.memory.readings, None if watched.reasons else reading.counts)
+        grip.feel(reading, watched)
+        counts = None
+        if not watched.reasons and 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
+            counts = grip.counts_to_judge(reading, watched)
+            if counts is not None:
+                grip.judged()
+        return grip.felt(counts)
+
+    def _decide(
         self,
         t_ns: int,
         against: tuple[Reason, ...],
+        felt: Felt,
         opinion: Opinion,
-        *,
-        judged: bool,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        grip = self.grip
         health = (*against, *opinion.reasons)
         calibrated = None if self._session is None else self._session.calibrated
         if self._needs_session and calibrated is False:
@@ -253,33 +258,30 @@ class Pipeline:
         case = Case(
             p_slip=opinion.p_slip,
             health=health,
-            in_contact=grip is None or grip.in_contact,
-            settled=grip is None or grip.settled,
-            gate=() if grip is None else grip.reasons,
+            in_contact=felt.in_contact,
+            settled=felt.settled,
+            gate=felt.reasons,
             # Taken last, so that a slow inference counts too.
             age_ns=self._age_ns(t_ns),
         )
         outcome, reasons = decide(case, self._limits)
         return Judgement(
             t_ns=t_ns,
-            grasp=self._readings if grip is None else grip.grasp,
+            grasp=felt.grasp,
             outcome=outcome,
             p_slip=None if outcome is Outcome.UNKNOWN else opinion.p_slip,
             reasons=tuple(dict.fromkeys(reasons)),
-            judged=judged,
+            judged=felt.judged,
             repaired=opinion.repaired,
             session_calibrated=calibrated,
-            gate=None if grip is None else grip.state,
-            contact=None if grip is None else grip.touching,
-            changes=() if grip is None else tuple(grip.take_changes()),
+            gate=felt.gate,
+            contact=felt.touching,
+            changes=felt.changes,
             judged_counts=counts,
         )
 
     def _age_ns(self, t_ns: int) -> int:
         return self._clock() - t_ns
-
-    def _name(self, finger: int, electrode: int) -> str:
-        return f"{self._fingers[finger]}_{electrode + 1}"
 
 
 def _grip(fingers: Sequence[Finger], limits: GripLimits) -> Grip:
@@ -289,11 +291,10 @@ def _grip(fingers: Sequence[Finger], limits: GripLimits) -> Grip:
     return Grip(fingers, limits)
 
 
-def _session(model: TactileModel, electrodes: Electrodes) -> SessionCalibration | None:
+def _session(contract: ModelContract, electrodes: Electrodes) -> SessionCalibration | None:
     """Imported only where the model has a session."""
-    wanted, inputs = model.contract.input, model.inputs
-    if not (isinstance(wanted, SessionInput) and isinstance(inputs, SessionBuilder)):
+    if not isinstance(contract.input, SessionInput):
         return None
     from daemon.judge.calibration import SessionCalibration
 
-    return SessionCalibration(wanted, inputs, electrodes.centre, electrodes.spread)
+    return SessionCalibration(contract.input, electrodes.centre, electrodes.spread)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.findings import Examined, electrode_name
 from daemon.judge.health import too_many
 from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
-from models.contract import SeenCounts
+from models.contract import Finger, SeenCounts
 from models.electrodes import Electrodes
-from models.seen import SeenCheck
+from models.novelty import NoveltyCheck
 
 if TYPE_CHECKING:
-    from daemon.judge.calibration import SessionCalibration
+    from daemon.judge.calibration import Calibration
 
 CONTRADICTING_MAX = 2
 """Electrodes that may contradict the others without anything else being known against them. Of
@@ -28,67 +29,53 @@ of the smallest of 4682 real grasps, 148."""
 ONES = np.ones(ELECTRODES)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Findings:
-    """What was found in the counts of one grasp."""
-
-    reasons: tuple[Reason, ...]
-    """Against judging it; none if it is sound, or has been repaired."""
-    counts: NDArray[np.generic]
-    """Shape (fingers, 24), with the broken electrodes repaired; as read where there are reasons."""
-    repaired: NDArray[np.bool_] | None = None
-    """Shape (fingers, 24); None if nothing had to be."""
-    grasp: NDArray[np.generic] | None = None
-    """Shape (fingers, 24): what a session may take in, even if it is like nothing that was seen
-    before, because that is how a drifted sensor starts. Only electrodes that are certainly broken
-    are repaired in it. None where the reading tells nothing."""
-
-
 class Plausibility:
     """Compares counts with the training's."""
 
-    def __init__(
-        self, seen: SeenCounts, electrodes: Electrodes, session: SessionCalibration | None = None
-    ) -> None:
-        """`seen` is what the model was trained on, `session` how today's sensors differ from it."""
-        self._seen = SeenCheck(seen)
+    def __init__(self, fingers: Sequence[Finger], seen: SeenCounts, electrodes: Electrodes) -> None:
+        """`seen` is what the model was trained on, `electrodes` what follows from it."""
+        self._fingers = tuple(fingers)
+        self._novelty = NoveltyCheck(seen)
         self._electrodes = electrodes
-        self._session = session
 
-    def examine(self, counts: NDArray[np.uint16], broken: NDArray[np.bool_]) -> Findings:
-        """Reasons against judging these counts, or those to judge by; shapes (fingers, 24)."""
+    def examine(
+        self,
+        counts: NDArray[np.uint16],
+        broken: NDArray[np.bool_],
+        session: Calibration | None = None,
+    ) -> Examined:
+        """Reasons against judging these counts, or those to judge by; shapes (fingers, 24).
+
+        `session` is how today's sensors differ from the training's, as far as it is known.
+        """
         if _is_flat(counts, broken):
-            return Findings((Reason.FLAT,), counts)
-        values = self._to_training(counts)
-        grasp, values = self._repair(counts, values, broken)
+            return Examined((Reason.FLAT,), counts)
+        values = counts.astype(np.float64) if session is None else session.to_training(counts)
+        grasp, values = self._repair(counts, values, broken, session)
         at_most = int(np.count_nonzero(broken)) + CONTRADICTING_MAX + 1
         found = self._electrodes.implausible(values, broken, at_most)
         number = int(np.count_nonzero(found))
-        if number == at_most or too_many(found):
-            # So much does not fit that the reading as a whole is like nothing in the training.
-            return self._never_seen(counts, grasp)
-        repaired, values = self._repair(counts, values, found)
-        if self._session is not None and self._is_odd(self._session, repaired):
-            return self._never_seen(counts, grasp)
-        if not self._seen.is_seen(values, number):
-            return self._never_seen(counts, grasp)
-        return Findings((), repaired, found if number else None, grasp)
+        # With so many, the reading as a whole is like nothing in the training.
+        never_seen = number == at_most or too_many(found)
+        if not never_seen:
+            repaired, values = self._repair(counts, values, found, session)
+            never_seen = (
+                session is not None and self._is_odd(session, repaired)
+            ) or not self._novelty.is_seen(values, number)
+        if never_seen:
+            # A session learns from it only while it is young, for that is how drift begins; later
+            # on a sensor that fails would slowly become its own standard.
+            young = session is None or not session.calibrated
+            return Examined((Reason.NEVER_SEEN,), counts, (), grasp if young else None)
+        return Examined((), repaired, self._names(found) if number else (), grasp)
 
-    def _never_seen(self, counts: NDArray[np.uint16], grasp: NDArray[np.generic]) -> Findings:
-        """Refused; a session learns from it only while it is young: that is how drift begins.
-
-        A calibrated one does not, or a sensor that fails would slowly become its own standard.
-        """
-        young = self._session is None or not self._session.calibrated
-        return Findings((Reason.NEVER_SEEN,), counts, None, grasp if young else None)
-
-    def _is_odd(self, session: SessionCalibration, counts: NDArray[np.generic]) -> bool:
+    def _is_odd(self, session: Calibration, counts: NDArray[np.generic]) -> bool:
         """Whether session or reading cannot be of grasps, whatever the session's spreads make it.
 
         The reading is compared once more with only the session's mean taken off: how much the
         electrodes of a finger vary, and with one another, hardly differs from day to day.
         """
-        return session.odd or self._seen.is_far(
+        return session.odd or self._novelty.is_far(
             self._electrodes.centre + (counts.astype(np.float64) - session.counts_mean)
         )
 
@@ -97,22 +84,19 @@ class Plausibility:
         counts: NDArray[np.uint16],
         values: NDArray[np.float64],
         broken: NDArray[np.bool_],
+        session: Calibration | None,
     ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Counts, and their values with the training's sensors, with the broken ones repaired."""
         if not np.count_nonzero(broken):
             return counts, values
         values = self._electrodes.repaired(values, broken)
-        return np.where(broken, self._from_training(values), counts), values
+        expected = values if session is None else session.from_training(values)
+        expected = np.minimum(np.maximum(expected, 0.0), COUNT_MAX)
+        return np.where(broken, expected, counts), values
 
-    def _to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
-        """What the counts would have been with the training's sensors."""
-        if self._session is None:
-            return counts.astype(np.float64)
-        return self._session.to_training(counts)
-
-    def _from_training(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        counts = values if self._session is None else self._session.from_training(values)
-        return np.minimum(np.maximum(counts, 0.0), COUNT_MAX)
+    def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
+        places = np.argwhere(which).tolist()
+        return tuple(electrode_name(self._fingers[finger], place) for finger, place in places)
 
 
 def _is_flat(counts: NDArray[np.uint16], broken: NDArray[np.bool_]) -> bool:

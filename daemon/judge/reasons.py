@@ -1,4 +1,13 @@
-"""What a verdict may be, why it is `unknown`, and where in a grasp the hand is."""
+"""What a verdict may be, why it is `unknown`, and where in a grasp the hand is.
+
+A new reason for `unknown` starts here: a member of `Reason`, and what to do about it in `ADVICE`.
+Then the part that notices puts it among the `reasons` of what it finds (`findings`: `Watched` for
+a reading that cannot be used, `Felt` for a hand that is not ready, `Examined` for counts that are
+no grasp, `Opinion` for a network that failed); any of them makes the verdict `unknown`, with no
+change of `decision`. None outranks another: a verdict lists them in the order of the parts, then
+age and confidence. A test asks for the row in the table of deploy/wire/README.md, another for
+`graspd schema > deploy/wire/messages.schema.json`.
+"""
 
 from __future__ import annotations
 

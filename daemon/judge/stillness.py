@@ -5,9 +5,12 @@ The window is remembered in few sweeps however fast they come, so memory is cons
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.findings import Number
 from drivers.base import ELECTRODES
 
 SWEEPS = 16
@@ -33,37 +36,51 @@ def mean_distance(
     return mean
 
 
+@dataclass(slots=True, eq=False)
+class StillnessMemory:
+    """The medians of the last window."""
+
+    times_ns: list[int]
+    """Of the sweeps of the window, oldest first."""
+    sweeps: NDArray[np.float32]
+    """Shape (2 * KEPT, fingers, 24), twice as long as it must be: the window is a slice of it that
+    moves to the right, and goes back to the left when it has come to the end."""
+    first: Number
+    """Where in `sweeps` the window begins."""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for what no window can be."""
+        if self.first + len(self.times_ns) > len(self.sweeps):
+            raise ValueError("the window is longer than what is remembered")
+
+
 class Stillness:
     """Remembers the medians of the last window."""
 
     def __init__(self, window_ns: int, fingers: int) -> None:
         """`window_ns` is how far back a sweep is compared with, at least, ns."""
         self._window_ns = window_ns
-        self._times_ns: list[int] = []
-        """Of the sweeps of the window, oldest first."""
-        # Twice as long as it must be: the window is a slice of it that moves to the right, and goes
-        # back to the left when it has come to the end.
-        self._sweeps = np.zeros((2 * KEPT, fingers, ELECTRODES), dtype=np.float32)
-        self._first = 0
-        """Where in `_sweeps` the window begins."""
+        sweeps = np.zeros((2 * KEPT, fingers, ELECTRODES), dtype=np.float32)
+        self.memory = StillnessMemory([], sweeps, 0)
 
     def reset(self) -> None:
         """Forget: what comes next does not continue what came before."""
-        self._times_ns.clear()
-        self._first = 0
+        self.memory.times_ns.clear()
+        self.memory.first = 0
 
     def add(self, t_ns: int, median: NDArray[np.float32]) -> None:
         """Take in the median of `t_ns`, shape (fingers, 24)."""
-        times_ns = self._times_ns
+        memory = self.memory
+        times_ns, sweeps = memory.times_ns, memory.sweeps
         if times_ns and t_ns - times_ns[-1] < self._window_ns // SWEEPS:
             return
         if len(times_ns) == KEPT:
             self._drop_oldest()
-        place = self._first + len(times_ns)
-        if place == len(self._sweeps):
-            self._sweeps[: len(times_ns)] = self._sweeps[self._first :]
-            self._first, place = 0, len(times_ns)
-        self._sweeps[place] = median
+        place = memory.first + len(times_ns)
+        if place == len(sweeps):
+            sweeps[: len(times_ns)] = sweeps[memory.first :]
+            memory.first, place = 0, len(times_ns)
+        sweeps[place] = median
         times_ns.append(t_ns)
 
     def rate(
@@ -75,12 +92,13 @@ class Stillness:
         before it, over its age: two moments alone would miss what swings. None while no sweep is
         that old.
         """
-        times_ns, window_ns = self._times_ns, self._window_ns
+        memory, window_ns = self.memory, self._window_ns
+        times_ns = memory.times_ns
         while len(times_ns) > 1 and t_ns - times_ns[1] >= window_ns:
             self._drop_oldest()
         if not times_ns or t_ns - times_ns[0] < window_ns:
             return None
-        past = self._sweeps[self._first : self._first + len(times_ns)]
+        past = memory.sweeps[memory.first : memory.first + len(times_ns)]
         rates = mean_distance(past, median, usable)
         rates[0] /= (t_ns - times_ns[0]) / 1e9
         rates[1:] /= window_ns / 1e9
@@ -88,5 +106,5 @@ class Stillness:
         return rate
 
     def _drop_oldest(self) -> None:
-        del self._times_ns[0]
-        self._first += 1
+        del self.memory.times_ns[0]
+        self.memory.first += 1

@@ -15,7 +15,8 @@ class LatencyHistogram:
     """Counts durations in buckets of equal ratio, so that a year of readings needs no more room."""
 
     def __init__(self) -> None:
-        self._buckets = [0] * BUCKETS
+        self.buckets = [0] * BUCKETS
+        """Durations in each bucket, the shortest first."""
         self.count = 0
         self.max_us = 0.0
 
@@ -24,7 +25,7 @@ class LatencyHistogram:
         index = 0
         if duration_us > FLOOR_US:
             index = min(int(math.log(duration_us / FLOOR_US) / _LOG_STEP), BUCKETS - 1)
-        self._buckets[index] += 1
+        self.buckets[index] += 1
         self.count += 1
         self.max_us = max(self.max_us, duration_us)
 
@@ -32,7 +33,7 @@ class LatencyHistogram:
         """Duration, us, that `fraction` of all stay at or below, to 2 %; 0 if there is none."""
         wanted = math.ceil(fraction * self.count)
         seen = 0
-        for index, number in enumerate(self._buckets):
+        for index, number in enumerate(self.buckets):
             seen += number
             if seen >= wanted and number:
                 return min(FLOOR_US * STEP ** (index + 1), self.max_us)

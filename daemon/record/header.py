@@ -11,7 +11,7 @@ from typing import Any, Self
 import msgspec
 
 from drivers.base import FINGERS
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

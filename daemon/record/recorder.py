@@ -223,16 +223,16 @@ class Recorder(Companion):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
             while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
-                self._go_round()
+                self.go_round()
             self._flush_due_ns = 0
-            self._go_round()
+            self.go_round()
         except BaseException:
             self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
             raise
         finally:
             self._finish()
 
-    def _go_round(self) -> None:
+    def go_round(self) -> None:
         """Write what is queued; after a failure lose it until the next try is due."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()

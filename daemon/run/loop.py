@@ -27,6 +27,9 @@ limit. Consumers apply the same rule to the daemon."""
 DRAINS_MAX = 8
 """How often the driver is asked for more in one round when there is too much: what the kernel keeps
 is taken in fewer, and a flood cannot hold the loop."""
+BLOCKED_NS = 50_000
+"""A wait of this length, ns, was one: the kernel had this thread sleep. Without one it returns in a
+few microseconds."""
 
 
 class Ended(Enum):
@@ -51,6 +54,10 @@ class Timing:
     """Gives monotonic ns."""
     sleep: Sleep = field(default_factory=Sleep)
     """Says whether the computer has slept."""
+    rest: Callable[[float], None] = time.sleep
+    """Has the kernel put this thread to sleep, s."""
+    selector: Callable[[], selectors.BaseSelector] = selectors.SelectSelector
+    """Makes what waits for descriptors."""
 
 
 class Loop:
@@ -73,6 +80,7 @@ class Loop:
         self._stop = stop
         self._clock = timing.clock
         self._sleep = timing.sleep
+        self._new_selector = timing.selector
         self._max_age_ns = timing.max_age_ns
 
         self._filenos = overridden(companions, Companion.filenos)
@@ -97,7 +105,7 @@ class Loop:
         """Descriptors of drivers and companions that the selector has."""
         self._state = State.RUNNING
         now_ns = self._clock()
-        self._overload = Overload(now_ns, live=self._tactile.live)
+        self._overload = Overload(now_ns, live=self._tactile.live, sleep=timing.rest)
         self._last_t_ns = now_ns
         self._silence_due_ns = now_ns + self._silence_ns()
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
@@ -110,7 +118,7 @@ class Loop:
         Raises `DriverError` if the driver gives up.
         """
         self._watched = set()
-        with selectors.SelectSelector() as selector:
+        with self._new_selector() as selector:
             selector.register(self._stop, selectors.EVENT_READ)
             while self._stop.received is None:
                 if self._tactile.exhausted:
@@ -184,11 +192,13 @@ class Loop:
             timer_ns = timer()
             if timer_ns is not None and timer_ns < due_ns:
                 due_ns = timer_ns
-        now_ns = self._clock()
-        if now_ns < due_ns and not selector.select(0):
-            selector.select((due_ns - now_ns) / 1e9)
-            self._overload.waited(self._clock())
-        else:  # there is work already
+        now_ns = began_ns = self._clock()
+        if began_ns < due_ns:
+            selector.select((due_ns - began_ns) / 1e9)
+            now_ns = self._clock()
+        if now_ns - began_ns >= BLOCKED_NS:
+            self._overload.waited(now_ns)
+        else:  # there was work already
             self._overload.rest(now_ns)
 
     def _take_readings(self) -> bool:

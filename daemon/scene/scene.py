@@ -15,6 +15,8 @@ from pydantic import (
     model_validator,
 )
 
+from daemon.judge.decision import Limits
+from daemon.judge.limits import ContactLimits, GateLimits, JointLimits
 from daemon.process.files import read_regular
 from daemon.process.text import printable
 from daemon.scene.drivers import (
@@ -66,8 +68,8 @@ class Model(Section):
     """A model of the zoo, `small-session` when neither name nor path is given; for a hand of fewer
     fingers in its form for these, where the zoo has one."""
     path: FilePath | None = None
-    """A model file of your own."""
-    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.5
+    """A model file of your own, relative to the scene file."""
+    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = Limits.slip_threshold
     """`p_slip` from here on is slip."""
     min_accuracy: Annotated[float, Field(gt=0.5, lt=1.0)] | None = None
     """Verdicts must be right this often, by the model's card; less sure ones become `unknown`."""
@@ -112,24 +114,24 @@ class Gate(Section):
     given, 3, and with mode `every` 1."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that must touch; all of `hand.fingers` unless given."""
-    contact_counts: Annotated[float, Field(ge=5.0, le=1000.0)] = 20.0
+    contact_counts: Annotated[float, Field(ge=5.0, le=1000.0)] = ContactLimits.counts
     """A finger touches when three electrodes fall by so much below where they rest, counts ..."""
-    contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0)] = 5.0
+    contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0)] = ContactLimits.sigmas
     """... and by so many standard deviations of its noise."""
-    rate_counts_per_s: Annotated[float, Field(ge=10.0, le=10_000.0)] = 120.0
+    rate_counts_per_s: Annotated[float, Field(ge=10.0, le=10_000.0)] = GateLimits.rate_counts_per_s
     """Electrodes of a finger that change faster, in the mean, are moving, counts/s."""
-    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.1
+    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0)] = JointLimits.rad_per_s
     """A joint that turns faster is moving, rad/s; only with `[joints]`."""
-    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = 1000.0
+    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = JointLimits.lost_ns / 1e6
     """Late joint angles block a verdict no longer than this, ms; only with `[joints]`."""
-    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = 60.0
+    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = GateLimits.hold_ns / 1e6
     """All this must last so long, ms."""
-    request_ms: Milliseconds = 1000.0
+    request_ms: Milliseconds = GateLimits.request_ns / 1e6
     """A question that cannot be answered with a judgement by then is answered with `unknown`."""
-    gap_ms: Milliseconds = 100.0
+    gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
     """After so long without a usable reading the grasp must settle anew, ms. More than two periods
     of the readings."""
-    change_counts: Annotated[float, Field(ge=10.0, le=1000.0)] = 40.0
+    change_counts: Annotated[float, Field(ge=10.0, le=1000.0)] = GateLimits.change_counts
     """Electrodes of a finger that are so far from where they were judged, in the mean, are another
     grasp, counts."""
 

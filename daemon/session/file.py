@@ -13,7 +13,7 @@ from typing import Final, Literal, Self
 import msgspec
 
 from daemon.process.files import read_regular, write_atomically
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 VERSION: Final = 1
 MAX_BYTES = 1 << 20

@@ -13,7 +13,7 @@ from daemon.judge.calibration import SessionCalibration
 from daemon.publish.companion import Companion
 from daemon.session.file import SessionFile, SessionFileError, exchanged, statistics_of
 from drivers.base import Driver
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 

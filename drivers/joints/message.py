@@ -77,7 +77,8 @@ class JointParser:
 
     def __init__(self, counters: JointCounters) -> None:
         self._counters = counters
-        self._joints: dict[str, str | None] = {}
+        self.joint_by_name: dict[str, str | None] = {}
+        """Names that have come, at most `_NAMES_KEPT`, and the joint that each is, if it is one."""
 
     def parse(self, data: bytes) -> JointMessage | None:
         """The message, or None if it is none, which is counted."""
@@ -103,11 +104,11 @@ class JointParser:
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
 
     def _joint(self, name: str) -> str | None:
-        if name not in self._joints:
-            if len(self._joints) >= _NAMES_KEPT:
+        if name not in self.joint_by_name:
+            if len(self.joint_by_name) >= _NAMES_KEPT:
                 return joint_name(name)
-            self._joints[name] = joint_name(name)
-        return self._joints[name]
+            self.joint_by_name[name] = joint_name(name)
+        return self.joint_by_name[name]
 
 
 class MessageOrder:

@@ -88,7 +88,7 @@ class RoundAssembler:
     def repeats(self, packet: PalmPacket) -> bool:
         """Whether the round at hand, or the one just finished, already has this very packet."""
         position = position_of(packet.tactile_type)
-        return position is not None and self._packets[position] == packet
+        return position is not None and self.packets[position] == packet
 
     def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
         """Take a packet, received at `t_ns`; the readings that it completes, oldest first."""
@@ -111,7 +111,7 @@ class RoundAssembler:
         finished: Sequence[TactileReading] = ()
         if place // ROUND > self._round:
             finished = self._move_on(place // ROUND)
-        elif self._packets[position] is not None:
+        elif self.packets[position] is not None:
             self._contradict(position)
             return ()
         elif is_behind:
@@ -163,14 +163,15 @@ class RoundAssembler:
         self._have = 0
         """Bit i: position i has come, in conflict or not."""
         self._finished = False
-        self._packets: list[PalmPacket | None] = [None] * ROUND
+        self.packets: list[PalmPacket | None] = [None] * ROUND
+        """What has come of this round, by position."""
         self._t_ns = 0
         self._counts[:] = 0
         self._faults[:] = ElectrodeFault.MISSING
         self._absent = [False] * len(self._slots)
 
     def _store(self, position: int, packet: PalmPacket, t_ns: int) -> None:
-        self._packets[position] = packet
+        self.packets[position] = packet
         self._have |= 1 << position
         self._t_ns = t_ns
         first, second = CHANNELS[position]

@@ -136,7 +136,7 @@ class CanTwin(Opened):
         """Send what a burst still holds back."""
         burst, self._burst = self._burst, []
         for outgoing in burst:
-            self._put(outgoing)
+            self.put(outgoing)
 
     def serve(self, stop: threading.Event) -> None:
         """Send sweeps at their rate, frames evenly spread, until told to stop or counts end.
@@ -215,7 +215,7 @@ class CanTwin(Opened):
             return False
         for outgoing in self._spoiled(frame):
             if self._faults.burst_frames == 1:
-                self._put(outgoing)
+                self.put(outgoing)
                 continue
             self._burst.append(outgoing)
             if len(self._burst) >= self._faults.burst_frames:
@@ -235,7 +235,8 @@ class CanTwin(Opened):
             self._held_id = identifier
         return spoiled
 
-    def _put(self, outgoing: Outgoing) -> None:
+    def put(self, outgoing: Outgoing) -> None:
+        """Put one frame on the bus; what it does not take is counted in `unsent`."""
         identifier, data = outgoing
         message = can.Message(
             timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps it

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import Limits
-from daemon.judge.grip import GripLimits
-from daemon.judge.joint_motion import JointLimits
+from daemon.judge.limits import GripLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Outcome
 from drivers.base import JointReading, TactileReading

@@ -146,9 +146,9 @@ class StampedCanTwin(CanTwin):
         )
         self.frames_ns: list[Stamp] = []
 
-    def _put(self, outgoing: Outgoing) -> None:
+    def put(self, outgoing: Outgoing) -> None:
         before_ns = time.monotonic_ns()
-        super()._put(outgoing)
+        super().put(outgoing)
         self.frames_ns.append((before_ns, before_ns, time.monotonic_ns()))
 
 

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from daemon.judge.decision import Limits
-from daemon.judge.grip import GripLimits
+from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Pipeline
 from drivers.base import DriverCounters, DriverError, Reading, TactileReading
 from models.contract import (

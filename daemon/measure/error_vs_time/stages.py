@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.grip import Grip, GripLimits
+from daemon.judge.grip import Grip
 from daemon.judge.health import Health
+from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.plausibility import Plausibility
 from daemon.publish.outbox import Outbox
@@ -56,7 +57,7 @@ def _stages(
     limits = Limits(max_age_ns=10**12)
     health, grip = Health(len(fingers)), Grip(fingers, GripLimits())
     electrodes = Electrodes(model.contract.seen)
-    plausibility = Plausibility(model.contract.seen, electrodes)
+    plausibility = Plausibility(fingers, model.contract.seen, electrodes)
     pipeline = Pipeline(model, fingers, limits, time.monotonic_ns, learns=False)
     outbox = Outbox(
         "report", model.contract.fingers, model.contract.name, model.sha256, [publisher]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from daemon.judge.network import TINY
 from models.contract import CountsInput, ImageInput, ModelContract, SessionInput
 from models.layout import LAYOUTS, Layout
-from models.session import SessionState
+from models.session_statistics import SessionState
 from models.tactile_image import SPREAD_FLOOR_COUNTS, Composition, Fill, Normalisation
 
 Exact = NDArray[np.longdouble]

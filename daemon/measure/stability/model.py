@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.findings import Examined
 from daemon.judge.network import Network
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Outcome, Reason
@@ -19,8 +20,9 @@ from daemon.measure.stability.cases import StabilityCase
 from drivers.base import TactileReading
 from models.contract import ModelContract, SessionInput
 from models.electrodes import Electrodes
+from models.inputs import SessionBuilder
 from models.runtime import TactileModel
-from models.session import HORIZON_GRASPS, SessionState
+from models.session_statistics import HORIZON_GRASPS, SessionState
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 
 if TYPE_CHECKING:
@@ -129,7 +131,10 @@ class ModelStability:
         self._bounds = bounds
         self._state = state
         self._name = model.path.stem
-        self._session = self._pipeline().session
+        session = self._pipeline().session
+        self._session = None if session is None else session.now
+        if self._session is not None and isinstance(model.inputs, SessionBuilder):
+            model.inputs.use(self._session.features_mean, self._session.features_spread)
         wanted = model.contract.input
         self._standard = (
             exact_standard(wanted, state)
@@ -294,12 +299,14 @@ class ModelStability:
 
     def _judge_floats(self, counts: NDArray[np.generic], said: _Said) -> None:
         """What no driver can hand over goes to the network's door, as repaired counts do."""
-        network = Network(self._model, self._session, LIMITS.slip_threshold)
+        network = Network(self._model, LIMITS.slip_threshold)
         for reading in counts:
-            p_slip, reasons = network.judge(reading)
-            case = Case(p_slip, reasons, in_contact=True, settled=True, gate=(), age_ns=0)
+            found = network.judge(Examined((), reading), self._session)
+            case = Case(
+                found.p_slip, found.reasons, in_contact=True, settled=True, gate=(), age_ns=0
+            )
             outcome, reasons = decide(case, LIMITS)
-            said.add(outcome, p_slip, reasons, self._model)
+            said.add(outcome, found.p_slip, reasons, self._model)
 
 
 def seasoned_session(contract: ModelContract) -> SessionState | None:

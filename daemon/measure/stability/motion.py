@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.grip import Grip, GripLimits
-from daemon.judge.health import Watched
-from daemon.judge.joint_motion import JointLimits, JointMotion
+from daemon.judge.findings import Watched
+from daemon.judge.grip import Grip
+from daemon.judge.joint_motion import JointMotion
+from daemon.judge.limits import GripLimits, JointLimits
 from daemon.judge.reasons import Reason
 from daemon.measure.stability.steps import StepRow
 from drivers.base import COUNT_MAX, ELECTRODES, JointReading, TactileReading

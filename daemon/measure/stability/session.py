@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from daemon.measure.stability.steps import StepRow
 from drivers.base import COUNT_MAX
-from models.session import HORIZON_GRASPS, SessionState, SessionStatistics
+from models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics
 
 WIDTH = 24
 UPDATES = 4000

@@ -10,6 +10,7 @@ from itertools import product
 from typing import Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPClassifier
@@ -20,6 +21,20 @@ from models.training.arrays import Bools, Floats, Floats32
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
+
+
+class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-learn has no types
+    """Gradient boosting that shows what it consists of."""
+
+    @property
+    def trees(self) -> list[NDArray[np.void]]:
+        """Nodes of each tree, as scikit-learn keeps them."""
+        return [predictor.nodes for (predictor,) in self._predictors]
+
+    @property
+    def base(self) -> float:
+        """Margin before the first tree."""
+        return float(self._baseline_prediction.item())
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +148,7 @@ def classical_margins(model: ClassicalModel, inputs: Floats32) -> Floats:
         return np.empty(0)
     with _one_thread():
         match model:
-            case SVC() | HistGradientBoostingClassifier():
+            case SVC() | Boosting():
                 margins: Floats = model.decision_function(inputs)
             case MLPClassifier():
                 margins = _mlp_margins(model, inputs)
@@ -155,8 +170,8 @@ def classical_size(model: ClassicalModel) -> int:
             return sum(int(part.size) for part in (*model.coefs_, *model.intercepts_))
         case RandomForestClassifier():
             return sum(int(tree.tree_.node_count) for tree in model.estimators_)
-        case HistGradientBoostingClassifier():
-            return sum(len(tree.nodes) for (tree,) in model._predictors)
+        case Boosting():
+            return sum(map(len, model.trees))
         case _:
             raise TypeError(f"no classifier of this module: {type(model).__name__}")
 
@@ -180,7 +195,7 @@ def _model(config: ClassicalConfig, seed: int) -> ClassicalModel:
                 random_state=seed,
             )
         case BoostingConfig():
-            model = HistGradientBoostingClassifier(
+            model = Boosting(
                 max_iter=config.iterations,
                 learning_rate=config.learning_rate,
                 max_leaf_nodes=config.leaves,

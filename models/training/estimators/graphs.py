@@ -13,14 +13,14 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 from skl2onnx import to_onnx
-from sklearn.ensemble import HistGradientBoostingClassifier, RandomForestClassifier
+from sklearn.ensemble import RandomForestClassifier
 from sklearn.neural_network import MLPClassifier
 from sklearn.svm import SVC
 from torch import nn
 
 from models.contract import OUTPUT_NAME
 from models.training.arrays import Floats, Floats32, Numbers
-from models.training.estimators.classical import PROBABILITY_FLOOR, ClassicalModel
+from models.training.estimators.classical import PROBABILITY_FLOOR, Boosting, ClassicalModel
 from models.training.estimators.networks import for_inference, for_margin
 
 OPSET = 18
@@ -54,7 +54,7 @@ def classical_margin(model: ClassicalModel, input_name: str) -> onnx.ModelProto:
     match model:
         case SVC():
             return _svm(model, input_name)
-        case HistGradientBoostingClassifier():
+        case Boosting():
             return _boosting(model, input_name)
         case RandomForestClassifier():
             return _forest(model, input_name)
@@ -198,9 +198,9 @@ def _svm(model: SVC, input_name: str) -> onnx.ModelProto:
     return _model(_nodes(steps), constants, _vectors(input_name, features), MARGIN_NAME, 1)
 
 
-def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.ModelProto:
+def _boosting(model: Boosting, input_name: str) -> onnx.ModelProto:
     """As one TreeEnsembleRegressor; skl2onnx 1.20 cannot write these trees with onnx 1.23."""
-    trees = [predictor.nodes for (predictor,) in model._predictors]
+    trees = model.trees
     of_tree = np.repeat(np.arange(len(trees)), [len(tree) for tree in trees])
     of_node = np.concatenate([np.arange(len(tree)) for tree in trees])
     nodes = np.concatenate(trees)
@@ -212,7 +212,7 @@ def _boosting(model: HistGradientBoostingClassifier, input_name: str) -> onnx.Mo
         domain="ai.onnx.ml",
         n_targets=1,
         aggregate_function="SUM",
-        base_values=[float(model._baseline_prediction.item())],
+        base_values=[model.base],
         nodes_treeids=of_tree.tolist(),
         nodes_nodeids=of_node.tolist(),
         nodes_modes=np.where(leaf, "LEAF", "BRANCH_LEQ").tolist(),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from models.contract import SeenCounts
-from models.seen import SeenCheck
+from models.novelty import NoveltyCheck
 from models.training.arrays import Numbers
 from models.training.data.datasets import COUNT_MAX
 
@@ -60,7 +60,9 @@ def held_out_never_seen(counts: Numbers, group_of: Numbers, margin: int = MARGIN
     never = np.empty(len(counts), dtype=np.bool_)
     for group in np.unique(group_of):
         inside = group_of == group
-        never[inside] = SeenCheck(seen_counts(counts[~inside], margin)).never_seen(counts[inside])
+        never[inside] = NoveltyCheck(seen_counts(counts[~inside], margin)).never_seen(
+            counts[inside]
+        )
     return float(never.mean())
 
 
@@ -80,7 +82,7 @@ def made_up_never_seen(counts: Numbers, seen: SeenCounts, seed: int) -> dict[str
         "each electrode from another grasp": lambda: random.permuted(counts, axis=0),
         "middle of the ranges, with noise": lambda: (low + high) / 2 + random.normal(0, 3.5, shape),
     }
-    check = SeenCheck(seen)
+    check = NoveltyCheck(seen)
     return {
         name: float(check.never_seen(make().astype(np.uint16)).mean())
         for name, make in makers.items()

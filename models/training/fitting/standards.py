@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.session import SessionStatistics
+from models.session_statistics import SessionStatistics
 from models.training.arrays import Floats, Floats32, Ints
 
 PRIOR_GRASPS = 1.0

@@ -13,9 +13,7 @@ from functools import cache
 import numpy as np
 
 from daemon.judge.decision import Limits
-from daemon.judge.gate import GateLimits
-from daemon.judge.grip import GripLimits
-from daemon.judge.joint_motion import JointLimits
+from daemon.judge.limits import GateLimits, GripLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading

@@ -12,6 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
+from daemon.judge.limits import ContactLimits
 from daemon.judge.median import FreshMedian
 from drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
@@ -33,7 +34,7 @@ class Hand:
     """Feeds a hand's sweeps, 10 ms apart, to fresh values and contact."""
 
     def __init__(self) -> None:
-        self.contact = Contact(3)
+        self.contact = Contact(3, ContactLimits())
         self.fresh = FreshMedian((3, 24))
         self.t_ns = 10**12
 

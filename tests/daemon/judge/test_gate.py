@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.gate import GateChange, GateLimits
-from daemon.judge.grip import Grip, GripLimits
-from daemon.judge.health import Watched
-from daemon.judge.joint_motion import JointLimits
+from daemon.judge.findings import Watched
+from daemon.judge.gate import GateChange
+from daemon.judge.grip import Grip
+from daemon.judge.limits import GateLimits, GripLimits, JointLimits
 from daemon.judge.reasons import GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from daemon.judge.gate import CHANGES_MAX, Gate, GateChange, GateLimits
+from daemon.judge.findings import Watched
+from daemon.judge.gate import CHANGES_MAX, Gate, GateChange
 from daemon.judge.grip import Grip
-from daemon.judge.health import Watched
+from daemon.judge.limits import GateLimits
 from daemon.judge.reasons import GateCause, GateState, Reason
 from tests.daemon.judge.test_gate import (
     ALL,

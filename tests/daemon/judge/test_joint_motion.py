@@ -8,7 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from daemon.judge.joint_motion import SOURCES_MAX, JointLimits, JointMotion
+from daemon.judge.joint_motion import SOURCES_MAX, JointMotion
+from daemon.judge.limits import JointLimits
 from daemon.judge.reasons import Reason
 from drivers.base import JointReading
 

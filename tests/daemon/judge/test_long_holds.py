@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.grip import Grip, GripLimits
-from daemon.judge.health import Watched
+from daemon.judge.findings import Watched
+from daemon.judge.grip import Grip
+from daemon.judge.limits import GripLimits
 from daemon.judge.reasons import GateState
 from drivers.base import TactileReading
 from tests.daemon.judge.test_contact import PRESSED, Hand, at_rest, noisy, still

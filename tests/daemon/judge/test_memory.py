@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.judge.memory import JudgeMemory, decode, encode
+from daemon.judge.memory import encode, recall, remember
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Outcome, Reason
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger
 from models.runtime import TactileModel
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 SECTIONS: dict[str, Any] = {
@@ -98,9 +98,9 @@ def handed_on(former: Pipeline, other: Pipeline) -> Pipeline:
     """The other one, with what this one knows, as a recording tells it."""
     assert former.session is not None
     assert other.session is not None
-    memory = encode(JudgeMemory.of(former))
+    memory = encode(remember(former))
     state = msgspec.json.encode(former.session.state())
-    decode(memory).give_judge(other, same_model=True)
+    recall(other, memory, same_model=True)
     other.session.restore(msgspec.json.decode(state, type=SessionState))
     return other
 
@@ -126,7 +126,7 @@ def test_what_is_taken_does_not_change_when_the_judge_goes_on(readings: list[Rea
     now = [0]
     pipeline = judge(now, {"mode": "settled"})
     judged(pipeline, now, readings[:2000])
-    memory = JudgeMemory.of(pipeline)
+    memory = remember(pipeline)
     before = encode(memory)
     judged(pipeline, now, readings[2000:])
     assert encode(memory) == before
@@ -143,7 +143,7 @@ def test_another_model_judges_the_grasp_at_hand_anew_and_knows_where_the_hand_re
         said += [each for each, _ in judged(pipeline, now, readings[place : place + 1])]
         place += 1
     other = judge(now, {"mode": "settled"}, "cnn1")
-    decode(encode(JudgeMemory.of(pipeline))).give_judge(other, same_model=False)
+    recall(other, encode(remember(pipeline)), same_model=False)
     found = [each for each, _ in judged(other, now, readings[place : place + 100])]
     assert found[0].outcome is Outcome.UNKNOWN
     assert Reason.NOT_TARED not in {reason for each in found for reason in each.reasons}
@@ -159,7 +159,7 @@ def test_the_memory_of_another_hand_is_refused(readings: list[Reading]) -> None:
     wanted = scene.parse(sections, Path("test"))
     two = assembly.build_pipeline(wanted, assembly.load_model(wanted))
     with pytest.raises(ValueError, match="shape"):
-        JudgeMemory.of(pipeline).give_judge(two, same_model=False)
+        recall(two, encode(remember(pipeline)), same_model=False)
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +167,7 @@ def known(readings: list[Reading]) -> bytes:
     now = [0]
     pipeline = judge(now, {"mode": "settled"})
     judged(pipeline, now, readings[:1500])
-    return encode(JudgeMemory.of(pipeline))
+    return encode(remember(pipeline))
 
 
 @pytest.fixture(scope="module")
@@ -205,13 +205,13 @@ def test_whatever_is_in_a_memory_is_refused_or_can_be_gone_on_from(
     place[key] = odd
     pipeline, now = spare
     try:
-        decode(zlib.compress(msgspec.msgpack.encode(tree))).give_judge(pipeline, same_model=True)
+        recall(pipeline, zlib.compress(msgspec.msgpack.encode(tree)), same_model=True)
     except ValueError:
         return
     judged(pipeline, now, readings[1500:1504])
 
 
 @pytest.mark.parametrize("data", [b"", b"\x80", zlib.compress(b"{}"), zlib.compress(bytes(9**7))])
-def test_what_is_no_memory_is_refused(data: bytes) -> None:
+def test_what_is_no_memory_is_refused(spare: tuple[Pipeline, list[int]], data: bytes) -> None:
     with pytest.raises(ValueError, match=r".+"):
-        decode(data)
+        recall(spare[0], data, same_model=True)

@@ -18,10 +18,7 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon.judge.contact import ContactLimits
-from daemon.judge.gate import GateLimits
-from daemon.judge.grip import GripLimits
-from daemon.judge.joint_motion import JointLimits
+from daemon.judge.limits import ContactLimits, GateLimits, GripLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Outcome
 from drivers.base import ElectrodeFault, JointReading, TactileReading

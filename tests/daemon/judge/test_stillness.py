@@ -99,4 +99,4 @@ def test_memory_is_bounded_however_fast_readings_come() -> None:
     stillness = Stillness(WINDOW_NS, 3)
     for n in range(5000):
         swept(stillness, n / 100_000, 0.0)
-    assert len(stillness._times_ns) <= SWEEPS + 2
+    assert len(stillness.memory.times_ns) <= SWEEPS + 2

@@ -68,7 +68,7 @@ BUSES = {
 JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
 HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
 GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "median", "grip", "stillness")}
-STATISTICS = {"daemon.judge.calibration", "models.session"}
+STATISTICS = {"daemon.judge.calibration", "models.session_statistics"}
 KEPT = {"daemon.session.file", "daemon.session.keeper"}
 ASK = {"daemon.publish.questions"}
 

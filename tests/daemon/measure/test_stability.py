@@ -26,6 +26,7 @@ import onnxruntime as ort
 from onnx import helper, numpy_helper
 
 from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.findings import Examined
 from daemon.judge.network import Network
 from daemon.judge.reasons import Outcome
 from daemon.measure.reference.reference import Reference
@@ -329,7 +330,8 @@ def test_probabilities_keep_their_bound_over_the_12_bit_space(
     model, reference = model_and_reference(name)
     counts = counts[: HANDS[name]]
     exact, exact_spread = inputs_by_hand(name, counts)
-    p_slip, reasons = Network(model, None, 0.5).judge(counts)
+    said = Network(model, 0.5).judge(Examined((), counts))
+    p_slip, reasons = said.p_slip, said.reasons
     if p_slip is None:
         assert reasons
         assert min(exact_spread) < 1.0 + 1e-9
@@ -354,9 +356,9 @@ def test_what_is_not_finite_never_gives_a_verdict(
     for place, value in wrong.items():
         floats.flat[place % floats.size] = value
     with np.errstate(invalid="ignore"):
-        p_slip, reasons = Network(model, None, 0.5).judge(floats)
-    assert p_slip is None
-    assert reasons
+        said = Network(model, 0.5).judge(Examined((), floats))
+    assert said.p_slip is None
+    assert said.reasons
 
 
 @pytest.mark.parametrize("p_slip", [np.nan, np.inf, -np.inf, -1e-9, 1.0 + 1e-9, None])

@@ -20,7 +20,7 @@ from daemon.record.mcap import McapReader, McapWriter, RecordedMessage, header_o
 from daemon.record.player import McapReplayDriver
 from daemon.record.topics import Joints
 from drivers.base import FINGERS, JointReading, RecordingError, TactileReading
-from models.session import SessionState
+from models.session_statistics import SessionState
 
 BOOT = "0123456789abcdef" * 2
 OFFSET_NS = 10**18

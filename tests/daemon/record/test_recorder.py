@@ -281,10 +281,10 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
     monkeypatch.setattr(McapWriter, "write", write)
     for number in range(10):
         recorder.send(TOPIC, payload(number))
-    recorder._go_round()
+    recorder.go_round()
     for number in range(20):
         recorder.send(TOPIC, payload(number))
-    recorder._go_round()
+    recorder.go_round()
     recorder.send(TOPIC, payload(0))
     recorder.close()
     counted = recorder.counters()

@@ -5,15 +5,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import logging
+import selectors
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 
 import numpy as np
 import pytest
 
-from daemon.judge.contact import ContactLimits
-from daemon.judge.gate import GateLimits
-from daemon.judge.grip import GripLimits
+from daemon.judge.limits import ContactLimits, GateLimits, GripLimits
 from daemon.judge.reasons import Outcome, Reason
 from daemon.process.signals import StopSignal
 from daemon.publish.companion import Companion
@@ -52,6 +51,18 @@ class LiveDriver(FakeDriver):
         return taken  # type: ignore[return-value]
 
 
+class ClockSelector(selectors.SelectSelector):
+    """Moves the clock instead of waiting; no descriptor is ever ready."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self.clock = clock
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self.clock.now_ns += round((timeout or 0.0) * 1e9)
+        return []
+
+
 class Bench(Companion):
     """A loop on a clock of its own, which stands still but for what judging costs."""
 
@@ -80,22 +91,10 @@ class Bench(Companion):
                 Outbox("right", FINGERS, "fake", "ab" * 32, [self], clock, lambda: 1.79e9),
                 stop,
                 [self],
-                Timing(SECOND_NS, clock),
+                Timing(SECOND_NS, clock, rest=self._rest, selector=lambda: ClockSelector(clock)),
             )
-            loop._overload._sleep = self._rest
-            loop._wait = self._wait  # type: ignore[assignment, method-assign]
-            self.loop = loop
             with closing(loop):
                 loop.run()
-
-    def _wait(self, _selector: object) -> None:
-        """Move the clock instead of waiting."""
-        due_ns = self.driver.due_ns()
-        if due_ns is not None and due_ns > self.clock():
-            self.clock.now_ns = due_ns
-            self.loop._overload.waited(due_ns)
-        else:
-            self.loop._overload.rest(self.clock())
 
     def _rest(self, seconds: float) -> None:
         self.rests_s.append(seconds)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
-from daemon.judge.grip import GripLimits
+from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import GateState, Outcome, Reason
 from daemon.session.file import SessionFile, SessionFileError, exchanged, load
@@ -42,11 +42,9 @@ def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
     return np.random.default_rng(seed).integers(500, 3500, (number, 3, 24), dtype=np.uint16)
 
 
-def calibration(builder: SessionBuilder | None = None) -> SessionCalibration:
+def calibration() -> SessionCalibration:
     wanted = SessionInput((0.0,) * 78, (1.0,) * 78, 3.0, 1.0, 20.0, SHARPNESS)
-    return SessionCalibration(
-        wanted, builder or SessionBuilder(3, 3.0), np.full((3, 24), 2000.0), np.full((3, 24), 300.0)
-    )
+    return SessionCalibration(wanted, np.full((3, 24), 2000.0), np.full((3, 24), 300.0))
 
 
 def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
@@ -55,16 +53,17 @@ def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
 
 
 def test_the_input_follows_the_session() -> None:
-    builder = SessionBuilder(3, 3.0)
-    session = calibration(builder)
+    builder, session = SessionBuilder(3, 3.0), calibration()
     observe(session, 200)
+    known = session.now
+    builder.use(known.features_mean, known.features_spread)
     raw = raw_features(counts(200))
     # The prior weighs one grasp in two hundred: the session's own statistics, nearly.
     fresh = counts(10, seed=1)
     expected = np.clip((raw_features(fresh) - raw.mean(axis=0)) / raw.std(axis=0), -3.0, 3.0)
     np.testing.assert_allclose(builder.build_batch(fresh)[0], expected, atol=0.5)
-    np.testing.assert_allclose(session.counts_mean, counts(200).mean(axis=0), rtol=0.02)
-    np.testing.assert_allclose(session.counts_spread, counts(200).std(axis=0), rtol=0.05)
+    np.testing.assert_allclose(known.counts_mean, counts(200).mean(axis=0), rtol=0.02)
+    np.testing.assert_allclose(known.counts_spread, counts(200).std(axis=0), rtol=0.05)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +74,7 @@ def test_a_young_session_is_less_sure(grasps: int, temperature: float, calibrate
     session = calibration()
     observe(session, grasps)
     assert session.grasps == grasps
-    assert session.temperature == temperature
+    assert session.now.temperature == temperature
     assert session.calibrated is calibrated
 
 

@@ -225,5 +225,5 @@ class TwinLink:
         with twin:
             frames = twin.next_frames()
             for frame in frames[: len(frames) // 2]:
-                twin._put(frame)
+                twin.put(frame)
         return len(frames) // 2

@@ -147,7 +147,7 @@ def test_names_are_remembered_up_to_a_limit() -> None:
     parser = JointParser(counters)
     for number in range(500):
         parser.parse(json.dumps({"joints": {f"X{number}": 0.1, "FFJ3": 0.5}}).encode())
-    assert len(parser._joints) <= 64
+    assert len(parser.joint_by_name) <= 64
     assert counters.unknown_names == 500
 
 

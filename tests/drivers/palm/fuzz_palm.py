@@ -70,7 +70,7 @@ class _Palm:
 
     @property
     def held_bytes(self) -> int:
-        return sum(packet is not None for packet in self._sweeps._packets)
+        return sum(packet is not None for packet in self._sweeps.packets)
 
 
 def _is_a_packet(packet: PalmPacket) -> bool:
@@ -123,7 +123,7 @@ class _Joints:
 
     @property
     def held_bytes(self) -> int:
-        return len(self._parser._joints)
+        return len(self._parser.joint_by_name)
 
 
 def _are_angles(message: Angles) -> bool:

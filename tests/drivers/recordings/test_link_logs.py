@@ -21,6 +21,7 @@ from drivers.recordings.serial_log import (
     SerialRecord,
     encode_records,
 )
+from drivers.spi.framing import FrameParser
 from drivers.spi.line import LineEvent
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
@@ -141,7 +142,9 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
         for record in parser.feed(data[start : start + size])
     ]
     assert found == made
-    counters = parser._frames.counters
+    frames = FrameParser()
+    assert len(list(frames.feed(data))) == len(made)
+    counters = frames.counters
     assert counters.bad_cobs + counters.bad_crc + counters.too_long == 0
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from models.contract import SeenCounts
 
 
-class SeenCheck:
+class NoveltyCheck:
     """Tells readings that are far from all training data: for them a network's answer is noise.
 
     Two tests, each of which catches what the other lets through: every electrode must lie in its
@@ -47,7 +47,7 @@ class SeenCheck:
         )
 
     def is_far(self, counts: NDArray[np.float64]) -> bool:
-        """Whether counts (fingers, 24) fit the training covariance; the ranges do not matter."""
+        """Whether counts (fingers, 24) do not fit the training covariance; ranges do not matter."""
         return not self._square(counts, 0) <= self._square_max
 
     def _square(self, values: NDArray[np.float64], repaired: int) -> float:

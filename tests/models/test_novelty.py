@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
-from models.seen import SeenCheck
+from models.novelty import NoveltyCheck
 from tests.daemon.fakes import contract
 
 
@@ -32,14 +32,14 @@ def session(**changes: object) -> dict[str, object]:
 def test_a_count_beyond_the_margin_was_never_seen(count: int, refused: bool) -> None:
     counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
     counts[1, 1, 11] = count
-    assert SeenCheck(seen()).never_seen(counts).tolist() == [False, refused]
+    assert NoveltyCheck(seen()).never_seen(counts).tolist() == [False, refused]
 
 
 @pytest.mark.parametrize(("off", "refused"), [(200, False), (201, True), (-201, True)])
 def test_the_distance_is_the_root_mean_square_deviation(off: int, refused: bool) -> None:
     # All 72 electrodes `off` counts from the centre, one spread being 100 counts: distance 2.
     counts = np.full((1, 3, 24), 2000 + off, dtype=np.uint16)
-    check = SeenCheck(seen(spread=1 / 100, distance_max=2.0))
+    check = NoveltyCheck(seen(spread=1 / 100, distance_max=2.0))
     assert check.never_seen(counts).tolist() == [refused]
 
 
@@ -50,12 +50,12 @@ def test_the_triangle_is_read_row_by_row() -> None:
     counts = np.full((2, 3, 24), 2000, dtype=np.uint16)
     counts[0, 0, 5] += 100
     counts[1, 0, 2] += 100
-    assert SeenCheck(crossed).never_seen(counts).tolist() == [True, False]
+    assert NoveltyCheck(crossed).never_seen(counts).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("repaired", [0, 5])
 def test_one_reading_is_looked_at_as_many_are(repaired: int) -> None:
-    check = SeenCheck(seen(spread=1 / 100, distance_max=2.4))
+    check = NoveltyCheck(seen(spread=1 / 100, distance_max=2.4))
     random = np.random.default_rng(repaired)
     values = 2000.0 + random.normal(0.0, 1.0, (400, 3, 24)) * random.uniform(50, 300, (400, 1, 1))
     values[::7, 1, 2] = np.nan

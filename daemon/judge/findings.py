@@ -1,0 +1,92 @@
+"""What each part of the judge finds in one reading, in the order in which the reading comes to it.
+
+    health -> Watched -> grip -> Felt -> plausibility -> Examined -> network -> Opinion -> decision
+
+Each is a value: the next part needs nothing else of those before it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.reasons import GateState, Reason
+from models.contract import Finger
+
+if TYPE_CHECKING:
+    from daemon.judge.gate import GateChange
+
+Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
+"""Of readings or grasps so far; bounded, for a part's memory may come from a recording."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Watched:
+    """What is wrong with a reading and its electrodes."""
+
+    reasons: tuple[Reason, ...]
+    """Against using it at all."""
+    broken: NDArray[np.bool_]
+    """Shape (fingers, 24): electrodes that mean nothing in it."""
+
+
+class Felt(NamedTuple):
+    """Where in a grasp the hand is; the defaults are those of a reading that is a grasp itself.
+
+    A tuple, for there is one at every reading: a frozen dataclass takes four times as long to make.
+    """
+
+    grasp: int
+    """Number of the grasp at hand."""
+    counts: NDArray[np.uint16] | None
+    """Shape (fingers, 24): what is to be judged; None if nothing is, for now."""
+    judged: bool = True
+    """Whether this very reading is one to judge, sound or not."""
+    in_contact: bool = True
+    """Whether all required fingers touch."""
+    settled: bool = True
+    """Whether the grasp has settled, was judged, and still keeps still."""
+    reasons: tuple[Reason, ...] = ()
+    """Why it has not."""
+    gate: GateState | None = None
+    touching: tuple[Finger, ...] | None = None
+    """Fingers that touch."""
+    changes: tuple[GateChange, ...] = ()
+    """What the gate did since it was asked last, oldest first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Examined:
+    """Whether counts look like a grasp of the training, with what was broken repaired."""
+
+    reasons: tuple[Reason, ...]
+    """Against judging it; none if it is sound, or has been repaired."""
+    counts: NDArray[np.generic]
+    """Shape (fingers, 24), with the broken electrodes repaired; as read where there are reasons."""
+    repaired: tuple[str, ...] = ()
+    """Electrodes that were replaced, such as `ff_7`."""
+    grasp: NDArray[np.generic] | None = None
+    """Shape (fingers, 24): what a session may take in, even if it is like nothing that was seen
+    before, because that is how a drifted sensor starts. Only electrodes that are certainly broken
+    are repaired in it. None where the reading tells nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opinion:
+    """What the network said of a grasp, and what stands against its being asked."""
+
+    p_slip: float | None
+    reasons: tuple[Reason, ...]
+    repaired: tuple[str, ...] = ()
+
+
+NO_OPINION = Opinion(None, ())
+
+
+def electrode_name(finger: Finger, place: int) -> str:
+    """Such as `ff_7`, of the electrode at place 6 of 0..23."""
+    return f"{finger}_{place + 1}"
