@@ -25,6 +25,8 @@ from models.tactile_image import (
     scale_of,
 )
 
+Floats = NDArray[np.float64]
+
 
 class InputBuilder(Protocol):
     """Makes the input of one kind of model, one reading at a time or many."""
@@ -38,9 +40,9 @@ class InputBuilder(Protocol):
         """Of one reading's input."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the input of counts (fingers, 24) into `out` and return each finger's spread.
+        """Write the input of counts (fingers, 24) into `out`; the spread of each finger, counts.
 
-        A finger whose spread, counts, is below `SPREAD_FLOOR_COUNTS` must not be judged.
+        A finger whose spread is below `SPREAD_FLOOR_COUNTS` must not be judged.
         """
 
     def build_batch(
@@ -73,7 +75,25 @@ def builder(wanted: Input, fingers: int) -> InputBuilder:
             return features
 
 
-class VectorBuilder:
+class _FlatBuilder:
+    """One reading or many, by the same arithmetic; see `InputBuilder`."""
+
+    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> Floats:
+        """Write the input of counts (fingers, 24) into `out`; the spread of each finger, counts."""
+        out[...], spread = self._values(counts.astype(np.float64))
+        return spread
+
+    def build_batch(self, counts: NDArray[np.generic]) -> tuple[NDArray[np.float32], Floats]:
+        """Inputs (N, width) and spreads (N, fingers) of counts (N, fingers, 24)."""
+        values, spread = self._values(counts.astype(np.float64))
+        return values.astype(np.float32), spread
+
+    def _values(self, counts: Floats) -> tuple[Floats, Floats]:
+        """Inputs (..., width) and spreads (..., fingers) of counts (..., fingers, 24)."""
+        raise NotImplementedError
+
+
+class VectorBuilder(_FlatBuilder):
     """The counts as one vector, z-scored per finger over its 24 electrodes (paper, III-D)."""
 
     name = "tactile_vector"
@@ -81,21 +101,12 @@ class VectorBuilder:
     def __init__(self, fingers: int) -> None:
         self.shape = (fingers * ELECTRODES,)
 
-    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the vector into `out`; see `InputBuilder`."""
-        z, _, spread = _z_scores(counts.astype(np.float64))
-        out[...] = z.reshape(self.shape)
-        return spread
-
-    def build_batch(
-        self, counts: NDArray[np.generic]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Vectors of many readings; see `InputBuilder`."""
-        z, _, spread = _z_scores(counts.astype(np.float64))
-        return z.reshape(len(counts), *self.shape).astype(np.float32), spread
+    def _values(self, counts: Floats) -> tuple[Floats, Floats]:
+        z, _, spread = _z_scores(counts)
+        return _flat(z), spread
 
 
-class CountsBuilder:
+class CountsBuilder(_FlatBuilder):
     """The counts as one vector, untouched."""
 
     name = "tactile_counts"
@@ -103,20 +114,11 @@ class CountsBuilder:
     def __init__(self, fingers: int) -> None:
         self.shape = (fingers * ELECTRODES,)
 
-    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the counts into `out`; see `InputBuilder`."""
-        out[...] = counts.reshape(self.shape)
-        return _z_scores(counts.astype(np.float64))[2]
-
-    def build_batch(
-        self, counts: NDArray[np.generic]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Vectors of many readings; see `InputBuilder`."""
-        flat = counts.reshape(len(counts), *self.shape).astype(np.float32)
-        return flat, _z_scores(counts.astype(np.float64))[2]
+    def _values(self, counts: Floats) -> tuple[Floats, Floats]:
+        return _flat(counts), _z_scores(counts)[2]
 
 
-class SessionBuilder:
+class SessionBuilder(_FlatBuilder):
     """Features of a reading, standardised by what `use` was told, then clipped.
 
     The error is 6e-8 of the largest magnitude, the rounding to float32, as long as no mean is more
@@ -131,45 +133,37 @@ class SessionBuilder:
         self._mean = np.zeros(self.shape)
         self._scale = np.ones(self.shape)
 
-    def use(self, mean: NDArray[np.float64], spread: NDArray[np.float64]) -> None:
+    def use(self, mean: Floats, spread: Floats) -> None:
         """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero."""
         self._mean = mean
         self._scale = 1.0 / spread
 
-    def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Write the features into `out`; see `InputBuilder`."""
-        features, spread = _features(counts.astype(np.float64))
-        out[...] = self._standardise(features)
-        return spread
-
-    def build_batch(
-        self, counts: NDArray[np.generic]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-        """Features of many readings; see `InputBuilder`."""
-        features, spread = _features(counts.astype(np.float64))
-        return self._standardise(features).astype(np.float32), spread
-
-    def _standardise(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        standard: NDArray[np.float64] = (features - self._mean) * self._scale
+    def _values(self, counts: Floats) -> tuple[Floats, Floats]:
+        features, spread = _features(counts)
+        standard: Floats = (features - self._mean) * self._scale
         # What `np.clip` does, in half its time.
         np.maximum(standard, -self._clip, out=standard)
-        return np.minimum(standard, self._clip, out=standard)
+        return np.minimum(standard, self._clip, out=standard), spread
 
 
-def raw_features(counts: NDArray[np.generic]) -> NDArray[np.float64]:
+def raw_features(counts: NDArray[np.generic]) -> Floats:
     """Features before standardising, shape (..., fingers * 26), of counts (..., fingers, 24)."""
     return _features(counts.astype(np.float64))[0]
 
 
-def _features(counts: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _features(counts: Floats) -> tuple[Floats, Floats]:
     z, mean, spread = _z_scores(counts)
-    flat = z.reshape(*z.shape[:-2], -1)
-    return np.concatenate((flat, mean, spread), axis=-1), spread
+    return np.concatenate((_flat(z), mean, spread), axis=-1), spread
+
+
+def _flat(values: Floats) -> Floats:
+    """Shape (..., fingers * 24) of (..., fingers, 24)."""
+    return values.reshape(*values.shape[:-2], -1)
 
 
 def _z_scores(
-    counts: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    counts: Floats,
+) -> tuple[Floats, Floats, Floats]:
     """Z-values, means and (population) spreads of each finger; all zero where it is flat.
 
     In two passes, so that large counts that hardly differ cancel before they are squared: for
@@ -177,6 +171,6 @@ def _z_scores(
     """
     mean = np.add.reduce(counts, axis=-1) / ELECTRODES
     centred = counts - mean[..., np.newaxis]
-    spread: NDArray[np.float64] = np.sqrt(np.add.reduce(centred**2, axis=-1) / ELECTRODES)
+    spread: Floats = np.sqrt(np.add.reduce(centred**2, axis=-1) / ELECTRODES)
     centred *= scale_of(spread)[..., np.newaxis]
     return centred, mean, spread

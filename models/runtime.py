@@ -10,12 +10,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from models.contract import (
-    METADATA_KEY,
-    OUTPUT_NAME,
-    ModelContract,
-    ModelError,
-)
+from models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
 from models.inputs import InputBuilder, builder
 
 MAX_MODEL_BYTES = 256 * 2**20
@@ -37,8 +32,7 @@ class TactileModel:
         self.path = path
         self.sha256 = hashlib.sha256(data).hexdigest()
         self._session = _session(path, data)
-        self.contract = _contract(path, self._session)
-        self.inputs = _inputs(path, self.contract)
+        self.contract, self.inputs = _contract(path, self._session)
         _check_signature(path, self._session, self.inputs)
         self._batch = np.zeros((1, *self.inputs.shape), dtype=np.float32)
         self.input: NDArray[np.float32] = self._batch[0]
@@ -100,19 +94,13 @@ def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _contract(path: Path, session: ort.InferenceSession) -> ModelContract:
+def _contract(path: Path, session: ort.InferenceSession) -> tuple[ModelContract, InputBuilder]:
     text = session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
     if text is None:
         raise ModelError(f"{path}: has no contract (no metadata entry '{METADATA_KEY}')")
     try:
-        return ModelContract.from_json(text)
-    except ModelError as error:
-        raise ModelError(f"{path}: {error}") from error
-
-
-def _inputs(path: Path, contract: ModelContract) -> InputBuilder:
-    try:
-        return builder(contract.input, len(contract.fingers))
+        contract = ModelContract.from_json(text)
+        return contract, builder(contract.input, len(contract.fingers))
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
 

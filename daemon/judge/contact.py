@@ -236,21 +236,6 @@ class Contact:
         """Whether it is known where each finger rests, shape (fingers,)."""
         return self.memory.tared
 
-    @property
-    def baseline(self) -> NDArray[np.float64]:
-        """Where each electrode rests, counts, shape (fingers, 24); 0 without a tare."""
-        return self.memory.baseline
-
-    @property
-    def fall(self) -> NDArray[np.float64]:
-        """How deep each finger is pressed, counts, shape (fingers,); see `Touch.fall`."""
-        return np.array([touch.fall for touch in self.memory.touches])
-
-    @property
-    def threshold(self) -> NDArray[np.float64]:
-        """Fall that makes a touch, counts, shape (fingers,)."""
-        return np.array([touch.threshold for touch in self.memory.touches])
-
     def forget(self) -> None:
         """Forget every tare: the sensors may be others, or have been off."""
         for finger in range(len(self.memory.tares)):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from daemon.judge.contact import Contact
 from daemon.judge.findings import Felt, Watched
 from daemon.judge.gate import Gate, GateChange
-from daemon.judge.limits import MEDIAN_SWEEPS, GripLimits, JointLimits
+from daemon.judge.limits import MEDIAN_SWEEPS, GripLimits
 from daemon.judge.median import FreshMedian
 from daemon.judge.reasons import GateState, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
@@ -49,7 +49,11 @@ class Grip:
         self._judges_median = limits.sweeps == MEDIAN_SWEEPS
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
         self._contact = Contact(len(fingers), limits.contact)
-        self._joints = None if limits.joints is None else _joint_motion(limits.joints)
+        self._joints: JointMotion | None = None
+        if limits.joints is not None:
+            from daemon.judge.joint_motion import JointMotion  # only where it is needed
+
+            self._joints = JointMotion(limits.joints)
         must_touch = np.array([finger in required for finger in fingers])
         self._gate = Gate(must_touch, limits.gate, on_request=limits.on_request)
         self.memory = GripMemory()
@@ -199,10 +203,3 @@ class Grip:
     def _names(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
         chosen = zip(self._fingers, which.tolist(), strict=True)
         return tuple(finger for finger, is_chosen in chosen if is_chosen)
-
-
-def _joint_motion(limits: JointLimits) -> JointMotion:
-    """Imported only where the scene has joints."""
-    from daemon.judge.joint_motion import JointMotion
-
-    return JointMotion(limits)

@@ -17,7 +17,7 @@ from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
 from daemon.judge.reasons import GateState, Outcome, Reason
 from drivers.base import JointReading, TactileReading
-from models.contract import Finger, ModelContract, ModelError, SessionInput
+from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
 from models.runtime import TactileModel
 
@@ -92,7 +92,11 @@ class Pipeline:
             )
         contract = model.contract
         electrodes = Electrodes(contract.seen)
-        self._session = _session(contract, electrodes)
+        self._session: SessionCalibration | None = None
+        if isinstance(contract.input, SessionInput):
+            from daemon.judge.calibration import SessionCalibration  # only where it is needed
+
+            self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
         self._clock = clock
         self._learns = learns
@@ -101,8 +105,12 @@ class Pipeline:
         self._health = Health(len(fingers))
         self._plausibility = Plausibility(fingers, contract.seen, electrodes)
         self._network = Network(model, limits.slip_threshold)
-        self.grip = None if grip is None else _grip(fingers, grip)
+        self.grip: Grip | None = None
         """None where each reading is a grasp."""
+        if grip is not None:
+            from daemon.judge.grip import Grip  # only where it is needed
+
+            self.grip = Grip(fingers, grip)
         self.memory = PipelineMemory()
         self._to_learn: NDArray[np.generic] | None = None
         self._latest: TactileReading | None = None
@@ -282,19 +290,3 @@ class Pipeline:
 
     def _age_ns(self, t_ns: int) -> int:
         return self._clock() - t_ns
-
-
-def _grip(fingers: Sequence[Finger], limits: GripLimits) -> Grip:
-    """Imported only where the scene has a gate."""
-    from daemon.judge.grip import Grip
-
-    return Grip(fingers, limits)
-
-
-def _session(contract: ModelContract, electrodes: Electrodes) -> SessionCalibration | None:
-    """Imported only where the model has a session."""
-    if not isinstance(contract.input, SessionInput):
-        return None
-    from daemon.judge.calibration import SessionCalibration
-
-    return SessionCalibration(contract.input, electrodes.centre, electrodes.spread)

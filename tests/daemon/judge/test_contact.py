@@ -101,7 +101,7 @@ def test_nothing_touches_in_a_real_untouched_recording_five_times_in_a_row(
     falls = []
     for counts in played[100:]:
         hand.feel(counts)
-        falls.append(hand.contact.fall)
+        falls.append([touch.fall for touch in hand.contact.memory.touches])
         assert not hand.contact.touching.any()
         assert hand.contact.tared.all()
     assert np.max(falls) < 11.0, "the third deepest fall leaves half of the threshold free"
@@ -113,9 +113,10 @@ def test_baseline_and_threshold_are_those_of_the_real_noise(untouched: Counts) -
     window = untouched[:100].astype(np.float64)
     baseline = np.median(window, axis=0)
     sigma = 1.4826 * np.median(np.abs(window - baseline), axis=0)
-    np.testing.assert_allclose(hand.contact.baseline, baseline)
+    np.testing.assert_allclose(hand.contact.memory.baseline, baseline)
     expected = np.maximum(20.0, 5.0 * np.median(sigma, axis=1))
-    np.testing.assert_allclose(hand.contact.threshold, expected, rtol=1e-6)
+    thresholds = [touch.threshold for touch in hand.contact.memory.touches]
+    np.testing.assert_allclose(thresholds, expected, rtol=1e-6)
 
 
 @dataclass
@@ -250,14 +251,14 @@ def ten_minutes() -> TenMinutes:
         mean = ten_minutes_mean(second + np.arange(100) / 100, held=True)
         touching.append(hand.play(noisy(mean, second)))
         tared.append(hand.contact.tared.copy())
-    baseline = hand.contact.baseline.copy()
+    baseline = hand.contact.memory.baseline.copy()
     after = hand.play(noisy(ten_minutes_mean(600 + np.arange(300) / 100, held=False), 600))
     return TenMinutes(
         np.concatenate(touching),
         np.array(tared),
         baseline,
         after,
-        hand.contact.baseline.copy(),
+        hand.contact.memory.baseline.copy(),
         hand,
     )
 
