@@ -30,7 +30,7 @@ TRIAL_STATUSES: Final = 3
 OVERLOAD_MIN: Final = 3.0
 """By which a rate that is carried is below what is judged at most ..."""
 BURST_TIMES: Final = 10.0
-"""... and by which another one is above it, but for what a twin can."""
+"""... and by which another one is above that, at least, but for what a twin can."""
 TWIN_MAX_HZ: Final = 1000.0
 STEADY_S: Final = 10.0
 BURST_S: Final = 10.0
@@ -131,8 +131,9 @@ def can_frames(lab: Lab) -> Outcome:
     """No frame is lost at a rate that is carried, and all are accounted for at ten times that."""
     restarts = lab.show("can", "NRestarts")
     try:
-        carried_hz = _overloaded_hz(lab) / OVERLOAD_MIN
-        burst_hz = min(BURST_TIMES * carried_hz, TWIN_MAX_HZ)
+        sent_hz, judged_hz = _overloaded_hz(lab)
+        carried_hz = judged_hz / OVERLOAD_MIN
+        burst_hz = min(max(BURST_TIMES * carried_hz, sent_hz), TWIN_MAX_HZ)
         before = _tally(lab)
         began_s = lab.now_s()
         lab.twin("--rate", f"{carried_hz:.3f}")
@@ -163,8 +164,8 @@ def can_frames(lab: Lab) -> Outcome:
     )
 
 
-def _overloaded_hz(lab: Lab) -> float:
-    """What is judged per second of what comes faster. Raises `StepError` if nothing is faster."""
+def _overloaded_hz(lab: Lab) -> tuple[float, float]:
+    """A rate that overloads, and what is judged of it. Raises `StepError` if none does."""
     for rate_hz in BURST_RATES_HZ:
         began_s = lab.now_s()
         lab.twin("--rate", str(rate_hz), *RECORDING)
@@ -176,8 +177,8 @@ def _overloaded_hz(lab: Lab) -> float:
             for former, later in itertools.pairwise(statuses)
             if later.body["skipped_readings"] > former.body["skipped_readings"]
         ]
-        if len(judged) >= TRIAL_STATUSES:
-            return statistics.median(judged)
+        if len(judged) >= TRIAL_STATUSES and any(map(_overloaded, statuses)):
+            return rate_hz, statistics.median(judged)
     raise StepError(f"not overloaded at {BURST_RATES_HZ[-1]} Hz")
 
 
