@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import statistics
@@ -22,6 +23,8 @@ SETTLING_S: Final = 2.0
 """After a twin's end: for what is on its way."""
 BURST_RATES_HZ: Final = (100.0, 200.0, 400.0, 800.0)
 """Sweeps/s, of which the first that is more than can be judged is the measure of what can be."""
+RECORDING: Final = ("--recording", f"{PAYLOAD}/recording.csv", "--loop")
+"""Costs a twin less than to make up grasps."""
 TRIAL_S: Final = 12.0
 TRIAL_STATUSES: Final = 3
 OVERLOAD_MIN: Final = 3.0
@@ -39,7 +42,7 @@ def can_verdicts(lab: Lab) -> Outcome:
     replayed = lab.sh(f"graspd replay --json --session off {recording}", 180.0)
     expected = [json.loads(line)["p_slip"] for line in replayed.splitlines()]
     began_s = lab.now_s()
-    lab.twin("--rate", str(CAN_RATE_HZ), "--recording", recording, "--loop")
+    lab.twin("--rate", str(CAN_RATE_HZ), *RECORDING)
     lab.await_message("can", began_s, "a verdict")
     judged = _run_of_judged(lab, began_s)
     at = _place(judged, expected)
@@ -139,7 +142,7 @@ def can_frames(lab: Lab) -> Outcome:
         if steady.dropped != before.dropped or steady.taken - before.taken != _sent(before, steady):
             raise StepError(f"frames lost at {carried_hz:.1f} Hz: {before}, then {steady}")
         began_s = lab.now_s()
-        lab.twin("--rate", f"{burst_hz:.3f}")
+        lab.twin("--rate", f"{burst_hz:.3f}", *RECORDING)
         lab.await_message("can", began_s, "overloaded", _overloaded)
         time.sleep(BURST_S)
         burst = _tally(lab)
@@ -164,12 +167,14 @@ def _overloaded_hz(lab: Lab) -> float:
     """What is judged per second of what comes faster. Raises `StepError` if nothing is faster."""
     for rate_hz in BURST_RATES_HZ:
         began_s = lab.now_s()
-        lab.twin("--rate", str(rate_hz))
+        lab.twin("--rate", str(rate_hz), *RECORDING)
         lab.await_message("can", began_s, "a verdict")
         time.sleep(TRIAL_S)
         statuses = lab.machine.messages.between("can", "status", began_s, math.inf)
         judged: list[float] = [
-            status.body["readings_hz"] for status in statuses if _overloaded(status)
+            later.body["readings_hz"]
+            for former, later in itertools.pairwise(statuses)
+            if later.body["skipped_readings"] > former.body["skipped_readings"]
         ]
         if len(judged) >= TRIAL_STATUSES:
             return statistics.median(judged)

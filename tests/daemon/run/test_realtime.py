@@ -257,6 +257,31 @@ RTTIME_US = 1_000_000
 """As `LimitRTTIME` of the unit, but a fifth: so long may it compute without sleeping."""
 
 
+def test_the_kernel_takes_the_rests_of_an_overloaded_loop_for_sleep(tmp_path: Path) -> None:
+    """Who computes in realtime for longer than its limit without sleeping is ended."""
+    if not fifo_may_be_had():
+        pytest.skip("SCHED_FIFO is refused here")
+    said = in_a_process(
+        f"""
+import time
+from daemon.run.overload import Overload
+RLIMIT_RTTIME = 15  # linux/asm-generic/resource.h
+resource.setrlimit(RLIMIT_RTTIME, ({RTTIME_US // 2}, {RTTIME_US}))
+with RealtimeMode(Realtime(priority=1, cpus=(max(os.sched_getaffinity(0)),), lock_memory=False)):
+    overload = Overload(time.monotonic_ns(), live=True)
+    end_s = time.monotonic() + 2.5
+    while time.monotonic() < end_s:
+        judged_s = time.monotonic() + 0.03
+        while time.monotonic() < judged_s:
+            pass
+        overload.rest(time.monotonic_ns())
+print("lives on")
+""",
+        tmp_path,
+    )
+    assert said.endswith("lives on\n")
+
+
 @pytest.mark.parametrize("realtime", [False, True])
 def test_a_daemon_at_three_times_its_capacity_lives_on_and_accounts_for_all(
     tmp_path: Path, realtime: bool
