@@ -1,4 +1,4 @@
-"""From a scene to the parts that it needs, and to no others: a driver is imported when named."""
+"""Makes the model, the judge and the drivers of a scene; imports only the drivers it names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Judgements to messages: numbers them, stamps them, encodes them once, hands them out."""
+"""Turns judgements into messages, encodes each once and sends it to every output."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Output(Protocol):
 
 
 class Outbox:
-    """Makes the verdict and status messages of one run of the daemon."""
+    """Makes, numbers and sends the messages of one run of the daemon."""
 
     def __init__(
         self,
@@ -99,10 +99,10 @@ class Outbox:
     def verdict(
         self, judgement: Judgement, received_ns: int, silence_ns: int
     ) -> tuple[Verdict, bytes]:
-        """Send one verdict, and before it what the gate did.
+        """Send one verdict, and before it what the gate did; the message, and it encoded.
 
-        `received_ns` is when the driver handed the reading over, `silence_ns` how long no message
-        may come before the consumer must take it for unknown.
+        `received_ns` is when the driver handed the reading over, monotonic; `silence_ns` how long
+        no message may come before the consumer must take the grasp for unknown.
         """
         for change in judgement.changes:
             self._gate_change(judgement.t_ns, change)
@@ -141,10 +141,6 @@ class Outbox:
             self._remember(judgement.grasp)
         return message, payload
 
-    def _send(self, topic: bytes, payload: bytes) -> None:
-        for output in self._outputs:
-            output.send(topic, payload)
-
     def _remember(self, grasp: int) -> None:
         self._judged[grasp] = None
         if len(self._judged) > JUDGED_MAX:
@@ -157,7 +153,11 @@ class Outbox:
         outcome: Literal["stable", "slip"],
         object_name: str | None = None,
     ) -> str | None:
-        """Send how the lift of a grasp ended, and what was lifted; or say why not."""
+        """Send how the lift of a grasp ended, and what was lifted if that is known.
+
+        None once it is sent; else why it is not: `boot_id` is of another start, or the grasp was
+        not judged, or too long ago.
+        """
         if boot_id != self._boot_id:
             return "unknown boot_id: not of this start"
         if grasp not in self._judged:
@@ -176,10 +176,15 @@ class Outbox:
         return None
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
-        """Send one reading, with the newest joint angles, if somebody wants it."""
-        wanting = [output for output in self._outputs if output.wanted(self._tactile_topic)]
-        if not wanting:
-            return
+        """Send one reading, with the newest joint angles, to each output that wants it."""
+        payload: bytes | None = None
+        for output in self._outputs:
+            if output.wanted(self._tactile_topic):
+                if payload is None:
+                    payload = self._encoded(reading, joints)
+                output.send(self._tactile_topic, payload)
+
+    def _encoded(self, reading: TactileReading, joints: JointReading | None) -> bytes:
         message = Tactile(
             boot_id=self._boot_id,
             seq=self._tactile_seq,
@@ -191,9 +196,11 @@ class Outbox:
             joints={} if joints is None else _angles(joints),
         )
         self._tactile_seq += 1
-        payload = encode(message)
-        for output in wanting:
-            output.send(self._tactile_topic, payload)
+        return encode(message)
+
+    def _send(self, topic: bytes, payload: bytes) -> None:
+        for output in self._outputs:
+            output.send(topic, payload)
 
     def _gate_change(self, t_ns: int, change: GateChange) -> None:
         message = GateMessage(
@@ -217,10 +224,14 @@ class Outbox:
         pipeline: Pipeline,
         deadlines: Deadlines,
         *,
-        skipped_readings: int = 0,
-        overloaded: bool = False,
+        skipped_readings: int,
+        overloaded: bool,
     ) -> Status:
-        """Send one status message."""
+        """Send one status message.
+
+        `readings_hz` is how many came per second since the last one; `drivers` the counters of all
+        parts by name. `skipped_readings` and `overloaded` are as in `Status`.
+        """
         session, grip = pipeline.session, pipeline.grip
         health = pipeline.health()
         if state is State.SILENT:

@@ -1,4 +1,4 @@
-"""The loop: waits for drivers, judges what they bring, reports, says so when nothing comes."""
+"""The loop: waits for readings, has them judged and the verdicts sent, and notices silence."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Ended(Enum):
     RELOAD = "reload"
     """The scene is to be read again."""
     SLEPT = "slept"
-    """The computer has: what is known of the hand is from before it, however fresh it looks."""
+    """The computer has slept: what is known of the hand is from before, however fresh it looks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Timing:
 
 
 class Loop:
-    """Runs one hand in one thread until told to stop or until a recording ends."""
+    """Runs one hand, in one thread, until told to stop or until a recording ends."""
 
     def __init__(
         self,
@@ -72,7 +72,11 @@ class Loop:
         companions: Sequence[Companion],
         timing: Timing,
     ) -> None:
-        """`drivers` are open, the tactile one first; `companions` are told in their order."""
+        """`drivers` are open, the tactile one first, and are closed by who opened them.
+
+        `stop` says when to end and when the scene is to be read again. `companions` are called in
+        their order.
+        """
         self._drivers = drivers
         self._tactile = drivers[0]
         self._pipeline = pipeline
@@ -113,9 +117,9 @@ class Loop:
         self._readings_since_status = 0
 
     def run(self) -> Ended:
-        """Run until something ends it; after `RELOAD`, being called again, go on as if it had not.
+        """Run until something ends it. Called again after `RELOAD`, it goes on where it was.
 
-        Raises `DriverError` if the driver gives up.
+        Raises `DriverError` if a driver gives up. Call `close` when it is not to go on.
         """
         self._watched = set()
         with self._new_selector() as selector:
@@ -133,7 +137,7 @@ class Loop:
         return Ended.STOPPED
 
     def close(self) -> None:
-        """Send the last status, which says that the daemon stops."""
+        """Send the last status, whose state is `stopping`."""
         self._state = State.STOPPING
         self._send_status()
 

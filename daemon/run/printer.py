@@ -22,9 +22,9 @@ class Printer(Companion):
     """Writes verdicts as they come, and a summary at the end."""
 
     def __init__(self, *, as_json: bool, prompt: bool) -> None:
-        """`as_json`: the messages themselves on stdout, and the summary as JSON on stderr.
+        """With `as_json`, messages go to stdout as they are, and the summary as JSON to stderr.
 
-        `prompt`: each line goes out at once, also into a pipe, for readings that come in time.
+        With `prompt`, each line is flushed, also into a pipe: for readings that come in real time.
         """
         self._prompt = prompt
         self._as_json = as_json
@@ -33,7 +33,7 @@ class Printer(Companion):
         self._gate: GateState | None = None
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        """Write one verdict; `reading` is None where the verdict is about silence."""
+        """Write one verdict, and how the lift of its grasp ended if the recording says so."""
         annotation = reading.annotation if reading else None
         self._summary.add(verdict, annotation.slipped if annotation else None)
         if not self._as_json and not self._is_news(verdict):

@@ -1,4 +1,4 @@
-"""Realtime: priority, processors, locked memory, no garbage collector on the hot path."""
+"""Realtime mode: priority, processors, locked memory, no garbage collection while judging."""
 
 from __future__ import annotations
 
@@ -24,19 +24,20 @@ CAP_IPC_LOCK = 14
 
 
 class RealtimeMode(Companion):
-    """A process that runs in realtime from `__enter__` to `__exit__`.
+    """Has the process run in realtime from `__enter__` to `__exit__`.
 
-    What cannot be had is left out, and told in one warning that says what to grant.
+    What the system refuses is left out; one warning says which rights to grant.
     """
 
     def __init__(self, wanted: Realtime) -> None:
+        """`wanted` is the scene's section `[realtime]`."""
         self._wanted = wanted
         self._processors = os.sched_getaffinity(0)
         self.lacking: list[str] = []
-        """What could not be had, each with what to grant."""
+        """What was refused, each with the right to grant."""
 
     def __enter__(self) -> Self:
-        """Take what the scene wants, for all threads that there are."""
+        """Take what the scene wants, for all threads that exist now."""
         wanted = self._wanted
         if wanted.cpus is not None:
             self._pin(set(wanted.cpus))

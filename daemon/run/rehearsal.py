@@ -1,4 +1,4 @@
-"""Grasps that are typical of what a model has seen, to try the whole chain before it counts."""
+"""Synthetic grasps like those a model was trained on, to judge one before real readings come."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ COUNTS_MAX = 4000.0
 
 
 def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
-    """Counts (fingers, 24) of a hand that rests, and then grasps for so many readings."""
+    """Counts (fingers, 24) of a hand at rest, long enough to tare, and then `readings` of grasps.
+
+    `seen` is what the model was trained on.
+    """
     # One standard deviation along each axis of the training: its very centre was never grasped.
     sides = 1.0 - 2.0 * (np.arange(np.size(seen.centre)) % 2)
     away = np.linalg.solve(seen.whitening_matrix().T, sides)
@@ -40,10 +43,10 @@ def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def rehearse(make: Callable[[Callable[[], int]], Pipeline], seen: SeenCounts) -> Pipeline:
-    """Judge one grasp, so that what the first real one needs is imported and allocated.
+    """Judge one synthetic grasp, so that what the first real one needs is imported and allocated.
 
-    `make` makes a pipeline with a clock of its own; it is returned as the rehearsal left it.
-    `seen` is what its model was trained on.
+    `make` takes a clock, monotonic ns, and makes a pipeline with it, which is returned as the
+    rehearsal left it. `seen` is what its model was trained on.
     """
     now_ns = 0
     pipeline = make(lambda: now_ns)

@@ -1,4 +1,4 @@
-"""What a replay has shown: counts, scores against the recorded outcomes, latencies."""
+"""Summary of a run: counts of verdicts, scores against recorded outcomes, latencies."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from daemon.publish.messages import Verdict
 
 
 class Tally:
-    """Outcomes, their reasons, and how they compare with how the lifts ended."""
+    """Counts verdicts and their reasons, and compares them with how the lifts ended."""
 
     def __init__(self) -> None:
         self.outcomes: Counter[Outcome] = Counter()

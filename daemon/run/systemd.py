@@ -1,4 +1,4 @@
-"""What systemd is told: ready, alive, how it goes (sd_notify(3)). Nobody else hears it."""
+"""Tells systemd that the daemon is ready, alive, reloading or stopping (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NS_PER_US = 1000
 class Systemd(Companion):
     """Messages to the service manager that started this process.
 
-    A manager that does not listen costs one warning and nothing else: it is not what graspd is for.
+    One that does not listen costs a warning, and the daemon goes on.
     """
 
     def __init__(
@@ -47,7 +47,10 @@ class Systemd(Companion):
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Systemd | None:
-        """The manager that the environment names (sd_notify(3), sd_watchdog_enabled(3))."""
+        """The manager that the environment names; None if it names none that can be told.
+
+        As in sd_notify(3) and sd_watchdog_enabled(3).
+        """
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@"):
             return None
@@ -56,21 +59,21 @@ class Systemd(Companion):
         return cls(address, int(timeout) if mine else None)
 
     def ready(self, what: str) -> None:
-        """Model and drivers are there, or are there again after a reload."""
+        """Say that model and drivers are there, or again after a reload; `what` is for people."""
         lines = ["READY=1", f"STATUS={what}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={self._watchdog_us}", "WATCHDOG=1"]
         self._send(*lines)
 
     def reloading(self) -> None:
-        """The scene is read again; until `ready` the watchdog has patience."""
+        """Say that the scene is read again; until `ready` the watchdog waits longer."""
         lines = ["RELOADING=1", f"MONOTONIC_USEC={self._clock() // NS_PER_US}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={RELOAD_PATIENCE_US}", "WATCHDOG=1"]
         self._send(*lines)
 
     def stopping(self) -> None:
-        """The process is about to end."""
+        """Say that the process is about to end."""
         self._send("STOPPING=1", "STATUS=stopping")
 
     def on_status(self, status: Status) -> None:
@@ -101,7 +104,7 @@ class Systemd(Companion):
 
 
 def in_a_line(status: Status) -> str:
-    """How it goes, for people."""
+    """A status in one line, for people."""
     parts = [f"{status.state}: {status.readings_hz:.1f} readings/s"]
     parts += [f"{number} {outcome}" for outcome, number in status.verdicts.items() if number]
     if status.gate is not None:

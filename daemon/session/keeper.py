@@ -1,4 +1,4 @@
-"""Keeps the session of a running daemon: restores it, saves it, drops it with the sensor."""
+"""Keeps the session of a running daemon in a file, and begins a new one for other sensors."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from models.session_statistics import SessionState
 log = logging.getLogger("graspd")
 
 WAIT_S = 0.4
-"""For a disk, at the end: the daemon has a second."""
+"""How long the end waits for the disk, s: the daemon is given a second to stop."""
 SAVE_PERIOD_NS = 10_000_000_000
-"""What a power cut may cost: the grasps of ten seconds."""
+"""Between two saves, ns: a power cut costs the grasps of ten seconds."""
 
 
 class SessionKeeper(Companion):
-    """Looks after one session from time to time; never raises for a file that cannot be had."""
+    """Restores, saves and drops one session; a file that fails costs a warning, not the run."""
 
     def __init__(
         self,
@@ -35,10 +35,10 @@ class SessionKeeper(Companion):
         clock: Callable[[], int] = time.monotonic_ns,
         on_exchange: Callable[[], None] | None = None,
     ) -> None:
-        """Restore what `file` has; a new session, and a warning, if that is none of this hand.
+        """Restore what `file` holds; if that is no session of these fingers, warn and begin anew.
 
-        `on_exchange` is done when a sensor is another one than before; it must reset the session,
-        which is what is done unless it is given.
+        `tactile` knows the serial numbers of the sensors. `on_exchange` is called when one of them
+        is another than before, and must reset the session; unless given, only that is done.
         """
         self._session = session
         self._on_exchange = on_exchange or session.reset
@@ -60,13 +60,13 @@ class SessionKeeper(Companion):
             self._begin_to_save()
 
     def save(self) -> None:
-        """Save if there is anything new, now; one warning if that cannot be done."""
+        """Save now if there is anything new; a failure is one warning."""
         self.wait()
         self._begin_to_save()
         self.wait()
 
     def wait(self) -> None:
-        """Until what is being saved is on the disk, or is not; not for a disk that hangs."""
+        """Wait until saving has ended, for `WAIT_S` at most."""
         if self._thread is not None:
             self._thread.join(WAIT_S)
             self._thread = None

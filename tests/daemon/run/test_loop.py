@@ -14,7 +14,7 @@ import pytest
 from daemon.judge.reasons import Outcome, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
-from daemon.publish.companion import Companion
+from daemon.publish.companion import Companion, Requests, overridden
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
@@ -58,6 +58,7 @@ class Bench(Companion):
         model: FakeModel | None = None,
         companions: Sequence[Companion] = (),
         sleep: Sleep | None = None,
+        boot_id: str | None = None,
     ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
@@ -67,7 +68,16 @@ class Bench(Companion):
         self.loop = Loop(
             [driver],
             pipeline(model or FakeModel(), clock),
-            Outbox("right", FINGERS, "fake", "ab" * 32, outputs, clock, lambda: 1.79e9),
+            Outbox(
+                "right",
+                FINGERS,
+                "fake",
+                "ab" * 32,
+                outputs,
+                clock,
+                lambda: 1.79e9,
+                boot_id=boot_id,
+            ),
             stop,
             [self, *companions],
             Timing(100 * MS, clock, Sleep() if sleep is None else sleep),
@@ -409,3 +419,48 @@ def test_a_reading_is_sent_before_its_verdict_only_while_somebody_wants_it(
     assert message.faults == second.faults.tolist()
     assert message.fingers == list(FINGERS)
     assert message.joints == {"FFJ3": 0.5}
+
+
+class Peer(Companion):
+    """Asks and tells an outcome before every wait, and keeps what it hears of that."""
+
+    def __init__(self, boot_id: str) -> None:
+        self.boot_id = boot_id
+        self.refused: list[str | None] = []
+        self.heard: list[object] = []
+
+    def before_wait(self, requests: Requests) -> None:
+        requests.ask()
+        self.refused.append(requests.outcome(self.boot_id, 1, "slip", "mug"))
+
+    def on_asked(self) -> None:
+        self.heard.append("asked")
+
+    def on_outcome(self, grasp: int, outcome: str, object_name: str | None) -> None:
+        self.heard.append((grasp, outcome, object_name))
+
+    def on_answer(self, payload: bytes) -> None:
+        self.heard.append(payload)
+
+    def counters_by_part(self) -> dict[str, dict[str, int]]:
+        return {"peer": {"outcomes": self.refused.count(None)}}
+
+
+def test_a_companion_asks_and_tells_and_hears_what_comes_of_it(stop: StopSignal) -> None:
+    clock = Clock()
+    driver = FakeDriver([reading(clock(), seed) for seed in (1, 2)], clock)
+    peer = Peer("b" * 32)
+    bench = Bench(driver, clock, stop, companions=[peer], boot_id=peer.boot_id)
+    bench.run()
+    first, second = bench.payloads
+    assert peer.refused == ["unknown grasp: not judged, or too long ago", None]
+    assert peer.heard == ["asked", first, "asked", (1, "slip", "mug"), second]
+    assert [topic for topic, _ in bench.output.sent[:-1]].count(b"outcome.right") == 1
+    assert bench.output.statuses()[-1].drivers["peer"] == {"outcomes": 1}
+
+
+def test_companions_are_called_in_their_order_and_only_for_hooks_of_their_own() -> None:
+    first, second = Watchdog(), Watchdog()
+    hooks = overridden([first, Companion(), second], Companion.after_round)
+    assert hooks == (first.after_round, second.after_round)
+    assert overridden([first, second], Companion.on_status) == ()

@@ -44,8 +44,8 @@ class LiveDriver(FakeDriver):
 
     def read_ready(self) -> list[Reading]:
         self.calls += 1
-        came = [item for item in self.queue if item.t_ns <= self.clock()]  # type: ignore[union-attr]
-        taken = came[: self.at_once]
+        came = itertools.takewhile(lambda item: item.t_ns <= self.clock(), self.queue)  # type: ignore[union-attr]
+        taken = list(itertools.islice(came, self.at_once))
         del self.queue[: len(taken)]
         self.counters.readings += len(taken)
         return taken  # type: ignore[return-value]
