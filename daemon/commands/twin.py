@@ -68,7 +68,7 @@ def _add_faults(parser: argparse.ArgumentParser) -> None:
     faults.add_argument("--disconnect-every", type=int, metavar="FRAMES")
     faults.add_argument("--wrong-version", action="store_true")
     faults.add_argument("--stuck-clock", action="store_true")
-    faults.add_argument("--dead", action="append", default=[], metavar="FINGER:ELECTRODE")
+    faults.add_argument("--dead", action="append", default=[], metavar="FINGER_ELECTRODE")
     faults.add_argument("--unplugged", action="append", default=[], choices=FINGERS)
     faults.add_argument("--seed", type=int, default=0)
 
@@ -129,9 +129,9 @@ def _given(args: argparse.Namespace, name: str) -> float:
 
 
 def _electrode(text: str) -> tuple[int, int]:
-    finger, _, number = text.partition(":")
+    finger, _, number = text.replace(":", "_").partition("_")
     if finger not in FINGERS or not number.isdecimal() or not 1 <= int(number) <= 24:
-        raise ValueError(f"{text!r} is no electrode; th:24 would be one")
+        raise ValueError(f"{text!r} is no electrode; th_24 would be one")
     return FINGERS.index(finger), int(number) - 1
 
 
