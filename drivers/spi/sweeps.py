@@ -67,7 +67,7 @@ class BridgeCounters(DriverCounters):
 
 
 class SweepDecoder:
-    """Makes readings of the sweeps that follow one HELLO; a HELLO tells slots, sensors and clock."""
+    """Makes readings of the sweeps after one HELLO, which tells slots, sensors and clock."""
 
     def __init__(
         self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters, next_seq: int
