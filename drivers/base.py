@@ -62,7 +62,7 @@ class ElectrodeFault(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """What a recording says about a reading beside its counts. The judge never looks at it."""
+    """Where a reading stands in a table or stream, and its labels. Never used for judging."""
 
     source: Path
     line: int
@@ -86,12 +86,12 @@ class TactileReading:
     """Shape (fingers, 24), `ElectrodeFault` bits per electrode."""
     annotation: Annotation | None = None
     recorded_ns: int | None = None
-    """Of a recording, which may be played faster or slower: when it was made, ns, on an axis of
-    its own."""
+    """Recordings only, as they may be played at any speed: when it was made, ns since the
+    recording's own zero."""
 
     @property
     def made_ns(self) -> int:
-        """Time, ns, by which readings follow each other; `t_ns` tells how old they are."""
+        """When the sensor made it, ns: for intervals. `t_ns` is for age."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
@@ -114,11 +114,11 @@ class JointReading:
     position_rad: NDArray[np.float64]
     """Shape (joints,), radians; NaN where a joint has no valid angle."""
     recorded_ns: int | None = None
-    """As in a `TactileReading`."""
+    """See `TactileReading.recorded_ns`."""
 
     @property
     def made_ns(self) -> int:
-        """As in a `TactileReading`."""
+        """See `TactileReading.made_ns`."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
 
@@ -142,7 +142,7 @@ class DriverCounters:
 
 
 class Opened(ABC):
-    """Something that a `with` block opens and closes."""
+    """A context manager: `with` opens it, and closes it at the end."""
 
     @abstractmethod
     def open(self) -> None:

@@ -1,4 +1,4 @@
-"""The state of a link that must come back: what it is doing, and when it tries again."""
+"""Whether a link is up, why not, and when it is tried again: a backoff with a cap."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LinkState(StrEnum):
     """What a link is doing."""
 
     CLOSED = "closed"
-    """Not wanted."""
+    """Not opened, or closed by its owner."""
     WAITING = "waiting"
     """Lost or not yet found; the next try comes at `Link.retry_ns`."""
     GREETING = "greeting"
@@ -55,7 +55,7 @@ class Link:
         return self.retry_ns is None or now_ns >= self.retry_ns
 
     def start(self, now_ns: int) -> None:
-        """Want the link: the first try is due at once."""
+        """Begin: the first try is due at once."""
         self.state = LinkState.WAITING
         self.reason = None
         self._tries = 0
@@ -94,6 +94,6 @@ class Link:
         self.state = LinkState.WAITING
 
     def close(self) -> None:
-        """The link is no longer wanted."""
+        """Stop trying."""
         self.state = LinkState.CLOSED
         self.retry_ns = None

@@ -14,12 +14,10 @@ from daemon.record.files import create
 from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
 from drivers.can.frames import LOST
-from drivers.recordings.can_log import line_of
-from drivers.recordings.serial_log import encode_records
 
 if TYPE_CHECKING:
     from daemon.record.recorder import RawFile
-    from drivers.can.frames import Stamped
+    from drivers.can.frames import CanFrame, Stamped
     from drivers.spi.line import LineEvent
 
 EARLY_MAX: Final = 1000
@@ -66,16 +64,18 @@ def tap_of(driver: Driver, section: Tactile) -> Tap | None:
     """A tap on the link of a driver; None for one that has no link of these kinds."""
     if isinstance(section, CanTactile):
         from drivers.can.driver import CanBridgeDriver
+        from drivers.recordings.can_log import line_of
 
         channel = section.channel
-        tap = Tap(lambda name: CandumpFile(name, channel))
+        tap = Tap(lambda name: CandumpFile(name, channel, line_of))
         if isinstance(driver, CanBridgeDriver):
             driver.tap(tap.frames)
         return tap
     if isinstance(section, SpiTactile):
+        from drivers.recordings.serial_log import encode_records
         from drivers.spi.driver import SpiBridgeDriver
 
-        tap = Tap(SerialFile)
+        tap = Tap(lambda name: SerialFile(name, encode_records))
         if isinstance(driver, SpiBridgeDriver):
             driver.tap(tap.bytes)
         return tap
@@ -110,8 +110,11 @@ class _File:
 class CandumpFile(_File):
     """CAN frames as `candump -L` writes them. What the kernel lost has no line."""
 
-    def __init__(self, name: Path, channel: str) -> None:
+    def __init__(
+        self, name: Path, channel: str, line_of: Callable[[CanFrame, int, str], str]
+    ) -> None:
         super().__init__(name, ".can.log")
+        self._line_of = line_of
         self._channel = channel.replace(" ", "_")
 
     def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
@@ -119,7 +122,7 @@ class CandumpFile(_File):
         if not isinstance(entry, list):
             return
         lines = [
-            line_of(frame, max(until_ns + offset_ns, 0), self._channel)
+            self._line_of(frame, max(until_ns + offset_ns, 0), self._channel)
             for frame, _, until_ns in entry
             if not frame.flags & LOST
         ]
@@ -129,11 +132,12 @@ class CandumpFile(_File):
 class SerialFile(_File):
     """Serial bytes in the frames of `drivers.recordings.serial_log`, with monotonic times."""
 
-    def __init__(self, name: Path) -> None:
+    def __init__(self, name: Path, encode: Callable[[LineEvent, int, bytes], bytes]) -> None:
         super().__init__(name, ".serial")
+        self._encode = encode
 
     def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
         """Take bytes that came or went at once."""
         if isinstance(entry, tuple):
             event, data = entry
-            self._stream.write(encode_records(event, at_ns, data))
+            self._stream.write(self._encode(event, at_ns, data))

@@ -1,4 +1,4 @@
-"""What both formats share on the way to a reading: counters, numbers, the period, the words."""
+"""What both CAN formats share: counters, sequence numbers, the measured period, decoded words."""
 
 from __future__ import annotations
 

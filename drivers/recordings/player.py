@@ -90,9 +90,9 @@ class Timeline(Generic[Item]):
         return *item, now_ns - due_ns
 
     def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
-        """A reading of the recording as one of now, as old as it was at the recording's `at_ns`.
+        """The same reading moved to now: as old as it was at the recording's time `at_ns`.
 
-        `recorded_ns` is counted from `axis_ns`.
+        Its `recorded_ns` is counted from `axis_ns`, ns on the recording's clock.
         """
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)

@@ -67,7 +67,7 @@ class BridgeCounters(DriverCounters):
 
 
 class SweepDecoder:
-    """Makes readings of the sweeps that one HELLO describes."""
+    """Makes readings of the sweeps after one HELLO, which tells slots, sensors and clock."""
 
     def __init__(
         self, hello: Hello, sensors: Sequence[int], counters: BridgeCounters, next_seq: int
