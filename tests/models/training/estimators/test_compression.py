@@ -131,8 +131,8 @@ def test_a_network_is_trained_once_for_all_its_forms(monkeypatch: pytest.MonkeyP
 
     fitting = importlib.import_module("models.training.fitting.fit")
 
-    original = fitting.train
-    monkeypatch.setattr(fitting, "train", counted)
+    original = fitting.train_network
+    monkeypatch.setattr(fitting, "train_network", counted)
     slipped = np.arange(64) % 2 == 0
     fitted = [
         fit(dataclasses.replace(system, compression=how), inputs(), slipped, seed=0)
