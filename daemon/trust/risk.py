@@ -25,7 +25,7 @@ class Permission(StrEnum):
     WITHHELD = "withheld"
     """Too likely to slip for the risk that is set."""
     UNPROVEN = "unproven"
-    """Too few outcomes are known: lift under supervision."""
+    """As withheld, and too few outcomes are known: lift under supervision."""
     RISK_EXCEEDED = "risk-exceeded"
     """More slipped than the rule can make good: nothing is `stable` until the user starts anew."""
 
@@ -37,7 +37,8 @@ class RiskLimits:
     max_slip_when_stable: float | None = None
     """Share of the `stable` lifts that may slip, 0.001..0.5; None: no rule, all is allowed."""
     warm_up: int = 0
-    """Outcomes that must be known, since the start or an exchange of a sensor, before `stable`."""
+    """Outcomes, since the start or an exchange of a sensor, until which every grasp is to be
+    lifted under supervision; few are surely `stable` by then."""
     explore: float = 0.0
     """Share, 0..1, of the grasps that are not `stable` to be lifted under supervision: without
     their outcomes nobody learns that the rule is too strict."""
@@ -103,7 +104,7 @@ class Risk:
 
     @property
     def warm_up_left(self) -> int:
-        """Outcomes that are missing before `stable` may be said."""
+        """Outcomes that are missing until the warm-up is over."""
         return max(self.limits.warm_up - self.proven, 0)
 
     @property
@@ -121,10 +122,9 @@ class Risk:
             return Permission.ALLOWED
         if self.theta < LOWEST:
             return Permission.RISK_EXCEEDED
-        if self.warm_up_left:
-            return Permission.UNPROVEN
-        # False for NaN, so that it is withheld.
-        return Permission.ALLOWED if log_odds <= self.theta else Permission.WITHHELD
+        if log_odds <= self.theta:  # false for NaN
+            return Permission.ALLOWED
+        return Permission.UNPROVEN if self.warm_up_left else Permission.WITHHELD
 
     def supervised(self, permission: Permission, seed: str, grasp: int) -> bool:
         """Whether to ask for a lift under supervision; the same for the same seed and grasp."""

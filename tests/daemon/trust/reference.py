@@ -31,7 +31,8 @@ class Reference:
             (features[i] * self.covariance[i][j] * features[j] for i in size for j in size),
             Number(0),
         )
-        return self._middle(features) / np.sqrt(1 + MODERATION * variance)
+        moderated: Number = self._middle(features) / np.sqrt(1 + MODERATION * variance)
+        return moderated
 
     def learn(self, features: list[Number], slipped: bool) -> None:
         size = range(len(features))

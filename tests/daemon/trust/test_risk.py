@@ -109,7 +109,8 @@ def test_with_each_outcome_told_at_once_the_bound_is_the_published_one(
 ) -> None:
     rule = risk(alpha)
     for log_odds, slipped in steps:
-        lift(rule, log_odds, lambda _, slipped=slipped: slipped)
+        stable = rule.decide(log_odds) is Permission.ALLOWED
+        rule.take(stable=stable, slipped=slipped, proves=True)
         assert rule.overdue <= 1
         assert rule.bound == pytest.approx(bound(alpha, rule.lifts))
         assert rule.slips <= bound(alpha, rule.lifts) + ROUNDING
@@ -156,16 +157,18 @@ def test_without_a_risk_all_is_allowed_and_counted() -> None:
     assert (rule.lifts, rule.slips, rule.bound, rule.theta) == (3, 2, None, 0.0)
 
 
-def test_nothing_is_stable_before_the_warm_up_is_over() -> None:
+def test_in_the_warm_up_what_is_not_surely_stable_is_unproven_and_to_be_lifted() -> None:
     rule = risk(0.05, warm_up=3)
     for left in (3, 2, 1):
         assert rule.warm_up_left == left
-        assert rule.decide(-9.0) is Permission.UNPROVEN
+        assert rule.decide(-1.0) is Permission.UNPROVEN
+        assert rule.decide(math.nan) is Permission.UNPROVEN
+        assert rule.decide(rule.start) is Permission.ALLOWED
         assert rule.supervised(Permission.UNPROVEN, "boot", left)
         rule.take(stable=False, slipped=False, proves=True)
-    assert rule.decide(-9.0) is Permission.ALLOWED
+    assert rule.decide(-1.0) is Permission.WITHHELD
     rule.exchanged()
-    assert rule.decide(-9.0) is Permission.UNPROVEN
+    assert rule.decide(-1.0) is Permission.UNPROVEN
     rule.take(stable=True, slipped=True, proves=False)  # a lift with the former sensor
     assert (rule.warm_up_left, rule.slips) == (3, 1)
 
