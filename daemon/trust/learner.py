@@ -19,6 +19,8 @@ TEMPERATURE: Final = 1.5
 MARGIN_MAX: Final = 30.0
 """Larger margins, log-odds, say no more: the logarithm of the smallest probability that a network's
 float32 output is taken for."""
+INPUT_MAX: Final = 1e3
+"""Larger inputs are refused: standardised features have a few units."""
 MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.3, 0.5, 0.2
 """Standard deviations of the prior: of the margin's weight, the bias, and each feature's weight."""
 DRIFT: Final = 2e-3
@@ -72,13 +74,14 @@ class Learner:
     def features(self, margin: float, inputs: NDArray[np.floating]) -> Vector:
         """What is judged by, and to be kept until the outcome is known.
 
-        `margin` is the model's log-odds of slip, `inputs` (inputs,) what the model was given.
-        Raises `ValueError` for another shape and for what is not finite.
+        `margin` is the model's log-odds of slip, before a young session softens them; `inputs`
+        (inputs,) what the model was given, as standardised features of a session. Raises
+        `ValueError` for another shape, and for what is not finite or too large.
         """
         if inputs.shape != (self._width - 2,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
-        if not (math.isfinite(margin) and np.isfinite(inputs).all()):
-            raise ValueError("margin or inputs are not finite")
+        if not (math.isfinite(margin) and (np.abs(inputs) <= INPUT_MAX).all()):  # false for NaN
+            raise ValueError("margin or inputs are not finite, or too large")
         values = np.empty(self._width)
         values[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE
         values[1] = 1.0

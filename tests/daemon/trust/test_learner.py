@@ -203,6 +203,7 @@ def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
         (math.inf, np.zeros(3)),
         (0.0, np.array([0.0, math.nan, 0.0])),
         (0.0, np.array([0.0, math.inf, -math.inf])),
+        (0.0, np.array([0.0, 0.0, -1001.0])),
         (0.0, np.zeros(4)),
         (0.0, np.zeros(1)),
         (0.0, np.zeros((1, 3))),
@@ -213,6 +214,23 @@ def test_what_is_not_finite_or_of_another_shape_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=r"not finite|of shape"):
         Learner(3).features(margin, inputs)
+
+
+def test_a_weight_stops_at_fifty_times_its_priors_deviation_whatever_is_told() -> None:
+    learner = Learner(2)
+    for index in range(2000):
+        sign = -1.0 if index % 2 else 1.0
+        # In turns so far on one side that the learner is sure, and wrong.
+        features = learner.features(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
+        learner.learn(features, slipped=learner.log_odds(features) < 0.0)
+    weights = np.frombuffer(learner.state().mean)
+    limits = 50.0 * np.array([0.3, 0.5, 0.2, 0.2])
+    assert (np.abs(weights - [1.0, 0.0, 0.0, 0.0]) <= limits).all()
+    features = learner.features(0.0, np.array([1000.0, 0.0]))
+    learner.learn(features, slipped=learner.log_odds(features) < 0.0)
+    assert np.abs(np.frombuffer(learner.state().mean)[2]) == pytest.approx(10.0)
+    assert np.isfinite(learner.log_odds(features))
+    Learner(2).restore(learner.state())
 
 
 def test_a_reset_learner_is_a_new_one() -> None:
