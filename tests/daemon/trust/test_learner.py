@@ -47,6 +47,14 @@ def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_
     assert found == pytest.approx(-2.0 / math.sqrt(1.0 + math.pi * variance / 8.0), rel=1e-14)
 
 
+def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
+    learner, x = Learner(2), np.zeros(2)
+    for margin in (30.5, 1e9):
+        for sign in (1.0, -1.0):
+            found = learner.features(sign * margin, x)
+            np.testing.assert_array_equal(found, [sign * 20.0, 1.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize("inputs", [0, 1, 6])
 def test_it_is_the_information_filter_in_long_double(inputs: int) -> None:
     learner, reference = Learner(inputs), Reference(inputs)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -138,6 +140,27 @@ def test_what_a_grasp_is_lifted_on_counts_the_first_verdict_or_the_first_stable_
         each.note(named(8), again, stable=True)  # too late to be what it was lifted on
         assert (each.risk.lifts, each.risk.slips, each.ledger.outstanding) == (1, 1, 0)
     assert part.learner.state() == expected.learner.state()
+
+
+def test_stable_said_after_the_outcome_is_not_what_was_lifted_on() -> None:
+    part = trust()
+    assert not judge(part, 7, 2.0)
+    assert part.outcome(named(7), slipped=True) is Told.TAKEN
+    kept = encode(part.state())
+    judge(part, 7, -9.0)
+    assert encode(part.state()) == kept
+    assert part.ledger.outstanding == 0
+
+
+def test_only_stable_grasps_without_an_outcome_count_as_unreported() -> None:
+    part = trust()
+    assert judge(part, 0)
+    assert part.outcome(named(0), slipped=False) is Told.TAKEN
+    assert not judge(part, 1, 6.0)
+    assert judge(part, 2)
+    for grasp in range(3, GRASPS_MAX + 3):
+        judge(part, grasp, 6.0)
+    assert part.ledger.unreported == 1
 
 
 def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
@@ -294,24 +317,19 @@ def test_no_damaged_byte_goes_unnoticed() -> None:
         damaged[place] ^= 0x10
         with pytest.raises(ValueError, match="damaged"):
             decode(bytes(damaged))
-    for bad in (b"", data[:-1], data[:20], data + b"\0", bytes(MAX_BYTES + 1)):
+    long = bytes(MAX_BYTES)
+    for bad in (b"", data[:-1], data[:20], data + b"\0", hashlib.sha256(long).digest() + long):
         with pytest.raises(ValueError, match="damaged"):
             decode(bad)
 
 
 def test_what_is_whole_and_no_state_is_refused() -> None:
-    import hashlib
-
-    import msgspec
-
     for content in (b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2})):
         with pytest.raises(ValueError, match="nothing that was learned"):
             decode(hashlib.sha256(content).digest() + content)
 
 
 def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
-    import msgspec
-
     part = full()
     before = encode(part.state())
     state = part.state()
@@ -330,6 +348,8 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
         ("of .* values", with_records(replace(unlearned, features=b"12345678"))),
         ("not finite", with_records(replace(unlearned, features=b"\xff" * 8 * (INPUTS + 2)))),
         ("more slips", replace(state, risk=replace(state.risk, slips=1000))),
+        # The learner's and the risk's parts are sound, and of other outcomes.
+        ("twice", replace(trust().state(), ledger=with_records(records[0], records[0]).ledger)),
     ):
         with pytest.raises(ValueError, match=why):
             part.restore(other)
@@ -337,8 +357,6 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
 
 
 def test_too_many_records_are_no_state() -> None:
-    import msgspec
-
     state = full().state()
     many = tuple(
         msgspec.structs.replace(state.ledger.records[0], id=named(grasp))
