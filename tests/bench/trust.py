@@ -275,22 +275,38 @@ def risk_lines(streams: Sequence[Stream]) -> Iterator[str]:
             "every lift told" if every else "warm-up 50, stable lifts and 5 % of the others told"
         )
         yield f"max_slip_when_stable {limits.max_slip_when_stable:g}, {which}"
-        for protocol, order, group in _groups(streams):
-            lives = [live(stream, limits, every=every) for stream in group]
-            lifts = sum(int(one.stable.sum()) for one in lives)
-            slips = sum(int((one.stable & one.stream.slipped).sum()) for one in lives)
-            windows = np.array([worst_window(one) for one in lives])
-            told = ~np.isnan(windows)
-            worst = f"{windows[told].mean():.0f}/{windows[told].max():.0f}" if told.any() else "-"
-            young, whole, rest = (np.mean([coverage(one, part) for one in lives]) for part in PARTS)
-            asked = 100.0 * np.mean([one.supervised.mean() for one in lives])
-            yield (
-                f"{protocol} {order:16} slips among stable {100.0 * slips / max(lifts, 1):4.1f} %, "
-                f"coverage first 50 {young:2.0f}, whole {whole:2.0f}, from 200 {rest:2.0f} %, "
-                f"worst {WINDOW} mean/max {worst} %, "
-                f"supervised {asked:2.0f} %, excess {max(one.excess for one in lives):4.1f}, "
-                f"bound broken on {sum(not one.within for one in lives)} of {len(lives)}"
-            )
+        yield from _risk_rows(streams, limits, every=every)
+    for name, spoil in (("inverted from the middle on", _inverted), ("wrong by 3 %", _wrong)):
+        yield f"max_slip_when_stable 0.05, every lift told, outcomes {name}"
+        spoilt = [dataclasses.replace(one, slipped=spoil(one.slipped)) for one in streams]
+        yield from _risk_rows(spoilt, RiskLimits(0.05), every=True)
+
+
+def _inverted(slipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return slipped ^ (np.arange(len(slipped)) >= len(slipped) // 2)
+
+
+def _wrong(slipped: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return slipped ^ (np.random.default_rng(0).random(len(slipped)) < 0.03)
+
+
+def _risk_rows(streams: Sequence[Stream], limits: RiskLimits, *, every: bool) -> Iterator[str]:
+    for protocol, order, group in _groups(streams):
+        lives = [live(stream, limits, every=every) for stream in group]
+        lifts = sum(int(one.stable.sum()) for one in lives)
+        slips = sum(int((one.stable & one.stream.slipped).sum()) for one in lives)
+        windows = np.array([worst_window(one) for one in lives])
+        told = ~np.isnan(windows)
+        worst = f"{windows[told].mean():.0f}/{windows[told].max():.0f}" if told.any() else "-"
+        young, whole, rest = (np.mean([coverage(one, part) for one in lives]) for part in PARTS)
+        asked = 100.0 * np.mean([one.supervised.mean() for one in lives])
+        yield (
+            f"{protocol} {order:16} slips among stable {100.0 * slips / max(lifts, 1):4.1f} %, "
+            f"coverage first 50 {young:2.0f}, whole {whole:2.0f}, from 200 {rest:2.0f} %, "
+            f"worst {WINDOW} mean/max {worst} %, "
+            f"supervised {asked:2.0f} %, excess {max(one.excess for one in lives):4.1f}, "
+            f"bound broken on {sum(not one.within for one in lives)} of {len(lives)}"
+        )
 
 
 def endurance_lines(outcomes: int, width: int) -> Iterator[str]:
