@@ -1,0 +1,123 @@
+"""Which grasps were judged how, until outcomes of their lifts are told: late, twice or never."""
+
+from __future__ import annotations
+
+from collections import Counter
+from enum import StrEnum
+from typing import Annotated, Final, NamedTuple
+
+import msgspec
+
+from daemon.trust.learner import Vector, vector
+
+GRASPS_MAX: Final = 256
+"""Grasps that are remembered: those of an hour and more. Outcomes of older ones are refused."""
+
+
+class GraspId(NamedTuple):
+    """Names a grasp for ever."""
+
+    boot_id: str
+    """Of the start of the daemon that judged it."""
+    grasp: Annotated[int, msgspec.Meta(ge=0)]
+    """Its number since that start."""
+
+
+class Told(StrEnum):
+    """What became of an outcome."""
+
+    TAKEN = "taken"
+    REPEATED = "repeated"
+    """Known already, and the same: ignored."""
+    CONTRADICTS = "contradicts"
+    """Known already, and the opposite: refused, the first one counts."""
+    UNKNOWN = "unknown"
+    """Of a grasp that was not judged or is too long ago: refused."""
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One judged grasp."""
+
+    id: GraspId
+    stable: bool
+    """Whether it was called `stable`."""
+    features: bytes | None
+    """What it was judged by, float64; None once it must no longer be learned from."""
+    slipped: bool | None = None
+    """None until it is told."""
+
+
+class LedgerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a ledger knows."""
+
+    records: Annotated[tuple[Record, ...], msgspec.Meta(max_length=GRASPS_MAX)]
+    """Oldest first."""
+    told: dict[Told, Annotated[int, msgspec.Meta(ge=0)]]
+    unreported: Annotated[int, msgspec.Meta(ge=0)]
+
+
+class Ledger:
+    """Remembers the last `GRASPS_MAX` judged grasps."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._records: dict[GraspId, Record] = {}
+        self.told: Counter[Told] = Counter()
+        """Outcomes, by what became of them."""
+        self.unreported = 0
+        """Grasps that were called `stable` and forgotten before an outcome came."""
+
+    @property
+    def outstanding(self) -> int:
+        """Grasps called `stable` whose outcome can still come."""
+        return sum(record.stable and record.slipped is None for record in self._records.values())
+
+    def note(self, grasp: GraspId, features: Vector, *, stable: bool) -> None:
+        """Remember how a grasp was judged.
+
+        Its first verdict counts, or the first that called it `stable`: that is what it is lifted
+        on. Once its outcome is known, nothing changes.
+        """
+        known = self._records.get(grasp)
+        if known is None:
+            self._records[grasp] = Record(grasp, stable, features.astype("<f8").tobytes())
+            if len(self._records) > GRASPS_MAX:
+                oldest = self._records.pop(next(iter(self._records)))
+                self.unreported += oldest.stable and oldest.slipped is None
+        elif stable and not known.stable and known.slipped is None:
+            self._records[grasp] = Record(grasp, stable, features.astype("<f8").tobytes())
+
+    def tell(self, grasp: GraspId, *, slipped: bool) -> tuple[Told, Record | None]:
+        """Take an outcome; returns also what was known of the grasp until now."""
+        record = self._records.get(grasp)
+        if record is None:
+            told = Told.UNKNOWN
+        elif record.slipped is None:
+            told = Told.TAKEN
+            self._records[grasp] = Record(grasp, record.stable, None, slipped)
+        else:
+            told = Told.REPEATED if record.slipped == slipped else Told.CONTRADICTS
+        self.told[told] += 1
+        return told, record
+
+    def exchanged(self) -> None:
+        """A sensor was exchanged: what is still to be told teaches nothing any more."""
+        for grasp, known in self._records.items():
+            self._records[grasp] = Record(grasp, known.stable, None, known.slipped)
+
+    def state(self) -> LedgerState:
+        """What `restore` needs."""
+        return LedgerState(tuple(self._records.values()), dict(self.told), self.unreported)
+
+    def restore(self, state: LedgerState, width: int) -> None:
+        """Go on from an earlier state, with features (width,). Raises `ValueError`."""
+        records = {record.id: record for record in state.records}
+        if len(records) != len(state.records):
+            raise ValueError("holds a grasp twice")
+        for record in state.records:
+            if record.features is not None:
+                vector(record.features, width)
+            if record.features is not None and record.slipped is not None:
+                raise ValueError("would learn from a grasp twice")
+        self._records, self.told = records, Counter(state.told)
+        self.unreported = state.unreported

@@ -1,0 +1,141 @@
+"""What a verdict is worth: the model's opinion, corrected by outcomes, under the risk that is set.
+
+Between judge and message: `judge` a grasp, decide, `note` what was said; tell each `outcome`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.trust.learner import Learner, LearnerState, Vector, sigmoid
+from daemon.trust.ledger import GraspId, Ledger, LedgerState, Told
+from daemon.trust.risk import Permission, Risk, RiskLimits, RiskState
+
+VERSION: Final = 1
+MAX_BYTES: Final = 1 << 20
+"""Of an encoded state: of three fingers, with every outcome still out, it has 240 kB."""
+DIGEST_BYTES: Final = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Assessment:
+    """What is thought of one grasp, before anything is said."""
+
+    p_slip: float
+    """After learning, 0..1; the model's own as long as nothing was learned."""
+    permission: Permission
+    """Whether it may be called `stable`."""
+    supervised: bool
+    """Whether its lift, watched, would teach what is not known: ask for it."""
+    features: Vector
+    """What `note` remembers."""
+
+
+class TrustState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """All that is learned; worth nothing with another model or other fingers."""
+
+    version: Literal[1]
+    model: str
+    learner: LearnerState
+    risk: RiskState
+    ledger: LedgerState
+
+
+class Trust:
+    """Learner, risk and ledger of one hand with one model."""
+
+    def __init__(
+        self, model: str, inputs: int, limits: RiskLimits | None = None, *, learns: bool = True
+    ) -> None:
+        """Start with nothing known.
+
+        `model` names the model, as by its digest, which has so many input features (78 for three
+        fingers). With `learns` false outcomes move the risk's threshold only.
+        """
+        self._model = model
+        self._inputs = inputs
+        self._limits = limits or RiskLimits()
+        self._learns = learns
+        self.learner = Learner(inputs)
+        self.risk = Risk(self._limits)
+        self.ledger = Ledger()
+
+    def judge(
+        self, grasp: GraspId, p_slip: float, margin: float, inputs: NDArray[np.floating]
+    ) -> Assessment:
+        """Assess a grasp by the model's `p_slip`, its log-odds `margin`, and its flat `inputs`.
+
+        Changes nothing. Raises `ValueError` for what is not finite or of another shape: such a
+        grasp must be `unknown`.
+        """
+        if not 0.0 <= p_slip <= 1.0:  # also true for NaN
+            raise ValueError(f"{p_slip} is no probability")
+        features = self.learner.features(margin, inputs)
+        log_odds = self.learner.log_odds(features)
+        permission = self.risk.decide(log_odds)
+        return Assessment(
+            p_slip=sigmoid(log_odds) if self.learner.outcomes else p_slip,
+            permission=permission,
+            supervised=self.risk.supervised(permission, grasp.boot_id, grasp.grasp),
+            features=features,
+        )
+
+    def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
+        """Remember what was said of a grasp. Raises `ValueError` if that was not allowed."""
+        if stable and assessment.permission is not Permission.ALLOWED:
+            raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
+        self.ledger.note(grasp, assessment.features, stable=stable)
+
+    def outcome(self, grasp: GraspId, *, slipped: bool) -> Told:
+        """Take in how a lift ended; what is not `TAKEN` has changed nothing but a counter."""
+        told, record = self.ledger.tell(grasp, slipped=slipped)
+        if told is Told.TAKEN and record is not None:
+            current = record.features is not None
+            self.risk.take(stable=record.stable, slipped=slipped, proves=current)
+            if record.features is not None and self._learns:
+                self.learner.learn(np.frombuffer(record.features, "<f8"), slipped=slipped)
+        return told
+
+    def sensors_exchanged(self) -> None:
+        """Start learning again; slips that were counted stay counted."""
+        self.learner.reset()
+        self.risk.exchanged()
+        self.ledger.exchanged()
+
+    def state(self) -> TrustState:
+        """What `restore` needs; what comes later does not change it."""
+        parts = self.learner.state(), self.risk.state(), self.ledger.state()
+        return TrustState(VERSION, self._model, *parts)
+
+    def restore(self, state: TrustState) -> None:
+        """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
+        if state.model != self._model:
+            raise ValueError("is of another model")
+        learner, risk, ledger = Learner(self._inputs), Risk(self._limits), Ledger()
+        learner.restore(state.learner)
+        risk.restore(state.risk)
+        ledger.restore(state.ledger, self._inputs + 2)
+        self.learner, self.risk, self.ledger = learner, risk, ledger
+
+
+def encode(state: TrustState) -> bytes:
+    """A state as bytes, behind their SHA-256."""
+    data = msgspec.msgpack.encode(state)
+    return hashlib.sha256(data).digest() + data
+
+
+def decode(data: bytes) -> TrustState:
+    """The inverse of `encode`. Raises `ValueError` for what is too long, damaged or no state."""
+    digest, content = data[:DIGEST_BYTES], data[DIGEST_BYTES:]
+    if len(data) > MAX_BYTES or hashlib.sha256(content).digest() != digest:
+        raise ValueError("is damaged, or nothing that was learned")
+    try:
+        return msgspec.msgpack.decode(content, type=TrustState)
+    except msgspec.DecodeError as error:
+        raise ValueError(f"is nothing that was learned: {error}") from error

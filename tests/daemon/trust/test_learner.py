@@ -1,0 +1,299 @@
+"""The learner against an independent one, against batch fits, and against what could break it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sklearn.linear_model import LogisticRegression
+
+from daemon.trust import learner as module
+from daemon.trust.learner import Learner, LearnerState, sigmoid
+from tests.daemon.trust.reference import Reference
+
+CLIP = 3.0
+ONE_FINGER, THREE_FINGERS = 26, 78
+
+Outcome = tuple[float, NDArray[np.float32], bool]
+
+
+def lifts(number: int, inputs: int, seed: int = 0, strength: float = 0.6) -> Iterator[Outcome]:
+    """Margin, input and outcome; the truth is a logistic model, not the margin's."""
+    random = np.random.default_rng(seed)
+    weights = random.normal(0.0, strength / math.sqrt(inputs), inputs)
+    for _ in range(number):
+        x = np.clip(random.normal(0.0, 1.0, inputs), -CLIP, CLIP).astype(np.float32)
+        margin = float(random.normal(0.0, 2.0))
+        slipped = random.random() < sigmoid(0.4 * margin - 0.5 + 2.0 * float(x @ weights))
+        yield margin, x, bool(slipped)
+
+
+def learn(learner: Learner, stream: Iterator[Outcome]) -> None:
+    for margin, x, slipped in stream:
+        learner.learn(learner.features(margin, x), slipped=slipped)
+
+
+def covariance(learner: Learner) -> NDArray[np.float64]:
+    return np.frombuffer(learner.state().covariance).reshape(learner._width, -1)
+
+
+def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_open() -> None:
+    learner = Learner(2)
+    found = learner.log_odds(learner.features(-3.0, np.array([1.0, -2.0])))
+    variance = 2.0**2 * 0.3**2 + 0.5**2 + 0.2**2 * (1.0 + 4.0)
+    assert found == pytest.approx(-2.0 / math.sqrt(1.0 + math.pi * variance / 8.0), rel=1e-14)
+
+
+def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
+    learner, x = Learner(2), np.zeros(2)
+    for margin in (30.5, 1e9):
+        for sign in (1.0, -1.0):
+            found = learner.features(sign * margin, x)
+            np.testing.assert_array_equal(found, [sign * 20.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("inputs", [0, 1, 6])
+def test_it_is_the_information_filter_in_long_double(inputs: int) -> None:
+    learner, reference = Learner(inputs), Reference(inputs)
+    for margin, x, slipped in lifts(60, inputs or 1):
+        x = x[:inputs]
+        mine, theirs = learner.features(margin, x), reference.features(margin, x.tolist())
+        assert learner.log_odds(mine) == pytest.approx(float(reference.log_odds(theirs)), abs=1e-12)
+        learner.learn(mine, slipped=slipped)
+        reference.learn(theirs, slipped)
+    expected = np.array(reference.covariance, dtype=np.float64)
+    np.testing.assert_allclose(covariance(learner), expected, rtol=0.0, atol=1e-14)
+
+
+def test_float64_is_long_double_after_2000_outcomes_of_three_fingers() -> None:
+    learner = Learner(THREE_FINGERS)
+    prior = np.array([0.3**2, 0.5**2] + [0.2**2] * THREE_FINGERS, dtype=np.longdouble)
+    mean = np.zeros(len(prior), dtype=np.longdouble)
+    mean[0] = 1.0
+    spread, drift = np.diag(prior), np.longdouble(2e-3) * prior
+    worst = 0.0
+    for margin, x, slipped in lifts(2000, THREE_FINGERS):
+        f = np.concatenate(([margin / 1.5, 1.0], x)).astype(np.longdouble)
+        features = learner.features(margin, x)
+        expected = f @ mean / np.sqrt(1 + np.longdouble(math.pi) / 8 * (f @ spread @ f))
+        worst = max(worst, abs(learner.log_odds(features) - float(expected)))
+        learner.learn(features, slipped=slipped)
+        p = 1 / (1 + np.exp(-(f @ mean)))
+        w, seen = p * (1 - p), spread @ f
+        spread = spread - np.outer(seen, seen) * (w / (1 + w * (f @ seen)))
+        mean = mean + spread @ f * (slipped - p)
+        spread = spread + np.diag(drift)
+        scale = np.sqrt(np.minimum(1, prior / np.diag(spread)))
+        spread = scale[:, None] * spread * scale
+    assert worst < 1e-11
+
+
+def test_without_drift_it_ends_where_a_batch_fit_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "DRIFT", 0.0)
+    learner = Learner(6)
+    stream = [(0.0, x, slipped) for _, x, slipped in lifts(3000, 6)]
+    learn(learner, iter(stream))
+    x = np.array([x for _, x, _ in stream])
+    slipped = np.array([slipped for *_, slipped in stream])
+    # The same prior as a penalty: each feature in units of its weight's standard deviation.
+    scaled = np.hstack((np.full((len(x), 1), 0.5), 0.2 * x))
+    batch = LogisticRegression(C=1.0, fit_intercept=False, tol=1e-10, max_iter=10_000)
+    batch.fit(scaled, slipped)
+    weights = np.frombuffer(learner.state().mean)[1:]
+    np.testing.assert_allclose(weights, batch.coef_[0] * ([0.5] + [0.2] * 6), atol=0.02)
+    p = scaled @ batch.coef_[0]
+    w = np.exp(-np.abs(p)) / (1.0 + np.exp(-np.abs(p))) ** 2
+    unscaled = scaled / ([0.5] + [0.2] * 6)
+    laplace = np.linalg.inv(np.diag([4.0] + [25.0] * 6) + unscaled.T @ (w[:, None] * unscaled))
+    np.testing.assert_allclose(covariance(learner)[1:, 1:], laplace, atol=0.05 * laplace.max())
+
+
+def test_moderated_log_odds_are_those_of_the_mean_probability() -> None:
+    learner = Learner(ONE_FINGER)
+    learn(learner, lifts(40, ONE_FINGER))
+    mean, spread = np.frombuffer(learner.state().mean), covariance(learner)
+    nodes, shares = np.polynomial.hermite_e.hermegauss(60)
+    for margin, x, _ in lifts(50, ONE_FINGER, seed=1):
+        f = learner.features(margin, x)
+        at = float(f @ mean) + math.sqrt(float(f @ spread @ f)) * nodes
+        expected = float(shares @ (1.0 / (1.0 + np.exp(-at))) / shares.sum())
+        assert sigmoid(learner.log_odds(f)) == pytest.approx(expected, abs=0.02)
+
+
+def test_it_learns_what_the_margin_does_not_know_and_follows_when_that_changes() -> None:
+    learner = Learner(ONE_FINGER)
+
+    def right(stream: list[Outcome]) -> float:
+        says = [learner.log_odds(learner.features(m, x)) > 0.0 for m, x, _ in stream]
+        return sum(a == y for a, (*_, y) in zip(says, stream, strict=True)) / len(stream)
+
+    stream = list(lifts(1300, ONE_FINGER, strength=3.0))
+    before = right(stream[800:])
+    learn(learner, iter(stream[:800]))
+    after = right(stream[800:])
+    inverted = [(m, x, not y) for m, x, y in stream]
+    fooled = right(inverted[800:])
+    learn(learner, iter(inverted[:800]))
+    assert before < 0.7
+    assert after > 0.85
+    assert fooled < 0.15
+    assert right(inverted[800:]) > 0.8
+
+
+Stream = Callable[[np.random.Generator, int], Iterator[Outcome]]
+
+
+def constant(random: np.random.Generator, number: int) -> Iterator[Outcome]:
+    x = np.full(ONE_FINGER, 0.5, np.float32)
+    yield from ((1.0, x, bool(slipped)) for slipped in random.integers(0, 2, number))
+
+
+def at_the_clip(random: np.random.Generator, number: int) -> Iterator[Outcome]:
+    signs = random.choice([-CLIP, CLIP], (number, ONE_FINGER)).astype(np.float32)
+    told = random.integers(0, 2, (number, 2))
+    yield from ((1e9 * (2 * far - 1), x, bool(y)) for x, (far, y) in zip(signs, told, strict=True))
+
+
+def contradicting(random: np.random.Generator, number: int) -> Iterator[Outcome]:
+    x = np.linspace(-CLIP, CLIP, ONE_FINGER, dtype=np.float32)
+    yield from ((5.0, x, index % 2 == 0) for index in range(number))
+
+
+def separable(random: np.random.Generator, number: int) -> Iterator[Outcome]:
+    x = np.full(ONE_FINGER, CLIP, np.float32)
+    yield from (
+        (0.0, x if slipped else -x, bool(slipped)) for slipped in random.random(number) < 0.5
+    )
+
+
+def against_the_margin(random: np.random.Generator, number: int) -> Iterator[Outcome]:
+    units = CLIP * np.eye(ONE_FINGER, dtype=np.float32)
+    yield from ((-30.0, units[index % ONE_FINGER], True) for index in range(number))
+
+
+def all_in_turns(random: np.random.Generator, number: int) -> Iterator[Outcome]:
+    for _ in range(number // 2500):
+        for kind in KINDS:
+            yield from kind(random, 500)
+
+
+KINDS: tuple[Stream, ...] = (constant, at_the_clip, contradicting, separable, against_the_margin)
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"), [*((kind, 4000) for kind in KINDS), (all_in_turns, 100_000)]
+)
+def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
+    kind: Stream, number: int
+) -> None:
+    learner = Learner(ONE_FINGER)
+    prior = np.array([0.3**2, 0.5**2] + [0.2**2] * ONE_FINGER)
+    start = np.array([1.0, *([0.0] * (ONE_FINGER + 1))])
+    for index, (margin, x, slipped) in enumerate(kind(np.random.default_rng(0), number), 1):
+        learner.learn(learner.features(margin, x), slipped=slipped)
+        if index % (number // 50) == 0:
+            matrix, weights = covariance(learner), np.frombuffer(learner.state().mean)
+            np.testing.assert_array_equal(matrix, matrix.T)
+            assert (np.diag(matrix) <= prior * (1.0 + 1e-12)).all()
+            assert np.linalg.eigvalsh(matrix)[0] >= 0.99 * 2e-3 * 0.2**2
+            assert (np.abs(weights - start) <= 50 * prior**0.5).all()
+    assert learner.outcomes == number
+    Learner(ONE_FINGER).restore(learner.state())
+
+
+@pytest.mark.parametrize(
+    ("margin", "inputs"),
+    [
+        (math.nan, np.zeros(3)),
+        (math.inf, np.zeros(3)),
+        (0.0, np.array([0.0, math.nan, 0.0])),
+        (0.0, np.array([0.0, math.inf, -math.inf])),
+        (0.0, np.array([0.0, 0.0, -1001.0])),
+        (0.0, np.zeros(4)),
+        (0.0, np.zeros(1)),
+        (0.0, np.zeros((1, 3))),
+    ],
+)
+def test_what_is_not_finite_or_of_another_shape_is_refused(
+    margin: float, inputs: NDArray[np.float64]
+) -> None:
+    with pytest.raises(ValueError, match=r"not finite|of shape"):
+        Learner(3).features(margin, inputs)
+
+
+def test_a_weight_stops_at_fifty_times_its_priors_deviation_whatever_is_told() -> None:
+    learner = Learner(2)
+    for index in range(2000):
+        sign = -1.0 if index % 2 else 1.0
+        # In turns so far on one side that the learner is sure, and wrong.
+        features = learner.features(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
+        learner.learn(features, slipped=learner.log_odds(features) < 0.0)
+    weights = np.frombuffer(learner.state().mean)
+    limits = 50.0 * np.array([0.3, 0.5, 0.2, 0.2])
+    assert (np.abs(weights - [1.0, 0.0, 0.0, 0.0]) <= limits).all()
+    features = learner.features(0.0, np.array([1000.0, 0.0]))
+    learner.learn(features, slipped=learner.log_odds(features) < 0.0)
+    assert np.abs(np.frombuffer(learner.state().mean)[2]) == pytest.approx(10.0)
+    assert np.isfinite(learner.log_odds(features))
+    Learner(2).restore(learner.state())
+
+
+def test_a_reset_learner_is_a_new_one() -> None:
+    learner = Learner(ONE_FINGER)
+    learn(learner, lifts(30, ONE_FINGER))
+    assert learner.outcomes == 30
+    learner.reset()
+    assert learner.state() == Learner(ONE_FINGER).state()
+
+
+@pytest.mark.parametrize("inputs", [26, 52, 78])
+def test_a_restored_learner_goes_on_bit_for_bit(inputs: int) -> None:
+    whole, first, second = Learner(inputs), Learner(inputs), Learner(inputs)
+    stream = list(lifts(80, inputs))
+    learn(whole, iter(stream))
+    learn(first, iter(stream[:33]))
+    state = first.state()
+    learn(first, iter(stream[:5]))  # what it learns later is not in the state
+    second.restore(state)
+    learn(second, iter(stream[33:]))
+    assert second.state() == whole.state()
+
+
+def spoilt(state: LearnerState) -> Iterator[tuple[str, LearnerState]]:
+    mean = np.frombuffer(state.mean).copy()
+    size = len(mean)
+    matrix = np.frombuffer(state.covariance).reshape(size, size)
+
+    def with_mean(value: float) -> LearnerState:
+        changed = mean.copy()
+        changed[2] = value
+        return LearnerState(3, changed.tobytes(), state.covariance)
+
+    def with_entry(row: int, column: int, value: float) -> LearnerState:
+        changed = matrix.copy()
+        changed[row, column] = value
+        return LearnerState(3, state.mean, changed.tobytes())
+
+    yield "values", LearnerState(3, state.mean[:-8], state.covariance)
+    yield "values", LearnerState(3, state.mean, state.covariance[:-1])
+    yield "values", LearnerState(3, state.mean + bytes(8), state.covariance)
+    yield "not finite", with_mean(math.nan)
+    yield "not finite", with_entry(1, 1, math.inf)
+    yield "no outcomes", with_mean(10.1)
+    yield "before the first", with_entry(2, 2, 0.041)
+    yield "no covariance", with_entry(2, 3, 0.01)  # not symmetric
+    yield "no covariance", with_entry(2, 2, -0.01)
+    yield "no covariance", LearnerState(3, state.mean, (0.0 * matrix).tobytes())
+
+
+def test_a_state_that_no_outcomes_lead_to_is_refused_and_changes_nothing() -> None:
+    learner = Learner(4)
+    learn(learner, lifts(7, 4))
+    before = learner.state()
+    for why, state in spoilt(before):
+        with pytest.raises(ValueError, match=why):
+            learner.restore(state)
+        assert learner.state() == before

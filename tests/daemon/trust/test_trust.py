@@ -1,0 +1,375 @@
+"""Learner, risk and ledger together: outcomes late, twice, contradicting, and across restarts."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from daemon.trust.learner import sigmoid
+from daemon.trust.ledger import GRASPS_MAX, GraspId, Told
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+
+BOOT = "0123456789abcdef" * 2
+INPUTS = 26
+RULE = RiskLimits(0.1)
+TABLE = np.clip(np.random.default_rng(5).normal(0.0, 1.0, (997, INPUTS)), -3, 3).astype(np.float32)
+
+
+def trust(limits: RiskLimits = RULE, *, learns: bool = True) -> Trust:
+    return Trust("model", INPUTS, limits, learns=learns)
+
+
+def named(grasp: int, boot: str = BOOT) -> GraspId:
+    return GraspId(boot, grasp)
+
+
+def inputs(grasp: int) -> NDArray[np.float32]:
+    row: NDArray[np.float32] = TABLE[grasp % len(TABLE)]
+    return row
+
+
+def judge(part: Trust, grasp: int, margin: float = -6.0, boot: str = BOOT) -> bool:
+    """Judge and note a grasp; returns whether it was called stable."""
+    name = named(grasp, boot)
+    assessment = part.judge(name, sigmoid(margin), margin, inputs(grasp))
+    stable = assessment.permission is Permission.ALLOWED and assessment.p_slip < 0.5
+    part.note(name, assessment, stable=stable)
+    return stable
+
+
+def p_slip(part: Trust, grasp: int = 0, margin: float = -1.0) -> float:
+    return part.judge(named(10**6), sigmoid(margin), margin, inputs(grasp)).p_slip
+
+
+@pytest.mark.parametrize("limits", [RiskLimits(), RULE])
+def test_without_an_outcome_the_models_probability_is_handed_back_to_the_bit(
+    limits: RiskLimits,
+) -> None:
+    part = trust(limits)
+    for grasp, p in enumerate((0.0, 1e-300, 0.1, 0.1 + 1e-17, 0.5, 1.0 - 2**-53, 1.0)):
+        found = part.judge(named(grasp), p, 0.3, inputs(grasp))
+        part.note(named(grasp), found, stable=False)
+        assert found.p_slip == p
+
+
+def test_an_outcome_changes_the_probability_towards_what_happened() -> None:
+    before = p_slip(trust())
+    for slipped in (True, False):
+        part = trust()
+        judge(part, 0, -1.0)
+        assert part.outcome(named(0), slipped=slipped) is Told.TAKEN
+        assert part.learner.outcomes == 1
+        moderated = part.judge(named(1), 0.5, -1.0, inputs(0)).p_slip
+        assert (moderated > before) or not slipped
+    assert part.learner.outcomes == 1
+
+
+def test_with_learning_off_outcomes_move_the_risk_alone() -> None:
+    part = trust(learns=False)
+    assert judge(part, 0)
+    assert part.outcome(named(0), slipped=True) is Told.TAKEN
+    assert p_slip(part) == sigmoid(-1.0)
+    assert (part.risk.lifts, part.risk.slips, part.risk.proven) == (1, 1, 1)
+
+
+def test_an_outcome_told_twice_counts_once_and_a_contradiction_is_refused() -> None:
+    part = trust()
+    judge(part, 0)
+    assert part.outcome(named(0), slipped=False) is Told.TAKEN
+    learned, risked = part.learner.state(), part.risk.state()
+    assert part.outcome(named(0), slipped=False) is Told.REPEATED
+    assert part.outcome(named(0), slipped=True) is Told.CONTRADICTS
+    assert part.outcome(named(1), slipped=True) is Told.UNKNOWN
+    assert part.outcome(named(0, "f" * 32), slipped=True) is Told.UNKNOWN
+    assert (part.learner.state(), part.risk.state()) == (learned, risked)
+    assert part.ledger.told == {
+        Told.TAKEN: 1, Told.REPEATED: 1, Told.CONTRADICTS: 1, Told.UNKNOWN: 2
+    }  # fmt: skip
+
+
+def test_late_outcomes_teach_what_was_judged_then() -> None:
+    late, now = trust(RiskLimits()), trust(RiskLimits())
+    for grasp in range(50):
+        judge(late, grasp, 1.0)
+    for grasp in reversed(range(50)):
+        judge(now, grasp, 1.0)
+        for part in (late, now):
+            assert part.outcome(named(grasp), slipped=grasp % 3 == 0) is Told.TAKEN
+    assert late.learner.state() == now.learner.state()
+
+
+def test_the_outcome_of_a_forgotten_grasp_is_unknown_and_a_stable_one_counts_as_unreported() -> (
+    None
+):
+    part = trust()
+    first = judge(part, 0)
+    said = [judge(part, grasp, -6.0 if grasp % 2 else 6.0) for grasp in range(1, GRASPS_MAX)]
+    assert first
+    assert part.ledger.outstanding == 1 + sum(said) > 50
+    assert part.ledger.unreported == 0
+    judge(part, GRASPS_MAX)
+    judge(part, GRASPS_MAX + 1)
+    assert part.ledger.unreported == 1 + said[0]
+    assert part.outcome(named(0), slipped=True) is Told.UNKNOWN
+    assert part.outcome(named(2), slipped=True) is Told.TAKEN
+    assert part.risk.slips == said[1]
+
+
+def test_what_a_grasp_is_lifted_on_counts_the_first_verdict_or_the_first_stable_one() -> None:
+    part = trust()
+    assert not judge(part, 7, 2.0)
+    unsure = part.judge(named(8), 0.9, 2.0, inputs(8))
+    part.note(named(8), unsure, stable=False)
+    sure = part.judge(named(8), 0.01, -6.0, inputs(9))
+    part.note(named(8), sure, stable=True)
+    again = part.judge(named(8), 0.01, -5.0, inputs(10))
+    part.note(named(8), again, stable=True)
+    part.note(named(8), unsure, stable=False)
+    expected = trust()
+    expected.note(named(8), sure, stable=True)
+    for each in (part, expected):
+        assert each.outcome(named(8), slipped=True) is Told.TAKEN
+        each.note(named(8), again, stable=True)  # too late to be what it was lifted on
+        assert (each.risk.lifts, each.risk.slips, each.ledger.outstanding) == (1, 1, 0)
+    assert part.learner.state() == expected.learner.state()
+
+
+def test_stable_said_after_the_outcome_is_not_what_was_lifted_on() -> None:
+    part = trust()
+    assert not judge(part, 7, 2.0)
+    assert part.outcome(named(7), slipped=True) is Told.TAKEN
+    kept = encode(part.state())
+    judge(part, 7, -9.0)
+    assert encode(part.state()) == kept
+    assert part.ledger.outstanding == 0
+
+
+def test_only_stable_grasps_without_an_outcome_count_as_unreported() -> None:
+    part = trust()
+    assert judge(part, 0)
+    assert part.outcome(named(0), slipped=False) is Told.TAKEN
+    assert not judge(part, 1, 6.0)
+    assert judge(part, 2)
+    for grasp in range(3, GRASPS_MAX + 3):
+        judge(part, grasp, 6.0)
+    assert part.ledger.unreported == 1
+
+
+def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
+    for limits, margin in ((RULE, 3.0), (RiskLimits(0.1, warm_up=5), -0.5)):
+        part = trust(limits)
+        assessment = part.judge(named(0), 0.1, margin, inputs(0))
+        with pytest.raises(ValueError, match="called stable"):
+            part.note(named(0), assessment, stable=True)
+
+
+@pytest.mark.parametrize("p", [math.nan, -0.1, 1.1, math.inf])
+def test_what_is_no_probability_is_refused(p: float) -> None:
+    with pytest.raises(ValueError, match="no probability"):
+        trust().judge(named(0), p, 0.0, inputs(0))
+    with pytest.raises(ValueError, match="not finite"):
+        trust().judge(named(0), 0.5, math.nan, inputs(0))
+
+
+def test_after_an_exchange_former_lifts_count_as_slips_but_teach_nothing() -> None:
+    part = trust(RiskLimits(0.1, warm_up=1))
+    assert not judge(part, 0, 2.0)
+    part.outcome(named(0), slipped=False)
+    assert judge(part, 1)
+    part.sensors_exchanged()
+    assert part.outcome(named(1), slipped=True) is Told.TAKEN
+    assert part.outcome(named(1), slipped=True) is Told.REPEATED
+    assert (part.risk.lifts, part.risk.slips, part.risk.warm_up_left) == (1, 1, 1)
+    assert p_slip(part) == sigmoid(-1.0)
+    assert part.judge(named(2), 0.3, -1.0, inputs(2)).permission is Permission.UNPROVEN
+
+
+Step = tuple[str, int, float, bool]
+STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(("lift", "lift", "lift", "grasp", "tell", "again", "exchange", "restart")),
+        st.integers(0, 40),
+        st.floats(-12.0, 4.0),
+        st.booleans(),
+    ),
+    max_size=120,
+)
+
+
+@settings(max_examples=150)
+@given(st.sampled_from((0.001, 0.02, 0.05, 0.2, 0.5)), st.booleans(), STEPS)
+def test_no_adversary_breaks_the_bound(
+    alpha: float, slips_if_stable: bool, steps: list[Step]
+) -> None:
+    """Late, lost, repeated, contradicting outcomes, exchanges and restarts, in any order."""
+    part = trust(RiskLimits(alpha))
+    said: dict[int, bool] = {}
+    told: dict[int, bool] = {}
+    for number, (what, back, margin, label) in enumerate(steps):
+        if what in ("lift", "grasp"):
+            said[number] = judge(part, number, margin)
+        which = number if what == "lift" else number - back
+        if what in ("lift", "tell", "again") and which in said:
+            # An adversary lets slip exactly what was called stable.
+            slipped = said[which] if slips_if_stable and which not in told else label
+            expected = Told.TAKEN
+            if which in told:
+                expected = Told.REPEATED if told[which] == slipped else Told.CONTRADICTS
+            assert part.outcome(named(which), slipped=slipped) is expected
+            told.setdefault(which, slipped)
+        elif what == "exchange":
+            part.sensors_exchanged()
+        elif what == "restart":
+            kept, part = encode(part.state()), trust(RiskLimits(alpha))
+            part.restore(decode(kept))
+            assert encode(part.state()) == kept
+        lifts = [slipped for grasp, slipped in told.items() if said[grasp]]
+        assert (part.risk.lifts, part.risk.slips) == (len(lifts), sum(lifts))
+        assert part.ledger.outstanding == sum(said.values()) - len(lifts)
+        assert part.risk.bound is not None
+        assert part.risk.slips <= part.risk.bound + 1e-9
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.05, 0.1])
+@pytest.mark.parametrize("wrong", [0.0, 0.03])
+def test_under_drift_and_wrong_outcomes_the_share_of_told_slips_is_kept(
+    alpha: float, wrong: float
+) -> None:
+    random = np.random.default_rng(3)
+    weights = random.normal(0.0, 0.5, INPUTS)
+    part, waiting = trust(RiskLimits(alpha)), []
+    for grasp in range(1500):
+        weights += random.normal(0.0, 0.02, INPUTS)
+        if grasp == 750:
+            weights = -weights  # a jump: the opposite of what was learned
+        truth = random.random() < sigmoid(-1.0 + 2.0 * float(inputs(grasp) @ weights))
+        judge(part, grasp, float(random.normal(-1.0 + 2.0 * (2 * truth - 1), 1.5)))
+        waiting.append((grasp, bool(truth != (random.random() < wrong))))
+        if random.random() < 0.7:
+            which, slipped = waiting.pop(int(random.integers(len(waiting))))
+            assert part.outcome(named(which), slipped=slipped) in (Told.TAKEN, Told.UNKNOWN)
+        assert part.risk.bound is not None
+        assert part.risk.slips <= part.risk.bound + 1e-9
+    assert part.risk.lifts > 15
+    assert part.risk.overdue == 0
+    excess = part.risk.slips - alpha * part.risk.lifts
+    assert excess <= math.log(2 * alpha / (1 - 2 * alpha)) + 6.0 + 1.0
+
+
+def test_a_restart_in_the_middle_changes_nothing() -> None:
+    whole, part = trust(), trust()
+    for grasp in range(300):
+        for each in (whole, part):
+            judge(each, grasp, 3.0 * math.sin(grasp) - 3.0)
+            if grasp >= 5:
+                each.outcome(named(grasp - 5), slipped=grasp % 4 == 0)
+        if grasp % 37 == 0:
+            kept, part = encode(part.state()), trust()
+            part.restore(decode(kept))
+    assert part.state() == whole.state()
+    assert part.learner.outcomes == 295
+
+
+def test_a_state_is_not_changed_by_what_comes_later() -> None:
+    part = trust()
+    judge(part, 0)
+    state = part.state()
+    kept = encode(state)
+    judge(part, 1)
+    part.outcome(named(0), slipped=True)
+    part.sensors_exchanged()
+    assert encode(state) == kept
+
+
+def test_the_largest_state_of_three_fingers_fits() -> None:
+    part = Trust("f" * 64, 78, RULE)
+    x = np.full(78, 3.0, np.float32)
+    for grasp in range(2 * GRASPS_MAX):
+        assessment = part.judge(named(grasp), 0.5, -9.0, x)
+        part.note(named(grasp), assessment, stable=False)
+    data = encode(part.state())
+    assert 200_000 < len(data) < MAX_BYTES // 2
+    other = Trust("f" * 64, 78, RULE)
+    other.restore(decode(data))
+    assert encode(other.state()) == data
+
+
+def full() -> Trust:
+    part = trust()
+    for grasp in range(5):
+        judge(part, grasp)
+        part.outcome(named(grasp // 2), slipped=grasp == 0)
+    return part
+
+
+def test_no_damaged_byte_goes_unnoticed() -> None:
+    data = encode(full().state())
+    for place in range(0, len(data), 97):
+        damaged = bytearray(data)
+        damaged[place] ^= 0x10
+        with pytest.raises(ValueError, match="damaged"):
+            decode(bytes(damaged))
+    long = bytes(MAX_BYTES)
+    for bad in (b"", data[:-1], data[:20], data + b"\0", hashlib.sha256(long).digest() + long):
+        with pytest.raises(ValueError, match="damaged"):
+            decode(bad)
+
+
+def test_what_is_whole_and_no_state_is_refused() -> None:
+    for content in (b"\x80", b"\xc1", msgspec.msgpack.encode({"version": 2})):
+        with pytest.raises(ValueError, match="nothing that was learned"):
+            decode(hashlib.sha256(content).digest() + content)
+
+
+def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
+    part = full()
+    before = encode(part.state())
+    state = part.state()
+    records = state.ledger.records
+    unlearned = next(record for record in records if record.slipped is None)
+    replace = msgspec.structs.replace
+
+    def with_records(*chosen: object) -> TrustState:
+        return replace(state, ledger=replace(state.ledger, records=chosen))
+
+    for why, other in (
+        ("another model", replace(state, model="other")),
+        ("of .* values", Trust("model", 78, RULE).state()),
+        ("twice", with_records(records[0], records[0])),
+        ("twice", with_records(replace(unlearned, slipped=True))),
+        ("of .* values", with_records(replace(unlearned, features=b"12345678"))),
+        ("not finite", with_records(replace(unlearned, features=b"\xff" * 8 * (INPUTS + 2)))),
+        ("more slips", replace(state, risk=replace(state.risk, slips=1000))),
+        # The learner's and the risk's parts are sound, and of other outcomes.
+        ("twice", replace(trust().state(), ledger=with_records(records[0], records[0]).ledger)),
+    ):
+        with pytest.raises(ValueError, match=why):
+            part.restore(other)
+        assert encode(part.state()) == before
+
+
+def test_too_many_records_are_no_state() -> None:
+    state = full().state()
+    many = tuple(
+        msgspec.structs.replace(state.ledger.records[0], id=named(grasp))
+        for grasp in range(GRASPS_MAX + 1)
+    )
+    ledger = msgspec.structs.replace(state.ledger, records=many)
+    with pytest.raises(ValueError, match="nothing that was learned"):
+        decode(encode(msgspec.structs.replace(state, ledger=ledger)))
+
+
+def test_judging_changes_nothing() -> None:
+    part = full()
+    before = encode(part.state())
+    found = [part.judge(named(99), 0.2, -2.0, inputs(3)) for _ in range(3)]
+    assert len({(one.p_slip, one.permission, one.supervised) for one in found}) == 1
+    assert encode(part.state()) == before
