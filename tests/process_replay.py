@@ -104,7 +104,7 @@ def judged(readings: Iterator[Reading], *, joints: bool) -> list[Entry]:
     for reading in readings:
         now_ns = reading.t_ns
         if isinstance(reading, JointReading):
-            pipeline.turn(reading)
+            pipeline.observe_joints(reading)
             continue
         verdict, _ = outbox.verdict(pipeline.judge(reading), now_ns, PERIOD_NS)
         fields = cast(Entry, msgspec.to_builtins(verdict))

@@ -148,7 +148,7 @@ def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
             readings = driver.read_ready()
             for reading in readings:
                 if isinstance(reading, JointReading):
-                    pipeline.turn(reading)
+                    pipeline.observe_joints(reading)
                 else:
                     judgements.append(pipeline.judge(reading))
     return [judgement for judgement in judgements if judgement.judged]

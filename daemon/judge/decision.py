@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 
 
 # Without slots, so that a default can be read from the class.
@@ -38,8 +38,8 @@ class Case:
     """Of the reading, ns."""
 
 
-def decide(case: Case, limits: Limits) -> tuple[Outcome, tuple[Reason, ...]]:
-    """Outcome, and the reasons if it is unknown: whatever is not clearly well is unknown."""
+def decide(case: Case, limits: Limits) -> tuple[Decision, tuple[Reason, ...]]:
+    """Decision, and the reasons if it is unknown: whatever is not clearly well is unknown."""
     reasons = [*case.health]
     if not (case.in_contact and case.settled):
         reasons += case.gate or (Reason.MOVING,)
@@ -47,10 +47,10 @@ def decide(case: Case, limits: Limits) -> tuple[Outcome, tuple[Reason, ...]]:
         reasons.append(Reason.STALE)
     p_slip = case.p_slip
     if p_slip is not None and 0.0 <= p_slip <= 1.0:  # false for NaN
-        outcome = Outcome.SLIP if p_slip >= limits.slip_threshold else Outcome.STABLE
-        confidence = p_slip if outcome is Outcome.SLIP else 1.0 - p_slip
+        decision = Decision.SLIP if p_slip >= limits.slip_threshold else Decision.STABLE
+        confidence = p_slip if decision is Decision.SLIP else 1.0 - p_slip
         if confidence < limits.min_confidence:
             reasons.append(Reason.LOW_CONFIDENCE)
         if not reasons:
-            return outcome, ()
-    return Outcome.UNKNOWN, tuple(reasons) or (Reason.MODEL_FAILED,)
+            return decision, ()
+    return Decision.UNKNOWN, tuple(reasons) or (Reason.MODEL_FAILED,)

@@ -136,12 +136,12 @@ class Grip:
         """Changes of the gate since the last call, oldest first."""
         return self._gate.take_changes()
 
-    def turn(self, reading: JointReading) -> None:
+    def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self._joints is not None:
             self._joints.observe(reading, reading.made_ns)
 
-    def feel(self, reading: TactileReading, watched: Watched) -> None:
+    def observe(self, reading: TactileReading, watched: Watched) -> None:
         """Take in a reading of these fingers and what was found in it."""
         t_ns, last_ns = reading.made_ns, self.memory.last_ns
         if watched.reasons:

@@ -15,7 +15,7 @@ from daemon.judge.health import Health
 from daemon.judge.limits import GripLimits
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
-from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
@@ -34,9 +34,9 @@ class Judgement:
     t_ns: int
     """Monotonic time, ns, of the reading's last byte."""
     grasp: int
-    outcome: Outcome
+    decision: Decision
     p_slip: float | None
-    """None exactly when the outcome is unknown."""
+    """None exactly when the decision is unknown."""
     reasons: tuple[Reason, ...]
     judged: bool = True
     """Whether the network judged, or would have judged, this very reading."""
@@ -170,10 +170,10 @@ class Pipeline:
         if self.grip is not None:
             self.grip.interrupt()
 
-    def turn(self, reading: JointReading) -> None:
+    def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
         if self.grip is not None:
-            self.grip.turn(reading)
+            self.grip.observe_joints(reading)
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
@@ -243,7 +243,7 @@ class Pipeline:
         grip = self.grip
         if grip is None:
             return Felt(self.memory.readings, None if watched.reasons else reading.counts)
-        grip.feel(reading, watched)
+        grip.observe(reading, watched)
         counts = None
         if not watched.reasons and 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
             counts = grip.counts_to_judge(reading, watched)
@@ -272,12 +272,12 @@ class Pipeline:
             # Taken last, so that a slow inference counts too.
             age_ns=self._age_ns(t_ns),
         )
-        outcome, reasons = decide(case, self._limits)
+        decision, reasons = decide(case, self._limits)
         return Judgement(
             t_ns=t_ns,
             grasp=felt.grasp,
-            outcome=outcome,
-            p_slip=None if outcome is Outcome.UNKNOWN else opinion.p_slip,
+            decision=decision,
+            p_slip=None if decision is Decision.UNKNOWN else opinion.p_slip,
             reasons=tuple(dict.fromkeys(reasons)),
             judged=felt.judged,
             repaired=opinion.repaired,

@@ -14,7 +14,7 @@ from __future__ import annotations
 from enum import StrEnum
 
 
-class Outcome(StrEnum):
+class Decision(StrEnum):
     """What graspd says of a grasp."""
 
     STABLE = "stable"

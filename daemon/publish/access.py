@@ -47,7 +47,7 @@ class _Watched:
     """Of the connection that goes next."""
 
 
-class Gatekeeper:
+class Authenticator:
     """Answers libzmq whether a peer's key is known, and counts peers that show none.
 
     Make it before the sockets of its context are bound. Never blocks. The log has the address of

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final, Literal
 
 import msgspec
 
-from daemon.judge.reasons import GateCause, GateState, Outcome, Reason
+from daemon.judge.reasons import Decision, GateCause, GateState, Reason
 from models.contract import Finger
 
 WIRE_VERSION: Final = 1
@@ -27,10 +27,10 @@ _HAND = msgspec.Meta(max_length=5)
 """A hand has five fingers."""
 
 
-OUTCOME_CODE: dict[Outcome, Literal[0, 1, 2]] = {
-    Outcome.UNKNOWN: 0,
-    Outcome.STABLE: 1,
-    Outcome.SLIP: 2,
+DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
+    Decision.UNKNOWN: 0,
+    Decision.STABLE: 1,
+    Decision.SLIP: 2,
 }
 """The same as a number, because plotting tools draw numbers and skip text."""
 
@@ -49,7 +49,7 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """Monotonic time, ns, of the reading's last byte; of the start where none has come yet."""
     grasp: Count
     """Counts up per contact episode (with gate mode `every`: per reading), from 1; 0 before."""
-    verdict: Outcome
+    verdict: Decision
     verdict_code: Literal[0, 1, 2]
     """0 unknown, 1 stable, 2 slip."""
     p_slip: Probability | None
@@ -157,7 +157,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     state: State
     readings_hz: Duration
     """Tactile readings per second since the last status."""
-    verdicts: dict[Outcome, Count]
+    verdicts: dict[Decision, Count]
     """Verdicts since start, by outcome."""
     reasons: dict[Reason, Count]
     """Reasons given since start; only those that occurred."""

@@ -12,10 +12,10 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import (
-    OUTCOME_CODE,
+    DECISION_CODE,
     GateMessage,
     OutcomeMessage,
     State,
@@ -68,7 +68,7 @@ class Outbox:
         given.
         """
         self.latency = LatencyHistogram()
-        self.outcomes: Counter[Outcome] = Counter()
+        self.decisions: Counter[Decision] = Counter()
         self.reasons: Counter[Reason] = Counter()
         self._repaired: Counter[str] = Counter()
         self._verdict_topic = f"verdict.{hand}".encode()
@@ -114,10 +114,10 @@ class Outbox:
             t=self._wall_clock(),
             t_mono_ns=judgement.t_ns,
             grasp=judgement.grasp,
-            verdict=judgement.outcome,
-            verdict_code=OUTCOME_CODE[judgement.outcome],
+            verdict=judgement.decision,
+            verdict_code=DECISION_CODE[judgement.decision],
             p_slip=judgement.p_slip,
-            valid=judgement.outcome is not Outcome.UNKNOWN,
+            valid=judgement.decision is not Decision.UNKNOWN,
             reasons=list(judgement.reasons),
             age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
             latency_us=latency_us,
@@ -134,7 +134,7 @@ class Outbox:
         self._send(self._verdict_topic, payload)
         self._verdict_seq += 1
         self.latency.add(latency_us)
-        self.outcomes[judgement.outcome] += 1
+        self.decisions[judgement.decision] += 1
         self.reasons.update(judgement.reasons)
         self._repaired.update(judgement.repaired)
         if judgement.judged:
@@ -243,7 +243,7 @@ class Outbox:
             t_mono_ns=self._clock(),
             state=state,
             readings_hz=readings_hz,
-            verdicts={outcome: self.outcomes[outcome] for outcome in Outcome},
+            verdicts={decision: self.decisions[decision] for decision in Decision},
             reasons=dict(self.reasons),
             drivers=drivers,
             repaired=dict(self._repaired),

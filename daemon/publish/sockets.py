@@ -19,7 +19,7 @@ from daemon.scene import Curve, Scene, SceneError
 from drivers.base import TactileReading
 
 if TYPE_CHECKING:
-    from daemon.publish.access import Gatekeeper
+    from daemon.publish.access import Authenticator
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
@@ -40,7 +40,7 @@ class Sockets(Companion):
         self._keys_seen: object = None
         self._lost = False
         """Whether a port could not be had again."""
-        self.gatekeeper: Gatekeeper | None = None
+        self.authenticator: Authenticator | None = None
         self.publisher: Publisher
         self.questions: Questions | None = None
         try:
@@ -65,7 +65,7 @@ class Sockets(Companion):
         self._watch()
 
     def _let_in_only_known(self, curve: Curve) -> tuple[bytes, bytes]:
-        from daemon.publish.access import Gatekeeper
+        from daemon.publish.access import Authenticator
         from daemon.publish.keys import KeysError, load_clients, load_pair
 
         try:
@@ -73,14 +73,14 @@ class Sockets(Companion):
         except KeysError as error:
             raise SceneError(str(error)) from error
         self._keys_seen = _state(curve.clients)
-        self.gatekeeper = Gatekeeper(self._context, admitted)
+        self.authenticator = Authenticator(self._context, admitted)
         return pair
 
     def _watch(self) -> None:
-        if self.gatekeeper is not None:
+        if self.authenticator is not None:
             for bound in self._bound():
                 if bound.endpoint.startswith("tcp://") and bound.is_open:
-                    self.gatekeeper.watch(bound.socket)
+                    self.authenticator.watch(bound.socket)
 
     def _bound(self) -> list[Publisher | Questions]:
         wanted = (getattr(self, "publisher", None), self.questions)
@@ -98,7 +98,7 @@ class Sockets(Companion):
         """Become readable when a peer may want something, as long as `before_wait` is called."""
         asked = [each for each in (self.publisher, self.questions) if each is not None]
         found = [each.fileno() for each in asked if each.is_open]
-        return found if self.gatekeeper is None else found + self.gatekeeper.filenos()
+        return found if self.authenticator is None else found + self.authenticator.filenos()
 
     def before_wait(self, requests: Requests) -> None:
         """See to peers that come; pass on what they ask and tell."""
@@ -110,8 +110,8 @@ class Sockets(Companion):
         """See to peers that come; questions are taken by `before_wait`."""
         if self.publisher.is_open:
             self.publisher.take()
-        if self.gatekeeper is not None:
-            self.gatekeeper.take()
+        if self.authenticator is not None:
+            self.authenticator.take()
 
     def on_answer(self, payload: bytes) -> None:
         """Answer all who have asked."""
@@ -125,20 +125,20 @@ class Sockets(Companion):
 
     def on_status(self, status: Status) -> None:
         """Take the list of those who may connect, if it has changed."""
-        self.mind_keys()
+        self.check_keys()
 
     def counters_by_part(self) -> dict[str, dict[str, int]]:
         """What peers did, by the part that counted it."""
-        parts = {"publish": self.publisher, "ask": self.questions, "keys": self.gatekeeper}
+        parts = {"publish": self.publisher, "ask": self.questions, "keys": self.authenticator}
         return {name: dict(part.counters) for name, part in parts.items() if part is not None}
 
-    def mind_keys(self) -> None:
+    def check_keys(self) -> None:
         """If the list of those who may connect has changed, take it; who is off it is cut off.
 
         A list that cannot be read changes nothing, and is tried again. A port that somebody else
         has taken meanwhile is left to them, and tried again.
         """
-        if self._curve is None or self.gatekeeper is None:
+        if self._curve is None or self.authenticator is None:
             return
         now = _state(self._curve.clients)
         if now == self._keys_seen and not self._lost:
@@ -153,13 +153,13 @@ class Sockets(Companion):
         if now != self._keys_seen:
             log.info("%d keys may connect", len(admitted))
         self._keys_seen = now
-        if self.gatekeeper.admit(admitted) or self._lost:
+        if self.authenticator.admit(admitted) or self._lost:
             self._cut_off()
 
     def _cut_off(self) -> None:
         """Close all connections by TCP: libzmq cannot cut off one peer alone."""
-        if self.gatekeeper is not None:
-            self.gatekeeper.unwatch()
+        if self.authenticator is not None:
+            self.authenticator.unwatch()
         self._lost = False
         for bound in self._bound():
             if bound.endpoint.startswith("tcp://"):
@@ -174,8 +174,8 @@ class Sockets(Companion):
         """Close them all. May be called again."""
         for bound in self._bound():
             bound.close()
-        if self.gatekeeper is not None:
-            self.gatekeeper.close()
+        if self.authenticator is not None:
+            self.authenticator.close()
         self._context.term()
 
     def __enter__(self) -> Self:

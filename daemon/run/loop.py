@@ -216,7 +216,7 @@ class Loop:
         skipped: list[TactileReading] = []
         for reading in readings:
             if isinstance(reading, JointReading):
-                self._pipeline.turn(reading)
+                self._pipeline.observe_joints(reading)
                 self._joints = reading
                 for on_joints in self._on_joints:
                     on_joints(reading)

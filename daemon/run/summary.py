@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import Verdict
 
@@ -16,20 +16,20 @@ class Tally:
     """Counts verdicts and their reasons, and compares them with how the lifts ended."""
 
     def __init__(self) -> None:
-        self.outcomes: Counter[Outcome] = Counter()
+        self.decisions: Counter[Decision] = Counter()
         self.reasons: Counter[Reason] = Counter()
         self.confusion: Counter[tuple[bool, bool]] = Counter()
         """(recorded slip, judged slip) of the judged grasps whose outcome was recorded."""
         self.labelled = 0
 
-    def add(self, outcome: Outcome, reasons: Iterable[Reason], slipped: bool | None) -> None:
+    def add(self, decision: Decision, reasons: Iterable[Reason], slipped: bool | None) -> None:
         """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
-        self.outcomes[outcome] += 1
+        self.decisions[decision] += 1
         self.reasons.update(reasons)
         if slipped is not None:
             self.labelled += 1
-            if outcome is not Outcome.UNKNOWN:
-                self.confusion[slipped, outcome is Outcome.SLIP] += 1
+            if decision is not Decision.UNKNOWN:
+                self.confusion[slipped, decision is Decision.SLIP] += 1
 
     def scores(self) -> dict[str, float] | None:
         """Accuracy, precision, recall and F1 over judged, labelled grasps; None if there are none.
@@ -52,7 +52,7 @@ class Tally:
     def as_dict(self) -> dict[str, Any]:
         """Everything as JSON-ready values."""
         return {
-            "verdicts": {outcome.value: self.outcomes[outcome] for outcome in Outcome},
+            "verdicts": {decision.value: self.decisions[decision] for decision in Decision},
             "reasons": {reason.value: number for reason, number in self.reasons.items()},
             "labelled": self.labelled,
             "judged_and_labelled": self.confusion.total(),
@@ -60,8 +60,8 @@ class Tally:
         }
 
     def counts(self) -> str:
-        """How often each outcome came, for people."""
-        return ", ".join(f"{self.outcomes[outcome]} {outcome}" for outcome in Outcome)
+        """How often each decision came, for people."""
+        return ", ".join(f"{self.decisions[decision]} {decision}" for decision in Decision)
 
     def lines(self) -> Iterator[str]:
         """Reasons and scores, for people."""
@@ -117,11 +117,11 @@ class Summary:
         """Count what would have been judged of a grasp without session calibration, once."""
         if grasp != self._compared_grasp:
             self._compared_grasp = grasp
-            self.without_session.add(judgement.outcome, judgement.reasons, slipped)
+            self.without_session.add(judgement.decision, judgement.reasons, slipped)
 
     def as_dict(self, wall_s: float) -> dict[str, Any]:
         """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""
-        compared = bool(self.without_session.outcomes)
+        compared = bool(self.without_session.decisions)
         return {
             **self.tally.as_dict(),
             "gated": self._gated(),
@@ -142,7 +142,7 @@ class Summary:
 
     def lines(self, wall_s: float) -> list[str]:
         """The same for people."""
-        total = self.tally.outcomes.total()
+        total = self.tally.decisions.total()
         if self.readings:
             lines = [
                 f"{self.readings} readings in {wall_s:.2f} s: {self.grasps} grasps, "
@@ -154,7 +154,7 @@ class Summary:
         lines += self.tally.lines()
         if self.repaired:
             lines.append(f"{self.repaired} of them with repaired electrodes")
-        if self.without_session.outcomes:
+        if self.without_session.decisions:
             lines.append(f"without session calibration: {self.without_session.counts()}")
             lines += [f"  {line}" for line in self.without_session.lines()]
         lines.append(

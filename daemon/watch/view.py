@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import ADVICE, GateState, Outcome, Reason
+from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import (
     GateMessage,
     OutcomeMessage,
@@ -176,13 +176,13 @@ class View:
         if silent_ms > verdict.silence_ms:
             silence = Line("unknown", f"no message for {silent_ms:.0f} ms")
             return Tone.SILENT, [silence, Line("link", self.link)]
-        if verdict.verdict is Outcome.UNKNOWN:
+        if verdict.verdict is Decision.UNKNOWN:
             quiet = all(reason in AS_IT_SHOULD_BE for reason in verdict.reasons)
             why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]
             return Tone.WAITING if quiet else Tone.TROUBLE, why
         less_sure = [Line("less sure", ADVICE[Reason.NOT_CALIBRATED])]
         also = less_sure if verdict.session_calibrated is False else []
-        if verdict.verdict is Outcome.STABLE:
+        if verdict.verdict is Decision.STABLE:
             return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
         return Tone.SLIP, [Line("do not lift", "it is judged to slip; grasp again"), *also]
 

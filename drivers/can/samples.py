@@ -250,7 +250,7 @@ class SampleAssembler:
         if self._finished or not self._have:
             return ()
         self._finished = True
-        self._mind_time()
+        self._check_time()
         self._previous_had = self._have
         words = np.zeros((len(self._rows), ELECTRODES), dtype=np.uint16)
         came = np.frombuffer(self._buffer, dtype=">u2").reshape(ELECTRODES, self._sensors)
@@ -263,7 +263,7 @@ class SampleAssembler:
             self._counters.lost_frames += lost
         return (self._readings.make(words, marks, self._t_ns),)
 
-    def _mind_time(self) -> None:
+    def _check_time(self) -> None:
         """Find sweeps lost as a whole, and learn the period from two complete ends in a row."""
         period_ns = self._readings.period_ns
         start_ns = self._t_ns - round(self._position[self._last] * (period_ns or 0))

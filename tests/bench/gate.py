@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
@@ -46,7 +46,7 @@ class Seen:
     """What happened to one grasp."""
 
     truth: Timetable
-    row: Outcome
+    row: Decision
     """Verdict on the row of the table that it was made from."""
     row_p_slip: float | None
     judged: list[tuple[float, Judgement]] = field(default_factory=list)
@@ -100,9 +100,9 @@ def study(
     ]
     result = Study(grasps)
     for moment, judgement in judge.stream(stream):
-        if judgement.outcome is not Outcome.UNKNOWN and moment.phase in QUIET_PHASES:
+        if judgement.decision is not Decision.UNKNOWN and moment.phase in QUIET_PHASES:
             result.too_early[moment.phase] += 1
-        if judgement.outcome is not Outcome.UNKNOWN and moment.phase is Phase.RELEASE:
+        if judgement.decision is not Decision.UNKNOWN and moment.phase is Phase.RELEASE:
             release_s = grasps[moment.grasp - 1].truth.release_s
             result.outlived_s = max(result.outlived_s, moment.t_s - release_s)
         if judgement.judged:
@@ -118,10 +118,10 @@ class Judge:
         self._now_ns = 0
         self._grip = GripLimits(sweeps=sweeps, joints=JointLimits())
 
-    def row(self, counts: NDArray[np.uint16]) -> tuple[Outcome, float | None]:
+    def row(self, counts: NDArray[np.uint16]) -> tuple[Decision, float | None]:
         """Verdict on a row of a table, which is a grasp of its own."""
         judgement = self._pipeline(None).judge(_tactile(self._now_ns, 0, counts))
-        return judgement.outcome, judgement.p_slip
+        return judgement.decision, judgement.p_slip
 
     def stream(self, stream: WholeGrasps) -> Iterator[tuple[Moment, Judgement]]:
         """Every row of the stream and what is said of it."""
@@ -129,7 +129,7 @@ class Judge:
         for index, moment in enumerate(stream):
             self._now_ns = round(moment.t_s * 1e9)
             names, angles = moment.joint_names, moment.position_rad
-            pipeline.turn(JointReading(self._now_ns, index, names, angles))
+            pipeline.observe_joints(JointReading(self._now_ns, index, names, angles))
             yield moment, pipeline.judge(_tactile(self._now_ns, index, moment.counts))
 
     def _pipeline(self, grip: GripLimits | None) -> Pipeline:
@@ -162,7 +162,7 @@ def lines(name: str, found: Study) -> Iterator[str]:
     once = sum(len(seen.before_lift) == 1 for seen in grasps)
     waited_ms = 1e3 * np.array([seen.waited_s for seen in judged])
     spare_ms = 1e3 * np.array([seen.truth.lift_s - seen.judged[0][0] for seen in judged])
-    same = sum(seen.judged[0][1].outcome is seen.row for seen in judged)
+    same = sum(seen.judged[0][1].decision is seen.row for seen in judged)
     yield f"{name}: {len(grasps)} grasps, {len(judged)} judged before the lift, {once} of them once"
     yield (
         f"  from still to verdict: p50 {np.quantile(waited_ms, 0.5):.0f}, "
@@ -176,10 +176,10 @@ def lines(name: str, found: Study) -> Iterator[str]:
     )
     for seen in judged:
         _, first = seen.judged[0]
-        if first.outcome is not seen.row:
+        if first.decision is not seen.row:
             yield (
                 f"    grasp {seen.truth.grasp}: row {seen.row} {_shown(seen.row_p_slip)}, stream "
-                f"{first.outcome} {_shown(first.p_slip)} {' '.join(first.reasons)}"
+                f"{first.decision} {_shown(first.p_slip)} {' '.join(first.reasons)}"
             )
 
 

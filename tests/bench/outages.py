@@ -20,7 +20,7 @@ from typing import Self
 
 import numpy as np
 
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.publish.messages import Verdict, decode_verdict
 from drivers.joints.message import JointMessage
 from drivers.twins.spi import SpiTwin
@@ -138,7 +138,7 @@ class Bench:
         self.wait_for(is_valid)
         began_s = time.monotonic()
         deed()
-        verdict = self.wait_for(lambda verdict: verdict.verdict is Outcome.UNKNOWN)
+        verdict = self.wait_for(lambda verdict: verdict.verdict is Decision.UNKNOWN)
         return self.last_s - began_s, verdict
 
     def until_silence_s(self, deed: Callable[[], object]) -> float:

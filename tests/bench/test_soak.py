@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.publish.messages import Verdict, encode
 from drivers.twins.faults import LinkFaults
 from tests.bench.live import TALLIED, Kind, Usage
@@ -177,7 +177,7 @@ def verdict(seq: int, t_ns: int, age_ms: float = 0.0, *, boot: str = "one") -> b
             t=0.0,
             t_mono_ns=t_ns,
             grasp=0,
-            verdict=Outcome.UNKNOWN,
+            verdict=Decision.UNKNOWN,
             verdict_code=0,
             p_slip=None,
             valid=False,

@@ -77,10 +77,10 @@ def trained_margins(
 
     One epoch over so many augmented copies is as many epochs with new augmentation in each.
     """
-    from models.training.fitting.fitting import fit
+    from models.training.fitting.fit import fit
     from models.training.fitting.standards import TrainingStandards
+    from models.training.systems.registry import SYSTEMS
     from models.training.systems.system import with_recipes
-    from models.training.systems.systems import SYSTEMS
 
     random = np.random.default_rng(seed)
     table_of = training.table_of

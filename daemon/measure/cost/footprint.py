@@ -263,7 +263,7 @@ def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, i
     from drivers.base import JointReading
 
     if isinstance(reading, JointReading):
-        pipeline.turn(reading)
+        pipeline.observe_joints(reading)
         return None
     begun_ns = time.thread_time_ns()
     judgement = pipeline.judge(reading)

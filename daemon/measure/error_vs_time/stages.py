@@ -81,7 +81,7 @@ def _stages(
     return {
         "parse a row of CSV, with its header": parse,
         "health": lambda index: health.watch(readings[index]),
-        "contact and gate": lambda index: grip.feel(readings[index], watched[index]),
+        "contact and gate": lambda index: grip.observe(readings[index], watched[index]),
         "like the training?": lambda index: plausibility.examine(counts[index], sound),
         "image or features": lambda index: model.inputs.build(counts[index], model.input),
         "session (the network)": lambda _: model.run(),

@@ -14,7 +14,7 @@ from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.findings import Examined
 from daemon.judge.network import Network
 from daemon.judge.pipeline import Pipeline
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.measure.reference.exact import Exact, exact_input, exact_softening, exact_standard
 from daemon.measure.stability.cases import StabilityCase
 from drivers.base import TactileReading
@@ -85,13 +85,17 @@ class _Said:
     """Probabilities of the same."""
 
     def add(
-        self, outcome: Outcome, p_slip: float | None, reasons: Iterable[Reason], model: TactileModel
+        self,
+        decision: Decision,
+        p_slip: float | None,
+        reasons: Iterable[Reason],
+        model: TactileModel,
     ) -> None:
         """Take in one verdict; `model.input` still holds what it was made of."""
         reasons = tuple(reasons)
-        self.verdicts[outcome.value] += 1
+        self.verdicts[decision.value] += 1
         self.reasons.update(reason.value for reason in reasons)
-        if outcome is Outcome.UNKNOWN:
+        if decision is Decision.UNKNOWN:
             if not reasons:
                 self.problems.append("unknown without a reason")
         elif p_slip is None or not 0.0 <= p_slip <= 1.0:
@@ -286,7 +290,7 @@ class ModelStability:
                 pipeline = self._pipeline()
             faults = np.zeros(counts.shape, dtype=np.uint8)
             judgement = pipeline.judge(TactileReading(0, number, counts, faults))
-            said.add(judgement.outcome, judgement.p_slip, judgement.reasons, self._model)
+            said.add(judgement.decision, judgement.p_slip, judgement.reasons, self._model)
         return said
 
     def _pipeline(self) -> Pipeline:
@@ -305,8 +309,8 @@ class ModelStability:
             case = Case(
                 found.p_slip, found.reasons, in_contact=True, settled=True, gate=(), age_ns=0
             )
-            outcome, reasons = decide(case, LIMITS)
-            said.add(outcome, found.p_slip, reasons, self._model)
+            decision, reasons = decide(case, LIMITS)
+            said.add(decision, found.p_slip, reasons, self._model)
 
 
 def seasoned_session(contract: ModelContract) -> SessionState | None:

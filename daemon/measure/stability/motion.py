@@ -163,7 +163,7 @@ def _grasp_through_gate(period_ns: int, touching: int) -> tuple[int, list[Reason
         level = REST_COUNTS if number < TARE_SWEEPS else TOUCH_COUNTS
         reading = _sweep(number, number * period_ns, level, random)
         watched = Watched((), np.zeros(reading.counts.shape, dtype=np.bool_))
-        grip.feel(reading, watched)
+        grip.observe(reading, watched)
         if grip.counts_to_judge(reading, watched) is not None:
             judged += 1
             grip.judged()

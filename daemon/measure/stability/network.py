@@ -16,7 +16,7 @@ from onnx import helper, numpy_helper
 from torch import nn
 
 from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.measure.stability.steps import StepRow
 from models.contract import METADATA_KEY, ModelContract, VectorInput
 from models.inputs import builder
@@ -106,8 +106,8 @@ def _logit_errors(contract: ModelContract) -> tuple[float, int, float]:
 def _is_judged(p_slip: float, logit: float) -> bool:
     """Whether the daemon says of a margin what its sign says."""
     case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
-    outcome, _ = decide(case, Limits(max_age_ns=0))
-    return outcome is (Outcome.SLIP if logit >= 0.0 else Outcome.STABLE)
+    decision, _ = decide(case, Limits(max_age_ns=0))
+    return decision is (Decision.SLIP if logit >= 0.0 else Decision.STABLE)
 
 
 def _logit_model(contract: ModelContract) -> bytes:

@@ -12,7 +12,7 @@ from typing import Any, cast
 import pytest
 
 from daemon.assembly import assembly
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.scene import Scene, parse
 from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from drivers.spi.driver import SpiBridgeDriver
@@ -72,9 +72,9 @@ def test_the_threshold_of_the_scene_decides(threshold: float) -> None:
     pipeline = assembly.build_pipeline(scene, assembly.load_model(scene), clock)
     assert first.t_ns == clock()
     judgement = pipeline.judge(first)  # type: ignore[arg-type]
-    assert judgement.outcome is (Outcome.SLIP if threshold < 0.5 else Outcome.STABLE)
+    assert judgement.decision is (Decision.SLIP if threshold < 0.5 else Decision.STABLE)
     clock.now_ns += 2_000_000
-    assert pipeline.judge(reading(clock() - 1_500_000)).outcome is Outcome.UNKNOWN
+    assert pipeline.judge(reading(clock() - 1_500_000)).decision is Decision.UNKNOWN
 
 
 def test_the_rate_and_the_faults_of_the_scene_arrive_at_the_replay() -> None:

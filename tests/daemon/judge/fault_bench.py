@@ -15,7 +15,7 @@ import numpy as np
 from daemon.judge.decision import Limits
 from daemon.judge.limits import GateLimits, GripLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, synthetic_grasps
@@ -54,7 +54,7 @@ Fault = Callable[[Sequence[Step]], list[Step]]
 class Finding:
     """What is said under a fault, and without it."""
 
-    outcome: Outcome
+    decision: Decision
     reasons: tuple[Reason, ...]
     sound: Judgement
     """Of the last sound reading by then."""
@@ -77,7 +77,7 @@ class _Hand:
         for step in steps[1:]:
             self.clock.now_ns = step.now_ns
             if step.joints is not None:
-                self.pipeline.turn(step.joints)
+                self.pipeline.observe_joints(step.joints)
             if step.tactile is not None:
                 last_ns, due_ns = step.tactile.t_ns, step.now_ns + self.silence_ns
                 yield step, self.pipeline.judge(step.tactile)
@@ -114,7 +114,7 @@ class Grasp:
         begin = at - earlier
         sound = self._steps[begin : at + UNDER_FAULT + 1]
         return [
-            Finding(judgement.outcome, judgement.reasons, self._judgement_at(step.now_ns))
+            Finding(judgement.decision, judgement.reasons, self._judgement_at(step.now_ns))
             for step, judgement in self._hand_at(begin).play([sound[0], *fault(sound)])
             if step.now_ns > self._steps[at].now_ns
         ]

@@ -86,7 +86,7 @@ class Necessity:
         self._without_joints_since_ns: int | None = None
         self._unusable: list[str] = []
 
-    def turn(self, reading: JointReading) -> None:
+    def observe_joints(self, reading: JointReading) -> None:
         """Take in angles."""
         valid = ~np.isnan(reading.position_rad)
         if not valid.any():
@@ -98,7 +98,7 @@ class Necessity:
         kept = [one for one in before if t_ns - one.t_ns <= KEPT_MS * MS]
         self._joints[valid.tobytes()] = [*kept, _Angles(t_ns, reading.position_rad[valid])]
 
-    def feel(self, reading: TactileReading) -> None:
+    def observe(self, reading: TactileReading) -> None:
         """Take in a reading."""
         self._doubt = max(self._doubt - 1, 0)
         self._unusable = []

@@ -15,7 +15,7 @@ import pytest
 
 from daemon.judge import decision
 from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from tests.daemon.judge.mutants import load, mutants
 
 LIMIT_NS = 100
@@ -72,10 +72,10 @@ def broken_cases(judge: Callable[[Case, Limits], Any]) -> int:
         (p_slip, worth), (age_ns, fresh), health, gate, contact, settled = case_of
         worth = worth.removeprefix("unsure ") if limits is ANY_CONFIDENCE else worth
         case = Case(p_slip, health, contact, settled, gate, age_ns)
-        outcome, against = expected(worth, fresh, health, gate, contact and settled)
+        decision, against = expected(worth, fresh, health, gate, contact and settled)
         try:
             found, reasons = judge(case, limits)
-            wrong += (found, set(reasons), len(reasons)) != (outcome, against, len(against))
+            wrong += (found, set(reasons), len(reasons)) != (decision, against, len(against))
         except Exception:  # noqa: BLE001 - a mutant may raise anything
             wrong += 1
     return wrong
@@ -91,14 +91,14 @@ def test_every_combination_is_judged_by_the_rule() -> None:
 def test_any_reason_makes_the_verdict_unknown(reason: Reason, where: str) -> None:
     health, gate = ((reason,), ()) if where == "health" else ((), (reason,))
     case = Case(0.0, health, in_contact=where == "health", settled=True, gate=gate, age_ns=0)
-    assert decide(case, LIMITS) == (Outcome.UNKNOWN, (reason,))
+    assert decide(case, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
 def test_the_defaults_ask_for_no_confidence() -> None:
     limits = Limits(max_age_ns=LIMIT_NS)
-    for p_slip, outcome in ((0.499999, Outcome.STABLE), (0.5, Outcome.SLIP)):
+    for p_slip, decided in ((0.499999, Decision.STABLE), (0.5, Decision.SLIP)):
         case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
-        assert decide(case, limits) == (outcome, ())
+        assert decide(case, limits) == (decided, ())
 
 
 def test_every_small_mistake_in_the_rule_would_be_noticed() -> None:

@@ -12,7 +12,7 @@ from functools import cache
 
 import pytest
 
-from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.judge.reasons import Decision, GateState, Reason
 from tests.daemon.judge.fault_bench import UNDER_FAULT, Finding, grasp
 from tests.daemon.judge.judge_faults import EARLIER, FAULTS, JOINTS_LOST_FOR
 
@@ -139,7 +139,7 @@ def cell(found: Sequence[Finding]) -> str:
         return HARMLESS
     most = max(reasons.values())
     dominant = next(reason for reason in Reason if reasons[reason] == most)
-    refused = all(finding.outcome is Outcome.UNKNOWN for finding in found)
+    refused = all(finding.decision is Decision.UNKNOWN for finding in found)
     return dominant if refused else f"~{dominant}"
 
 
@@ -165,24 +165,24 @@ def test_each_fault_has_an_expected_cell_in_each_state_and_the_table_is_printed(
 
 @pytest.mark.parametrize("of_a_palm", [False, True])
 @pytest.mark.parametrize(
-    ("state", "outcome", "reasons"),
+    ("state", "decision", "reasons"),
     [
-        (GateState.IDLE, Outcome.UNKNOWN, {Reason.NO_CONTACT}),
-        (GateState.CLOSING, Outcome.UNKNOWN, {Reason.NO_CONTACT, Reason.MOVING}),
-        (GateState.SETTLED, Outcome.UNKNOWN, {Reason.NOT_ASKED}),
-        (GateState.JUDGED, Outcome.STABLE, set()),
-        (GateState.RELEASED, Outcome.UNKNOWN, {Reason.NO_CONTACT}),
+        (GateState.IDLE, Decision.UNKNOWN, {Reason.NO_CONTACT}),
+        (GateState.CLOSING, Decision.UNKNOWN, {Reason.NO_CONTACT, Reason.MOVING}),
+        (GateState.SETTLED, Decision.UNKNOWN, {Reason.NOT_ASKED}),
+        (GateState.JUDGED, Decision.STABLE, set()),
+        (GateState.RELEASED, Decision.UNKNOWN, {Reason.NO_CONTACT}),
     ],
 )
 def test_the_sound_grasp_is_in_each_state_and_stable_only_when_judged(
-    state: GateState, outcome: Outcome, reasons: set[Reason], *, of_a_palm: bool
+    state: GateState, decision: Decision, reasons: set[Reason], *, of_a_palm: bool
 ) -> None:
     hand = grasp(of_a_palm=of_a_palm, on_request=state is GateState.SETTLED)
     said = hand.soundly(state)
     assert said[0].gate is state
     after = GateState.IDLE if state is GateState.RELEASED else state
     assert {judgement.gate for judgement in said} == {state, after}
-    assert {judgement.outcome for judgement in said} == {outcome}
+    assert {judgement.decision for judgement in said} == {decision}
     assert {reason for judgement in said for reason in judgement.reasons} == reasons
 
 
@@ -192,10 +192,10 @@ def test_no_fault_makes_a_verdict_more_certain(name: str) -> None:
         found = findings(name, state)
         assert found
         for finding in found:
-            assert finding.outcome in {Outcome.UNKNOWN, finding.sound.outcome}
-            assert (finding.outcome is Outcome.UNKNOWN) is bool(finding.reasons)
+            assert finding.decision in {Decision.UNKNOWN, finding.sound.decision}
+            assert (finding.decision is Decision.UNKNOWN) is bool(finding.reasons)
             if state is not GateState.JUDGED:
-                assert finding.outcome is Outcome.UNKNOWN
+                assert finding.decision is Decision.UNKNOWN
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -204,7 +204,7 @@ def test_each_cell_is_what_the_table_says(name: str) -> None:
     assert [cell(one) for one in found] == expected()[name]
     for one, text in zip(found, expected()[name], strict=True):
         if text == HARMLESS:
-            assert all(finding.outcome is finding.sound.outcome for finding in one)
+            assert all(finding.decision is finding.sound.decision for finding in one)
         else:
             reason = Reason(text.removeprefix("~"))
             assert set(unsound(one)) <= {reason} | ALSO[reason]
@@ -225,13 +225,15 @@ def test_each_cell_is_what_the_table_says(name: str) -> None:
     ],
 )
 def test_a_verdict_stands_under_a_fault_for_so_many_readings(name: str, readings: int) -> None:
-    outcomes = [finding.outcome for finding in findings(name, GateState.JUDGED)]
-    assert outcomes == [Outcome.STABLE] * readings + [Outcome.UNKNOWN] * (len(outcomes) - readings)
+    decisions = [finding.decision for finding in findings(name, GateState.JUDGED)]
+    assert decisions == [Decision.STABLE] * readings + [Decision.UNKNOWN] * (
+        len(decisions) - readings
+    )
 
 
 def test_after_a_jump_of_time_a_grasp_settles_anew_for_the_window_and_the_hold_time() -> None:
-    outcomes = [finding.outcome for finding in findings("time back by 50 ms", GateState.JUDGED)]
-    assert outcomes == [Outcome.UNKNOWN] * (8 + 8) + [Outcome.STABLE] * 14
+    decisions = [finding.decision for finding in findings("time back by 50 ms", GateState.JUDGED)]
+    assert decisions == [Decision.UNKNOWN] * (8 + 8) + [Decision.STABLE] * 14
 
 
 @pytest.mark.parametrize("name", SINGLE)
@@ -240,4 +242,4 @@ def test_one_electrode_that_fails_before_the_grasp_is_repaired_and_changes_nothi
 ) -> None:
     hand = grasp(of_a_palm=False, on_request=False)
     found = hand.under(FAULTS[name], GateState.JUDGED, earlier=JOINTS_LOST_FOR)
-    assert [finding.outcome for finding in found] == [Outcome.STABLE] * UNDER_FAULT
+    assert [finding.decision for finding in found] == [Decision.STABLE] * UNDER_FAULT

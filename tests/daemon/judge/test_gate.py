@@ -133,12 +133,14 @@ def play(scenario: Scenario) -> Played:
             asks.pop(0)
         angle = None if scenario.joint is None else scenario.joint(t_s)
         if angle is not None:
-            grip.turn(JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), np.array([angle, 0.4])))
+            grip.observe_joints(
+                JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), np.array([angle, 0.4]))
+            )
         if scenario.missing[0] <= t_s < scenario.missing[1]:
             continue
         lost = scenario.unusable[0] <= t_s < scenario.unusable[1]
         watched = Watched((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
-        grip.feel(reading, watched)
+        grip.observe(reading, watched)
         counts = None if lost else grip.counts_to_judge(reading, watched)
         if counts is not None:
             assert grip.state is GateState.SETTLED

@@ -251,7 +251,7 @@ def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> Non
     sweeps = [(t_s, reading) for t_s, reading in readings(firm) if not 0.5 < t_s < 0.75]
     after = [reading.counts for t_s, reading in sweeps if t_s >= 0.75]
     for t_s, reading in sweeps:
-        grip.feel(reading, none)
+        grip.observe(reading, none)
         counts = grip.counts_to_judge(reading, none)
         if counts is not None:
             grip.judged()
@@ -311,7 +311,7 @@ def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_
     for t_s, reading in readings(firm):
         away = -0.05 <= t_s < moment_s - 1e-3
         watched = Watched((), lost if away else ~ALL)
-        grip.feel(reading, watched)
+        grip.observe(reading, watched)
         counts = grip.counts_to_judge(reading, watched)
         if counts is not None:
             assert t_s >= moment_s - 1e-3

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from models import zoo
 from models.runtime import TactileModel
 from tests.bench.gate import Study, end_points, streams, study
@@ -50,8 +50,8 @@ def test_nothing_is_judged_before_the_hand_has_closed_or_while_it_opens(found: S
 def test_the_verdict_is_that_of_the_row_unless_the_row_is_a_toss_up(found: Study) -> None:
     for seen in found.grasps:
         _, first = seen.judged[0]
-        if first.outcome is not seen.row:
+        if first.decision is not seen.row:
             assert seen.row_p_slip is not None
             # What noise and creep may move a probability by: 0.083 in one of a hundred readings.
             assert abs(seen.row_p_slip - 0.5) < 0.1
-            assert first.outcome is not Outcome.UNKNOWN
+            assert first.decision is not Decision.UNKNOWN

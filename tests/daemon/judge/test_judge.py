@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from daemon.judge.health import REASON_OF_FAULT
-from daemon.judge.reasons import ADVICE, Outcome, Reason
+from daemon.judge.reasons import ADVICE, Decision, Reason
 from drivers.base import ElectrodeFault, TactileReading
 from models.contract import ModelError
 from tests.daemon.fakes import FINGERS, HIGH, LOW, MARGIN, MS, Clock, FakeModel, pipeline, reading
@@ -23,11 +23,11 @@ def test_every_reason_says_what_to_do_and_every_fault_has_a_reason() -> None:
     assert set(REASON_OF_FAULT) == {fault for fault in ElectrodeFault if fault}
 
 
-@pytest.mark.parametrize(("p_slip", "outcome"), [(0.1, Outcome.STABLE), (0.9, Outcome.SLIP)])
-def test_a_sound_reading_is_judged(p_slip: float, outcome: Outcome) -> None:
+@pytest.mark.parametrize(("p_slip", "decision"), [(0.1, Decision.STABLE), (0.9, Decision.SLIP)])
+def test_a_sound_reading_is_judged(p_slip: float, decision: Decision) -> None:
     clock = Clock()
     judgement = pipeline(FakeModel(p_slip), clock).judge(reading(clock()))
-    assert judgement.outcome is outcome
+    assert judgement.decision is decision
     assert judgement.p_slip == p_slip
     assert judgement.reasons == ()
     assert judgement.grasp == 1
@@ -54,7 +54,7 @@ def test_one_electrode_that_is_not_of_now_makes_the_verdict_unknown(fault: Elect
     bad = reading(clock())
     bad.faults[2, 23] = fault
     judgement = pipeline(model, clock).judge(bad)
-    assert judgement.outcome is Outcome.UNKNOWN
+    assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (REASON_OF_FAULT[fault],)
     assert judgement.p_slip is None
     assert model.runs == 0
@@ -71,7 +71,7 @@ def test_a_flagged_electrode_is_repaired_and_named_whatever_it_reads(
     bad.counts[2, 23] = value
     model = FakeModel()
     judgement = pipeline(model, clock).judge(bad)
-    assert judgement.outcome is Outcome.STABLE
+    assert judgement.decision is Decision.STABLE
     assert judgement.repaired == ("th_24",)
     # What the network saw is the image with the training's mean: the fake's electrodes are
     # independent of each other, so nothing else is expected of one.
@@ -107,7 +107,7 @@ def test_a_fault_flag_that_nobody_knows_is_still_a_fault() -> None:
     clock = Clock()
     bad = reading(clock())
     bad.faults[0, 0] = 128
-    assert pipeline(FakeModel(), clock).judge(bad).outcome is Outcome.UNKNOWN
+    assert pipeline(FakeModel(), clock).judge(bad).decision is Decision.UNKNOWN
 
 
 def _set(finger: int, electrode: int, count: int) -> Callable[[TactileReading], None]:
@@ -136,7 +136,7 @@ def test_counts_that_cannot_be_judged_are_unknown(
     bad = reading(clock())
     change(bad)
     judgement = pipeline(model, clock).judge(bad)
-    assert judgement.outcome is Outcome.UNKNOWN
+    assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (reason,)
     assert model.runs == 0
 
@@ -147,7 +147,7 @@ def test_an_electrode_at_a_rail_is_repaired(count: int) -> None:
     bad = reading(clock())
     bad.counts[0, 6] = count
     judgement = pipeline(FakeModel(), clock).judge(bad)
-    assert judgement.outcome is Outcome.STABLE
+    assert judgement.decision is Decision.STABLE
     assert judgement.repaired == ("ff_7",)
 
 
@@ -173,7 +173,7 @@ def test_an_electrode_that_jumps_while_the_others_keep_still_has_a_loose_contact
             counts[1, 4] += 250
         moving = TactileReading(clock(), number, counts, np.zeros((3, 24), dtype=np.uint8))
         judgement = judge.judge(moving)
-        assert judgement.outcome is Outcome.STABLE
+        assert judgement.decision is Decision.STABLE
         repaired.append(judgement.repaired)
     assert repaired[:3] == [()] * 3
     assert repaired[5:30] == [("mf_5",)] * 25
@@ -206,7 +206,7 @@ def test_a_verdict_that_is_not_sure_enough_is_unknown(
     judge = pipeline(FakeModel(p_slip), clock, min_confidence=0.8)
     judgement = judge.judge(reading(clock()))
     assert judgement.reasons == reasons
-    assert (judgement.outcome is Outcome.UNKNOWN) is bool(reasons)
+    assert (judgement.decision is Decision.UNKNOWN) is bool(reasons)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_counts_at_the_edge_of_what_was_seen_are_judged(count: int) -> None:
     clock = Clock()
     edge = reading(clock())
     edge.counts[1, 3] = count
-    assert pipeline(FakeModel(), clock).judge(edge).outcome is Outcome.STABLE
+    assert pipeline(FakeModel(), clock).judge(edge).decision is Decision.STABLE
 
 
 def test_a_finger_that_repeats_itself_is_frozen_until_it_moves() -> None:
@@ -234,23 +234,23 @@ def test_a_finger_that_repeats_itself_is_frozen_until_it_moves() -> None:
     judge = pipeline(FakeModel(), clock)
     first, second, third = reading(clock(), 1), reading(clock(), 2), reading(clock(), 3)
     second.counts[1] = first.counts[1]
-    assert judge.judge(first).outcome is Outcome.STABLE
+    assert judge.judge(first).decision is Decision.STABLE
     assert judge.judge(second).reasons == (Reason.FROZEN,)
-    assert judge.judge(third).outcome is Outcome.STABLE
+    assert judge.judge(third).decision is Decision.STABLE
 
 
 def test_an_electrode_that_keeps_its_count_is_repaired_in_time() -> None:
     clock = Clock()
     judge = pipeline(FakeModel(), clock)
-    outcomes = []
+    decisions = []
     for number in range(40):
         stuck = reading(clock(), seed=number)
         stuck.counts[2, 7] = 2000 if number < 30 else 2001 + number
         judgement = judge.judge(stuck)
         assert judgement.reasons == ()
-        outcomes.append(judgement.repaired)
+        decisions.append(judgement.repaired)
     # 16 repeats after the first make it frozen, until it moves again.
-    assert outcomes == [()] * 16 + [("th_8",)] * 14 + [()] * 10
+    assert decisions == [()] * 16 + [("th_8",)] * 14 + [()] * 10
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_an_electrode_that_keeps_its_count_is_repaired_in_time() -> None:
 def test_an_old_reading_and_one_from_the_future_are_stale(age_ns: int, stale: bool) -> None:
     clock = Clock(10**16)
     judgement = pipeline(FakeModel(), clock).judge(reading(clock() - age_ns))
-    assert (judgement.outcome is Outcome.UNKNOWN) is stale
+    assert (judgement.decision is Decision.UNKNOWN) is stale
     assert judgement.reasons == ((Reason.STALE,) if stale else ())
 
 
@@ -283,7 +283,7 @@ def test_a_slow_network_makes_the_verdict_stale() -> None:
 def test_a_network_without_a_probability_is_unknown(answer: float | Exception) -> None:
     clock = Clock()
     judgement = pipeline(FakeModel(answer), clock).judge(reading(clock()))
-    assert judgement.outcome is Outcome.UNKNOWN
+    assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.MODEL_FAILED,)
     assert judgement.p_slip is None
 
@@ -313,7 +313,7 @@ def test_a_reading_of_other_fingers_is_unknown() -> None:
 
 def test_silence_is_stale() -> None:
     judgement = pipeline(FakeModel(), Clock()).silence(5)
-    assert judgement.outcome is Outcome.UNKNOWN
+    assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.STALE,)
     assert judgement.t_ns == 5
 
@@ -345,9 +345,9 @@ def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
     for raw, age_ns in sequence:
         given_reading = TactileReading(clock() - age_ns, 0, raw.counts, raw.faults)
         judgement = judge.judge(given_reading)
-        assert (judgement.outcome is Outcome.UNKNOWN) is bool(judgement.reasons)
-        assert (judgement.p_slip is None) is (judgement.outcome is Outcome.UNKNOWN)
-        if judgement.outcome is not Outcome.UNKNOWN:
+        assert (judgement.decision is Decision.UNKNOWN) is bool(judgement.reasons)
+        assert (judgement.p_slip is None) is (judgement.decision is Decision.UNKNOWN)
+        if judgement.decision is not Decision.UNKNOWN:
             assert raw.counts.shape == (3, 24)
             assert not (raw.faults & (ElectrodeFault.HELD | ElectrodeFault.CUT_OFF | 0xC0)).any()
             broken = (raw.faults != 0) | (raw.counts == 0) | (raw.counts >= 4095)
@@ -361,7 +361,7 @@ def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
             for finger, out in zip(raw.counts, broken, strict=True):
                 assert len(set(finger[~out].tolist())) > 1
             assert 0.0 <= p_slip <= 1.0
-            assert (judgement.outcome is Outcome.STABLE) is (p_slip < 0.5)
+            assert (judgement.decision is Decision.STABLE) is (p_slip < 0.5)
             if before is not None and before.counts.shape == raw.counts.shape:
                 assert not (before.counts == raw.counts).all(axis=1).any()
         before = given_reading

@@ -87,7 +87,7 @@ def test_sensors_that_were_away_are_tared_anew() -> None:
         t_ns += round(pause_s * 1e9)
         for counts in noisy(np.broadcast_to(mean, (300, 3, 24))):
             faults = np.zeros(counts.shape, dtype=np.uint8)
-            grip.feel(TactileReading(t_ns, 0, counts, faults), usable)
+            grip.observe(TactileReading(t_ns, 0, counts, faults), usable)
             states.append(grip.state)
             t_ns += 10_000_000
     assert set(states) == {GateState.IDLE}

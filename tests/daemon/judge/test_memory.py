@@ -18,7 +18,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.judge.memory import encode, recall, remember
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger
@@ -88,7 +88,7 @@ def judged(
         if isinstance(reading, JointReading):
             if reading.seq % 97 == 0:
                 pipeline.ask()
-            pipeline.turn(reading)
+            pipeline.observe_joints(reading)
         else:
             found.append((pipeline.judge(reading), pipeline.health()))
     return found
@@ -139,13 +139,13 @@ def test_another_model_judges_the_grasp_at_hand_anew_and_knows_where_the_hand_re
     pipeline = judge(now, {"mode": "settled"})
     said: list[Judgement] = []
     place = 0
-    while not (said and said[-1].outcome is not Outcome.UNKNOWN):
+    while not (said and said[-1].decision is not Decision.UNKNOWN):
         said += [each for each, _ in judged(pipeline, now, readings[place : place + 1])]
         place += 1
     other = judge(now, {"mode": "settled"}, "cnn1")
     recall(other, encode(remember(pipeline)), same_model=False)
     found = [each for each, _ in judged(other, now, readings[place : place + 100])]
-    assert found[0].outcome is Outcome.UNKNOWN
+    assert found[0].decision is Decision.UNKNOWN
     assert Reason.NOT_TARED not in {reason for each in found for reason in each.reasons}
     assert found[0].grasp == said[-1].grasp
     assert any(each.judged for each in found if each.grasp == said[-1].grasp)

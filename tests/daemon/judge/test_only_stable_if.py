@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.limits import ContactLimits, GateLimits, GripLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from drivers.base import ElectrodeFault, JointReading, TactileReading
 from models.contract import Finger
 from models.tactile_image import TactileImager
@@ -141,11 +141,11 @@ class Hand:
 
     def _judge(self, reading: TactileReading, answer: float | None) -> Judgement:
         runs = self.model.runs
-        self.necessity.feel(reading)
+        self.necessity.observe(reading)
         judgement = self.pipeline.judge(reading)
         if self.model.runs != runs:
             self.answer = answer
-        unknown = judgement.outcome is Outcome.UNKNOWN
+        unknown = judgement.decision is Decision.UNKNOWN
         assert unknown is bool(judgement.reasons)
         assert unknown is (judgement.p_slip is None)
         if not unknown:
@@ -153,7 +153,7 @@ class Hand:
             assert p_slip is not None
             assert 0.0 <= p_slip <= 1.0
             assert judgement.p_slip == p_slip
-            assert (judgement.outcome is Outcome.SLIP) is (p_slip >= 0.5)
+            assert (judgement.decision is Decision.SLIP) is (p_slip >= 0.5)
             assert 0 <= self.clock() - reading.t_ns <= AGE_MAX_MS * MS
             assert not self.necessity.lacks(), self.necessity.lacks()
         return judgement
@@ -192,8 +192,8 @@ class Hand:
             angles[1] = np.nan
         t_ns = self.clock() + AHEAD_NS * (kind == "ahead")
         reading = JointReading(t_ns, 0, JOINTS, angles)
-        self.necessity.turn(reading)
-        self.pipeline.turn(reading)
+        self.necessity.observe_joints(reading)
+        self.pipeline.observe_joints(reading)
 
 
 def limits(
@@ -326,30 +326,30 @@ def test_a_verdict_is_given_only_if_all_that_it_needs_holds_in(
 def test_a_verdict_is_given_only_if_all_that_it_needs_holds(
     gate: GripLimits, begin: Sequence[Feel], feels: Sequence[Feel]
 ) -> None:
-    for outcome in check(gate, (*begin, *feels)):
-        event(outcome)
+    for decision in check(gate, (*begin, *feels)):
+        event(decision)
 
 
-def check(gate: GripLimits, feels: Sequence[Feel]) -> set[Outcome]:
-    """Play to a tared hand as much of it as there is time for; the outcomes."""
+def check(gate: GripLimits, feels: Sequence[Feel]) -> set[Decision]:
+    """Play to a tared hand as much of it as there is time for; the decisions."""
     hand = tared(gate)
     left = STEPS_MAX
-    outcomes = set()
+    decisions = set()
     for feel in feels:
         part = dataclasses.replace(feel, times=min(feel.times, left))
-        outcomes |= {said.outcome for said in hand.play(part)}
+        decisions |= {said.decision for said in hand.play(part)}
         left -= part.times
     if gate.on_request:
         assert hand.model.runs <= hand.asked
-    return outcomes
+    return decisions
 
 
 def test_a_hand_that_closes_and_keeps_still_gets_a_verdict() -> None:
-    outcomes = [said.outcome for said in tared(limits()).play(Feel(times=40))]
+    decisions = [said.decision for said in tared(limits()).play(Feel(times=40))]
     # Two or three sweeps until the median touches, 80 ms to know the motion, 80 ms of stillness.
-    first = outcomes.index(Outcome.STABLE)
+    first = decisions.index(Decision.STABLE)
     assert first in {1 + 8 + 8, 2 + 8 + 8}
-    assert set(outcomes[first:]) == {Outcome.STABLE}
+    assert set(decisions[first:]) == {Decision.STABLE}
 
 
 class Watched(TactileImager):
@@ -363,7 +363,7 @@ class Watched(TactileImager):
 def test_electrodes_that_come_back_are_not_judged_by_an_earlier_grasp() -> None:
     hand = tared(limits())
     hand.model.inputs = watched = Watched(3)
-    assert hand.play(Feel("grasp", times=40))[-1].outcome is Outcome.STABLE
+    assert hand.play(Feel("grasp", times=40))[-1].decision is Decision.STABLE
     lost = (Flaw(0, 0, 8, int(ElectrodeFault.MISSING), 0),)
     hand.play(Feel("rest", times=40, flaws=lost))
     closing = Feel("other", times=40, flaws=lost)
@@ -377,15 +377,15 @@ def test_electrodes_that_come_back_are_not_judged_by_an_earlier_grasp() -> None:
 
 def test_joints_that_come_back_moving_are_not_taken_for_still() -> None:
     hand = tared(limits())
-    assert hand.play(Feel(times=40))[-1].outcome is Outcome.STABLE
-    assert hand.play(Feel(times=50, joints="none"))[-1].outcome is Outcome.UNKNOWN
-    outcomes = {said.outcome for said in hand.play(Feel(times=8, joints="moving"))}
-    assert outcomes == {Outcome.UNKNOWN}
+    assert hand.play(Feel(times=40))[-1].decision is Decision.STABLE
+    assert hand.play(Feel(times=50, joints="none"))[-1].decision is Decision.UNKNOWN
+    decisions = {said.decision for said in hand.play(Feel(times=8, joints="moving"))}
+    assert decisions == {Decision.UNKNOWN}
 
 
 def test_fingers_that_repeat_themselves_are_frozen_with_a_flagged_electrode_too() -> None:
     hand = tared(limits())
-    assert hand.play(Feel(times=40))[-1].outcome is Outcome.STABLE
+    assert hand.play(Feel(times=40))[-1].decision is Decision.STABLE
     missing = tuple(Flaw(finger, 0, 1, int(ElectrodeFault.MISSING), 0) for finger in range(3))
     _, *repeated = hand.play(Feel(times=10, repeats=True, flaws=missing))
-    assert {said.outcome for said in repeated} == {Outcome.UNKNOWN}
+    assert {said.decision for said in repeated} == {Decision.UNKNOWN}

@@ -28,7 +28,7 @@ from onnx import helper, numpy_helper
 from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.findings import Examined
 from daemon.judge.network import Network
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.measure.reference.reference import Reference
 from daemon.measure.stability import report as stability
 from daemon.measure.stability.cases import StabilityCase, recorded
@@ -365,7 +365,7 @@ def test_what_is_not_finite_never_gives_a_verdict(
 def test_a_probability_that_is_none_is_unknown(p_slip: float | None) -> None:
     case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
     outcome, reasons = decide(case, Limits(max_age_ns=1))
-    assert outcome is Outcome.UNKNOWN
+    assert outcome is Decision.UNKNOWN
     assert reasons
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import BUCKETS, LatencyHistogram
-from daemon.publish.messages import OUTCOME_CODE, Verdict
+from daemon.publish.messages import DECISION_CODE, Verdict
 from daemon.run.summary import Summary
 
 
@@ -36,8 +36,8 @@ def test_an_empty_histogram_is_zero() -> None:
     assert LatencyHistogram().quantile_us(0.5) == 0.0
 
 
-def verdict(outcome: Outcome) -> Verdict:
-    unknown = outcome is Outcome.UNKNOWN
+def verdict(outcome: Decision) -> Verdict:
+    unknown = outcome is Decision.UNKNOWN
     return Verdict(
         boot_id="0",
         seq=0,
@@ -45,7 +45,7 @@ def verdict(outcome: Outcome) -> Verdict:
         t_mono_ns=0,
         grasp=1,
         verdict=outcome,
-        verdict_code=OUTCOME_CODE[outcome],
+        verdict_code=DECISION_CODE[outcome],
         p_slip=None if unknown else 0.5,
         valid=not unknown,
         reasons=[Reason.STALE] if unknown else [],
@@ -60,12 +60,12 @@ def verdict(outcome: Outcome) -> Verdict:
 def test_scores_follow_their_definitions_with_slip_positive() -> None:
     summary = Summary()
     cases = [
-        (Outcome.SLIP, True, 8),
-        (Outcome.STABLE, True, 2),
-        (Outcome.SLIP, False, 1),
-        (Outcome.STABLE, False, 9),
-        (Outcome.UNKNOWN, True, 3),
-        (Outcome.STABLE, None, 5),
+        (Decision.SLIP, True, 8),
+        (Decision.STABLE, True, 2),
+        (Decision.SLIP, False, 1),
+        (Decision.STABLE, False, 9),
+        (Decision.UNKNOWN, True, 3),
+        (Decision.STABLE, None, 5),
     ]
     for outcome, slipped, number in cases:
         for _ in range(number):
@@ -81,12 +81,12 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
 
 def test_no_labels_means_no_scores() -> None:
     summary = Summary()
-    summary.add(verdict(Outcome.STABLE), None)
+    summary.add(verdict(Decision.STABLE), None)
     assert summary.tally.scores() is None
     assert not any("recorded" in line for line in summary.lines(1.0))
 
 
 def test_a_score_without_a_denominator_is_left_out() -> None:
     summary = Summary()
-    summary.add(verdict(Outcome.STABLE), False)
+    summary.add(verdict(Decision.STABLE), False)
     assert summary.tally.scores() == {"accuracy": 1.0}

@@ -201,12 +201,12 @@ def test_a_key_that_is_taken_off_the_list_is_cut_off_while_connected(
 ) -> None:
     friend = door.client("friend", tmp_path / "friends")
     (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     leaving, staying = door.connect(friend), door.connect(door.known)
     assert door.hears(leaving, PATIENCE_S)
     assert door.hears(staying, PATIENCE_S)
     (door.clients / "friend.key").unlink()
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     while leaving.poll(100):
         leaving.recv_multipart()
     assert not door.hears(leaving, QUIET_S)
@@ -217,7 +217,7 @@ def test_a_list_that_cannot_be_read_changes_nothing(
     door: Door, caplog: pytest.LogCaptureFixture
 ) -> None:
     (door.clients / "broken.key").write_text("nothing")
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     assert "the former list stands" in caplog.text
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
@@ -282,16 +282,16 @@ def test_a_list_that_could_not_be_read_is_tried_again(door: Door, tmp_path: Path
     """A key is taken off while another one is broken: once that is mended, it is off."""
     friend = door.client("friend", tmp_path / "friends")
     (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     leaving = door.connect(friend)
     assert door.hears(leaving, PATIENCE_S)
     good = (door.clients / "controller.key").read_text()
     (door.clients / "controller.key").write_text("nothing")
     (door.clients / "friend.key").unlink()
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     assert door.hears(leaving, PATIENCE_S)
     (door.clients / "controller.key").write_text(good)
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     while leaving.poll(100):
         leaving.recv_multipart()
     assert not door.hears(leaving, QUIET_S)
@@ -309,7 +309,7 @@ def test_a_port_that_is_lost_to_another_costs_that_port_alone(
     """The key of a client is removed, and somebody takes the port meanwhile."""
     door.client("friend", tmp_path / "friends")
     (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     (door.clients / "friend.key").unlink()
     publisher = door.sockets.publisher
     publisher.socket.close(linger=0)
@@ -323,10 +323,10 @@ def test_a_port_that_is_lost_to_another_costs_that_port_alone(
             except OSError:
                 assert time.monotonic() < deadline_s
         thief.listen()
-        door.sockets.mind_keys()
+        door.sockets.check_keys()
         assert "nobody can connect there" in caplog.text
         door.sockets.take()
         door.sockets.send(b"verdict.right", b"{}")
         assert door.sockets.filenos()
-    door.sockets.mind_keys()
+    door.sockets.check_keys()
     assert door.hears(door.connect(door.known), PATIENCE_S)

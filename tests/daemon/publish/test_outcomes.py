@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
@@ -47,7 +47,7 @@ def outbox(output: Output) -> Outbox:
 
 
 def judge(outbox: Outbox, grasp: int, *, judged: bool = True) -> None:
-    outcome = Outcome.SLIP if judged else Outcome.UNKNOWN
+    outcome = Decision.SLIP if judged else Decision.UNKNOWN
     reasons = () if judged else (Reason.MOVING,)
     p_slip = 0.9 if judged else None
     outbox.verdict(Judgement(NOW_NS, grasp, outcome, p_slip, reasons, judged), NOW_NS, 10**8)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.publish.binding import PublishError
 from daemon.publish.messages import Verdict, decode_verdict
 from daemon.publish.questions import WAITING_MAX, Questions
@@ -212,14 +212,14 @@ def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown_in_time(
             answer, took_s = ask(asker)
             answers.append(answer)
             assert took_s < 0.8 + 0.5  # the deadline, and a machine that is busy
-            assert answer.valid == (answer.judged and answer.verdict is not Outcome.UNKNOWN)
+            assert answer.valid == (answer.judged and answer.verdict is not Decision.UNKNOWN)
         daemon.terminate()
         daemon.communicate(timeout=TIMEOUT_S)
     assert len([answer for answer in answers if answer.valid]) >= 2
     for answer in answers:
         assert answer.valid or answer.reasons
         if not answer.judged:
-            assert answer.verdict is Outcome.UNKNOWN
+            assert answer.verdict is Decision.UNKNOWN
 
 
 def test_nothing_is_judged_in_request_mode_unless_somebody_asks(

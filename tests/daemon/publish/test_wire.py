@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from daemon.commands.schema import schema_text
-from daemon.judge.reasons import ADVICE, GateCause, GateState, Outcome, Reason
+from daemon.judge.reasons import ADVICE, Decision, GateCause, GateState, Reason
 from daemon.publish.messages import (
     GateMessage,
     OutcomeMessage,
@@ -41,7 +41,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t=1790000000.25,
         t_mono_ns=123456789012345,
         grasp=42,
-        verdict=Outcome.STABLE,
+        verdict=Decision.STABLE,
         verdict_code=1,
         p_slip=0.03125,
         valid=True,
@@ -58,7 +58,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t=1790000000.5,
         t_mono_ns=123456799012345,
         grasp=43,
-        verdict=Outcome.SLIP,
+        verdict=Decision.SLIP,
         verdict_code=2,
         p_slip=0.96875,
         valid=True,
@@ -75,7 +75,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t=1790000000.75,
         t_mono_ns=123456809012345,
         grasp=44,
-        verdict=Outcome.UNKNOWN,
+        verdict=Decision.UNKNOWN,
         verdict_code=0,
         p_slip=None,
         valid=False,
@@ -92,7 +92,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t=1790000000.875,
         t_mono_ns=123456819012345,
         grasp=45,
-        verdict=Outcome.STABLE,
+        verdict=Decision.STABLE,
         verdict_code=1,
         p_slip=0.25,
         valid=True,
@@ -111,7 +111,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t=1790000000.9375,
         t_mono_ns=123456829012345,
         grasp=3,
-        verdict=Outcome.SLIP,
+        verdict=Decision.SLIP,
         verdict_code=2,
         p_slip=0.75,
         valid=True,
@@ -162,7 +162,7 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         t_mono_ns=123456909012345,
         state=State.RUNNING,
         readings_hz=100.0,
-        verdicts={Outcome.STABLE: 1, Outcome.SLIP: 1, Outcome.UNKNOWN: 1},
+        verdicts={Decision.STABLE: 1, Decision.SLIP: 1, Decision.UNKNOWN: 1},
         reasons={Reason.PARITY: 1, Reason.STALE: 1},
         drivers={"replay": {"readings": 3, "faulty_readings": 1, "missed_readings": 0}},
         repaired={"ff_7": 12},

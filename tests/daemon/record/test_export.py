@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.judge.reasons import GateState, Outcome
+from daemon.judge.reasons import Decision, GateState
 from daemon.publish.messages import OutcomeMessage, Tactile, Verdict, encode
 from daemon.record.export import collect
 from daemon.record.header import RecordingHeader
@@ -71,7 +71,7 @@ class Writer:
             t=0.0,
             t_mono_ns=self._now_ns,
             grasp=grasp,
-            verdict=Outcome.SLIP,
+            verdict=Decision.SLIP,
             verdict_code=2,
             p_slip=0.9,
             valid=True,

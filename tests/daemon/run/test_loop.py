@@ -11,7 +11,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import Companion, Requests, overridden
@@ -98,7 +98,7 @@ def test_every_reading_gets_one_verdict_in_order(stop: StopSignal) -> None:
     bench.run()
     assert [verdict.seq for verdict in bench.verdicts] == list(range(20))
     assert [verdict.grasp for verdict in bench.verdicts] == list(range(1, 21))
-    assert {verdict.verdict for verdict in bench.verdicts} == {Outcome.STABLE}
+    assert {verdict.verdict for verdict in bench.verdicts} == {Decision.STABLE}
     assert {verdict.verdict_code for verdict in bench.verdicts} == {1}
     assert {verdict.valid for verdict in bench.verdicts} == {True}
     assert {verdict.silence_ms for verdict in bench.verdicts} == {100.0}
@@ -122,7 +122,7 @@ def test_the_last_message_is_a_status_that_says_stopping(stop: StopSignal) -> No
     status = bench.output.statuses()[-1]
     assert bench.output.sent[-1][0] == b"status.right"
     assert status.state is State.STOPPING
-    assert status.verdicts == {Outcome.STABLE: 1, Outcome.SLIP: 0, Outcome.UNKNOWN: 0}
+    assert status.verdicts == {Decision.STABLE: 1, Decision.SLIP: 0, Decision.UNKNOWN: 0}
     assert status.drivers["fake"]["readings"] == 1
 
 
@@ -159,11 +159,11 @@ def test_silence_is_reported_once_per_limit_and_ends_with_the_next_reading(
     bench.run()
     said = [(round((v.t_mono_ns - start_ns) / MS), v.verdict, v.reasons) for v in bench.verdicts]
     assert said == [
-        (10, Outcome.STABLE, []),
-        (10, Outcome.UNKNOWN, [Reason.STALE]),
-        (10, Outcome.UNKNOWN, [Reason.STALE]),
-        (10, Outcome.UNKNOWN, [Reason.STALE]),
-        (400, Outcome.STABLE, []),
+        (10, Decision.STABLE, []),
+        (10, Decision.UNKNOWN, [Reason.STALE]),
+        (10, Decision.UNKNOWN, [Reason.STALE]),
+        (10, Decision.UNKNOWN, [Reason.STALE]),
+        (400, Decision.STABLE, []),
     ]
     assert [round(verdict.age_ms) for verdict in bench.verdicts] == [0, 100, 200, 300, 0]
     assert [verdict.valid for verdict in bench.verdicts] == [True, False, False, False, True]
@@ -173,7 +173,7 @@ def test_a_sensor_that_never_speaks_is_unknown(stop: StopSignal) -> None:
     clock = Clock()
     bench = Bench(ScriptedDriver([], clock, 250), clock, stop)
     bench.run()
-    assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN] * 2
+    assert [verdict.verdict for verdict in bench.verdicts] == [Decision.UNKNOWN] * 2
 
 
 def test_a_slow_driver_may_be_silent_for_ten_of_its_periods(stop: StopSignal) -> None:

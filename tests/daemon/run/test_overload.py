@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from daemon.judge.limits import ContactLimits, GateLimits, GripLimits
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.publish.companion import Companion
 from daemon.publish.messages import Status, Verdict, decode_status
@@ -281,8 +281,8 @@ def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
         if seen.seq >= 100 and seen.seq % 10 and seen.seq % 10 != 9 and seen.t_ns not in first
     ]
     assert len(frozen) > 10
-    assert {verdict.verdict for verdict, _ in frozen} == {Outcome.UNKNOWN}
-    assert Outcome.STABLE in {verdict.verdict for verdict, _ in bench.judged}
+    assert {verdict.verdict for verdict, _ in frozen} == {Decision.UNKNOWN}
+    assert Decision.STABLE in {verdict.verdict for verdict, _ in bench.judged}
 
 
 LIMITS = GripLimits(contact=ContactLimits(), gate=GateLimits())
@@ -342,8 +342,8 @@ def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
     without, overloaded = judged
     assert len(without) >= 3000
     assert skipped > 300
-    stable = {seq for seq, verdict in overloaded.items() if verdict.verdict is Outcome.STABLE}
-    would = {seq for seq, verdict in without.items() if verdict.verdict is Outcome.STABLE}
+    stable = {seq for seq, verdict in overloaded.items() if verdict.verdict is Decision.STABLE}
+    would = {seq for seq, verdict in without.items() if verdict.verdict is Decision.STABLE}
     assert len(stable) > 30
     assert stable <= would, sorted(stable - would)
 
@@ -364,10 +364,10 @@ def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
     driver = LiveDriver(came, clock)
     bench = Bench(driver, clock, cost_ns, grip=LIMITS)
     said = {seen.seq: verdict for verdict, seen in bench.judged}
-    assert said[199].verdict is Outcome.STABLE
+    assert said[199].verdict is Decision.STABLE
     first_skipped = min(set(range(250)) - set(said))
     assert 200 <= first_skipped < 210
     after_it = [verdict for seq, verdict in said.items() if first_skipped < seq < 225]
-    assert {verdict.verdict for verdict in after_it} == {Outcome.UNKNOWN}
+    assert {verdict.verdict for verdict in after_it} == {Decision.UNKNOWN}
     assert after_it[0].reasons == [Reason.SEQUENCE_GAP]
-    assert said[249].verdict is Outcome.STABLE
+    assert said[249].verdict is Decision.STABLE

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD
@@ -206,7 +206,7 @@ def test_after_a_sleep_of_the_computer_everything_starts_anew_on_the_same_socket
         while (after := running.verdict()).boot_id == before.boot_id:
             former = after
             assert time.monotonic() < deadline_s
-        assert former.verdict is Outcome.UNKNOWN
+        assert former.verdict is Decision.UNKNOWN
         assert former.reasons[0] is Reason.STALE
         assert (after.seq, after.grasp) < (before.seq + 1000, before.grasp + 1)
         code, said = running.stop()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.judge.reasons import Outcome, Reason
+from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.messages import State
@@ -35,8 +35,8 @@ def test_a_reading_of_before_a_sleep_gives_no_verdict_however_fresh_it_looks() -
         bench = Bench(driver, clock, stop, Sleeper(boot), sleep=Sleep(clock, boot))
         assert bench.run() is Ended.SLEPT
     *before, last = bench.verdicts
-    assert [verdict.verdict for verdict in before] == [Outcome.STABLE] * 2
-    assert (last.verdict, last.reasons) == (Outcome.UNKNOWN, [Reason.STALE])
+    assert [verdict.verdict for verdict in before] == [Decision.STABLE] * 2
+    assert (last.verdict, last.reasons) == (Decision.UNKNOWN, [Reason.STALE])
     assert bench.output.statuses()[-1].state is State.STOPPING
 
 
@@ -47,7 +47,7 @@ def test_who_comes_late_after_a_sleep_is_told_nothing_of_before_it() -> None:
     with StopSignal() as stop:
         bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, sleep=sleep)
         assert bench.run() is Ended.SLEPT  # before it has looked who has come
-    assert [verdict.verdict for verdict in bench.verdicts] == [Outcome.UNKNOWN]
+    assert [verdict.verdict for verdict in bench.verdicts] == [Decision.UNKNOWN]
 
 
 @pytest.mark.parametrize(("apart_ms", "slept"), [(0, False), (49, False), (-90, False), (51, True)])

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import State, decode_status
 from daemon.run.systemd import Systemd, in_a_line
 from tests.daemon.fakes import MS, Clock
@@ -146,7 +146,7 @@ def test_a_manager_that_is_gone_costs_one_warning(
 def test_the_status_line_says_state_rate_verdicts_and_what_is_not_well() -> None:
     status = decode_status((GOLDEN / "status.json").read_bytes())
     assert status.state is State.RUNNING
-    assert status.verdicts[Outcome.SLIP] == 1
+    assert status.verdicts[Decision.SLIP] == 1
     assert status.gate is GateState.IDLE
     assert status.health["ff_7"] is Reason.SATURATED
     assert in_a_line(status) == (

@@ -21,7 +21,7 @@ from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import GateState, Outcome, Reason
+from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, exchanged, load
 from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
 from drivers.base import ElectrodeFault, TactileReading
@@ -348,7 +348,7 @@ def test_garbage_never_becomes_its_own_standard(bts3_dir: Path, what: str, grasp
     rows = read_table(bts3_dir / "palm_down.csv").counts
     judge(pipeline, rows[random.permutation(len(rows))[:grasps]])
     judgements = judge(pipeline, GARBAGE[what](random))
-    assert {judgement.outcome for judgement in judgements} == {Outcome.UNKNOWN}
+    assert {judgement.decision for judgement in judgements} == {Decision.UNKNOWN}
 
 
 def test_a_drifted_session_is_refused_at_first_and_then_learned(bts3_dir: Path) -> None:
@@ -357,7 +357,7 @@ def test_a_drifted_session_is_refused_at_first_and_then_learned(bts3_dir: Path) 
     rows[:, 0, :6] -= 400
     rows = np.clip(rows, 1, 4094)
     judgements = judge(session_pipeline(), rows)
-    judged = [judgement.outcome is not Outcome.UNKNOWN for judgement in judgements]
+    judged = [judgement.decision is not Decision.UNKNOWN for judgement in judgements]
     assert np.mean(judged[100:]) > 0.85
 
 
@@ -370,7 +370,7 @@ def test_a_finger_that_dies_is_never_judged_by_the_others(bts3_dir: Path, grasps
     judge(pipeline, rows[:grasps])
     dead = rows[200:600].copy()
     dead[:, 2] = 2048 + np.rint(random.normal(0.0, 3.5, dead[:, 2].shape)).astype(np.int64)
-    assert {judgement.outcome for judgement in judge(pipeline, dead)} == {Outcome.UNKNOWN}
+    assert {judgement.decision for judgement in judge(pipeline, dead)} == {Decision.UNKNOWN}
 
 
 def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
@@ -380,7 +380,7 @@ def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
     pipeline = session_pipeline()
     judge(pipeline, rows[:200])
     judgements = judge(pipeline, rows[200:600, [1, 2, 0]])
-    assert np.mean([judgement.outcome is Outcome.UNKNOWN for judgement in judgements]) > 0.95
+    assert np.mean([judgement.decision is Decision.UNKNOWN for judgement in judgements]) > 0.95
 
 
 @pytest.mark.parametrize("name", ["cnn1", "small-session"])
@@ -390,7 +390,7 @@ def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
     centre = np.array(model.contract.seen.centre)
     pipeline = Pipeline(model, FINGERS, Limits(max_age_ns=10**18), lambda: 0, learns=False)
     judgements = judge(pipeline, centre + random.normal(0.0, 2.0, (50, 3, 24)))
-    assert {judgement.outcome for judgement in judgements} == {Outcome.UNKNOWN}
+    assert {judgement.decision for judgement in judgements} == {Decision.UNKNOWN}
 
 
 def test_a_session_learns_nothing_from_what_is_stale(bts3_dir: Path) -> None:
@@ -415,7 +415,7 @@ def test_a_young_session_is_less_sure_and_on_the_same_side(
             continue
         model.inputs.build(row, model.input)
         _, p_slip = model.run()
-        assert (p_slip >= threshold) is (judgement.outcome is Outcome.SLIP)
+        assert (p_slip >= threshold) is (judgement.decision is Decision.SLIP)
         assert abs(judgement.p_slip - threshold) <= abs(p_slip - threshold) + 1e-6
 
 
@@ -476,10 +476,10 @@ def test_a_scene_that_requires_a_session_judges_nothing_without_one(bts3_dir: Pa
     assert pipeline.session is not None
     for row in read_table(bts3_dir / "palm_down.csv").counts[:100]:
         pipeline.session.observe(row)
-    assert settled_verdicts(pipeline, clock, 4.0)[-1].outcome is not Outcome.UNKNOWN
+    assert settled_verdicts(pipeline, clock, 4.0)[-1].decision is not Decision.UNKNOWN
     pipeline.session.reset()
     after = pipeline.judge(reading_of(clock))
-    assert after.outcome is Outcome.UNKNOWN
+    assert after.decision is Decision.UNKNOWN
     assert Reason.NOT_CALIBRATED in after.reasons
     assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
 
@@ -490,7 +490,7 @@ def test_an_exchanged_sensor_ends_the_verdict_that_stands(bts3_dir: Path) -> Non
     assert settled_verdicts(pipeline, clock, 4.0)[-1].gate is GateState.JUDGED
     pipeline.sensors_exchanged()
     after = pipeline.judge(reading_of(clock))
-    assert after.outcome is Outcome.UNKNOWN
+    assert after.decision is Decision.UNKNOWN
     assert Reason.NOT_TARED in after.reasons
     assert after.contact == ()
 

@@ -37,7 +37,8 @@ def learn(learner: Learner, stream: Iterator[Outcome]) -> None:
 
 
 def covariance(learner: Learner) -> NDArray[np.float64]:
-    return np.frombuffer(learner.state().covariance).reshape(learner._width, -1)
+    flat = np.frombuffer(learner.state().covariance)
+    return flat.reshape(math.isqrt(len(flat)), -1)
 
 
 def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_open() -> None:

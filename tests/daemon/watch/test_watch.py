@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from daemon.judge.reasons import ADVICE, GateState, Outcome, Reason
+from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import OutcomeMessage, encode
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, Rest, image
 from daemon.watch.pixels import Canvas
@@ -82,10 +82,10 @@ def test_before_the_first_message_it_is_unknown_and_says_what_may_be_wrong() -> 
 
 @pytest.mark.parametrize(
     ("outcome", "tone", "p_slip"),
-    [(Outcome.STABLE, Tone.STABLE, 0.25), (Outcome.SLIP, Tone.SLIP, 0.75)],
+    [(Decision.STABLE, Tone.STABLE, 0.25), (Decision.SLIP, Tone.SLIP, 0.75)],
 )
 def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
-    outcome: Outcome, tone: Tone, p_slip: float
+    outcome: Decision, tone: Tone, p_slip: float
 ) -> None:
     view = after((b"verdict.right", verdict(0, outcome)))
     seen = view.snapshot(100 * MS)
@@ -97,25 +97,25 @@ def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
 
 
 def test_a_message_that_is_repeated_for_somebody_else_is_no_sign_of_life() -> None:
-    view = after((b"verdict.right", verdict(5, Outcome.STABLE)))
-    view.take(b"verdict.right", verdict(5, Outcome.STABLE), 90 * MS)
+    view = after((b"verdict.right", verdict(5, Decision.STABLE)))
+    view.take(b"verdict.right", verdict(5, Decision.STABLE), 90 * MS)
     assert view.snapshot(101 * MS).tone is Tone.SILENT
 
 
 def test_gaps_are_counted_as_lost_but_not_over_a_restart() -> None:
     view = after(*[(b"verdict.right", verdict(seq)) for seq in (3, 4, 9)])
     assert view.snapshot(0).timing.lost == 4
-    view.take(b"verdict.right", verdict(0, Outcome.SLIP, boot_id="another"), 0)
+    view.take(b"verdict.right", verdict(0, Decision.SLIP, boot_id="another"), 0)
     seen = view.snapshot(0)
     assert (seen.timing.lost, seen.verdict) == (4, "slip")
 
 
 @pytest.mark.parametrize(
     "payload",
-    [b"", b"{", b"\xff\xfe", b"[]", verdict(1, Outcome.STABLE).replace(b'"v":1', b'"v":2')],
+    [b"", b"{", b"\xff\xfe", b"[]", verdict(1, Decision.STABLE).replace(b'"v":1', b'"v":2')],
 )
 def test_what_is_not_understood_is_counted_and_is_no_sign_of_life(payload: bytes) -> None:
-    view = after((b"verdict.right", verdict(0, Outcome.STABLE)))
+    view = after((b"verdict.right", verdict(0, Decision.STABLE)))
     view.take(b"verdict.right", payload, 90 * MS)
     seen = view.snapshot(101 * MS)
     assert seen.timing.not_understood == 1
@@ -125,7 +125,7 @@ def test_what_is_not_understood_is_counted_and_is_no_sign_of_life(payload: bytes
 def test_other_hands_and_other_topics_are_not_looked_at() -> None:
     view = a_view("right")
     for topic in (b"verdict.right2", b"verdict.left", b"verdict", b"other.right", b"\xff"):
-        view.take(topic, verdict(0, Outcome.STABLE), 0)
+        view.take(topic, verdict(0, Decision.STABLE), 0)
     seen = view.snapshot(0)
     assert (seen.verdict, seen.timing.not_understood) == ("unknown", 0)
 
@@ -148,13 +148,13 @@ def test_unknown_is_told_apart_by_whether_something_is_wrong(
 
 
 def test_a_verdict_without_a_calibrated_session_is_said_to_be_less_sure() -> None:
-    message = verdict(0, Outcome.STABLE, session_calibrated=False)
+    message = verdict(0, Decision.STABLE, session_calibrated=False)
     why = after((b"verdict.right", message)).snapshot(0).why
     assert [line.what for line in why] == ["lift", "less sure"]
 
 
 def test_the_last_judgement_stays_and_gets_how_its_lift_ended() -> None:
-    view = after((b"verdict.right", verdict(0, Outcome.SLIP, grasp=42)))
+    view = after((b"verdict.right", verdict(0, Decision.SLIP, grasp=42)))
     view.take(b"verdict.right", verdict(1, grasp=42), 2_000 * MS)
     for grasp, ended in ((41, None), (42, "slip")):
         told = OutcomeMessage(boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome="slip")
@@ -170,7 +170,7 @@ def test_rates_and_the_last_half_minute_are_of_what_arrived() -> None:
     for moment in range(400):
         now_ns = moment * 100 * MS
         for part in range(5):
-            view.take(b"verdict.right", verdict(moment * 5 + part, Outcome.STABLE), now_ns)
+            view.take(b"verdict.right", verdict(moment * 5 + part, Decision.STABLE), now_ns)
         seen = view.snapshot(now_ns)
     assert seen.timing.verdicts_hz == pytest.approx(50.0)
     assert HISTORY == 300
@@ -257,7 +257,7 @@ def test_a_faulty_electrode_is_marked_and_not_taken_for_a_touch() -> None:
     counts = [3000] * 24
     counts[6] = 0
     view.take(b"tactile.right", tactile(99, counts, RESTING, faulty=(6,)), 0)
-    view.take(b"verdict.right", verdict(99, Outcome.STABLE, repaired=["ff_1", "th_24"]), 0)
+    view.take(b"verdict.right", verdict(99, Decision.STABLE, repaired=["ff_1", "th_24"]), 0)
     first, second = view.snapshot(0).fingers
     assert first.levels == [0] * 132
     assert first.marked == [1, 8 * WIDTH + 1]  # E1 stands in row 0, column 1
@@ -283,7 +283,7 @@ def a_grasp() -> Snapshot:
     rested(view)
     pressed = [3000 - 60 * electrode for electrode in range(24)]
     view.take(b"tactile.right", tactile(99, pressed, RESTING, faulty=(6,)), 0)
-    view.take(b"verdict.right", verdict(99, Outcome.SLIP), 0)
+    view.take(b"verdict.right", verdict(99, Decision.SLIP), 0)
     return view.snapshot(0)
 
 
@@ -308,7 +308,7 @@ def test_a_terminal_of_ascii_gets_ascii() -> None:
 def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TZ", "CET-1")
     time.tzset()
-    seen = after((b"verdict.right", verdict(0, Outcome.STABLE))).snapshot(0)
+    seen = after((b"verdict.right", verdict(0, Decision.STABLE))).snapshot(0)
     header = text_of(seen, 80, 24, Canvas())[0]
     monkeypatch.undo()
     time.tzset()
@@ -348,7 +348,7 @@ def test_an_overloaded_daemon_is_not_well(overloaded: bool) -> None:
 def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     evil = "\x1b[2J\x1b]0;owned\x07"
     view = after(
-        (b"verdict.right", verdict(0, Outcome.SLIP, model=evil, repaired=[evil])),
+        (b"verdict.right", verdict(0, Decision.SLIP, model=evil, repaired=[evil])),
         (b"status.right", status(0, health={evil: Reason.HELD}, drivers={evil: {evil: 1}})),
     )
     text = "\n".join(text_of(view.snapshot(0), 120, 40, Canvas()))
@@ -357,8 +357,8 @@ def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
     assert r"\x1b[2J" in text
 
 
-@pytest.mark.parametrize("outcome", Outcome)
-def test_the_verdict_stands_alone_in_a_field_of_five_lines(outcome: Outcome) -> None:
+@pytest.mark.parametrize("outcome", Decision)
+def test_the_verdict_stands_alone_in_a_field_of_five_lines(outcome: Decision) -> None:
     seen = after((b"verdict.right", verdict(0, outcome))).snapshot(0)
     field = [line[:24].strip() for line in text_of(seen, 80, 24, Canvas())[1:6]]
     assert field == ["", "", outcome.value.upper(), "", ""]

@@ -12,7 +12,7 @@ from typing import Literal
 import msgspec
 import pytest
 
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.watch.feed import Feed
 from daemon.watch.view import View
 from daemon.watch.watching import TICK_S, snapshots
@@ -104,13 +104,13 @@ def test_the_page_shows_verdict_images_and_advice_in_both_themes(
 ) -> None:
     browser.look(width, height, theme)
     browser.go(f"http://127.0.0.1:{page.port}/")
-    for outcome, share in ((Outcome.STABLE, "25 %"), (Outcome.SLIP, "75 %")):
-        talker.outcome = outcome
-        see(browser, outcome.value)
-        assert text(browser, "verdict") == outcome.value.upper()
+    for decision, share in ((Decision.STABLE, "25 %"), (Decision.SLIP, "75 %")):
+        talker.decision = decision
+        see(browser, decision.value)
+        assert text(browser, "verdict") == decision.value.upper()
         assert share in text(browser, "p")
         colour = browser.value(f"getComputedStyle({BANNER}).backgroundColor")
-        assert colour == COLOURS[theme][outcome.value]
+        assert colour == COLOURS[theme][decision.value]
     browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
     assert text(browser, "who") == "graspd right"
     assert "FFJ3" in text(browser, "joints")
@@ -133,15 +133,15 @@ def test_the_page_shows_verdict_images_and_advice_in_both_themes(
 def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    talker.outcome = Outcome.STABLE
+    talker.decision = Decision.STABLE
     browser.look(1280, 800)
     browser.go(f"http://localhost:{page.port}/")
     see(browser, "stable")
-    talker.outcome = None
+    talker.decision = None
     see(browser, "silent")
     assert text(browser, "verdict") == "UNKNOWN"
     assert "unknown: no message for " in text(browser, "why")
-    talker.outcome = Outcome.SLIP
+    talker.decision = Decision.SLIP
     see(browser, "slip")
     page.stop()
     see(browser, "silent")
@@ -170,14 +170,14 @@ def hide(browser: Browser, hidden: str) -> None:
 def test_a_page_that_was_frozen_shows_unknown_and_nothing_of_what_waited(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    talker.outcome = Outcome.STABLE
+    talker.decision = Decision.STABLE
     browser.go(f"http://127.0.0.1:{page.port}/")
     see(browser, "stable")
     hide(browser, "false")  # as far as the page knows
     note_tones(browser)
     browser.ask("Page.setWebLifecycleState", state="frozen")
     time.sleep(1.0)  # of which stable verdicts wait
-    talker.outcome = Outcome.SLIP
+    talker.decision = Decision.SLIP
     time.sleep(1.0)
     browser.ask("Page.setWebLifecycleState", state="active")
     see(browser, "slip")
@@ -189,7 +189,7 @@ def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     """Only the wall clock has gone on meanwhile."""
-    talker.outcome = Outcome.STABLE
+    talker.decision = Decision.STABLE
     browser.go(f"http://127.0.0.1:{page.port}/")
     see(browser, "stable")
     note_tones(browser)
@@ -201,7 +201,7 @@ def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
 def test_a_page_in_the_background_shows_no_verdict(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
-    talker.outcome = Outcome.STABLE
+    talker.decision = Decision.STABLE
     browser.go(f"http://127.0.0.1:{page.port}/")
     see(browser, "stable")
     for hidden, tone in (("true", "silent"), ("false", "stable")):
@@ -227,7 +227,7 @@ def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> N
     def put() -> None:
         seq = 0
         while not over.wait(0.05):
-            view.take(b"verdict.right", verdict(seq, Outcome.STABLE), 0)
+            view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
             server.newest.put(msgspec.json.encode(view.snapshot(0)))
             seq += 1
 

@@ -21,7 +21,7 @@ from typing import Self
 import pytest
 
 from daemon import scene
-from daemon.judge.reasons import Outcome
+from daemon.judge.reasons import Decision
 from daemon.publish.keys import KeysError, make
 from daemon.publish.messages import decode_verdict
 from daemon.publish.publisher import Publisher
@@ -138,12 +138,12 @@ def test_it_ends_cleanly_and_leaves_the_terminal_as_it_was(
 def test_it_shows_verdicts_then_silence_and_verdicts_again(endpoint: str) -> None:
     with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
         terminal.read_until(re.escape(ENTER))
-        talker.outcome = Outcome.SLIP
+        talker.decision = Decision.SLIP
         terminal.read_until(rb"do not lift")
         assert b"75 %" in terminal.output
-        talker.outcome = None
+        talker.decision = None
         terminal.read_until(rb"no message for [0-9]+ ms")
-        talker.outcome = Outcome.STABLE
+        talker.decision = Decision.STABLE
         terminal.read_until(rb"judged to hold")
         terminal.resize(200, 60)
         terminal.read_until(rb"pressed, below ")
@@ -161,14 +161,14 @@ def test_stopped_by_ctrl_z_it_shows_no_verdict_and_comes_back_with_new_ones(endp
     terminal = Terminal("--connect", endpoint)
     terminal.shell = SHELL
     with Talker(endpoint) as talker, terminal:
-        talker.outcome = Outcome.STABLE
+        talker.decision = Decision.STABLE
         terminal.read_until(rb"judged to hold")
         terminal.type(b"\x1a")
         terminal.read_until(
             re.escape(LEAVE) + rb".*stopped at \d\d:\d\d:\d\d: unknown.*\[stopped\]"
         )
         assert ENTER not in terminal.output
-        talker.outcome = Outcome.SLIP
+        talker.decision = Decision.SLIP
         time.sleep(1.2)  # longer than it may be without looking
         terminal.type(b"\n")
         terminal.read_until(re.escape(ENTER) + rb".*do not lift")
@@ -181,7 +181,7 @@ def test_stopped_by_ctrl_z_it_shows_no_verdict_and_comes_back_with_new_ones(endp
 def test_ctrl_z_where_no_shell_could_continue_it_is_no_end(endpoint: str) -> None:
     """The kernel stops nobody then (POSIX, orphaned process groups)."""
     with Talker(endpoint) as talker, Terminal("--connect", endpoint) as terminal:
-        talker.outcome = Outcome.STABLE
+        talker.decision = Decision.STABLE
         terminal.read_until(rb"judged to hold")
         terminal.type(b"\x1a")
         terminal.read_until(re.escape(ENTER) + rb".*judged to hold")
@@ -193,23 +193,23 @@ def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
     clock = Clock()
     with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
 
-        def came(outcome: Outcome, seq: int) -> list[bytes]:
+        def came(decision: Decision, seq: int) -> list[bytes]:
             deadline_s = time.monotonic() + PATIENCE_S
             while not (found := [payload for _, payload in feed.take()]):
                 assert time.monotonic() < deadline_s
                 publisher.take()
-                publisher.send(b"verdict.right", verdict(seq, outcome))
+                publisher.send(b"verdict.right", verdict(seq, decision))
                 time.sleep(0.01)
             return found
 
-        came(Outcome.STABLE, 0)
+        came(Decision.STABLE, 0)
         for seq in range(1, 50):
-            publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+            publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
         time.sleep(0.1)
         publisher.forget()
         clock.now_ns += 1001 * MS
         assert list(feed.take()) == []
-        for payload in came(Outcome.SLIP, 50):
+        for payload in came(Decision.SLIP, 50):
             assert decode_verdict(payload).seq == 50
 
 
@@ -220,13 +220,13 @@ def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoi
         while not list(feed.take()):
             assert time.monotonic() < deadline_s
             publisher.take()
-            publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+            publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
             seq += 1
             time.sleep(0.01)
         while list(feed.take()):
             pass
         looked_ns = clock.now_ns
-        publisher.send(b"verdict.right", verdict(seq, Outcome.STABLE))
+        publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
         time.sleep(0.2)
         clock.now_ns += 900 * MS
         view = View(endpoint)
@@ -240,7 +240,7 @@ def test_it_waits_for_a_daemon_that_is_not_there_yet(endpoint: str) -> None:
     with Terminal("--connect", endpoint) as terminal:
         terminal.read_until(rb"no message has come yet")
         with Talker(endpoint) as talker:
-            talker.outcome = Outcome.STABLE
+            talker.decision = Decision.STABLE
             terminal.read_until(rb"judged to hold")
         press_q(terminal)
         assert terminal.end() == 0
@@ -261,7 +261,7 @@ def test_a_scene_says_where_and_which_hand(tmp_path: Path, endpoint: str) -> Non
         f'[publish]\nendpoint = "{endpoint}"\n'
     )
     with Talker(endpoint) as talker, Terminal(str(path)) as terminal:
-        talker.outcome = Outcome.STABLE
+        talker.decision = Decision.STABLE
         terminal.read_until(rb"judged to hold")
         press_q(terminal)
         assert terminal.end() == 0
@@ -391,7 +391,7 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_known(tmp_path: Path, doo
     with Feed(TCP, keys, clock) as feed:
         hears(door, feed, lambda _: feed.is_turned_away)
         (tmp_path / "stranger.key").rename(tmp_path / "clients" / "stranger.key")
-        door.mind_keys()
+        door.check_keys()
         for _ in range(6):  # looks, and is not paused
             clock.now_ns += 900 * MS
             list(feed.take())

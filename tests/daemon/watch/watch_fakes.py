@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from typing import Any, Self
 
-from daemon.judge.reasons import GateState, Outcome, Reason
-from daemon.publish.messages import OUTCOME_CODE, State, Status, Tactile, Verdict, encode
+from daemon.judge.reasons import Decision, GateState, Reason
+from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
 from daemon.publish.publisher import Publisher
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"
@@ -14,16 +14,16 @@ MS = 1_000_000
 PERIOD_S = 0.02
 
 
-def verdict(seq: int, outcome: Outcome = Outcome.UNKNOWN, **other: Any) -> bytes:  # noqa: ANN401
-    p_slip = {Outcome.STABLE: 0.25, Outcome.SLIP: 0.75, Outcome.UNKNOWN: None}[outcome]
+def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> bytes:  # noqa: ANN401
+    p_slip = {Decision.STABLE: 0.25, Decision.SLIP: 0.75, Decision.UNKNOWN: None}[decision]
     content: dict[str, Any] = {
         "boot_id": BOOT,
         "seq": seq,
         "t": 1790000000.0,
         "t_mono_ns": 123456789012345,
         "grasp": 7,
-        "verdict": outcome,
-        "verdict_code": OUTCOME_CODE[outcome],
+        "verdict": decision,
+        "verdict_code": DECISION_CODE[decision],
         "p_slip": p_slip,
         "valid": p_slip is not None,
         "reasons": [] if p_slip is not None else [Reason.NO_CONTACT],
@@ -66,7 +66,7 @@ def status(seq: int, **other: Any) -> bytes:  # noqa: ANN401
         "t_mono_ns": 123456789012345,
         "state": State.RUNNING,
         "readings_hz": 100.0,
-        "verdicts": {Outcome.STABLE: 3},
+        "verdicts": {Decision.STABLE: 3},
         "reasons": {},
         "drivers": {"replay": {"readings": 3}},
         "session_grasps": 12,
@@ -86,7 +86,7 @@ class Talker:
     """A daemon that says what it is told, fifty times a second, until the block ends."""
 
     def __init__(self, endpoint: str) -> None:
-        self.outcome: Outcome | None = Outcome.UNKNOWN
+        self.decision: Decision | None = Decision.UNKNOWN
         """What the verdicts are; none come if None."""
         self._publisher = Publisher(endpoint)
         self._over = threading.Event()
@@ -105,12 +105,12 @@ class Talker:
         seq = 0
         while not self._over.wait(PERIOD_S):
             self._publisher.take()
-            outcome = self.outcome
-            if outcome is None:
+            decision = self.decision
+            if decision is None:
                 continue
-            pressed = 0 if outcome is Outcome.UNKNOWN else 400
+            pressed = 0 if decision is Decision.UNKNOWN else 400
             counts = [3000 - pressed] * 12 + [3000] * 12
             self._publisher.send(b"status.right", status(seq))
             self._publisher.send(b"tactile.right", tactile(seq, counts, counts, faulty=(6,)))
-            self._publisher.send(b"verdict.right", verdict(seq, outcome))
+            self._publisher.send(b"verdict.right", verdict(seq, decision))
             seq += 1
