@@ -1,7 +1,6 @@
 """What a judge knows between two readings, as bytes and back: where it goes on, another one can.
 
-Every part has one `memory`, a dataclass of all that readings change in it. Copying them is quick,
-encoding is not.
+Each part has a `memory`, a dataclass of all that readings change in it; copying these is quick.
 """
 
 from __future__ import annotations
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.pipeline import Pipeline
 
-MAX_BYTES: Final = 1 << 20
-"""Before it is compressed; three fingers take 37 kB."""
+MAX_BYTES: Final = 1 << 20  # before it is compressed; three fingers take 37 kB
 
 
 def remember(pipeline: Pipeline) -> object:
