@@ -129,7 +129,7 @@ def gate_mode(scene: Scene) -> GateMode:
 
 
 def grip_limits(scene: Scene) -> GripLimits | None:
-    """The conditions of the moment before the lift; None if each reading is a grasp."""
+    """What must hold before a grasp is judged; None with mode `every`, which judges each reading."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
         if gate.sweeps == 3:

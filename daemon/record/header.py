@@ -69,7 +69,10 @@ class RecordingHeader:
 
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
-        """The header of such texts. Raises `KeyError` or `ValueError` if they are not its."""
+        """Read a header back from what `texts` gave, as it stands in an MCAP file.
+
+        Raises `KeyError` for a field that is missing and `ValueError` for a wrong one.
+        """
         fingers = msgspec.json.decode(texts["fingers"], type=tuple[str, ...])
         session = texts["session"]
         if not fingers or not set(fingers) <= set(FINGERS):

@@ -89,7 +89,10 @@ class Learner:
         return values
 
     def log_odds(self, features: Vector) -> float:
-        """Log-odds of slip, moderated: nearer to 0 the less is known of such a grasp (MacKay)."""
+        """Log-odds of slip for what `features` gave, drawn towards 0 the less is known of such grasps.
+
+        MacKay's moderated output.
+        """
         variance = float(features @ (self._covariance @ features))
         return float(features @ self._mean) / math.sqrt(1.0 + math.pi / 8.0 * variance)
 

@@ -82,7 +82,7 @@ class View:
         self._history: deque[tuple[str, int]] = deque(maxlen=HISTORY)
 
     def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
-        """Take one message that arrived at `now_ns`, ns of a clock here that only goes on."""
+        """Take one message that arrived at `now_ns`, monotonic ns of this computer."""
         kind, _, hand = topic.decode("ascii", "replace").partition(".")
         decode = DECODERS.get(kind)
         if decode is None or (self._hand is not None and hand != self._hand):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import assert_never
 
 import numpy as np
 
@@ -93,13 +94,23 @@ def make_decoder(
     check_fingers(fingers)
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:
         raise ValueError(f"arbitration_id {arbitration_id} is not in 0..{EXTENDED_ID_MAX:#x}")
-    if frame_format is CanFormat.SYNTOUCH:
-        return SynTouchDecoder(fingers, sensors, arbitration_id, sequence, data_length, counters)
-    if sensors is not None:
-        raise ValueError("sensors is for the format syntouch; sweep frames say whose they are")
-    if data_length is not None:
-        raise ValueError("data_length is for the format syntouch; sweep frames have 64 bytes")
-    return SweepFrameDecoder(fingers, arbitration_id, counters)
+    match frame_format:
+        case CanFormat.SYNTOUCH:
+            return SynTouchDecoder(
+                fingers, sensors, arbitration_id, sequence, data_length, counters
+            )
+        case CanFormat.SWEEP_FD:
+            if sensors is not None:
+                raise ValueError(
+                    "sensors is for the format syntouch; sweep frames say whose they are"
+                )
+            if data_length is not None:
+                raise ValueError(
+                    "data_length is for the format syntouch; sweep frames have 64 bytes"
+                )
+            return SweepFrameDecoder(fingers, arbitration_id, counters)
+        case _:
+            assert_never(frame_format)
 
 
 class SynTouchDecoder(CanDecoder):

@@ -105,7 +105,7 @@ class CanBridgeDriver(Opened):
 
     @property
     def serials(self) -> dict[str, str]:
-        """No frame carries them."""
+        """Always empty: no CAN frame carries a sensor's serial number."""
         return {}
 
     def describe(self) -> dict[str, str]:

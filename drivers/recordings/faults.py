@@ -126,7 +126,7 @@ class FaultInjector:
         return True
 
     def loses(self) -> bool:
-        """Whether the reading is lost on the way: `intermittent`."""
+        """Draw whether this reading is lost (`intermittent`), and count it; call once a reading."""
         lost = self._happens(self._faults.intermittent_probability)
         self._counters.injected_intermittent += lost
         self._counters.missed_readings += lost

@@ -91,7 +91,10 @@ class DatagramLink:
         return known
 
     def open(self, counters: DatagramCounters) -> None:
-        """Listen, and count there. Raises `LinkError`: at the start that is the scene's mistake."""
+        """Begin to listen; `counters` count what comes.
+
+        Raises `LinkError` if it cannot: at the start that means that the scene is wrong.
+        """
         self.close()
         self._begin(counters)
         receiver = DatagramReceiver(self._endpoint, self._bytes_max)

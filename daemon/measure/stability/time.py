@@ -44,7 +44,7 @@ def clock_rows() -> Iterator[StepRow]:
 
 
 def wrap_rows() -> Iterator[StepRow]:
-    """Counters that begin again at 0."""
+    """Whether sweep numbers and ticks that begin again at 0 lose a reading, a row each."""
     readings, missed, restarts = _frames_around_wrap()
     yield StepRow(
         "CAN sweep number (16 bits) and tick (32 bits) at their wrap",

@@ -29,7 +29,7 @@ NEVER = {
         "daemon.run.printer",
         "daemon.run.summary",
     ),
-    *("daemon.scene.errors", "daemon.measure.cost.tables", "daemon.doctor"),
+    *("daemon.scene.errors", "daemon.measure.cost.tables", "daemon.commands.doctor"),
     *("daemon.run.realtime", "daemon.run.systemd", "daemon.watch"),
     *(
         "daemon.judge.memory",
