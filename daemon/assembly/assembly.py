@@ -129,7 +129,7 @@ def gate_mode(scene: Scene) -> GateMode:
 
 
 def grip_limits(scene: Scene) -> GripLimits | None:
-    """What must hold before a grasp is judged; None with mode `every`, which judges each reading."""
+    """What must hold before a grasp is judged; None with mode `every`: each reading is one."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
         if gate.sweeps == 3:

@@ -89,7 +89,7 @@ class Learner:
         return values
 
     def log_odds(self, features: Vector) -> float:
-        """Log-odds of slip for what `features` gave, drawn towards 0 the less is known of such grasps.
+        """Log-odds of slip for what `features` gave; nearer to 0 the less is known of such grasps.
 
         MacKay's moderated output.
         """

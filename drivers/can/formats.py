@@ -9,8 +9,8 @@ The sweep frame is graspd's own: one CAN FD frame per finger and sweep. No produ
 Both are described in `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc`.
 
 A new format starts here: a member of `CanFormat` and what its bytes mean. Then `decoders` gets its
-decoder (`make_decoder`; a type error says where one is missing), `daemon/scene/drivers.py` its name,
-`drivers/twins/can.py` a twin that sends it, and the two pages above its description.
+decoder (`make_decoder`; a type error says where one is missing), `daemon/scene/drivers.py` its
+name, `drivers/twins/can.py` a twin that sends it, and the two pages above its description.
 """
 
 from __future__ import annotations

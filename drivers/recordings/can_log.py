@@ -40,7 +40,7 @@ _LINE: Final = re.compile(
 
 
 def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
-    """A frame as a line of `candump -L`, newline included; `wall_ns` is when it came, since 1970."""
+    """A frame as a line of `candump -L`, with newline; `wall_ns`: when it came, ns since 1970."""
     seconds, rest_ns = divmod(wall_ns, 1_000_000_000)
     word = frame.arbitration_id
     if frame.flags & ERROR:
