@@ -80,7 +80,7 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
 
 
 def state_of(pipeline: Pipeline) -> Callable[[], Known]:
-    """Copy the state of judge and session, in some 50 us; calling the result encodes it.
+    """Copy the state of judge and session, in some 0.1 ms; calling the result encodes it.
 
     Encoding takes longer, and may be done in another thread.
     """

@@ -92,6 +92,11 @@ class Lab:
             if int(entry["__MONOTONIC_TIMESTAMP"]) / 1e6 > after_s
         ]
 
+    def warnings(self, hand: str, after_s: float) -> list[str]:
+        """What a hand's unit warned of since a time, but for an overloaded emulated processor."""
+        said = self.journal(hand, after_s, "warning")
+        return [line for line in said if not line.startswith("overloaded: ")]
+
     def await_journal(self, hand: str, after_s: float, text: str) -> None:
         """Wait until a hand's unit says something. Raises `StepError` if it does not."""
         deadline_s = time.monotonic() + PATIENCE_S

@@ -131,7 +131,7 @@ def disk_full(lab: Lab) -> Outcome:
             lab.await_journal("serial", full_s, text)
         for _ in range(2):  # grasps: another one that cannot be kept
             lab.await_message("serial", lab.now_s(), "a judged grasp", judgement)
-        warnings = lab.journal("serial", full_s, "warning")
+        warnings = lab.warnings("serial", full_s)
         if len(warnings) != 2:
             raise StepError(f"{len(warnings)} warnings: {warnings}")
         lab.sh("graspd session show /etc/graspd/serial.toml")  # what was kept before is whole
@@ -170,7 +170,7 @@ def clock_stepped(lab: Lab) -> Outcome:
             compared += len(verdicts)
     for hand in HANDS:
         _same_process(lab, hand, pids[hand])
-        said = lab.journal(hand, began_s, "warning")
+        said = lab.warnings(hand, began_s)
         if said:
             raise StepError(f"{hand}: {said}")
     return Outcome(f"by a day and back: {compared} verdicts, none stale or lost, no warning")
