@@ -46,12 +46,12 @@ def build_recorder(
         retention,
         options,
         header_of(wanted, model, boot_id),
-        make_raw=None if tap is None else tap.make_file,
+        make_link_log=None if tap is None else tap.make_file,
         take_state=lambda: state_of(pipeline),
     )
     pipeline.on_exchange = recorder.exchanged
     if tap is not None:
-        tap.pass_on(recorder.raw)
+        tap.pass_on(recorder.on_link)
     return recorder
 
 

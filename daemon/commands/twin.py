@@ -131,7 +131,7 @@ def _given(args: argparse.Namespace, name: str) -> float:
 
 
 def _electrode(text: str) -> tuple[int, int]:
-    finger, _, number = text.replace(":", "_").partition("_")
+    finger, _, number = text.partition("_")
     if finger not in FINGERS or not number.isdecimal() or not 1 <= int(number) <= 24:
         raise ValueError(f"{text!r} is no electrode; th_24 would be one")
     return FINGERS.index(finger), int(number) - 1

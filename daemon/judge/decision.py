@@ -12,7 +12,7 @@ from daemon.judge.reasons import Decision, Reason
 class Limits:
     """What a verdict other than `unknown` must keep to."""
 
-    max_age_ns: int
+    max_age_ns: int = 100_000_000
     """Age of the reading at the end of judging, ns."""
     slip_threshold: float = 0.5
     """`p_slip` from here on is slip, in 0..1."""

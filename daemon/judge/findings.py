@@ -18,7 +18,7 @@ from daemon.judge.reasons import GateState, Reason
 from models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.judge.gate import GateChange
+    from daemon.judge.reasons import GateChange
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 """Of readings or grasps so far; bounded, for a part's memory may come from a recording."""

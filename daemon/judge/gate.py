@@ -18,24 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.limits import GateLimits
-from daemon.judge.reasons import GateCause, GateState, Reason
+from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from daemon.judge.stillness import Stillness, mean_distance
 from drivers.base import ELECTRODES
 
 CHANGES_MAX = 64
 """Changes kept until somebody takes them; a reading makes three at most."""
-
-
-@dataclass(frozen=True, slots=True)
-class GateChange:
-    """The gate went from one state to another."""
-
-    t_ns: int
-    """Time of the reading that made it, ns."""
-    grasp: int
-    former: GateState
-    state: GateState
-    cause: GateCause
 
 
 @dataclass(slots=True, eq=False)

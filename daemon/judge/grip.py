@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
 from daemon.judge.findings import Felt, Watched
-from daemon.judge.gate import Gate, GateChange
+from daemon.judge.gate import Gate
 from daemon.judge.limits import MEDIAN_SWEEPS, GripLimits
 from daemon.judge.median import FreshMedian
-from daemon.judge.reasons import GateState, Reason
+from daemon.judge.reasons import GateChange, GateState, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger
 
@@ -31,7 +32,7 @@ class GripMemory:
 
     last_ns: int | None = None
     """Time of the last usable reading."""
-    unsettled: int = 0
+    unsettled: Annotated[int, msgspec.Meta(ge=0, le=MEDIAN_SWEEPS)] = 0
     """Readings to come whose median may be of values from before some that are missing."""
 
 

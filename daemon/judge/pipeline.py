@@ -23,8 +23,8 @@ from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
-    from daemon.judge.gate import GateChange
     from daemon.judge.grip import Grip
+    from daemon.judge.reasons import GateChange
 
 
 @dataclass(frozen=True, slots=True)

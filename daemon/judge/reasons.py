@@ -11,6 +11,7 @@ age and confidence. A test asks for the row in the table of deploy/wire/README.m
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -112,3 +113,15 @@ class GateCause(StrEnum):
     """No usable reading for too long."""
     ASKED = "asked"
     TIME = "time"
+
+
+@dataclass(frozen=True, slots=True)
+class GateChange:
+    """The gate went from one state to another."""
+
+    t_ns: int
+    """Time of the reading that made it, ns."""
+    grasp: int
+    former: GateState
+    state: GateState
+    cause: GateCause

@@ -28,7 +28,7 @@ from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.judge.gate import GateChange
+    from daemon.judge.reasons import GateChange
     from daemon.publish.deadlines import Deadlines
 
 SHA_DIGITS = 12

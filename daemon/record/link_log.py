@@ -16,7 +16,7 @@ from drivers.base import Driver
 from drivers.can.frames import LOST
 
 if TYPE_CHECKING:
-    from daemon.record.recorder import RawFile
+    from daemon.record.recorder import LinkLogFile
     from drivers.can.frames import CanFrame, Stamped
     from drivers.spi.line import LineEvent
 
@@ -31,7 +31,7 @@ class Tap:
     """Passes on what comes over a link; holds it until somebody takes it."""
 
     def __init__(
-        self, make_file: Callable[[Path], RawFile], clock: Callable[[], int] = time.monotonic_ns
+        self, make_file: Callable[[Path], LinkLogFile], clock: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.make_file = make_file
         """Makes the file of these entries by its name without ending."""

@@ -52,7 +52,7 @@ CLOSE_S: Final = 0.5
 """How long `close` waits for the thread, s."""
 
 
-class RawFile(Protocol):
+class LinkLogFile(Protocol):
     """Keeps what came over a link."""
 
     def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
@@ -68,8 +68,8 @@ class RawFile(Protocol):
         """Close as it is."""
 
 
-MakeRaw = Callable[[Path], RawFile]
-"""Makes a raw file by its name without ending."""
+MakeLinkLog = Callable[[Path], LinkLogFile]
+"""Makes a link log by its name without ending."""
 
 MakeKnown = Callable[[], Known]
 """Encodes a state that the loop has copied; called in the thread."""
@@ -92,7 +92,7 @@ class _Open:
     """Files that are being written, and since when, monotonic ns."""
 
     messages: McapWriter
-    raw: RawFile | None
+    link_log: LinkLogFile | None
     offset_ns: int
     since_ns: int
     size: int = 0
@@ -100,13 +100,13 @@ class _Open:
     unflushed: int = 0
     """Entries that are written to these files, but perhaps not yet on the disk."""
 
-    def all(self) -> list[McapWriter | RawFile]:
+    def all(self) -> list[McapWriter | LinkLogFile]:
         """One or two files."""
-        return [self.messages] if self.raw is None else [self.messages, self.raw]
+        return [self.messages] if self.link_log is None else [self.messages, self.link_log]
 
 
 class Recorder(Companion):
-    """Records one run of the daemon. `send`, `raw` and the hooks never block and never raise."""
+    """Records one run of the daemon. `send`, `on_link` and the hooks never block or raise."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Recorder(Companion):
         options: Record,
         header: RecordingHeader,
         *,
-        make_raw: MakeRaw | None = None,
+        make_link_log: MakeLinkLog | None = None,
         take_state: Callable[[], MakeKnown] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
@@ -130,7 +130,7 @@ class Recorder(Companion):
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
         self._header = header
-        self._make_raw = make_raw
+        self._make_link_log = make_link_log
         self._take_state = take_state
         self._clock = clock
         self._wall_clock = wall_clock
@@ -187,8 +187,8 @@ class Recorder(Companion):
         """Record that readings were left out before the next one."""
         self._put(self._names[Topic.SKIPPED], EVENT)
 
-    def raw(self, entry: object, at_ns: int) -> None:
-        """Record what came over the link at monotonic `at_ns`, ns; `make_raw`'s file writes it."""
+    def on_link(self, entry: object, at_ns: int) -> None:
+        """Record what came over the link at monotonic `at_ns`, ns, in the link log."""
         self._put(b"", entry, at_ns)
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
@@ -276,9 +276,9 @@ class Recorder(Companion):
                 self._header, file=self._number, known=known, wall_minus_monotonic_ns=offset_ns
             )
             messages = McapWriter(path, header)
-            raw = None
+            link_log = None
             try:
-                raw = None if self._make_raw is None else self._make_raw(name)
+                link_log = None if self._make_link_log is None else self._make_link_log(name)
             except OSError:
                 messages.remove()
                 raise
@@ -289,7 +289,7 @@ class Recorder(Companion):
         self._retry_due_ns = None
         self._number += 1
         self._counted["files"] += 1
-        self._open = _Open(messages, raw, offset_ns, now_ns)
+        self._open = _Open(messages, link_log, offset_ns, now_ns)
 
     def _write(self, entries: list[_Entry]) -> None:
         """Write entries; count them as lost if there is no file."""
@@ -304,8 +304,8 @@ class Recorder(Companion):
                     content = self._encoder.encode(content())
                 if topic and isinstance(content, bytes):
                     files.messages.write(topic, content, at_ns)
-                elif files.raw is not None:
-                    files.raw.write(content, at_ns, files.offset_ns)
+                elif files.link_log is not None:
+                    files.link_log.write(content, at_ns, files.offset_ns)
         except OSError as error:
             self._fail(error)
 

@@ -28,8 +28,8 @@ DRAINS_MAX = 8
 """How often the driver is asked for more in one round when there is too much: what the kernel keeps
 is taken in fewer, and a flood cannot hold the loop."""
 BLOCKED_NS = 50_000
-"""A wait of this length, ns, was one: the kernel had this thread sleep. Without one it returns in a
-few microseconds."""
+"""A wait longer by this than what the processor took for it, ns, was one: the kernel had this
+thread sleep. What is there already takes processor time alone, however slow the processor is."""
 
 
 class Ended(Enum):
@@ -197,10 +197,11 @@ class Loop:
             if timer_ns is not None and timer_ns < due_ns:
                 due_ns = timer_ns
         now_ns = began_ns = self._clock()
+        worked_ns = time.thread_time_ns()
         if began_ns < due_ns:
             selector.select((due_ns - began_ns) / 1e9)
             now_ns = self._clock()
-        if now_ns - began_ns >= BLOCKED_NS:
+        if now_ns - began_ns - (time.thread_time_ns() - worked_ns) >= BLOCKED_NS:
             self._overload.waited(now_ns)
         else:  # there was work already
             self._overload.rest(now_ns)

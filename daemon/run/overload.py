@@ -105,10 +105,13 @@ class Overload:
 def after(skipped: TactileReading, newest: TactileReading) -> TactileReading:
     """The newest reading, as it is to be judged when the one before it is not.
 
-    Fingers that only repeat what they read before are held, as the judge would have seen.
+    Fingers that only repeat what they read before, as far as both were read, are held, as the judge
+    would have seen.
     """
-    held = (newest.counts == skipped.counts).all(axis=1)
+    sound = (newest.faults | skipped.faults) == 0
+    differs = newest.counts != skipped.counts
+    held = sound.any(axis=1) & ~(differs & sound).any(axis=1)
     if not held.any():
         return newest
-    faults = newest.faults | np.uint8(ElectrodeFault.HELD) * held[:, np.newaxis]
+    faults = newest.faults | np.uint8(ElectrodeFault.HELD) * (sound & held[:, np.newaxis])
     return dataclasses.replace(newest, faults=faults)

@@ -107,7 +107,7 @@ class Gate(Section):
     """`settled`: once per grasp, when it has settled; `every`: each reading is a grasp of its own;
     `request`: when the controller asks. Unless given, `settled` for live sensors and for recorded
     streams, `every` for grasp tables."""
-    max_age_ms: Milliseconds = 100.0
+    max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
     """An older reading gives `unknown`; so does silence for that long."""
     sweeps: Literal[1, 3] | None = None
     """What is judged: 1, a single reading; 3, each electrode's median of three fresh ones. Unless

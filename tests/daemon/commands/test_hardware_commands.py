@@ -150,7 +150,7 @@ def test_run_prints_verdicts(tmp_path: Path) -> None:
 
 def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
     scene = scene_for("spi", tmp_path)
-    with twin("spi", tmp_path, "--dead", "th:24", "--unplugged", "mf") as hardware:
+    with twin("spi", tmp_path, "--dead", "th_24", "--unplugged", "mf") as hardware:
         people = graspd("doctor", scene, "--listen", 2)
         program = graspd("doctor", scene, "--listen", 2, "--json")
         end(hardware)
@@ -158,7 +158,7 @@ def test_the_doctor_finds_what_the_twin_broke(tmp_path: Path) -> None:
     report = json.loads(program.stdout)
     wrong = [finding["what"] for finding in report["findings"] if finding["level"] == "error"]
     assert any(what.startswith("mf: no electrode can be read") for what in wrong)
-    assert "th: E24 stuck at a rail" in wrong
+    assert "th_24 stuck at a rail" in wrong
     assert len(wrong) == 2
     assert report["readings"] > 50
     for what in wrong:

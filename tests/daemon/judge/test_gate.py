@@ -10,10 +10,9 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.findings import Watched
-from daemon.judge.gate import GateChange
 from daemon.judge.grip import Grip
 from daemon.judge.limits import GateLimits, GripLimits, JointLimits
-from daemon.judge.reasons import GateState, Reason
+from daemon.judge.reasons import GateChange, GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 

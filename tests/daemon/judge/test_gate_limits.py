@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from daemon.judge.findings import Watched
-from daemon.judge.gate import CHANGES_MAX, Gate, GateChange
+from daemon.judge.gate import CHANGES_MAX, Gate
 from daemon.judge.grip import Grip
 from daemon.judge.limits import GateLimits
-from daemon.judge.reasons import GateCause, GateState, Reason
+from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from tests.daemon.judge.test_gate import (
     ALL,
     FINGERS,

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import logging
 import selectors
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 
@@ -371,3 +372,69 @@ def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
     assert {verdict.verdict for verdict in after_it} == {Decision.UNKNOWN}
     assert after_it[0].reasons == [Reason.SEQUENCE_GAP]
     assert said[249].verdict is Decision.STABLE
+
+
+def test_a_finger_that_repeats_itself_is_held_whatever_is_read_of_its_flagged_electrodes() -> None:
+    """As without the gap, where health takes no flagged electrode for a difference."""
+    former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
+    counts = newest.counts.copy()
+    counts[0] = former.counts[0]
+    counts[0, 5] += 7
+    faults = np.zeros((3, 24), np.uint8)
+    faults[0, 5] = ElectrodeFault.PARITY
+    found = after(former, dataclasses.replace(newest, counts=counts, faults=faults))
+    held = (found.faults & ElectrodeFault.HELD) != 0
+    assert held[0].sum() == 23
+    assert not held[0, 5]
+    assert not held[1:].any()
+    assert found.faults[0, 5] == ElectrodeFault.PARITY
+
+
+def test_a_finger_of_which_nothing_is_read_is_missing_and_not_held() -> None:
+    former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
+    counts, faults = newest.counts.copy(), np.zeros((3, 24), np.uint8)
+    counts[2], faults[2] = 0, ElectrodeFault.MISSING
+    gone = dataclasses.replace(newest, counts=counts, faults=faults)
+    assert (
+        after(dataclasses.replace(gone, counts=counts.copy()), gone).faults[2].tolist()
+        == [ElectrodeFault.MISSING] * 24
+    )
+    assert after(former, gone) is gone
+
+
+class BusySelector(selectors.SelectSelector):
+    """What is ready is found after a while: a processor so slow that asking takes 0.2 ms."""
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        until_ns = time.thread_time_ns() + 200_000
+        while time.thread_time_ns() < until_ns:
+            pass
+        return super().select(0.0)
+
+
+def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> None:
+    rests_s: list[float] = []
+    clock = Clock()
+    driver = FakeDriver([], clock)
+    driver.ends = False
+
+    def rest(seconds: float) -> None:
+        rests_s.append(seconds)
+        driver.ends = True
+
+    driver.live = True
+    began_ns = time.monotonic_ns()
+    with StopSignal() as stop:
+        loop = Loop(
+            [driver],
+            pipeline(FakeModel(), clock, max_age_ns=SECOND_NS),
+            Outbox("right", FINGERS, "fake", "ab" * 32, []),
+            stop,
+            [],
+            Timing(60 * SECOND_NS, rest=rest, selector=BusySelector),
+        )
+        with closing(loop):
+            loop.run()
+    assert len(rests_s) == 1
+    assert 0.0 < rests_s[0] <= REST_MAX_NS / 1e9
+    assert time.monotonic_ns() - began_ns >= REST_AFTER_NS
