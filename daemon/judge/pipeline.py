@@ -182,7 +182,7 @@ class Pipeline:
         memory, grasp, counts = self.memory, None, None
         memory.readings += 1
         watched = self._health.watch(reading)
-        felt = self._feel(reading, watched)
+        felt = self._observe(reading, watched)
         if felt.counts is not None:
             session = None if self._session is None else self._session.now
             examined = self._plausibility.examine(felt.counts, watched.broken, session)
@@ -239,7 +239,7 @@ class Pipeline:
             self.memory.learnt_grasp = grasp
             self._to_learn = counts
 
-    def _feel(self, reading: TactileReading, watched: Watched) -> Felt:
+    def _observe(self, reading: TactileReading, watched: Watched) -> Felt:
         grip = self.grip
         if grip is None:
             return Felt(self.memory.readings, None if watched.reasons else reading.counts)
