@@ -8,17 +8,14 @@ Each is a value: the next part needs nothing else of those before it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import GateState, Reason
+from daemon.judge.reasons import GateChange, GateState, Reason
 from models.contract import Finger
-
-if TYPE_CHECKING:
-    from daemon.judge.reasons import GateChange
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
 """Of readings or grasps so far; bounded, for a part's memory may come from a recording."""

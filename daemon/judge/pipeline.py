@@ -15,7 +15,7 @@ from daemon.judge.health import Health
 from daemon.judge.limits import GripLimits
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
-from daemon.judge.reasons import Decision, GateState, Reason
+from daemon.judge.reasons import Decision, GateChange, GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
@@ -24,7 +24,6 @@ from models.runtime import TactileModel
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
     from daemon.judge.grip import Grip
-    from daemon.judge.reasons import GateChange
 
 
 @dataclass(frozen=True, slots=True)

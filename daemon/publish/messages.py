@@ -35,16 +35,24 @@ DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
 """The same as a number, because plotting tools draw numbers and skip text."""
 
 
-class Verdict(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of the grasp by one reading, on topic `verdict.<hand>`."""
+class _Message(msgspec.Struct, frozen=True, kw_only=True):
+    """How every message begins; what `t_mono_ns` is the time of, each says itself."""
 
     v: Literal[1] = WIRE_VERSION
     boot_id: str
     """Identifies this start of the daemon; a new one means that `seq` and `grasp` start again."""
     seq: Count
-    """Counts up by one per message of this topic; a gap is a loss."""
+    """Counts up by one per message of this topic; a gap is a loss, or of `tactile.<hand>` that
+    nobody wanted it."""
     t: float
     """Wall-clock seconds since 1970 at publishing, for plots and people only."""
+    t_mono_ns: Count
+    """Monotonic time, ns."""
+
+
+class Verdict(_Message, frozen=True, kw_only=True):
+    """What is known of the grasp by one reading, on topic `verdict.<hand>`."""
+
     t_mono_ns: Count
     """Monotonic time, ns, of the reading's last byte; of the start where none has come yet."""
     grasp: Count
@@ -81,14 +89,9 @@ class Verdict(msgspec.Struct, frozen=True, kw_only=True):
     """First 12 hex digits of the model file's SHA-256."""
 
 
-class GateMessage(msgspec.Struct, frozen=True, kw_only=True):
+class GateMessage(_Message, frozen=True, kw_only=True):
     """The gate changed its state, on topic `gate.<hand>`; comes before the reading's verdict."""
 
-    v: Literal[1] = WIRE_VERSION
-    boot_id: str
-    seq: Count
-    """Counts up by one per message of this topic; a gap is a loss."""
-    t: float
     t_mono_ns: Count
     """Monotonic time, ns, of the last byte of the reading that made the change."""
     grasp: Count
@@ -97,17 +100,12 @@ class GateMessage(msgspec.Struct, frozen=True, kw_only=True):
     cause: GateCause
 
 
-class Tactile(msgspec.Struct, frozen=True, kw_only=True):
+class Tactile(_Message, frozen=True, kw_only=True):
     """A reading as it was judged, on topic `tactile.<hand>`; comes before its verdict.
 
     Made only while somebody subscribes to it.
     """
 
-    v: Literal[1] = WIRE_VERSION
-    boot_id: str
-    seq: Count
-    """Counts up by one per message of this topic; a gap is a loss, or nobody wanted it."""
-    t: float
     t_mono_ns: Count
     """Monotonic time, ns, of the reading's last byte, as in its verdict."""
     fingers: Annotated[list[Finger], msgspec.Meta(max_length=5)]
@@ -120,13 +118,9 @@ class Tactile(msgspec.Struct, frozen=True, kw_only=True):
     """Newest angle of each joint that has one, rad."""
 
 
-class OutcomeMessage(msgspec.Struct, frozen=True, kw_only=True):
+class OutcomeMessage(_Message, frozen=True, kw_only=True):
     """How a lift ended, as the controller has told it, on topic `outcome.<hand>`."""
 
-    v: Literal[1] = WIRE_VERSION
-    boot_id: str
-    seq: Count
-    t: float
     t_mono_ns: Count
     """Monotonic time, ns, when the controller told it."""
     grasp: Count
@@ -145,13 +139,9 @@ class State(StrEnum):
     STOPPING = "stopping"
 
 
-class Status(msgspec.Struct, frozen=True, kw_only=True):
+class Status(_Message, frozen=True, kw_only=True):
     """How the daemon is, once a second even when idle, on topic `status.<hand>`."""
 
-    v: Literal[1] = WIRE_VERSION
-    boot_id: str
-    seq: Count
-    t: float
     t_mono_ns: Count
     """Monotonic time, ns, of this message."""
     state: State

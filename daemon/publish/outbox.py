@@ -12,7 +12,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal, Protocol
 
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, Reason
+from daemon.judge.reasons import Decision, GateChange, Reason
 from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import (
     DECISION_CODE,
@@ -28,7 +28,6 @@ from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.judge.reasons import GateChange
     from daemon.publish.deadlines import Deadlines
 
 SHA_DIGITS = 12

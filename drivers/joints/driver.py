@@ -5,16 +5,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 
-from drivers.base import JointReading, Opened, Reading
+from drivers.base import JointReading, Reading
 from drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointParser, MessageOrder
-from drivers.link import LinkState
-from drivers.udp.link import DatagramLink
+from drivers.udp.link import DatagramDriver, DatagramLink
 
 SILENCE_NS = 500_000_000
 """Without a message for so long the link is lost: 50 at 100 Hz, and a sender of 10 Hz passes."""
 
 
-class JointStreamDriver(Opened):
+class JointStreamDriver(DatagramDriver):
     """Gives a `JointReading` per message.
 
     `source` is `udp://ADDRESS:PORT` to listen on; `only_from` the sender's IP address, if no other
@@ -24,8 +23,6 @@ class JointStreamDriver(Opened):
 
     name = "joints"
     period_ns: int | None = None
-    exhausted = False
-    live = True
 
     def __init__(
         self,
@@ -34,7 +31,7 @@ class JointStreamDriver(Opened):
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._link = DatagramLink(
+        link = DatagramLink(
             self.name,
             source,
             clock,
@@ -42,6 +39,7 @@ class JointStreamDriver(Opened):
             silence_ns=SILENCE_NS,
             only_from=only_from,
         )
+        super().__init__(link)
         self._reset()
 
     def _reset(self) -> None:
@@ -49,55 +47,32 @@ class JointStreamDriver(Opened):
         self._parser = JointParser(self.counters)
         self._order = MessageOrder(self.counters)
 
-    @property
-    def link_state(self) -> LinkState:
-        """What the link is doing."""
-        return self._link.state
-
-    @property
-    def port(self) -> int | None:
-        """The port that is listened on, or None."""
-        return self._link.port
-
-    @property
-    def serials(self) -> dict[str, str]:
-        """There are no tactile sensors."""
-        return {}
-
-    def describe(self) -> dict[str, str]:
-        """Source, link, who is heard; after `close` as it was then."""
-        return self._link.describe()
-
     def open(self) -> None:
         """Listen."""
         self.close()
         self._reset()
-        self._link.open(self.counters)
-
-    def close(self) -> None:
-        """Release the socket."""
-        self._link.close()
+        self.link.open(self.counters)
 
     def fileno(self) -> int | None:
         """The socket."""
-        return self._link.fileno()
+        return self.link.fileno()
 
     def due_ns(self) -> int | None:
         """When silence is to be noticed."""
-        return self._link.due_ns()
+        return self.link.due_ns()
 
     def read_ready(self) -> Sequence[Reading]:
         """One reading per message that has arrived, oldest first."""
         readings: list[Reading] = []
-        for data, t_ns in self._link.receive():
+        for data, t_ns in self.link.receive():
             message = self._parser.parse(data)
             if message is None or not self._order.admits(message):
                 continue
-            self._link.confirm("joint stream")
+            self.link.confirm("joint stream")
             if message.names:
                 seq = self.counters.readings + self.counters.missed_readings
                 readings.append(JointReading(t_ns, seq, message.names, message.position_rad))
                 self.counters.readings += 1
-        if self._link.fell_silent():
+        if self.link.fell_silent():
             self._order.forget()
         return readings

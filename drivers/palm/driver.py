@@ -12,12 +12,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from drivers.base import Opened, Reading
+from drivers.base import Reading
 from drivers.link import LinkState
 from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
 from drivers.palm.rounds import ROUND_NS
 from drivers.palm.stream import PalmStream
-from drivers.udp.link import DatagramLink
+from drivers.udp.link import DatagramDriver, DatagramLink
 
 SILENCE_NS: Final = 10 * ROUND_NS
 """Without a packet for ten periods the link is lost."""
@@ -25,7 +25,7 @@ SPARE_CYCLES: Final = 2
 """The driver asks to be woken by packets again so many cycles before a round can end."""
 
 
-class PalmDriver(Opened):
+class PalmDriver(DatagramDriver):
     """Gives what a `PalmStream` makes of the packets that come to a UDP port.
 
     `source` is `udp://ADDRESS:PORT` to listen on; `only_from` is the relay's IP address, if no
@@ -38,8 +38,6 @@ class PalmDriver(Opened):
 
     name = "palm"
     period_ns: int | None = ROUND_NS
-    exhausted = False
-    live = True
 
     def __init__(
         self,
@@ -51,7 +49,7 @@ class PalmDriver(Opened):
         heed_finger_bits: bool = True,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._link = DatagramLink(
+        link = DatagramLink(
             self.name,
             source,
             clock,
@@ -59,6 +57,7 @@ class PalmDriver(Opened):
             silence_ns=SILENCE_NS,
             only_from=only_from,
         )
+        super().__init__(link)
         self._make_stream = functools.partial(
             PalmStream, fingers, heed_finger_bits=heed_finger_bits
         )
@@ -72,35 +71,12 @@ class PalmDriver(Opened):
         """Counters since `open`."""
         return self._stream.counters
 
-    @property
-    def link_state(self) -> LinkState:
-        """What the link is doing."""
-        return self._link.state
-
-    @property
-    def port(self) -> int | None:
-        """The port that is listened on, or None."""
-        return self._link.port
-
-    @property
-    def serials(self) -> dict[str, str]:
-        """The palm does not pass them on in its samples."""
-        return {}
-
-    def describe(self) -> dict[str, str]:
-        """Source, link, which palm is heard from whom; after `close` as it was then."""
-        return self._link.describe()
-
     def open(self) -> None:
         """Read the calibration, then listen."""
         self.close()
         self._stream = self._make_stream(calibration=self._calibration)
         self._attention_ns = self._clock()
-        self._link.open(self._stream.counters)
-
-    def close(self) -> None:
-        """Release the socket."""
-        self._link.close()
+        self.link.open(self._stream.counters)
 
     def fileno(self) -> int | None:
         """The socket, but None while no round can end.
@@ -108,24 +84,24 @@ class PalmDriver(Opened):
         The kernel collects packets and notes their times. A loop that woke for each of them would
         wake a thousand times a second for 71 readings.
         """
-        return None if self._clock() < self._attention_ns else self._link.fileno()
+        return None if self._clock() < self._attention_ns else self.link.fileno()
 
     def due_ns(self) -> int | None:
         """When a round is about to end, or silence is to be noticed."""
-        due_ns = self._link.due_ns()
-        if self._link.state is LinkState.CLOSED or self._clock() >= self._attention_ns:
+        due_ns = self.link.due_ns()
+        if self.link.state is LinkState.CLOSED or self._clock() >= self._attention_ns:
             return due_ns
         return self._attention_ns if due_ns is None else min(due_ns, self._attention_ns)
 
     def read_ready(self) -> Sequence[Reading]:
         """Readings that are complete, from `drivers.udp.link.DRAIN_MAX` packets at most."""
         readings: list[Reading] = []
-        for data, t_ns in self._link.receive():
+        for data, t_ns in self.link.receive():
             made = self._stream.receive(data, t_ns)
             if made is not None:
-                self._link.confirm(f"palm {self._stream.palm}")
+                self.link.confirm(f"palm {self._stream.palm}")
                 readings.extend(made)
-        if self._link.fell_silent():
+        if self.link.fell_silent():
             self._stream.interrupt()
         self._attention_ns = self._clock() + self._nothing_for_ns()
         return readings

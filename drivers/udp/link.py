@@ -6,7 +6,7 @@ import ipaddress
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from drivers.base import DriverCounters, LinkError
+from drivers.base import DriverCounters, LinkError, Opened
 from drivers.link import Link, LinkState
 from drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
 
@@ -190,3 +190,37 @@ class DatagramLink:
             self._earlier_drops += self._receiver.dropped
             self._receiver.close()
             self._receiver = None
+
+
+class DatagramDriver(Opened):
+    """Base of drivers that listen to datagrams; whoever derives opens `link` and reads from it."""
+
+    exhausted = False
+    live = True
+
+    def __init__(self, link: DatagramLink) -> None:
+        """Nothing is listened to yet."""
+        self.link = link
+
+    @property
+    def link_state(self) -> LinkState:
+        """What the link is doing."""
+        return self.link.state
+
+    @property
+    def port(self) -> int | None:
+        """The port that is listened on, or None."""
+        return self.link.port
+
+    @property
+    def serials(self) -> dict[str, str]:
+        """Always empty: no datagram carries a sensor's serial number."""
+        return {}
+
+    def describe(self) -> dict[str, str]:
+        """Source, link, what is heard from whom; after `close` as it was then."""
+        return self.link.describe()
+
+    def close(self) -> None:
+        """Release the socket."""
+        self.link.close()
