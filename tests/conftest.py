@@ -29,7 +29,7 @@ IN_REAL_TIME = {
     *("test_commands", "test_cpp_against_daemon", "test_export", "test_fewer_fingers"),
     *("test_hardware_commands", "test_joints", "test_keys", "test_lift", "test_logs"),
     *("test_systemd", "test_outages", "test_outcomes", "test_palm", "test_process"),
-    *("test_publisher", "test_questions", "test_raw_record", "test_readme"),
+    *("test_publisher", "test_questions", "test_link_log", "test_readme"),
     *("test_realtime", "test_record_and_replay", "test_recorder", "test_runner"),
     *("test_soak", "test_sockets", "test_spi_bridge", "test_spi_twin", "test_subscribers"),
     *("test_run_jobs", "test_watch_browser", "test_watch_command", "test_watch_web"),
