@@ -50,6 +50,8 @@ class Reason(StrEnum):
     NOT_ASKED = "not-asked"
     NOT_CALIBRATED = "not-calibrated"
     LOW_CONFIDENCE = "low-confidence"
+    UNPROVEN = "unproven"
+    RISK_EXCEEDED = "risk-exceeded"
     MODEL_MISMATCH = "model-mismatch"
     MODEL_FAILED = "model-failed"
 
@@ -78,7 +80,10 @@ ADVICE: dict[Reason, str] = {
     Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
     Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
     Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
-    Reason.LOW_CONFIDENCE: "too close to call for min_accuracy: grasp again",
+    Reason.LOW_CONFIDENCE: "too close to call for min_confidence or for [risk]: grasp again",
+    Reason.UNPROVEN: "too few outcomes are known for [risk]: lift under supervision, tell outcomes",
+    Reason.RISK_EXCEEDED: "more `stable` lifts slipped than [risk] can make good: find out why, "
+    "then `graspd session reset`",
     Reason.MODEL_MISMATCH: "the reading has other fingers than the model",
     Reason.MODEL_FAILED: "the network gave no probability: check the model file",
 }

@@ -12,6 +12,8 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 
 from daemon.judge.reasons import Decision, GateCause, GateState, Reason
+from daemon.trust.ledger import Told
+from daemon.trust.risk import RiskReport
 from models.contract import Finger
 
 WIRE_VERSION: Final = 1
@@ -87,6 +89,17 @@ class Verdict(_Message, frozen=True, kw_only=True):
     model: str
     model_sha: str
     """First 12 hex digits of the model file's SHA-256."""
+    p_slip_model: Probability | None = None
+    """What the network alone says, before what outcomes have taught; null exactly when `p_slip`
+    is."""
+    outcomes: Count = 0
+    """Outcomes of lifts that `p_slip` rests on: those learned from since the start of the session.
+    """
+    supervised: bool = False
+    """Lift it under supervision and tell the outcome, whatever the verdict: it would teach what is
+    not known yet."""
+    risk: RiskReport | None = None
+    """What lifts of `stable` verdicts came to; null where nothing learns and no risk is set."""
 
 
 class GateMessage(_Message, frozen=True, kw_only=True):
@@ -128,6 +141,9 @@ class OutcomeMessage(_Message, frozen=True, kw_only=True):
     outcome: Literal["stable", "slip"]
     object: ObjectName | None = None
     """What was lifted; null: it was not told."""
+    grasp_boot_id: str | None = None
+    """The `boot_id` under which the grasp was judged, if that was an earlier start; null: this
+    one."""
 
 
 class State(StrEnum):
@@ -137,6 +153,30 @@ class State(StrEnum):
     SILENT = "silent"
     """No reading arrives; every verdict is `unknown`."""
     STOPPING = "stopping"
+
+
+class Lifts(msgspec.Struct, frozen=True, kw_only=True):
+    """What has become of the grasps that were called `stable`, since the risk was set."""
+
+    reported: Count
+    """Lifts whose outcome was told."""
+    outstanding: Count
+    """Grasps whose outcome can still come."""
+    unreported: Count
+    """Grasps that were forgotten before an outcome came: they are in no bound."""
+
+
+class LearnerHealth(msgspec.Struct, frozen=True, kw_only=True):
+    """What the learner has to go by."""
+
+    enabled: bool
+    """`[learn] enabled`."""
+    outcomes: Count
+    """Learned from since the start of the session."""
+    told: dict[Told, Count]
+    """Outcomes since the start of the session, by what became of them; only what occurred."""
+    uncertainty: Probability
+    """1: nothing is learned yet; towards 0: what is learned hardly changes any more."""
 
 
 class Status(_Message, frozen=True, kw_only=True):
@@ -179,6 +219,10 @@ class Status(_Message, frozen=True, kw_only=True):
     """Readings since start that were not judged because newer ones were there already."""
     overloaded: bool = False
     """Whether readings come faster than they are judged, or did within the last five seconds."""
+    lifts: Lifts | None = None
+    """Null where nothing learns and no risk is set."""
+    learner: LearnerHealth | None = None
+    """Likewise."""
     model: str
     model_sha: str
     versions: dict[str, str]

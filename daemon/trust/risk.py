@@ -52,6 +52,23 @@ class RiskLimits:
             raise ValueError("warm_up must not be negative, explore must be 0..1")
 
 
+class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
+    """What lifts of `stable` verdicts came to, for those who decide whether to lift."""
+
+    target: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
+    """`[risk] max_slip_when_stable`; null: none is set."""
+    lifts: Count
+    """Lifts of `stable` verdicts whose outcome was told."""
+    slips: Count
+    """Slips among them."""
+    outstanding: Count
+    """`stable` verdicts whose outcome can still come; each may add one slip to the bound."""
+    bound: Annotated[float, msgspec.Meta(ge=0.0)] | None
+    """What `slips` cannot exceed, but for `outstanding`; null: no risk is set."""
+    warm_up_left: Count
+    """Outcomes that are missing until the warm-up is over; 0 without a risk."""
+
+
 class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a rule knows; see the attributes of `Risk`."""
 

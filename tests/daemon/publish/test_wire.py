@@ -16,6 +16,8 @@ from daemon.commands.schema import schema_text
 from daemon.judge.reasons import ADVICE, Decision, GateCause, GateState, Reason
 from daemon.publish.messages import (
     GateMessage,
+    LearnerHealth,
+    Lifts,
     OutcomeMessage,
     State,
     Status,
@@ -29,6 +31,8 @@ from daemon.publish.messages import (
     encode,
     schema,
 )
+from daemon.trust.ledger import Told
+from daemon.trust.risk import RiskReport
 
 GOLDEN = Path(__file__).parent / "golden"
 SCHEMA_FILE = Path(__file__).parents[3] / "deploy" / "wire" / "messages.schema.json"
@@ -125,6 +129,10 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         silence_ms=100.0,
         model="small-session",
         model_sha="0123456789ab",
+        p_slip_model=0.5,
+        outcomes=57,
+        supervised=True,
+        risk=RiskReport(target=0.0625, lifts=41, slips=2, outstanding=1, bound=8.5, warm_up_left=0),
     ),
     "gate": GateMessage(
         boot_id=BOOT,
@@ -177,6 +185,10 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         worst_age_ms=12.25,
         skipped_readings=4,
         overloaded=False,
+        lifts=Lifts(reported=41, outstanding=1, unreported=3),
+        learner=LearnerHealth(
+            enabled=True, outcomes=57, told={Told.TAKEN: 57, Told.CONTRADICTS: 1}, uncertainty=0.5
+        ),
         model="cnn1",
         model_sha="0123456789ab",
         versions={"graspd": "0.1.0", "onnxruntime": "1.31.1", "python": "3.11.7"},
@@ -193,9 +205,10 @@ DECODE: dict[type, Callable[[bytes], object]] = {
 }
 
 
-def test_a_verdict_of_before_there_was_a_gate_is_still_read() -> None:
+def test_a_verdict_of_before_there_was_a_gate_or_a_learner_is_still_read() -> None:
     former = json.loads((GOLDEN / "verdict_stable.json").read_text())
-    for added in ("judged", "gate", "contact", "repaired", "session_calibrated"):
+    gate = ("judged", "gate", "contact", "repaired", "session_calibrated")
+    for added in (*gate, "p_slip_model", "outcomes", "supervised", "risk"):
         del former[added]
     assert decode_verdict(json.dumps(former).encode()) == MESSAGES["verdict_stable"]
 
@@ -205,6 +218,13 @@ def test_an_outcome_of_before_objects_were_told_is_still_read() -> None:
     del former["object"]
     read = decode_outcome(json.dumps(former).encode())
     assert (read.grasp, read.outcome, read.object) == (42, "slip", None)
+
+
+def test_a_status_of_before_there_was_a_learner_is_still_read() -> None:
+    former = json.loads((GOLDEN / "status.json").read_text())
+    del former["lifts"], former["learner"]
+    read = decode_status(json.dumps(former).encode())
+    assert (read.seq, read.lifts, read.learner) == (7, None, None)
 
 
 @pytest.mark.parametrize(
