@@ -16,7 +16,6 @@ import itertools
 import json
 import math
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.trust.learner import Learner, sigmoid
-from daemon.trust.ledger import GRASPS_MAX, GraspId
+from daemon.trust.ledger import GraspId
 from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust, encode
+from daemon.trust.trust import Trust
 from models.inputs import SessionBuilder, raw_features
 from models.training.data.datasets import Grasps, read_all
 from models.training.data.folds import fold_seed, object_folds
@@ -309,50 +308,6 @@ def _risk_rows(streams: Sequence[Stream], limits: RiskLimits, *, every: bool) ->
         )
 
 
-def endurance_lines(outcomes: int, width: int) -> Iterator[str]:
-    """So many outcomes: at the clip, then constant and contradicting, then real variety."""
-    learner, random = Learner(width), np.random.default_rng(0)
-    for kind in ("at the clip", "constant, contradicting", "random"):
-        least = most = learner.log_odds(learner.features(0.0, np.zeros(width)))
-        rows = random.normal(0.0, 1.0, (1000, width)).clip(-CLIP, CLIP)
-        if kind != "random":
-            rows = np.sign(rows) * CLIP if kind == "at the clip" else np.full_like(rows, 0.5)
-        for index in range(outcomes // 3):
-            features = learner.features(30.0 * math.sin(index), rows[index % 1000])
-            learner.learn(features, slipped=bool(random.random() < 0.5))
-            said = learner.log_odds(features)
-            least, most = min(least, said), max(most, said)
-        Learner(width).restore(learner.state())  # raises for what is not positive definite
-        covariance = np.frombuffer(learner.state().covariance).reshape(width + 2, width + 2)
-        values = np.linalg.eigvalsh(covariance)
-        yield (
-            f"{outcomes // 3} outcomes, {kind}: log-odds {least:.1f}..{most:.1f}, "
-            f"eigenvalues {values[0]:.1e}..{values[-1]:.1e}"
-        )
-
-
-def cost_lines(width: int) -> Iterator[str]:
-    """What a judged grasp and an outcome take, and the largest state."""
-    trust, random = Trust("bench", width, RiskLimits(0.05)), np.random.default_rng(0)
-    rows = random.normal(0.0, 1.0, (3000, width)).clip(-CLIP, CLIP).astype(np.float32)
-    judged, told = [], []
-    for index, row in enumerate(rows):
-        grasp, began = GraspId("0" * 32, index), time.perf_counter_ns()
-        found = trust.judge(grasp, 0.5, 0.3, row)
-        trust.note(grasp, found, stable=found.permission is Permission.ALLOWED)
-        said = time.perf_counter_ns()
-        trust.outcome(grasp, slipped=bool(row[0] > 0.0))
-        judged.append(said - began)
-        told.append(time.perf_counter_ns() - said)
-    for index, row in enumerate(rows[:GRASPS_MAX]):
-        grasp = GraspId("1" * 32, index)
-        trust.note(grasp, trust.judge(grasp, 0.5, 0.3, row), stable=False)
-    for name, took in (("judge and note", judged), ("outcome", told)):
-        p50, p99 = np.percentile(took, (50, 99)) / 1e3
-        yield f"{name}: p50 {p50:.1f}, p99 {p99:.1f} us"
-    yield f"largest state: {len(encode(trust.state())) / 1024:.0f} KiB"
-
-
 def _groups(streams: Sequence[Stream]) -> Iterator[tuple[str, str, list[Stream]]]:
     for protocol in sorted({stream.protocol for stream in streams}):
         for order in ORDERS:
@@ -366,16 +321,10 @@ def main() -> None:
     parser.add_argument("data", type=Path, metavar="DIR")
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is scored")
     parser.add_argument("--quick", action="store_true", help="one seed, three epochs")
-    parser.add_argument("--outcomes", type=int, default=1_000_000, help="of the endurance run")
     options = parser.parse_args()
     seeds, copies = (1, 3) if options.quick else (2, 40)
     found = list(all_streams(options.data, options.cache, seeds, copies))
-    width = found[0].features.shape[1]
-    lines = (
-        *(cost_lines(width), learning_lines(found), risk_lines(found)),
-        endurance_lines(options.outcomes, width),
-    )
-    for line in itertools.chain(*lines):
+    for line in itertools.chain(learning_lines(found), risk_lines(found)):
         print(line, flush=True)  # noqa: T201
 
 
