@@ -1,47 +1,27 @@
 """Streams of another day through a session network, the learner and the risk: what they are worth.
 
 `python -m tests.bench.trust DIR --cache FOLDER` prints the tables; DIR is the folder that holds
-`bts3/`. Every stream has objects that its network was not trained on, in a pose that it was not
-trained on; the session's statistics run as in the daemon and every grasp is judged, none refused.
-A: palm_down and palm_side, then palm_45. B: palm_45, then palm_down or palm_side. C: palm_45 and
-one of the others, then the other one.
+`bts3/`. The streams are those of `graspd report worth`.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import hashlib
 import itertools
-import json
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.trust.learner import Learner, sigmoid
-from daemon.trust.ledger import GraspId
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust
-from models.inputs import SessionBuilder, raw_features
-from models.training.data.datasets import Grasps, read_all
-from models.training.data.folds import fold_seed, object_folds
+from daemon.measure.worth.lives import Life, live
+from daemon.measure.worth.streams import ORDERS, Plan, Stream, streams
+from daemon.trust.learner import Learner
+from daemon.trust.risk import RiskLimits
+from models.training.data.datasets import read_all
 
-FOLDS = 4
-CLIP = 3.0
-"""Of the session features, as the zoo's models have it."""
-SPLITS = (
-    ("A", ("palm_down", "palm_side"), ("palm_45",)),
-    ("B", ("palm_45",), ("palm_down", "palm_side")),
-    ("C", ("palm_45", "palm_down"), ("palm_side",)),
-    ("C", ("palm_45", "palm_side"), ("palm_down",)),
-)
-"""Protocol, tables of the training, tables of a stream each."""
-ORDERS = ("random", "object by object")
 OUTCOMES = (0, 5, 10, 20, 50, 100, 200)
 REST = 200
 """Grasps from here on are what frozen learners are compared on."""
@@ -49,162 +29,6 @@ AGES = ((0, 50), (50, 100), (100, 200), (200, None))
 ALPHAS = (0.02, 0.05, 0.1)
 PARTS = (slice(0, 50), slice(None), slice(REST, None))
 WINDOW = 50
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Stream:
-    """The grasps of one table and fold, as they come."""
-
-    protocol: str
-    table: str
-    order: str
-    margins: NDArray[np.float64]
-    """Log-odds of slip (N,) as the network says them."""
-    features: NDArray[np.float32]
-    """What the network was given, shape (N, 78)."""
-    slipped: NDArray[np.bool_]
-
-    def rows(self) -> Iterator[tuple[float, NDArray[np.float32], bool]]:
-        """Margin, features and outcome of each grasp."""
-        yield from zip(self.margins.tolist(), self.features, self.slipped.tolist(), strict=True)
-
-
-def trained_margins(
-    training: Grasps, streams: list[NDArray[np.uint16]], seed: int, copies: int
-) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-    """Margins (N,) and features (N, 78) of streams of counts by a network trained for other days.
-
-    One epoch over so many augmented copies is as many epochs with new augmentation in each.
-    """
-    from models.training.fitting.fit import fit
-    from models.training.fitting.standards import TrainingStandards
-    from models.training.systems.registry import SYSTEMS
-    from models.training.systems.system import with_recipes
-
-    random = np.random.default_rng(seed)
-    table_of = training.table_of
-    standards = TrainingStandards.of(raw_features(training.counts), table_of)
-    inputs = standards.apply(raw_features(training.counts), table_of, CLIP)
-    system = with_recipes(SYSTEMS["small-session"], epochs=1, input_noise=0.0)
-    many = np.concatenate([_another_day(inputs, random) for _ in range(copies)])
-    network = fit(system, many, np.tile(training.slipped, copies), seed=seed)
-    found = []
-    for counts in streams:
-        session = standards.statistics()
-        builder = SessionBuilder(counts.shape[1], CLIP)
-        features = np.empty((len(counts), *builder.shape), np.float32)
-        for row, reading in zip(features, counts, strict=True):
-            builder.use(session.mean, session.spread)
-            builder.build(reading, row)
-            session.observe(raw_features(reading))
-        found.append((network.margins(features), features))
-    return found
-
-
-def _another_day(inputs: NDArray[np.float32], random: np.random.Generator) -> NDArray[np.float32]:
-    """Standardised features (N, fingers * 26) as other sensors might have shown them."""
-    grasps, width = inputs.shape
-    fingers = width // 26
-    gain = np.exp(random.normal(0.0, 0.3, inputs.shape))
-    per_finger = np.exp(random.normal(0.0, 0.3, (grasps, fingers)))
-    gain[:, : 24 * fingers] *= np.repeat(per_finger, 24, axis=1)
-    shifted = inputs * gain
-    shifted[:, 24 * fingers :] += random.normal(0.0, 0.7, (grasps, 2 * fingers))
-    return (shifted + random.normal(0.0, 0.4, inputs.shape)).astype(np.float32)
-
-
-def all_streams(folder: Path, cache: Path, seeds: int, copies: int) -> Iterator[Stream]:
-    """All streams; networks that were trained before are not trained again."""
-    grasps = read_all(folder / "bts3")
-    objects = np.array(grasps.objects)
-    names = np.array([file.name for file in grasps.files])[grasps.table_of]
-    for seed in range(seeds):
-        fold_of = object_folds(grasps.objects, FOLDS, seed)
-        for fold in range(FOLDS):
-            for protocol, training, tests in SPLITS:
-                train = np.flatnonzero(np.isin(names, training) & (fold_of != fold))
-                random = np.random.default_rng([seed, fold])
-                kinds, rows = [], []
-                for table, order, _ in itertools.product(tests, ORDERS, range(2)):
-                    inside = np.flatnonzero((names == table) & (fold_of == fold))
-                    kinds.append((table, order))
-                    rows.append(_ordered(inside, objects, order, random))
-                scores = _scores(grasps, train, rows, cache, fold_seed(seed, fold), copies)
-                for (table, order), chosen, score in zip(kinds, rows, scores, strict=True):
-                    yield Stream(protocol, table, order, *score, grasps.slipped[chosen])
-
-
-def _ordered(
-    rows: NDArray[np.int64], objects: NDArray[np.str_], order: str, random: np.random.Generator
-) -> NDArray[np.int64]:
-    mixed = random.permutation(rows)
-    if order == "random":
-        return mixed
-    own = objects[mixed]
-    return np.concatenate([mixed[own == name] for name in random.permutation(np.unique(own))])
-
-
-def _scores(
-    grasps: Grasps,
-    train: NDArray[np.int64],
-    rows: list[NDArray[np.int64]],
-    cache: Path,
-    seed: int,
-    copies: int,
-) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-    """What `trained_margins` gives, from the cache where it has it."""
-    training = grasps.rows(train)
-    asked = [training.digest(), seed, copies, [chosen.tolist() for chosen in rows]]
-    key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:24]
-    path = cache / f"{key}.npz"
-    if not path.exists():
-        counts = [grasps.counts[chosen] for chosen in rows]
-        found = trained_margins(training, counts, seed, copies)
-        cache.mkdir(parents=True, exist_ok=True)
-        named: dict[str, Any] = {f"m{i}": margins for i, (margins, _) in enumerate(found)}
-        named |= {f"x{i}": features for i, (_, features) in enumerate(found)}
-        np.savez(path, **named)
-        print(f"trained {path.name}", file=sys.stderr, flush=True)  # noqa: T201
-    with np.load(path) as kept:
-        return [(kept[f"m{i}"], kept[f"x{i}"]) for i in range(len(rows))]
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Life:
-    """What was said of a stream's grasps (N,), each after the outcomes of those before it."""
-
-    stream: Stream
-    p_slip: NDArray[np.float64]
-    stable: NDArray[np.bool_]
-    """Which were called stable."""
-    supervised: NDArray[np.bool_]
-    """Which others were lifted all the same, though only stable ones are."""
-    excess: float
-    """Most slips among stable lifts at any time beyond the share that is allowed."""
-    within: bool
-    """Whether they never exceeded the bound."""
-
-
-def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
-    """Judge, lift and tell one grasp after the other; not `every` lift, but those that it asks for.
-
-    Without `every`, the outcomes of other grasps than stable and supervised ones stay unknown.
-    """
-    trust, number = Trust("bench", stream.features.shape[1], limits), len(stream.slipped)
-    p_slip, stable = np.empty(number), np.zeros(number, np.bool_)
-    supervised, excess, within = stable.copy(), 0.0, True
-    alpha = limits.max_slip_when_stable or 0.0
-    for index, (margin, row, slipped) in enumerate(stream.rows()):
-        grasp = GraspId(stream.table, index)
-        found = trust.judge(grasp, sigmoid(margin), margin, row)
-        p_slip[index], supervised[index] = found.p_slip, found.supervised
-        stable[index] = found.permission is Permission.ALLOWED and found.p_slip < 0.5
-        trust.note(grasp, found, stable=bool(stable[index]))
-        if every or stable[index] or found.supervised:
-            trust.outcome(grasp, slipped=slipped)
-        excess = max(excess, trust.risk.slips - alpha * trust.risk.lifts)
-        within &= trust.risk.bound is None or trust.risk.slips <= trust.risk.bound + 1e-9
-    return Life(stream, p_slip, stable, supervised & ~stable, excess, within)
 
 
 def frozen(stream: Stream, outcomes: Sequence[int]) -> Iterator[NDArray[np.bool_]]:
@@ -322,8 +146,8 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is scored")
     parser.add_argument("--quick", action="store_true", help="one seed, three epochs")
     options = parser.parse_args()
-    seeds, copies = (1, 3) if options.quick else (2, 40)
-    found = list(all_streams(options.data, options.cache, seeds, copies))
+    plan = Plan(1 if options.quick else 2, epochs=3 if options.quick else None, cache=options.cache)
+    found = list(streams(read_all(options.data / "bts3"), plan))
     for line in itertools.chain(learning_lines(found), risk_lines(found)):
         print(line, flush=True)  # noqa: T201
 
