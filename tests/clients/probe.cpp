@@ -21,7 +21,15 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
     for (const std::string& reason : verdict.reasons) std::cout << ' ' << reason;
     std::cout << ' ' << verdict.grasp.value_or(-1) << ' ' << verdict.seq.value_or(-1) << ' '
               << (verdict.boot_id.empty() ? "-" : verdict.boot_id) << ' '
-              << std::llrint(verdict.age_ms.value_or(-1) * 1e6) << ' ' << counts.messages << ' '
+              << std::llrint(verdict.age_ms.value_or(-1) * 1e6) << ' '
+              << std::llrint(verdict.p_slip.value_or(-1) * 1e9) << ' '
+              << std::llrint(verdict.p_slip_model.value_or(-1) * 1e9) << ' ' << verdict.outcomes
+              << ' ' << verdict.supervised << ' ' << static_cast<bool>(verdict) << ' ';
+    if (const auto& risk = verdict.risk)
+        std::cout << std::llrint(risk->target.value_or(-1) * 1e9) << ' ' << risk->lifts << ' '
+                  << risk->slips << ' ' << risk->outstanding << ' '
+                  << std::llrint(risk->bound.value_or(-1)) << ' ' << risk->warm_up_left << ' ';
+    std::cout << counts.messages << ' '
               << counts.lost << ' ' << counts.repeats << ' ' << counts.malformed << ' '
               << counts.restarts << ' ' << counts.former << std::endl;
 }

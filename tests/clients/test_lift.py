@@ -19,8 +19,37 @@ from tests.clients.oracle import is_stable, newest, told
 
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
+TAKEN = b'{"v":1,"ok":true}'
 LOOK_NS = 1000
 """What each look at the clock takes."""
+
+
+@dataclass
+class Call:
+    """What is asked or told, and the answers to it."""
+
+    world: World
+    answers: list[tuple[int, bytes]]
+    said: list[bytes] = field(default_factory=list)
+    answered: list[bytes] = field(default_factory=list)
+    due: tuple[int, bytes] | None = None
+
+    def ask(self, question: bytes) -> None:
+        assert self.due is None, "one question at a time"
+        self.said.append(question)
+        if self.answers:
+            delay_ns, payload = self.answers.pop(0)
+            self.due = self.world.now_ns + delay_ns, payload
+
+    def answer(self) -> bytes | None:
+        if self.due is None or self.due[0] > self.world.now_ns:
+            return None
+        self.answered.append(self.due[1])
+        self.due = None
+        return self.answered[-1]
+
+    def hang_up(self) -> None:
+        self.due = None
 
 
 @dataclass
@@ -31,14 +60,16 @@ class World:
     """When what comes, ns."""
     answers: list[tuple[int, bytes]] = field(default_factory=list)
     """How long after its question each comes, ns; then none any more."""
+    acknowledged: list[tuple[int, bytes]] = field(default_factory=list)
+    """The same of outcomes."""
     now_ns: int = START_NS
     slept_ns: int = 0
     """What the computer has slept: the monotonic clock does not count it."""
     came: list[list[bytes]] = field(default_factory=list)
-    answered: list[bytes] = field(default_factory=list)
-    questions: int = 0
     renewed: int = 0
-    _answer: tuple[int, bytes] | None = None
+
+    def __post_init__(self) -> None:
+        self.asking, self.telling = Call(self, self.answers), Call(self, self.acknowledged)
 
     def monotonic_ns(self) -> int:
         self.now_ns += LOOK_NS
@@ -54,25 +85,9 @@ class World:
         return self.came[-1]
 
     def wait(self, timeout_ms: int) -> None:
-        due_ns = [due for due, _ in self.coming[:1]] + ([self._answer[0]] if self._answer else [])
+        calls = (self.asking.due, self.telling.due)
+        due_ns = [due for due, _ in self.coming[:1]] + [due[0] for due in calls if due]
         self.now_ns = max(self.now_ns, min([self.now_ns + timeout_ms * MS, *due_ns]))
-
-    def ask(self, _question: bytes = b"judge") -> None:
-        assert self._answer is None, "one question at a time"
-        self.questions += 1
-        if self.answers:
-            delay_ns, payload = self.answers.pop(0)
-            self._answer = self.now_ns + delay_ns, payload
-
-    def answer(self) -> bytes | None:
-        if self._answer is None or self._answer[0] > self.now_ns:
-            return None
-        self.answered.append(self._answer[1])
-        self._answer = None
-        return self.answered[-1]
-
-    def hang_up(self) -> None:
-        self._answer = None
 
     def renew(self) -> None:
         self.renewed += 1
@@ -165,7 +180,7 @@ def test_a_closed_client_says_no_without_waiting() -> None:
         graspd.close()
         assert graspd.verdict().reasons == ("closed",)
         assert not graspd.may_i_lift(1.0)
-    assert world.questions == 0
+    assert len(world.asking.said) == 0
 
 
 def test_with_a_question_both_must_say_stable() -> None:
@@ -208,7 +223,7 @@ def test_an_unknown_answer_is_asked_for_again() -> None:
     world = World(stream(*["stable"] * 9), answers)
     with client(world, ask=True) as graspd:
         assert graspd.may_i_lift(0.1)
-    assert world.questions == 2
+    assert len(world.asking.said) == 2
 
 
 def test_an_answer_does_not_outlive_the_moment_in_which_nothing_is_known() -> None:
@@ -216,11 +231,11 @@ def test_an_answer_does_not_outlive_the_moment_in_which_nothing_is_known() -> No
     world = World(stream("unknown", *["stable"] * 9), answers)
     with client(world, ask=True) as graspd:
         assert not graspd.may_i_lift(0.09)
-    assert world.questions == 2
+    assert len(world.asking.said) == 2
 
 
 def test_while_an_outcome_is_answered_what_comes_is_read() -> None:
-    world = World(stream("unknown", *["stable"] * 9), [(45 * MS, b'{"v":1,"ok":true}')])
+    world = World(stream("unknown", *["stable"] * 9), acknowledged=[(45 * MS, TAKEN)])
     with client(world, ask=True) as graspd:
         before_ns = world.now_ns
         assert graspd.outcome(Verdict("stable", grasp=1, boot_id="a"), slipped=False)
@@ -321,7 +336,7 @@ def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     last = newest(world.came)
     assert last is not None
     if ask:
-        told_so = told(world.answered[-1])
+        told_so = told(world.asking.answered[-1])
         assert told_so is not None
         assert (told_so.verdict, told_so.boot_id) == ("stable", last.boot_id)
         assert told_so.grasp == last.grasp
