@@ -94,12 +94,12 @@ _anything = st.one_of(
 @st.composite
 def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
     """What daemons that know of outcomes add, or some of it."""
-    risk = RISK | {"slips": draw(st.sampled_from([0, 2, 41, 42]))}
+    risk: dict[str, Any] = RISK | {"slips": draw(st.sampled_from([0, 2, 41, 42]))}
     if draw(st.booleans()):
         risk |= {draw(st.sampled_from(sorted(RISK))): draw(_anything)}
     if draw(st.integers(0, 4)) == 0:
         del risk[draw(st.sampled_from(sorted(RISK)))]
-    found = {
+    found: dict[str, Any] = {
         "p_slip_model": draw(st.sampled_from([None, 0.3 if known else None, 0.3])),
         "outcomes": draw(st.integers(0, 99)),
         "supervised": draw(st.booleans()),

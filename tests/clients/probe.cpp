@@ -1,7 +1,8 @@
 // The C++ client's rules, line by line, for comparison with the Python client's.
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
-// takes a message; `at NOW_NS` answers with a line.
+// takes a message; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift`
+// asks it and answers with a line, `tell` tells it that the lift held.
 #include "graspd_client.hpp"
 
 #include <iostream>
@@ -38,6 +39,8 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
 
 int main() {
     graspd::detail::Newest newest("verdict.right", 0, true);
+    std::optional<graspd::Client> client;
+    graspd::LiftAnswer answer;
     for (std::string line; std::getline(std::cin, line);) {
         std::istringstream words(line);
         std::string order;
@@ -53,6 +56,20 @@ int main() {
             std::vector<std::string> frames;
             for (std::string frame; words >> frame;) frames.push_back(unhexed(frame));
             newest.take({frames.begin(), frames.end()}, empty_ns, now_ns);
+        } else if (order == "client") {
+            graspd::Options options;
+            words >> options.endpoint >> options.ask_endpoint;
+            options.warn = [](const std::string& text) {
+                std::cout << "warn " << text << std::endl;
+            };
+            client.emplace(options);
+        } else if (order == "lift") {
+            answer = client.value().may_i_lift(30.0);
+            std::cout << static_cast<bool>(answer) << ' ' << answer.verdict.grasp.value_or(0) << ' '
+                      << client->unreported() << std::endl;
+        } else if (order == "tell") {
+            const bool taken{client.value().tell(answer.verdict, graspd::Outcome::held, {}, 30.0)};
+            std::cout << (taken ? "told" : "not taken") << std::endl;
         } else {
             graspd::Nanoseconds now_ns = 0;
             words >> now_ns;

@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python.graspd_client import Newest
-from tests.clients.building import compiled_probe
 from tests.clients.messages import MS, TOPIC, Event, events
 from tests.clients.oracle import MAX_AGE_NS
 
@@ -44,11 +43,6 @@ class Probe:
         """End it; its exit code."""
         self._process.communicate(timeout=10)
         return self._process.returncode
-
-
-@pytest.fixture(scope="module")
-def binary(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled_probe(tmp_path_factory.mktemp("probe"))
 
 
 @pytest.fixture

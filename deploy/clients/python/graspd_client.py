@@ -301,11 +301,11 @@ class Graspd:
     def outcome(
         self,
         lifted_on: Verdict,
-        slipped: bool,
+        slipped: bool | str,
         object_name: str | None = None,
         wait_s: float = 2.0,
     ) -> OutcomeAnswer:
-        """Former name of `tell`, which took a bool."""
+        """Former name of `tell`, with a bool for how it ended."""
         how = Outcome.SLIPPED if slipped else Outcome.HELD
         return self.tell(
             lifted_on, slipped if isinstance(slipped, str) else how, object_name, wait_s

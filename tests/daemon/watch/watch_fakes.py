@@ -8,7 +8,10 @@ from typing import Any, Self
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
 from daemon.publish.publisher import Publisher
+from daemon.trust.risk import RiskReport
 
+RISK = RiskReport(target=0.1, lifts=41, slips=2, outstanding=1, bound=9.5, warm_up_left=0)
+"""Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 MS = 1_000_000
 PERIOD_S = 0.02
@@ -35,6 +38,9 @@ def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> by
         "silence_ms": 100.0,
         "model": "small-session",
         "model_sha": "0123456789ab",
+        "p_slip_model": None if p_slip is None else 0.3,
+        "outcomes": 57,
+        "risk": RISK,
     }
     return encode(Verdict(**{**content, **other}))
 
