@@ -94,6 +94,8 @@ class Talker:
     def __init__(self, endpoint: str) -> None:
         self.decision: Decision | None = Decision.UNKNOWN
         """What the verdicts are; none come if None."""
+        self.more: dict[str, Any] = {}
+        """What else they say."""
         self._publisher = Publisher(endpoint)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._talk)
@@ -118,5 +120,5 @@ class Talker:
             counts = [3000 - pressed] * 12 + [3000] * 12
             self._publisher.send(b"status.right", status(seq))
             self._publisher.send(b"tactile.right", tactile(seq, counts, counts, faulty=(6,)))
-            self._publisher.send(b"verdict.right", verdict(seq, decision))
+            self._publisher.send(b"verdict.right", verdict(seq, decision, **self.more))
             seq += 1
