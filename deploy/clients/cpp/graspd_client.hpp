@@ -158,7 +158,7 @@ struct Options {
     std::string endpoint;
     std::string hand = "right";
     double max_age_ms = 100.0;  // how old a reading may be that a lift relies on
-    // `[ask]`; with it `may_i_lift` asks for a judgement as well, and `outcome` has whom to tell.
+    // `[ask]`; with it `may_i_lift` asks for a judgement as well, and `tell` has whom to tell.
     std::string ask_endpoint = {};
     // Whether the daemon's monotonic clock is one's own. Unless given, it is with ipc:// and on
     // loopback addresses: say false through a tunnel.
@@ -645,8 +645,8 @@ public:
 
     // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
     //
-    // Waits at most `wait_s` seconds: graspd answers once it is written to disk. What is answered
-    // later is taken in by later calls, but told again unless it has been. Throws
+    // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
+    // comes later is taken in by later calls; without one, tell it again. Throws
     // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, for
     // `Outcome::unknown`, and for a name that is no 1 to 64 printable ASCII characters without
     // blank, quotes and comma.

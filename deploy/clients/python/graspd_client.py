@@ -191,11 +191,10 @@ class Graspd:
     ) -> None:
         """`max_age_ms` is how old a reading may be that a lift relies on, ms.
 
-        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `outcome` has
-        somebody to tell. `same_computer`
-        says whether the daemon's monotonic clock is one's own; unless given, it is with `ipc://`
-        and on loopback addresses: say False through a tunnel. Raises `zmq.ZMQError` for an endpoint
-        that is none, and `ValueError` for an age that is none.
+        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `tell` has
+        somebody to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
+        unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
+        Raises `zmq.ZMQError` for an endpoint, `ValueError` for an age that is none.
         """
         if not 0.0 < max_age_ms < math.inf:
             raise ValueError(f"max_age_ms must be above 0 and finite, not {max_age_ms}")
@@ -209,7 +208,7 @@ class Graspd:
         """Grasps whose lift was allowed, the oldest first, and whether graspd has the outcome."""
         self._last = self._telling = "", 0
         """The one that was allowed last, and the one that is being told."""
-        self._told: OutcomeAnswer | None = None
+        self._told = OutcomeAnswer("no-answer")
         self._forgotten, self._warn_at = 0, 1
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
         self._read_ns = self._empty_ns = self._heard_ns = time.monotonic_ns()
@@ -227,8 +226,8 @@ class Graspd:
         It cannot learn from them, and they are in no bound of `risk`. The logger `graspd_client`
         warns of the first one and of each tenth.
         """
-        untold = (key for key, told in self._lifts.items() if not told and key != self._last)
-        return self._forgotten + sum(1 for _ in untold)
+        untold = (key != self._last for key, told in self._lifts.items() if not told)
+        return self._forgotten + sum(untold)
 
     def verdict(self, wait_s: float = 0.0) -> Verdict:
         """The newest verdict; waits at most `wait_s` seconds for a new message."""
@@ -279,8 +278,8 @@ class Graspd:
     ) -> OutcomeAnswer:
         """Tell how the lift ended that was made on a verdict, and what was lifted.
 
-        Waits at most `wait_s` seconds: graspd answers once it is written to disk. What is answered
-        later is taken in by later calls, but told again unless it has been. Raises `ValueError`
+        Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
+        comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
         without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` that is none,
         and for a name that is no 1 to 64 printable ASCII characters without blank, quotes, comma.
         """
@@ -292,11 +291,11 @@ class Graspd:
         due_ns = time.monotonic_ns() + round(wait_s * 1e9)
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
-        self._told, self._telling = None, _key(lifted_on)
+        self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
         self._drain()
-        while self._told is None and self._wait(due_ns):
+        while self._telling[1] and self._wait(due_ns):
             self._drain()
-        return OutcomeAnswer("no-answer") if self._told is None else self._told
+        return self._told
 
     def outcome(
         self,
@@ -306,10 +305,8 @@ class Graspd:
         wait_s: float = 2.0,
     ) -> OutcomeAnswer:
         """Former name of `tell`, with a bool for how it ended."""
-        how = Outcome.SLIPPED if slipped else Outcome.HELD
-        return self.tell(
-            lifted_on, slipped if isinstance(slipped, str) else how, object_name, wait_s
-        )
+        how = slipped if isinstance(slipped, str) else SLIP if slipped else STABLE
+        return self.tell(lifted_on, how, object_name, wait_s)
 
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on."""
@@ -345,6 +342,7 @@ class Graspd:
         self.counts.malformed += self._told.why == "malformed"
         if self._told and self._telling in self._lifts:
             self._lifts[self._telling] = True
+        self._telling = "", 0
 
     def _drain(self) -> bool:
         """Read all that waits, without waiting; whether there was anything new."""

@@ -303,9 +303,9 @@ def test_silence_hides_what_was_judged_but_in_the_list() -> None:
     assert text_of(seen, 80, 24, Canvas())[4][:24].strip() == ""
 
 
-def outcome(grasp: int, ended: Literal["stable", "slip"], **other: str) -> bytes:
+def outcome(grasp: int, ended: Literal["stable", "slip"], judged_by: str | None = None) -> bytes:
     told = OutcomeMessage(
-        boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome=ended, **other
+        boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome=ended, grasp_boot_id=judged_by
     )
     return encode(told)
 
@@ -326,8 +326,8 @@ def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
     view.take(b"tactile.right", tactile(99, RESTING, RESTING), 11_000 * MS)
     view.take(b"outcome.right", outcome(1, "slip"), 0)
     view.take(b"outcome.right", outcome(8, "stable"), 0)
-    view.take(b"outcome.right", outcome(9, "slip", grasp_boot_id="another"), 0)
-    view.take(b"outcome.right", outcome(10, "slip", grasp_boot_id=BOOT), 0)
+    view.take(b"outcome.right", outcome(9, "slip", "another"), 0)
+    view.take(b"outcome.right", outcome(10, "slip", BOOT), 0)
     seen = view.snapshot(11_000 * MS)
     assert [(last.grasp, last.verdict, last.ended) for last in seen.grasps] == [
         *((11, "stable", None), (10, "unknown", "slip"), (9, "slip", None)),
