@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from daemon.judge.reasons import Decision
 from daemon.publish.messages import Status, Verdict
 from daemon.watch.snapshot import Line
 
@@ -39,6 +40,13 @@ def rests_on(verdict: Verdict) -> str:
     return said + ("" if risk.target is None else f", target {_percent(risk.target)}")
 
 
+def lift(verdict: Verdict, ended: str | None) -> str:
+    """How the lift of a judged grasp ended, in short; a grasp that is to slip has none."""
+    if ended is not None:
+        return "held" if ended == "stable" else "slipped"
+    return "not told" if verdict.verdict is Decision.STABLE or verdict.supervised else "-"
+
+
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
     """How learning goes, what matters most first."""
     risk = None if verdict is None else verdict.risk
@@ -61,7 +69,7 @@ def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * share:.3g} %" if share < 0.1 else f"{100 * share:.0f} %"
+    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
 def _number(count: int, what: str) -> str:

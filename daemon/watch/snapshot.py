@@ -54,6 +54,8 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     ago_s: float
     ended: str | None
     """How the lift ended, if the controller has told it: `stable` or `slip`."""
+    lift: str
+    """The same in short words, for the eye: `held`, `slipped`, `not told`, or `-`."""
     supervised: bool
     """Whether it was to be lifted while a person watches."""
     held: bool

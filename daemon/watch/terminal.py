@@ -31,8 +31,6 @@ JOINT = 15
 """Columns of a joint."""
 GRASPS = 26
 """Columns of the list of the last grasps."""
-ENDED = {None: "not told", "stable": "held", "slip": "slipped"}
-"""How a lift ended, in short."""
 DIM = Style(dim=True)
 BOLD = Style(bold=True)
 
@@ -110,7 +108,7 @@ def _facts(seen: Snapshot, canvas: Canvas, width: int) -> Text:
         return text.append("-")
     text.append(f"{last.verdict}{_share(last.p_slip)}", BOLD)
     text.append(f", {last.ago_s:.0f} s ago{'' if last.held else ', past'}", DIM)
-    text.append("\nits lift ", DIM).append(ENDED.get(last.ended, "-"), BOLD)
+    text.append("\nits lift ", DIM).append(last.lift, BOLD)
     return text.append(", supervised" if last.supervised else "", DIM)
 
 
@@ -165,7 +163,7 @@ def _beside(seen: Snapshot, width: int, lines: int) -> RenderableType:
 def _grasps(seen: Snapshot, lines: int) -> list[Text]:
     """A title and so many lines, the newest grasp first."""
     rows = [
-        f"{last.grasp:4} {last.verdict:7}{_share(last.p_slip):>5} {ENDED.get(last.ended, '-')}"
+        f"{last.grasp:4} {last.verdict:7}{_share(last.p_slip):>5} {last.lift}"
         f"{'*' if last.supervised else ''}"
         for last in seen.grasps[:lines]
     ]

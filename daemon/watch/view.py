@@ -23,7 +23,7 @@ from daemon.publish.messages import (
     decode_tactile,
     decode_verdict,
 )
-from daemon.watch.evidence import WATCHED, doubt, learning, rests_on
+from daemon.watch.evidence import WATCHED, doubt, learning, lift, rests_on
 from daemon.watch.fingers import FingerImage, Rest, image
 from daemon.watch.snapshot import TONE_CODE, Judged, Line, Session, Snapshot, Timing, Tone
 from models.layout import ELECTRODES
@@ -252,6 +252,7 @@ class View:
                 grasp=verdict.grasp,
                 ago_s=(now_ns - judged_ns) / 1e9,
                 ended=self._ended.get(key),
+                lift=lift(verdict, self._ended.get(key)),
                 supervised=verdict.supervised,
                 held=key == held,
             )

@@ -7,6 +7,7 @@
 
 #include <iostream>
 #include <sstream>
+#include <type_traits>
 
 namespace {
 
@@ -36,6 +37,8 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
 }
 
 }  // namespace
+
+static_assert(std::is_move_constructible_v<graspd::Client>, "whoever makes one may keep it");
 
 int main() {
     graspd::detail::Newest newest("verdict.right", 0, true);

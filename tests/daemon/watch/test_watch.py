@@ -335,6 +335,8 @@ def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
         *((5, "stable", None), (4, "stable", None)),
     ]
     assert [last.ago_s for last in seen.grasps[:3]] == [0.0, 1.0, 2.0]
+    lifts = [last.lift for last in seen.grasps[:4]]
+    assert lifts == ["not told", "slipped", "-", "held"]
     lines = "\n".join(text_of(seen, 80, 24, Canvas()))
     for row in ("11 stable  25 % not told", "10 unknown      slipped*", "8 stable  25 % held"):
         assert row in lines
