@@ -148,8 +148,8 @@ def draw(curves: Curves) -> str:
     left.axhline(100 * ALLOWED, color="#888", ls=":", lw=1)
     left.text(1.0, 100 * ALLOWED, "allowed ", transform=left.get_yaxis_transform(), ha="right",
               va="bottom", fontsize=8, color="#666")  # fmt: skip
-    _dress(left, "slips among `stable`, %")
-    _dress(right, "good lifts that are called `stable`, %")
+    _dress(left, "slips among 'stable', %")
+    _dress(right, "good lifts that are called 'stable', %")
     right.set_ylim(0, 100)
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4,
                   frameon=False, fontsize=9)  # fmt: skip
