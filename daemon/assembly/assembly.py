@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,9 +23,11 @@ from daemon.scene.drivers import (
     SpiTactile,
     StreamJoints,
 )
+from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import Trust
 from drivers.base import Driver, DriverError, LinkError
 from models import zoo
-from models.contract import ModelError
+from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
@@ -68,14 +69,14 @@ def build_pipeline(
 ) -> Pipeline:
     """The judge of this scene, whose session `learns` from the grasps or stays what it is.
 
-    Raises `ModelError` if the model does not fit the hand or never is right as often as wanted,
+    Raises `ModelError` if the model does not fit the hand,
     `SceneError` or `RecordingError` if recordings do not say whether they are grasps or streams.
     """
     _refuse_other_fingers(scene, model)
     limits = Limits(
         max_age_ns=scene.max_age_ns,
         slip_threshold=scene.model.slip_threshold,
-        min_confidence=min_confidence(model, scene.model.min_accuracy),
+        min_confidence=scene.model.min_confidence,
     )
     return Pipeline(
         model,
@@ -85,7 +86,18 @@ def build_pipeline(
         grip=grip_limits(scene),
         learns=learns,
         needs_session=scene.session.required,
+        trust=_trust(scene, model),
     )
+
+
+def _trust(scene: Scene, model: TactileModel) -> Trust | None:
+    """What learns from outcomes and keeps the risk; None if the scene wants neither."""
+    risk, given = scene.risk, model.contract.input
+    if risk is None and not scene.learn.enabled:
+        return None
+    limits = RiskLimits() if risk is None else RiskLimits(**risk.model_dump())
+    inputs = len(given.mean) if isinstance(given, SessionInput) else 0
+    return Trust(model.sha256, inputs, limits, learns=scene.learn.enabled)
 
 
 def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
@@ -182,29 +194,6 @@ def joint_limits(scene: Scene) -> JointLimits | None:
     return JointLimits(
         rad_per_s=scene.gate.joint_rad_per_s, lost_ns=round(scene.gate.joints_lost_ms * 1e6)
     )
-
-
-def min_confidence(model: TactileModel, min_accuracy: float | None) -> float:
-    """From which confidence on the model's verdicts are right as often as wanted; 0 for None.
-
-    By the accuracy-coverage curve of its contract, measured on objects that were left out. Raises
-    `ModelError` if it has none, or if not even its surest verdicts are.
-    """
-    if min_accuracy is None:
-        return 0.0
-    curve = model.contract.confidence
-    if not curve:
-        raise ModelError(
-            f"{model.path}: model.min_accuracy needs a model whose accuracy by confidence was "
-            "measured: this one's was not"
-        )
-    reached = list(itertools.takewhile(lambda s: s.accuracy >= min_accuracy, reversed(curve)))
-    if not reached:
-        raise ModelError(
-            f"{model.path}: model.min_accuracy {min_accuracy:g} is more than the model reaches "
-            f"where it is surest: {curve[-1].accuracy:g} of those verdicts were right"
-        )
-    return reached[-1].confidence
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:

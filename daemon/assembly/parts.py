@@ -54,6 +54,7 @@ class Assembly:
         self._parts = parts
         self._stack = stack
         self._boot_id = uuid.uuid4().hex
+        parts.pipeline.boot_id = parts.pipeline.boot_id or self._boot_id
         self._tap: Tap | None = None
 
     def add_sockets(self, sockets: Sockets) -> None:

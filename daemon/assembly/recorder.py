@@ -11,6 +11,7 @@ from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
 from daemon.record.header import Known, RecordingHeader
 from daemon.scene import Scene, SceneError
+from daemon.trust.trust import encode as encode_trust
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
@@ -68,7 +69,10 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
             "mode": assembly.gate_mode(wanted),
         },
         "session": {"learn": wanted.session_learns, "required": wanted.session.required},
+        "learn": wanted.learn.model_dump(mode="json"),
     }
+    if wanted.risk is not None:
+        sections["risk"] = wanted.risk.model_dump(mode="json")
     return RecordingHeader(
         fingers=wanted.hand.fingers,
         joints=assembly.joint_limits(wanted) is not None,
@@ -86,4 +90,10 @@ def state_of(pipeline: Pipeline) -> Callable[[], Known]:
     """
     judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()
-    return lambda: Known(judge=encode(judge), axis_ns=axis_ns, session=state)
+    trust = None if pipeline.trust is None else pipeline.trust.state()
+    return lambda: Known(
+        judge=encode(judge),
+        axis_ns=axis_ns,
+        session=state,
+        trust=b"" if trust is None else encode_trust(trust),
+    )

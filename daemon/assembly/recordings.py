@@ -16,10 +16,14 @@ from daemon.record.mcap import header_of
 from daemon.record.player import McapReplayDriver
 from daemon.record.topics import Topic
 from daemon.scene import Scene, SceneError, parse
+from daemon.trust.ledger import GraspId
+from daemon.trust.trust import decode
 from models.runtime import TactileModel
 
 log = logging.getLogger("graspd")
 
+SECTIONS: Final[tuple[str, ...]] = ("hand", "model", "gate", "session", "learn", "risk")
+"""Of a scene, that a recording says."""
 NOTHING_KNOWN: Final = (
     "%s: begins in the middle of a run and does not say what was known there: verdicts may differ "
     "until the hand has been open and its grasps are known"
@@ -46,8 +50,10 @@ class RecordedRun:
         `publish` and `model` are sections of it; an empty `model` and `mode` None leave model and
         gate mode as recorded. Raises `SceneError`.
         """
-        names = ("hand", "model", "gate", "session")
-        sections = {name: dict(self.header.scene.get(name, {})) for name in names}
+        recorded = self.header.scene
+        sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
+        if sections.get("model", {}).pop("min_accuracy", None) is not None:
+            log.warning("%s: was judged with min_accuracy, which is no more", self._paths[0])
         sections["tactile"] = {
             "driver": "replay",
             "recordings": [path.absolute() for path in self._paths],
@@ -84,14 +90,25 @@ class RecordedRun:
                 Topic.EXCHANGED: pipeline.sensors_exchanged,
                 Topic.SKIPPED: pipeline.skip,
             }
+            driver.on_outcome = lambda told: pipeline.outcome(
+                GraspId(told.grasp_boot_id or header.boot_id, told.grasp),
+                slipped=told.outcome == "slip",
+            )
+        pipeline.boot_id = header.boot_id
         return pipeline
 
     def restore(self, pipeline: Pipeline) -> None:
-        """Give `pipeline` the recorded session, if it has one. Raises `SceneError`."""
-        session = self.header.known.session
-        if pipeline.session is None or session is None:
-            return
+        """Give `pipeline` the recorded session and what outcomes had taught. Raises `SceneError`.
+
+        Another model than the recorded one begins with nothing learned.
+        """
+        known = self.header.known
         try:
-            pipeline.session.restore(session)
+            if pipeline.session is not None and known.session is not None:
+                pipeline.session.restore(known.session)
+            if pipeline.trust is not None and known.trust:
+                learned = decode(known.trust)
+                if pipeline.trust.fits(learned):
+                    pipeline.trust.restore(learned)
         except ValueError as error:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error

@@ -30,7 +30,7 @@ TACTILE_SECTIONS = (
 )
 
 WRONG, FAILED = 2, 1
-COIN = 0.505
+COIN = 0.5
 """Every verdict is as sure as this, to two digits: a threshold below refuses nothing."""
 
 
@@ -162,7 +162,7 @@ def _what_is_in(
         "tactile": _section(wanted.tactile),
         "model": (
             f"{contract.name} ({model.sha256[:12]}): F1 {figures}; slip from p_slip "
-            f"{wanted.model.slip_threshold:g} on{_rejects(wanted, model)}"
+            f"{wanted.model.slip_threshold:g} on{_rejects(wanted)}"
         ),
         "gate": _gate(wanted, limits),
         "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
@@ -175,6 +175,11 @@ def _what_is_in(
         parts["joints"] = "those of the recordings"
     if isinstance(contract.input, SessionInput):
         parts["session"] = _session(wanted, contract.input)
+    if wanted.learn.enabled:
+        told = "" if wanted.ask_endpoint else "; without [ask] nobody can tell any"
+        parts["learn"] = f"from the outcomes of lifts that are told{told}"
+    if wanted.risk is not None:
+        parts["risk"] = _risk(wanted.risk)
     if wanted.record is not None:
         parts["record"] = _record(wanted.record)
     if wanted.curve is not None:
@@ -212,9 +217,17 @@ def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
     )
 
 
-def _rejects(wanted: scene.Scene, model: TactileModel) -> str:
-    confidence = assembly.min_confidence(model, wanted.model.min_accuracy)
+def _rejects(wanted: scene.Scene) -> str:
+    confidence = wanted.model.min_confidence
     return f", unknown below a confidence of {confidence:.2f}" if confidence > COIN else ""
+
+
+def _risk(wanted: scene.Risk) -> str:
+    return (
+        f"{100 * wanted.max_slip_when_stable:g} % of the lifts of `stable` verdicts may slip; "
+        f"the first {wanted.warm_up} lifts supervised, then {100 * wanted.explore:g} % of those "
+        "that are not `stable`"
+    )
 
 
 def _session(wanted: scene.Scene, needs: SessionInput) -> str:
@@ -243,6 +256,10 @@ def _what_is_left_out(
         left_out["gate"] = "no tare, no contact, no gate: each reading is a grasp"
     if not isinstance(model.contract.input, SessionInput):
         left_out["session"] = f"{model.contract.name} needs no session calibration"
+    if not wanted.learn.enabled:
+        left_out["learn"] = "what is thought of a grasp is the network's alone"
+    if wanted.risk is None:
+        left_out["risk"] = "nothing limits how many `stable` lifts slip"
     if wanted.record is None:
         left_out["record"] = "nothing is written but what the session has learned"
     if wanted.curve is None:

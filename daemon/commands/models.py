@@ -85,7 +85,7 @@ def _card(card: dict[str, Any]) -> Iterator[str]:
         )
     if contract["confidence"]:
         yield ""
-        yield "accuracy by coverage, on other objects (see min_accuracy in [model]):"
+        yield "accuracy by coverage, on other objects of the same days:"
         for step in contract["confidence"][:: max(1, len(contract["confidence"]) // 6)]:
             yield (
                 f"  confidence {step['confidence']:.2f}: {100 * step['accuracy']:.1f} % right, "

@@ -36,6 +36,8 @@ class Case:
     """Why not, where one of both is missing."""
     age_ns: int
     """Of the reading, ns."""
+    against_stable: Reason | None = None
+    """Why it must not be called `stable`, whatever the network says; None: nothing is against."""
 
 
 def decide(case: Case, limits: Limits) -> tuple[Decision, tuple[Reason, ...]]:
@@ -51,6 +53,8 @@ def decide(case: Case, limits: Limits) -> tuple[Decision, tuple[Reason, ...]]:
         confidence = p_slip if decision is Decision.SLIP else 1.0 - p_slip
         if confidence < limits.min_confidence:
             reasons.append(Reason.LOW_CONFIDENCE)
+        if decision is Decision.STABLE and case.against_stable is not None:
+            reasons.append(case.against_stable)
         if not reasons:
             return decision, ()
     return Decision.UNKNOWN, tuple(reasons) or (Reason.MODEL_FAILED,)

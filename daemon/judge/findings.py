@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.reasons import GateChange, GateState, Reason
+from daemon.trust.trust import Assessment
 from models.contract import Finger
 
 Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
@@ -77,8 +78,13 @@ class Opinion:
     """What the network said of a grasp, and what stands against its being asked."""
 
     p_slip: float | None
+    """Probability of slip as the network says it, softened as far as its session is young."""
     reasons: tuple[Reason, ...]
     repaired: tuple[str, ...] = ()
+    margin: float = 0.0
+    """The network's log-odds of slip, before softening; 0 where it was not asked."""
+    assessment: Assessment | None = None
+    """What `p_slip` is worth by the outcomes that are known; None where nobody asks."""
 
 
 NO_OPINION = Opinion(None, ())

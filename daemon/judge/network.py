@@ -18,6 +18,7 @@ from models.tactile_image import SPREAD_FLOOR_COUNTS
 if TYPE_CHECKING:
     from daemon.judge.calibration import Calibration
 
+NO_FEATURES = np.empty(0, np.float32)
 TINY = 1e-12
 """Stands for a probability of zero, whose logarithm there is not."""
 
@@ -35,38 +36,50 @@ class Network:
 
         `session` is what is known of it, for a model that needs one.
         """
-        if examined.reasons:
-            return Opinion(None, examined.reasons, examined.repaired)
-        p_slip, reasons = self._ask(examined.counts, session)
-        return Opinion(p_slip, reasons, examined.repaired)
+        against = examined.reasons
+        if not against:
+            found = self._ask(examined.counts, session)
+            if isinstance(found, tuple):
+                return Opinion(found[0], (), examined.repaired, found[1])
+            against = (found,)
+        return Opinion(None, against, examined.repaired)
+
+    @property
+    def features(self) -> NDArray[np.float32]:
+        """What the network was asked about last, shape (inputs,), standardised by the session.
+
+        None, shape (0,), for models without a session: what they take is not of unit size.
+        """
+        model = self._model
+        return model.input if isinstance(model.inputs, SessionBuilder) else NO_FEATURES
 
     def _ask(
         self, counts: NDArray[np.generic], session: Calibration | None
-    ) -> tuple[float | None, tuple[Reason, ...]]:
+    ) -> tuple[float, float] | Reason:
+        """Probability of slip and margin, or why there are none."""
         model = self._model
         if session is not None and isinstance(model.inputs, SessionBuilder):
             model.inputs.use(session.features_mean, session.features_spread)
         spread = model.inputs.build(counts, model.input)
         if np.count_nonzero(spread >= SPREAD_FLOOR_COUNTS) < len(spread):
-            return None, (Reason.FLAT,)
+            return Reason.FLAT
         try:
             p_stable, p_slip = model.run()
         except ModelError:
-            return None, (Reason.MODEL_FAILED,)
-        if not abs(p_stable + p_slip - 1.0) < 1e-3:  # also true for NaN
-            return None, (Reason.MODEL_FAILED,)
-        if session is not None:
-            p_slip = _softened(p_stable, p_slip, session.temperature, self._threshold)
-        return p_slip, ()
+            return Reason.MODEL_FAILED
+        sound = 0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0  # false for NaN
+        if not (sound and abs(p_stable + p_slip - 1.0) < 1e-3):
+            return Reason.MODEL_FAILED
+        margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
+        if session is not None and session.temperature != 1.0:
+            p_slip = _softened(margin, session.temperature, self._threshold)
+        return p_slip, margin
 
 
-def _softened(p_stable: float, p_slip: float, temperature: float, threshold: float) -> float:
+def _softened(margin: float, temperature: float, threshold: float) -> float:
     """The slip probability with its log-odds, counted from the threshold, over the temperature.
 
     So it is less sure, and on the same side of the threshold as before.
     """
-    if temperature == 1.0 or not (0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0):
-        return p_slip
-    margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
     zero = math.log(threshold) - math.log1p(-threshold)
     return 1.0 / (1.0 + math.exp(-(zero + (margin - zero) / temperature)))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,27 @@ from daemon.judge.limits import GripLimits
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
 from daemon.judge.reasons import Decision, GateChange, GateState, Reason
+from daemon.trust.ledger import GraspId
+from daemon.trust.risk import Permission, RiskReport
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
 from models.runtime import TactileModel
 
+WITHHELD: Final = {
+    Permission.ALLOWED: None,
+    Permission.WITHHELD: Reason.LOW_CONFIDENCE,
+    Permission.UNPROVEN: Reason.UNPROVEN,
+    Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
+}
+"""What is against calling a grasp `stable`, by what the risk permits."""
+NOTHING_ELSE: Final = frozenset(filter(None, WITHHELD.values()))
+"""With other reasons than these there is nothing to lift, under supervision or not."""
+
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
     from daemon.judge.grip import Grip
+    from daemon.trust.trust import Trust
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +48,7 @@ class Judgement:
     grasp: int
     decision: Decision
     p_slip: float | None
-    """None exactly when the decision is unknown."""
+    """After what outcomes have taught; None exactly when the decision is unknown."""
     reasons: tuple[Reason, ...]
     judged: bool = True
     """Whether the network judged, or would have judged, this very reading."""
@@ -49,6 +62,14 @@ class Judgement:
     """Fingers that touch; None where nobody looks."""
     changes: tuple[GateChange, ...] = ()
     """What the gate did at this reading, oldest first."""
+    p_slip_model: float | None = None
+    """What the network alone says; None exactly when the decision is unknown."""
+    outcomes: int = 0
+    """How many `p_slip` rests on."""
+    supervised: bool = False
+    """Whether its lift, watched, would teach what is not known: ask for it."""
+    risk: RiskReport | None = None
+    """What lifts of `stable` verdicts came to; None where nothing learns and no risk is set."""
     judged_counts: NDArray[np.uint16] | None = field(default=None, compare=False, repr=False)
     """Shape (fingers, 24): what the network judged, before any repair; None if it did not judge
     this very reading, or if electrodes of it are broken."""
@@ -78,11 +99,13 @@ class Pipeline:
         grip: GripLimits | None = None,
         learns: bool = True,
         needs_session: bool = False,
+        trust: Trust | None = None,
     ) -> None:
         """`clock` gives monotonic ns; without `grip` each reading is a grasp.
 
-        With `learns` false the session stays what it is; with `needs_session` nothing is judged
-        before it is calibrated. Raises `ModelError` if the model is for other fingers.
+        `trust` learns from outcomes and keeps the risk that is set. With `learns` false the session
+        stays what it is; with `needs_session` nothing is judged before it is calibrated. Raises
+        `ModelError` if the model is for other fingers.
         """
         if model.contract.fingers != tuple(fingers):
             raise ModelError(
@@ -104,6 +127,10 @@ class Pipeline:
         self._health = Health(len(fingers))
         self._plausibility = Plausibility(fingers, contract.seen, electrodes)
         self._network = Network(model, limits.slip_threshold)
+        self.trust = trust
+        """What outcomes have taught; None where nothing learns and no risk is set."""
+        self.boot_id = ""
+        """Of the start of the daemon, which names its grasps for ever."""
         self.grip: Grip | None = None
         """None where each reading is a grasp."""
         if grip is not None:
@@ -144,10 +171,21 @@ class Pipeline:
         self._to_learn = None
         if self._session is not None:
             self._session.reset()
+        if self.trust is not None:
+            self.trust.sensors_exchanged()
         if self.grip is not None:
             self.grip.forget()
         if self.on_exchange is not None:
             self.on_exchange()
+
+    def knows(self, grasp: GraspId) -> bool:
+        """Whether an outcome of a grasp would be taken."""
+        return self.trust is not None and grasp in self.trust.ledger
+
+    def outcome(self, grasp: GraspId, *, slipped: bool) -> None:
+        """Take in how the lift of a grasp has ended; some 0.1 ms."""
+        if self.trust is not None:
+            self.trust.outcome(grasp, slipped=slipped)
 
     def restart(self) -> None:
         """What was said of the grasp at hand no longer counts: another model or gate goes on."""
@@ -185,12 +223,13 @@ class Pipeline:
         if felt.counts is not None:
             session = None if self._session is None else self._session.now
             examined = self._plausibility.examine(felt.counts, watched.broken, session)
-            memory.opinion = self._network.judge(examined, session)
+            memory.opinion = self._assess(self._network.judge(examined, session), felt.grasp)
             grasp = examined.grasp
             counts = None if np.count_nonzero(watched.broken) else felt.counts
         elif felt.gate is not GateState.JUDGED:
             memory.opinion = NO_OPINION
         judgement = self._decide(reading.t_ns, watched.reasons, felt, memory.opinion, counts)
+        self._remember(judgement.decision, felt)
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
             self._note(grasp, judgement.grasp)
         return judgement
@@ -232,6 +271,26 @@ class Pipeline:
             counts, self._to_learn = self._to_learn, None
             self._session.observe(counts)
 
+    def _assess(self, opinion: Opinion, grasp: int) -> Opinion:
+        """The opinion with what it is worth by the outcomes that are known."""
+        if self.trust is None or opinion.p_slip is None:
+            return opinion
+        try:
+            assessment = self.trust.judge(
+                GraspId(self.boot_id, grasp), opinion.p_slip, opinion.margin, self._network.features
+            )
+        except ValueError:
+            return Opinion(None, (Reason.MODEL_FAILED,), opinion.repaired)
+        return replace(opinion, assessment=assessment)
+
+    def _remember(self, decision: Decision, felt: Felt) -> None:
+        """Keep what was said of a grasp until its outcome is told."""
+        assessment, stable = self.memory.opinion.assessment, decision is Decision.STABLE
+        if self.trust is None or assessment is None:
+            return
+        if stable or felt.counts is not None:
+            self.trust.note(GraspId(self.boot_id, felt.grasp), assessment, stable=stable)
+
     def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
         if self._session is not None and grasp != self.memory.learnt_grasp:
@@ -262,21 +321,25 @@ class Pipeline:
         calibrated = None if self._session is None else self._session.calibrated
         if self._needs_session and calibrated is False:
             health = (*health, Reason.NOT_CALIBRATED)
+        assessment = opinion.assessment
+        p_slip = opinion.p_slip if assessment is None else assessment.p_slip
         case = Case(
-            p_slip=opinion.p_slip,
+            p_slip=p_slip,
             health=health,
             in_contact=felt.in_contact,
             settled=felt.settled,
             gate=felt.reasons,
             # Taken last, so that a slow inference counts too.
             age_ns=self._age_ns(t_ns),
+            against_stable=None if assessment is None else WITHHELD[assessment.permission],
         )
         decision, reasons = decide(case, self._limits)
+        known, trust = decision is not Decision.UNKNOWN, self.trust
         return Judgement(
             t_ns=t_ns,
             grasp=felt.grasp,
             decision=decision,
-            p_slip=None if decision is Decision.UNKNOWN else opinion.p_slip,
+            p_slip=p_slip if known else None,
             reasons=tuple(dict.fromkeys(reasons)),
             judged=felt.judged,
             repaired=opinion.repaired,
@@ -284,6 +347,14 @@ class Pipeline:
             gate=felt.gate,
             contact=felt.touching,
             changes=felt.changes,
+            p_slip_model=opinion.p_slip if known else None,
+            outcomes=0 if trust is None else trust.learner.outcomes,
+            supervised=(
+                assessment is not None
+                and assessment.supervised
+                and NOTHING_ELSE.issuperset(reasons)
+            ),
+            risk=None if trust is None else trust.report(),
             judged_counts=counts,
         )
 

@@ -17,6 +17,8 @@ from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import (
     DECISION_CODE,
     GateMessage,
+    LearnerHealth,
+    Lifts,
     OutcomeMessage,
     State,
     Status,
@@ -29,6 +31,7 @@ from models.contract import Finger
 
 if TYPE_CHECKING:
     from daemon.publish.deadlines import Deadlines
+    from daemon.trust.trust import Trust
 
 SHA_DIGITS = 12
 JUDGED_MAX = 1024
@@ -128,6 +131,10 @@ class Outbox:
             silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
+            p_slip_model=judgement.p_slip_model,
+            outcomes=judgement.outcomes,
+            supervised=judgement.supervised,
+            risk=judgement.risk,
         )
         payload = encode(message)
         self._send(self._verdict_topic, payload)
@@ -151,15 +158,18 @@ class Outbox:
         grasp: int,
         outcome: Literal["stable", "slip"],
         object_name: str | None = None,
+        *,
+        known: bool = False,
     ) -> str | None:
         """Send how the lift of a grasp ended, and what was lifted if that is known.
 
         None once it is sent; else why it is not: `boot_id` is of another start, or the grasp was
-        not judged, or too long ago.
+        not judged, or too long ago. A `known` grasp is sent in any case.
         """
-        if boot_id != self._boot_id:
-            return "unknown boot_id: not of this start"
-        if grasp not in self._judged:
+        own = boot_id == self._boot_id
+        if not (own or known):
+            return "unknown boot_id: of a start whose grasps are not known any more"
+        if not (known or grasp in self._judged):
             return "unknown grasp: not judged, or too long ago"
         message = OutcomeMessage(
             boot_id=boot_id,
@@ -169,6 +179,7 @@ class Outbox:
             grasp=grasp,
             outcome=outcome,
             object=object_name,
+            grasp_boot_id=None if own else boot_id,
         )
         self._outcome_seq += 1
         self._send(self._outcome_topic, encode(message))
@@ -231,7 +242,7 @@ class Outbox:
         `readings_hz` is how many came per second since the last one; `drivers` the counters of all
         parts by name. `skipped_readings` and `overloaded` are as in `Status`.
         """
-        session, grip = pipeline.session, pipeline.grip
+        session, grip, trust = pipeline.session, pipeline.grip, pipeline.trust
         health = pipeline.health()
         if state is State.SILENT:
             health["link"] = Reason.STALE
@@ -257,6 +268,8 @@ class Outbox:
             worst_age_ms=deadlines.worst_age_ms,
             skipped_readings=skipped_readings,
             overloaded=overloaded,
+            lifts=None if trust is None else _lifts(trust),
+            learner=None if trust is None else _learner(trust),
             model=self._model,
             model_sha=self._model_sha,
             versions=self._versions,
@@ -264,6 +277,22 @@ class Outbox:
         self._status_seq += 1
         self._send(self._status_topic, encode(message))
         return message
+
+
+def _lifts(trust: Trust) -> Lifts:
+    ledger = trust.ledger
+    return Lifts(
+        reported=trust.risk.lifts, outstanding=ledger.outstanding, unreported=ledger.unreported
+    )
+
+
+def _learner(trust: Trust) -> LearnerHealth:
+    return LearnerHealth(
+        enabled=trust.learns,
+        outcomes=trust.learner.outcomes,
+        told=dict(trust.ledger.told),
+        uncertainty=trust.learner.uncertainty,
+    )
 
 
 def _angles(joints: JointReading) -> dict[str, float]:

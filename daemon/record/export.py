@@ -93,7 +93,7 @@ class _Joining:
             self.judged[judgement.boot_id, judgement.grasp] = judgement
         elif message.kind == Topic.OUTCOME:
             outcome = decode_outcome(message.payload)
-            grasp = outcome.boot_id, outcome.grasp
+            grasp = outcome.grasp_boot_id or outcome.boot_id, outcome.grasp
             self.told.add(grasp)
             judged = self.judged.get(grasp)
             if judged is None:

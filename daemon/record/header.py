@@ -24,6 +24,9 @@ class Known:
     """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
     session: SessionState | None = None
     """Statistics of the session; None if the model needs none."""
+    trust: bytes = b""
+    """What outcomes have taught, as `daemon.trust.trust.encode` gives it; empty if nothing learns.
+    """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,7 +40,7 @@ class RecordingHeader:
     boot_id: str
     """As in the verdicts of the run."""
     scene: dict[str, dict[str, Any]]
-    """The scene's sections `hand`, `model`, `gate` and `session`, by name."""
+    """The scene's sections `hand`, `model`, `gate`, `session`, `learn` and `risk`, by name."""
     model: str
     """Name of the model that judged."""
     model_sha256: str
@@ -64,6 +67,7 @@ class RecordingHeader:
             "judge": base64.b64encode(self.known.judge).decode(),
             "axis_ns": str(self.known.axis_ns),
             "session": "" if session is None else msgspec.json.encode(session).decode(),
+            "trust": base64.b64encode(self.known.trust).decode(),
             "says_judged": json.dumps(self.says_judged),
         }
 
@@ -90,6 +94,7 @@ class RecordingHeader:
                 judge=base64.b64decode(texts["judge"]),
                 axis_ns=int(texts["axis_ns"]),
                 session=msgspec.json.decode(session, type=SessionState) if session else None,
+                trust=base64.b64decode(texts.get("trust", "")),
             ),
             says_judged=texts.get("says_judged") == "true",
         )

@@ -8,6 +8,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from daemon.publish.messages import OutcomeMessage, decode_outcome
 from daemon.record.mcap import McapReader, RecordedMessage, header_of
 from daemon.record.topics import EVENTS, Topic, joint_reading, tactile_reading
 from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
@@ -15,6 +16,8 @@ from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import RecordedDriver, Timeline
 
 _log = logging.getLogger(__name__)
+
+_Item = Reading | Topic | OutcomeMessage
 
 
 @dataclass(slots=True)
@@ -24,12 +27,12 @@ class McapCounters(DriverCounters):
     late: int = 0
     """Readings handed over more than one period after they were due."""
     malformed: int = 0
-    """Messages on the topics of readings that are no reading of these fingers."""
+    """Messages on the topics of readings or outcomes that are none, or not of these fingers."""
     cut_off: int = 0
     """Files that were cut off, as by a daemon that was killed, or are damaged."""
 
 
-class McapReplayDriver(RecordedDriver[Reading | Topic]):
+class McapReplayDriver(RecordedDriver[_Item]):
     """Plays the files of one run in a row, at most one reading per call of `read_ready`.
 
     `t_ns` of a reading makes it as old, when it is handed over, as it was when it was recorded;
@@ -55,6 +58,8 @@ class McapReplayDriver(RecordedDriver[Reading | Topic]):
         self._fingers = tuple(fingers)
         self.on_event: Mapping[Topic, Callable[[], None]] = {}
         """What to call at an event; events that are not in it are passed over."""
+        self.on_outcome: Callable[[OutcomeMessage], None] | None = None
+        """What to call where an outcome was told."""
         self._reset()
 
     def _reset(self) -> None:
@@ -75,7 +80,7 @@ class McapReplayDriver(RecordedDriver[Reading | Topic]):
         self.timeline.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """The next reading if it is due. An event that is due is told, and gives none."""
+        """The next reading if it is due. An event or outcome is told when it is, and gives none."""
         taken = self.timeline.take()
         if taken is None:
             return ()
@@ -83,6 +88,10 @@ class McapReplayDriver(RecordedDriver[Reading | Topic]):
         if isinstance(item, Topic):
             if item in self.on_event:
                 self.on_event[item]()
+            return ()
+        if isinstance(item, OutcomeMessage):
+            if self.on_outcome is not None:
+                self.on_outcome(item)
             return ()
         if self.timeline.speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
@@ -99,7 +108,7 @@ class McapReplayDriver(RecordedDriver[Reading | Topic]):
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 
-    def _items(self) -> Generator[tuple[int, Reading | Topic], None, None]:
+    def _items(self) -> Generator[tuple[int, Reading | Topic | OutcomeMessage], None, None]:
         for path in self.paths:
             with open_recording(path) as stream:
                 recording = McapReader(path, stream)
@@ -111,13 +120,15 @@ class McapReplayDriver(RecordedDriver[Reading | Topic]):
                     self.counters.cut_off += 1
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
-    def _item(self, message: RecordedMessage) -> Reading | Topic | None:
-        """The reading or event in a message; None if it is neither."""
+    def _item(self, message: RecordedMessage) -> _Item | None:
+        """The reading, event or outcome in a message; None if it is none of them."""
         try:
             if message.kind == Topic.TACTILE:
                 return tactile_reading(message.payload, self._fingers)
             if message.kind == Topic.JOINTS:
                 return joint_reading(message.payload)
+            if message.kind == Topic.OUTCOME:
+                return decode_outcome(message.payload)
         except (ValueError, OverflowError):
             self.counters.malformed += 1
             return None

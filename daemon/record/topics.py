@@ -92,7 +92,7 @@ class Topic(StrEnum):
     VERDICT = "verdict", Verdict  # read by other tools
     GATE = "gate", GateMessage  # read by other tools
     STATUS = "status", Status  # read by other tools
-    OUTCOME = "outcome", OutcomeMessage  # read by export
+    OUTCOME = "outcome", OutcomeMessage  # read by replay and export
     # Written by the recorder:
     JOINTS = "joints", Joints  # read by replay
     JUDGED = "judged", Judged  # read by export

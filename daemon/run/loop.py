@@ -17,6 +17,7 @@ from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.overload import Overload, after
+from daemon.trust.ledger import GraspId
 from drivers.base import Driver, JointReading, Reading, TactileReading
 
 STATUS_PERIOD_NS = 1_000_000_000
@@ -155,9 +156,13 @@ class Loop:
         outcome: Literal["stable", "slip"],
         object_name: str | None = None,
     ) -> str | None:
-        """Publish how the lift of a judged grasp has ended; None, or why that is of no use."""
-        refused = self._outbox.outcome(boot_id, grasp, outcome, object_name)
+        """Publish and learn how the lift of a judged grasp has ended; None, or why not."""
+        judged = GraspId(boot_id, grasp)
+        refused = self._outbox.outcome(
+            *judged, outcome, object_name, known=self._pipeline.knows(judged)
+        )
         if refused is None:
+            self._pipeline.outcome(judged, slipped=outcome == "slip")
             for on_outcome in self._on_outcome:
                 on_outcome(grasp, outcome, object_name)
         return refused

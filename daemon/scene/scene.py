@@ -71,8 +71,9 @@ class Model(Section):
     """A model file of your own, relative to the scene file."""
     slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = Limits.slip_threshold
     """`p_slip` from here on is slip."""
-    min_accuracy: Annotated[float, Field(gt=0.5, lt=1.0)] | None = None
-    """Verdicts must be right this often, by the model's card; less sure ones become `unknown`."""
+    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = Limits.min_confidence
+    """Less sure verdicts become `unknown`: `p_slip` of a slip, 1 - `p_slip` of a `stable` one must
+    reach this. It is no promise of how many are right: that is `[risk]`."""
 
     @model_validator(mode="after")
     def _one_of_name_and_path(self) -> Self:
@@ -94,6 +95,29 @@ class Session(Section):
     """Whether nothing is judged before the session is calibrated."""
     file: FilePath | None = None
     """`/var/lib/graspd/<hand>.session.json` unless given."""
+
+
+class Risk(Section):
+    """`[risk]`: how many lifts of `stable` verdicts may slip. Without it, none are counted on.
+
+    `stable` is said only as far as the outcomes that were told allow it.
+    """
+
+    max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5)] = 0.05
+    """Share of the `stable` lifts that may slip."""
+    warm_up: Annotated[int, Field(ge=0, le=1000)] = 50
+    """Outcomes, since the start of the session, until which all grasps are to be lifted under
+    supervision."""
+    explore: Annotated[float, Field(ge=0.0, le=1.0)] = 0.05
+    """Share of the grasps that are not `stable` to be lifted under supervision after that: without
+    their outcomes nobody learns that the rule is too strict."""
+
+
+class Learn(Section):
+    """`[learn]`: what outcomes of lifts are used for."""
+
+    enabled: bool = True
+    """Whether they change what is thought of later grasps."""
 
 
 GateMode = Literal["settled", "every", "request"]
@@ -214,6 +238,8 @@ class Scene(Section):
     joints: Joints | None = None
     model: Model = Model()
     session: Session = Session()
+    learn: Learn = Learn()
+    risk: Risk | None = None
     gate: Gate = Gate()
     publish: Publish = Publish()
     ask: Ask | None = None

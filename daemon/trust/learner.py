@@ -71,6 +71,13 @@ class Learner:
         self._mean = self._prior_mean.copy()
         self._covariance = np.diag(self._prior_variance)
 
+    @property
+    def uncertainty(self) -> float:
+        """Variances of the weights over those at the start, in the mean: 1 until the first outcome,
+        towards 0 as more is known."""
+        ratio = self._covariance.diagonal() / self._prior_variance
+        return min(float(ratio.mean()), 1.0)
+
     def features(self, margin: float, inputs: NDArray[np.floating]) -> Vector:
         """What is judged by, and to be kept until the outcome is known.
 

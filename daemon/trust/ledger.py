@@ -8,7 +8,7 @@ from typing import Annotated, Final, NamedTuple
 
 import msgspec
 
-from daemon.trust.learner import Vector, vector
+from daemon.trust.learner import vector
 
 GRASPS_MAX: Final = 256
 """Grasps that are remembered: those of an hour and more. Outcomes of older ones are refused."""
@@ -66,26 +66,30 @@ class Ledger:
         """Outcomes, by what became of them."""
         self.unreported = 0
         """Grasps that were called `stable` and forgotten before an outcome came."""
-
-    @property
-    def outstanding(self) -> int:
+        self.outstanding = 0
         """Grasps called `stable` whose outcome can still come."""
-        return sum(record.stable and record.slipped is None for record in self._records.values())
 
-    def note(self, grasp: GraspId, features: Vector, *, stable: bool) -> None:
-        """Remember how a grasp was judged.
+    def __contains__(self, grasp: object) -> bool:
+        """Whether a grasp is remembered."""
+        return grasp in self._records
+
+    def note(self, grasp: GraspId, features: bytes, *, stable: bool) -> bool:
+        """Remember how a grasp was judged, and by which features, float64.
 
         Its first verdict counts, or the first that called it `stable`: that is what it is lifted
-        on. Once its outcome is known, nothing changes.
+        on. Once its outcome is known, nothing changes. Returns whether this was new.
         """
         known = self._records.get(grasp)
-        if known is None:
-            self._records[grasp] = Record(grasp, stable, features.astype("<f8").tobytes())
-            if len(self._records) > GRASPS_MAX:
-                oldest = self._records.pop(next(iter(self._records)))
-                self.unreported += oldest.stable and oldest.slipped is None
-        elif stable and not known.stable and known.slipped is None:
-            self._records[grasp] = Record(grasp, stable, features.astype("<f8").tobytes())
+        if known is not None and (known.stable or not stable or known.slipped is not None):
+            return False
+        self._records[grasp] = Record(grasp, stable, features)
+        self.outstanding += stable
+        if len(self._records) > GRASPS_MAX:
+            oldest = self._records.pop(next(iter(self._records)))
+            forgotten = oldest.stable and oldest.slipped is None
+            self.unreported += forgotten
+            self.outstanding -= forgotten
+        return True
 
     def tell(self, grasp: GraspId, *, slipped: bool) -> tuple[Told, Record | None]:
         """Take an outcome; returns also what was known of the grasp until now."""
@@ -94,6 +98,7 @@ class Ledger:
             told = Told.UNKNOWN
         elif record.slipped is None:
             told = Told.TAKEN
+            self.outstanding -= record.stable
             self._records[grasp] = Record(grasp, record.stable, None, slipped)
         else:
             told = Told.REPEATED if record.slipped == slipped else Told.CONTRADICTS
@@ -121,3 +126,4 @@ class Ledger:
                 raise ValueError("would learn from a grasp twice")
         self._records, self.told = records, Counter(state.told)
         self.unreported = state.unreported
+        self.outstanding = sum(each.stable and each.slipped is None for each in records.values())

@@ -6,16 +6,15 @@ Between judge and message: `judge` a grasp, decide, `note` what was said; tell e
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from typing import Final, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.trust.learner import Learner, LearnerState, Vector, sigmoid
+from daemon.trust.learner import Learner, LearnerState, sigmoid
 from daemon.trust.ledger import GraspId, Ledger, LedgerState, Told
-from daemon.trust.risk import Permission, Risk, RiskLimits, RiskState
+from daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
 
 VERSION: Final = 1
 MAX_BYTES: Final = 1 << 20
@@ -23,8 +22,7 @@ MAX_BYTES: Final = 1 << 20
 DIGEST_BYTES: Final = 32
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Assessment:
+class Assessment(msgspec.Struct, frozen=True, eq=False):
     """What is thought of one grasp, before anything is said."""
 
     p_slip: float
@@ -33,8 +31,8 @@ class Assessment:
     """Whether it may be called `stable`."""
     supervised: bool
     """Whether its lift, watched, would teach what is not known: ask for it."""
-    features: Vector
-    """What `note` remembers."""
+    features: bytes
+    """What `note` remembers, float64."""
 
 
 class TrustState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -61,7 +59,9 @@ class Trust:
         self._model = model
         self._inputs = inputs
         self._limits = limits or RiskLimits()
-        self._learns = learns
+        self.learns = learns
+        """Whether outcomes change what is thought of grasps."""
+        self._report: RiskReport | None = None
         self.learner = Learner(inputs)
         self.risk = Risk(self._limits)
         self.ledger = Ledger()
@@ -83,14 +83,20 @@ class Trust:
             p_slip=sigmoid(log_odds) if self.learner.outcomes else p_slip,
             permission=permission,
             supervised=self.risk.supervised(permission, grasp.boot_id, grasp.grasp),
-            features=features,
+            features=features.astype("<f8").tobytes(),
         )
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
-        """Remember what was said of a grasp. Raises `ValueError` if that was not allowed."""
+        """Remember what was said of a grasp, unless it is of another model.
+
+        Raises `ValueError` if that was not allowed.
+        """
+        if len(assessment.features) != 8 * (self._inputs + 2):
+            return
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
-        self.ledger.note(grasp, assessment.features, stable=stable)
+        if self.ledger.note(grasp, assessment.features, stable=stable):
+            self._report = None
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> Told:
         """Take in how a lift ended; what is not `TAKEN` has changed nothing but a counter."""
@@ -98,30 +104,51 @@ class Trust:
         if told is Told.TAKEN and record is not None:
             current = record.features is not None
             self.risk.take(stable=record.stable, slipped=slipped, proves=current)
-            if record.features is not None and self._learns:
+            if record.features is not None and self.learns:
                 self.learner.learn(np.frombuffer(record.features, "<f8"), slipped=slipped)
+        self._report = None
         return told
+
+    def report(self) -> RiskReport:
+        """What lifts of `stable` verdicts came to, until now."""
+        if self._report is None:
+            risk = self.risk
+            self._report = RiskReport(
+                target=self._limits.max_slip_when_stable,
+                lifts=risk.lifts,
+                slips=risk.slips,
+                outstanding=self.ledger.outstanding,
+                bound=risk.bound,
+                warm_up_left=risk.warm_up_left,
+            )
+        return self._report
 
     def sensors_exchanged(self) -> None:
         """Start learning again; slips that were counted stay counted."""
         self.learner.reset()
         self.risk.exchanged()
         self.ledger.exchanged()
+        self._report = None
 
     def state(self) -> TrustState:
         """What `restore` needs; what comes later does not change it."""
         parts = self.learner.state(), self.risk.state(), self.ledger.state()
         return TrustState(VERSION, self._model, *parts)
 
+    def fits(self, state: TrustState) -> bool:
+        """Whether a state is of this model."""
+        return state.model == self._model
+
     def restore(self, state: TrustState) -> None:
         """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
-        if state.model != self._model:
+        if not self.fits(state):
             raise ValueError("is of another model")
         learner, risk, ledger = Learner(self._inputs), Risk(self._limits), Ledger()
         learner.restore(state.learner)
         risk.restore(state.risk)
         ledger.restore(state.ledger, self._inputs + 2)
         self.learner, self.risk, self.ledger = learner, risk, ledger
+        self._report = None
 
 
 def encode(state: TrustState) -> bytes:

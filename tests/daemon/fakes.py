@@ -11,6 +11,7 @@ import numpy as np
 from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Pipeline
+from daemon.trust.trust import Trust
 from drivers.base import DriverCounters, DriverError, Reading, TactileReading
 from models.contract import (
     Dataset,
@@ -95,6 +96,7 @@ def pipeline(
     fingers: Sequence[str] = FINGERS,
     *,
     grip: GripLimits | None = None,
+    trust: Trust | None = None,
     **limits: float,
 ) -> Pipeline:
     return Pipeline(
@@ -107,6 +109,7 @@ def pipeline(
         ),
         clock,
         grip=grip,
+        trust=trust,
     )
 
 

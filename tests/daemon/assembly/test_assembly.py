@@ -6,8 +6,7 @@ import itertools
 import re
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
@@ -16,46 +15,31 @@ from daemon.judge.reasons import Decision
 from daemon.scene import Scene, parse
 from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from drivers.spi.driver import SpiBridgeDriver
-from models.contract import ConfidenceStep, ModelError
-from models.runtime import TactileModel
+from models.contract import ModelError
 from tests.daemon.fakes import Clock, reading
 
 REPLAY = {"driver": "replay", "recordings": [str(DEMO_TABLE)]}
 
 
-def curve(*accuracies: float) -> tuple[ConfidenceStep, ...]:
-    """From the least confidence to the surest."""
-    return tuple(
-        ConfidenceStep(0.6 + number / 10, accuracy, 1.0)
-        for number, accuracy in enumerate(accuracies)
-    )
+TRUST = {
+    "": (True, None, 0),
+    "[learn]\nenabled = false": None,
+    "[risk]": (True, 0.05, 50),
+    "[risk]\nmax_slip_when_stable = 0.1\nwarm_up = 7\n[learn]\nenabled = false": (False, 0.1, 7),
+}
 
 
-def model_with(steps: tuple[ConfidenceStep, ...]) -> TactileModel:
-    contract = SimpleNamespace(confidence=steps)
-    return cast("TactileModel", SimpleNamespace(path="m.onnx", contract=contract))
-
-
-def test_the_lowest_confidence_is_taken_from_which_on_all_is_right_often_enough() -> None:
-    model = model_with(curve(0.7, 0.85, 0.8, 0.9))
-    assert assembly.min_confidence(model, None) == 0.0
-    assert assembly.min_confidence(model, 0.8) == pytest.approx(0.7)
-    assert assembly.min_confidence(model, 0.82) == pytest.approx(0.9)
-
-
-def test_an_accuracy_that_the_surest_verdicts_miss_is_refused_with_theirs() -> None:
-    model = model_with(curve(0.7, 0.8125, 0.75))
-    with pytest.raises(ModelError) as refused:
-        assembly.min_confidence(model, 0.8)
-    assert str(refused.value) == (
-        "m.onnx: model.min_accuracy 0.8 is more than the model reaches where it is surest: "
-        "0.75 of those verdicts were right"
-    )
-
-
-def test_an_accuracy_is_refused_of_a_model_that_was_not_measured_by_confidence() -> None:
-    with pytest.raises(ModelError, match="accuracy by confidence was measured: this one's was not"):
-        assembly.min_confidence(model_with(()), 0.5)
+@pytest.mark.parametrize("text", TRUST)
+def test_outcomes_teach_and_a_risk_is_kept_as_the_scene_says(text: str) -> None:
+    data = {"tactile": REPLAY, **tomllib.loads(text)}
+    scene = parse(data, Path("scene.toml"))
+    trust = assembly.build_pipeline(scene, assembly.load_model(scene), Clock()).trust
+    if TRUST[text] is None:
+        assert trust is None
+    else:
+        assert trust is not None
+        report = trust.report()
+        assert (trust.learns, report.target, report.warm_up_left) == TRUST[text]
 
 
 @pytest.mark.parametrize("threshold", [1e-9, 1 - 1e-9])

@@ -19,6 +19,7 @@ from daemon.assembly import assembly
 from daemon.judge.memory import encode, recall, remember
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
+from daemon.trust import trust
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from models.contract import Finger
@@ -102,6 +103,9 @@ def handed_on(former: Pipeline, other: Pipeline) -> Pipeline:
     state = msgspec.json.encode(former.session.state())
     recall(other, memory, same_model=True)
     other.session.restore(msgspec.json.decode(state, type=SessionState))
+    assert former.trust is not None
+    assert other.trust is not None
+    other.trust.restore(trust.decode(trust.encode(former.trust.state())))
     return other
 
 

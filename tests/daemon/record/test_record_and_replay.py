@@ -94,7 +94,8 @@ def test_another_model_can_judge_what_was_recorded(lab: Lab) -> None:
 def rotated(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     """A session model at work, and files that end after three seconds, whatever is held then."""
     options = "rotate_minutes = 0.05\nflush_ms = 200"
-    return work(tmp_path_factory.mktemp("rotated"), GRASPS, record=options)
+    risk = "[risk]\nmax_slip_when_stable = 0.5\nwarm_up = 2\n"
+    return work(tmp_path_factory.mktemp("rotated"), GRASPS, risk, record=options)
 
 
 def test_a_session_goes_on_in_the_replay_where_it_was(rotated: Lab) -> None:
@@ -103,6 +104,13 @@ def test_a_session_goes_on_in_the_replay_where_it_was(rotated: Lab) -> None:
     now = again(*rotated.files)
     assert {verdict["model"] for verdict in now} == {"small-session"}
     assert [compared(v) for v in now] == [compared(v) for v in before]
+
+
+def test_what_outcomes_teach_is_in_the_replay_as_it_was(rotated: Lab) -> None:
+    now = again(*rotated.files)
+    assert {verdict["outcomes"] for verdict in now} >= {0, 1, 2}
+    assert {verdict["risk"]["warm_up_left"] for verdict in now} == {0, 1, 2}
+    assert any(verdict["supervised"] for verdict in now)
 
 
 def test_each_file_of_a_run_is_judged_as_then_without_those_before_it(rotated: Lab) -> None:
@@ -170,7 +178,7 @@ def test_the_counts_in_the_table_give_the_very_probability_of_the_verdict(
     wanted = []
     for kind, content in messages(lab.files[0]):
         if kind == "verdict" and content["judged"]:
-            judged[content["grasp"]] = content["p_slip"]
+            judged[content["grasp"]] = content["p_slip_model"]
         if kind == "outcome":
             wanted.append(judged[content["grasp"]])  # what may be judged later is another grip
     found = [v["p_slip"] for v in again(table, "--model", "cnn1", "--gate", "every")]

@@ -141,6 +141,7 @@ class Daemon:
         self._now_ns = START_NS
         monkeypatch.setattr("daemon.record.recorder.Recorder", partial(Recorder, clock=self._clock))
         self.pipeline = assembly.build_pipeline(wanted, model, self._clock)
+        self.pipeline.boot_id = BOOT
         recorder = build_recorder(wanted, model, self.pipeline, BOOT)
         assert recorder is not None
         self.recorder = recorder

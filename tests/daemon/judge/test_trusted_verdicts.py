@@ -1,0 +1,171 @@
+"""What outcomes have taught, and the risk that is set, in the judge's verdicts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import Decision, Reason
+from daemon.trust.ledger import GraspId
+from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import Trust
+from drivers.base import ElectrodeFault
+from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
+
+BOOT = "b" * 32
+
+
+def trusting(
+    model: FakeModel, clock: Clock, limits: RiskLimits | None = None, *, learns: bool = True
+) -> Pipeline:
+    judge = pipeline(model, clock, trust=Trust(model.sha256, 0, limits, learns=learns))
+    judge.boot_id = BOOT
+    return judge
+
+
+def lift(judge: Pipeline, clock: Clock, seed: int, *, slipped: bool) -> Judgement:
+    """Judge a grasp and tell its outcome."""
+    judgement = judge.judge(reading(clock(), seed))
+    judge.outcome(GraspId(BOOT, judgement.grasp), slipped=slipped)
+    return judgement
+
+
+@pytest.mark.parametrize("p_slip", [0.0, 1e-9, 0.1, 0.4999, 0.5, 0.9, 1.0])
+def test_without_an_outcome_nothing_changes(p_slip: float) -> None:
+    clock = Clock()
+    plain = pipeline(FakeModel(p_slip), clock).judge(reading(clock()))
+    trusted = trusting(FakeModel(p_slip), clock).judge(reading(clock()))
+    assert trusted.p_slip == plain.p_slip == trusted.p_slip_model
+    assert trusted.risk is not None
+    assert (trusted.risk.target, trusted.risk.bound, trusted.supervised) == (None, None, False)
+    assert dataclasses.replace(trusted, risk=None) == plain
+
+
+def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(0.3), clock)
+    found = [lift(judge, clock, seed, slipped=True) for seed in range(30)]
+    assert [judgement.outcomes for judgement in found] == list(range(30))
+    assert {judgement.p_slip_model for judgement in found if judgement.p_slip} == {0.3}
+    assert found[0].p_slip == 0.3
+    assert found[-1].decision is Decision.SLIP
+    assert found[-1].p_slip is not None
+    assert found[-1].p_slip > 0.6
+
+
+def test_with_learning_off_outcomes_change_no_probability() -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(0.3), clock, RiskLimits(0.5), learns=False)
+    assert {lift(judge, clock, seed, slipped=seed % 2 == 0).p_slip for seed in range(20)} == {0.3}
+
+
+def test_in_the_warm_up_grasps_are_to_be_lifted_under_supervision() -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(0.3), clock, RiskLimits(0.05, warm_up=3))
+    found = [lift(judge, clock, seed, slipped=False) for seed in range(4)]
+    for left, judgement in zip((3, 2, 1), found, strict=False):
+        assert judgement.decision is Decision.UNKNOWN
+        assert judgement.reasons == (Reason.UNPROVEN,)
+        assert judgement.p_slip is judgement.p_slip_model is None
+        assert judgement.supervised
+        assert judgement.risk is not None
+        assert judgement.risk.warm_up_left == left
+    assert found[3].reasons in ((), (Reason.LOW_CONFIDENCE,))
+    assert not found[3].supervised
+
+
+def test_what_cannot_be_judged_is_never_to_be_lifted_under_supervision() -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(0.3), clock, RiskLimits(0.05, warm_up=50))
+    bad = reading(clock())
+    bad.faults[0, 0] = ElectrodeFault.HELD
+    assert not judge.judge(bad).supervised
+    old = reading(clock() - 10**9)
+    judgement = judge.judge(old)
+    assert Reason.STALE in judgement.reasons
+    assert not judgement.supervised
+
+
+def test_a_slip_stays_a_slip_under_every_risk() -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(0.9), clock, RiskLimits(0.05, warm_up=1))
+    judgement = judge.judge(reading(clock()))
+    assert (judgement.decision, judgement.reasons) == (Decision.SLIP, ())
+    assert judgement.supervised, "whatever the verdict"
+
+
+def test_when_too_many_slipped_nothing_is_stable_any_more() -> None:
+    clock, limits = Clock(), RiskLimits(0.05)
+    trust = Trust("model", 0, limits, learns=False)
+    for _ in range(6):
+        trust.risk.take(stable=True, slipped=True, proves=True)
+    judge = pipeline(FakeModel(1e-6), clock, trust=trust)
+    judgement = judge.judge(reading(clock()))
+    assert judgement.decision is Decision.UNKNOWN
+    assert judgement.reasons == (Reason.RISK_EXCEEDED,)
+    assert not judgement.supervised
+
+
+def test_exchanged_sensors_teach_nothing_of_the_new_ones() -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(0.3), clock)
+    for seed in range(30):
+        lift(judge, clock, seed, slipped=True)
+    judge.sensors_exchanged()
+    judgement = judge.judge(reading(clock(), 31))
+    assert (judgement.outcomes, judgement.p_slip) == (0, 0.3)
+
+
+@pytest.mark.parametrize("p_slip", [math.nan, -0.5, 1.5, RuntimeError()])
+def test_a_network_that_gives_no_probability_is_asked_for_no_more(
+    p_slip: float | Exception,
+) -> None:
+    clock = Clock()
+    judge = trusting(FakeModel(p_slip), clock)
+    judgement = judge.judge(reading(clock()))
+    assert judgement.reasons == (Reason.MODEL_FAILED,)
+    assert judge.trust is not None
+    assert not judge.knows(GraspId(BOOT, judgement.grasp))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    alpha=st.sampled_from([0.001, 0.02, 0.05, 0.2, 0.5]),
+    lifts=st.lists(
+        st.tuples(st.floats(0.0, 1.0), st.booleans(), st.integers(0, 5)), min_size=1, max_size=60
+    ),
+)
+def test_the_bound_holds_for_what_is_said(
+    alpha: float, lifts: Sequence[tuple[float, bool, int]]
+) -> None:
+    """Outcomes come when they come; each that is out may add one."""
+    clock, model = Clock(), FakeModel(0.1)
+    judge = trusting(model, clock, RiskLimits(alpha))
+    waiting: list[tuple[int, bool]] = []
+    said_stable: set[int] = set()
+    told = slips = 0
+    for seed, (p_slip, slipped, late) in enumerate(lifts):
+        model.answer = p_slip
+        judgement = judge.judge(reading(clock(), seed))
+        if judgement.decision is Decision.STABLE:
+            said_stable.add(judgement.grasp)
+        waiting.append((judgement.grasp, slipped))
+        while len(waiting) > late:
+            grasp, ended = waiting.pop(0)
+            judge.outcome(GraspId(BOOT, grasp), slipped=ended)
+            told += grasp in said_stable
+            slips += ended and grasp in said_stable
+        assert judge.trust is not None
+        report = judge.trust.report()
+        assert (report.lifts, report.slips) == (told, slips)
+        assert report.outstanding == sum(grasp in said_stable for grasp, _ in waiting)
+        assert report.bound is not None
+        start = min(math.log(min(2 * alpha, 0.5) / (1 - min(2 * alpha, 0.5))), 0.0)
+        assert slips <= alpha * told + max(start, -6.0) + 6.0 + 6
+        assert slips <= report.bound + 1e-9
