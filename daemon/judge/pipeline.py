@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -281,7 +281,7 @@ class Pipeline:
             )
         except ValueError:
             return Opinion(None, (Reason.MODEL_FAILED,), opinion.repaired)
-        return replace(opinion, assessment=assessment)
+        return Opinion(opinion.p_slip, (), opinion.repaired, opinion.margin, assessment)
 
     def _remember(self, decision: Decision, felt: Felt) -> None:
         """Keep what was said of a grasp until its outcome is told."""

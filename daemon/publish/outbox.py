@@ -172,7 +172,7 @@ class Outbox:
         if not (known or grasp in self._judged):
             return "unknown grasp: not judged, or too long ago"
         message = OutcomeMessage(
-            boot_id=boot_id,
+            boot_id=self._boot_id,
             seq=self._outcome_seq,
             t=self._wall_clock(),
             t_mono_ns=self._clock(),

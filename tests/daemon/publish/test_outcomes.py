@@ -97,6 +97,15 @@ def test_an_outcome_of_another_start_or_of_a_grasp_that_was_not_judged_is_refuse
     assert not [topic for topic, _ in output.sent if topic == b"outcome.right"]
 
 
+def test_an_outcome_of_a_grasp_that_an_earlier_start_judged_says_which() -> None:
+    output = Output()
+    sender = outbox(output)
+    for boot_id, judged_by in ((BOOT, None), ("f" * 32, "f" * 32)):
+        assert sender.outcome(boot_id, 3, "slip", known=True) is None
+        message = decode_outcome(output.sent[-1][1])
+        assert (message.boot_id, message.grasp, message.grasp_boot_id) == (BOOT, 3, judged_by)
+
+
 def test_only_so_many_grasps_are_remembered() -> None:
     sender = outbox(Output())
     for grasp in range(1, JUDGED_MAX + 2):

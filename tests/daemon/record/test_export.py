@@ -101,7 +101,9 @@ class Writer:
         )
         self._file.write(b"judged.right", msgspec.json.encode(message), self._now_ns)
 
-    def outcome(self, grasp: int, outcome: Ending, name: str | None = None) -> None:
+    def outcome(
+        self, grasp: int, outcome: Ending, name: str | None = None, judged_by: str | None = None
+    ) -> None:
         message = OutcomeMessage(
             boot_id=self._boot_id,
             seq=0,
@@ -110,6 +112,7 @@ class Writer:
             grasp=grasp,
             outcome=outcome,
             object=name,
+            grasp_boot_id=judged_by,
         )
         self._file.write(b"outcome.right", encode(message), self._now_ns)
 
@@ -243,6 +246,18 @@ def test_grasps_of_two_starts_are_told_apart(tmp_path: Path) -> None:
     writer.close()
     found = collect([tmp_path / "a.mcap", tmp_path / "b.mcap"])
     assert [grasp.slipped for grasp in found.grasps.values()] == [True, False]
+
+
+def test_an_outcome_may_be_told_to_the_next_start(tmp_path: Path) -> None:
+    first, second = Writer(tmp_path / "a.mcap"), Writer(tmp_path / "b.mcap", boot_id="f" * 32)
+    first.judged(1, sweeps(1)[0])
+    second.judged(1, sweeps(1, seed=1)[0])
+    second.outcome(1, "slip", judged_by=BOOT)
+    first.close()
+    second.close()
+    found = collect([tmp_path / "a.mcap", tmp_path / "b.mcap"])
+    assert list(found.grasps) == [(BOOT, 1)]
+    assert found.without_outcome == 1
 
 
 def test_a_judgement_and_its_outcome_may_stand_in_two_files(tmp_path: Path) -> None:

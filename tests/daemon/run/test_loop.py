@@ -15,9 +15,11 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import Answer, Companion, Requests, overridden
-from daemon.publish.messages import State, Status, Verdict, decode_status, decode_tactile
+from daemon.publish.messages import Lifts, State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
+from daemon.trust.ledger import GraspId, Told
+from daemon.trust.trust import Trust
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 
@@ -59,15 +61,18 @@ class Bench(Companion):
         companions: Sequence[Companion] = (),
         sleep: Sleep | None = None,
         boot_id: str | None = None,
+        trust: Trust | None = None,
     ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
         self.payloads: list[bytes] = []
         self.clock = clock
         outputs = [self.output]
+        self.pipeline = pipeline(model or FakeModel(), clock, trust=trust)
+        self.pipeline.boot_id = boot_id or ""
         self.loop = Loop(
             [driver],
-            pipeline(model or FakeModel(), clock),
+            self.pipeline,
             Outbox(
                 "right",
                 FINGERS,
@@ -478,6 +483,41 @@ def test_what_was_told_is_kept_by_whoever_keeps_it_and_at_once_by_nobody(stop: S
         bench.loop.keep(heard.append)
     assert heard == [None]
     assert keeper.waiting == [heard.append]
+
+
+def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status(stop: StopSignal) -> None:
+    clock, trust = Clock(), Trust("fake", 0)
+    driver = FakeDriver([reading(clock(), seed) for seed in (1, 2, 3)], clock)
+    peer = Peer("b" * 32)
+    bench = Bench(driver, clock, stop, companions=[peer], boot_id=peer.boot_id, trust=trust)
+    bench.run()
+    assert [verdict.outcomes for verdict in bench.verdicts] == [0, 1, 1]
+    first, second, _ = (verdict.p_slip for verdict in bench.verdicts)
+    assert first is not None
+    assert second is not None
+    assert second > first
+    assert bench.verdicts[1].p_slip_model == first
+    status = bench.output.statuses()[-1]
+    assert status.lifts == Lifts(reported=1, outstanding=2, unreported=0)
+    assert status.learner is not None
+    assert status.learner.told == {Told.TAKEN: 1, Told.REPEATED: 1}
+    assert 0.0 < status.learner.uncertainty < 1.0
+
+
+def test_an_outcome_of_a_grasp_of_an_earlier_start_is_taken_once_it_is_known(
+    stop: StopSignal,
+) -> None:
+    clock, earlier = Clock(), GraspId("e" * 32, 1)
+    known = Trust("fake", 0)
+    known.note(earlier, known.judge(earlier, 0.1, -2.0, np.empty(0)), stable=True)
+    for trust in (known, Trust("fake", 0)):
+        driver = FakeDriver([reading(clock(), seed) for seed in (1, 2)], clock)
+        peer = Peer(earlier.boot_id)
+        bench = Bench(driver, clock, stop, companions=[peer], boot_id="b" * 32, trust=trust)
+        bench.run()
+        taken = trust is known
+        assert [refused is None for refused in peer.refused] == [taken, taken]
+        assert trust.learner.outcomes == int(taken)
 
 
 def test_companions_are_called_in_their_order_and_only_for_hooks_of_their_own() -> None:
