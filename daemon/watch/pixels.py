@@ -15,6 +15,8 @@ from daemon.watch.snapshot import TONE_CODE, Tone
 
 COLOURS = {
     Tone.STABLE: "#2da44e",
+    Tone.LEANS: "#7fa98a",
+    Tone.LEARNING: "#2f7de0",
     Tone.SLIP: "#e5484d",
     Tone.WAITING: "#57606a",
     Tone.TROUBLE: "#d98e00",
@@ -23,13 +25,18 @@ COLOURS = {
 """Told apart by people who mix up red and green too: they differ in lightness, and are named."""
 PLAIN = {
     Tone.STABLE: "=",
+    Tone.LEANS: "-",
+    Tone.LEARNING: "!",
     Tone.SLIP: "X",
     Tone.WAITING: ".",
     Tone.TROUBLE: "?",
     Tone.SILENT: " ",
 }
 """The same in a strip without colour."""
-ALARM = (Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.STABLE, Tone.WAITING)
+ALARM = (
+    *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
+    *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
+)
 """Of several moments in one column, the first of these is shown."""
 _RISEN, _REST = (59, 125, 216), (38, 44, 54)
 _PRESSED = ((11, (92, 44, 104)), (30, (158, 47, 98)), (55, (229, 92, 48)), (80, (251, 180, 26)))
@@ -116,7 +123,9 @@ class Canvas:
     def banner(self, tone: Tone) -> Style:
         """Letters on the colour of a tone."""
         if not self.colour:
-            return Style(bold=True)
+            return Style(bold=tone is not Tone.LEANS)
+        if tone is Tone.LEANS:
+            return Style(color=COLOURS[tone])  # hollow
         return Style(color="#ffffff", bgcolor=COLOURS[tone], bold=True)
 
 

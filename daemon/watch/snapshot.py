@@ -10,10 +10,14 @@ from daemon.watch.fingers import FingerImage
 
 
 class Tone(StrEnum):
-    """The verdict in five kinds, a colour each, that an operator tells apart at a glance."""
+    """The verdict in seven kinds, a colour each, that an operator tells apart at a glance."""
 
     STABLE = "stable"
+    LEANS = "leans"
+    """Called `stable`, but lifts have not shown yet that this is a promise that is kept."""
     SLIP = "slip"
+    LEARNING = "learning"
+    """Unknown, and to be lifted while a person watches."""
     WAITING = "waiting"
     """Unknown, as it should be: nothing is grasped, or the grasp has not settled yet."""
     TROUBLE = "trouble"
@@ -24,7 +28,9 @@ class Tone(StrEnum):
 
 TONE_CODE = {
     Tone.STABLE: "s",
+    Tone.LEANS: "l",
     Tone.SLIP: "x",
+    Tone.LEARNING: "u",
     Tone.WAITING: "w",
     Tone.TROUBLE: "t",
     Tone.SILENT: ".",
@@ -40,7 +46,7 @@ class Line(msgspec.Struct, frozen=True):
 
 
 class Judged(msgspec.Struct, frozen=True, kw_only=True):
-    """The last judgement, which may not stand any more."""
+    """What a grasp was judged to be last, which may not stand any more."""
 
     verdict: str
     p_slip: float | None
@@ -48,6 +54,12 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     ago_s: float
     ended: str | None
     """How the lift ended, if the controller has told it: `stable` or `slip`."""
+    lift: str
+    """The same in short words, for the eye: `held`, `slipped`, `not told`, or `-`."""
+    supervised: bool
+    """Whether it was to be lifted while a person watches."""
+    held: bool
+    """Whether it is still the grasp of the hand; else it is past."""
 
 
 class Session(msgspec.Struct, frozen=True, kw_only=True):
@@ -87,12 +99,21 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     tone: Tone
     verdict: str
     """`stable`, `slip` or `unknown`; unknown too when no message comes."""
+    headline: str
+    """The same as it is to be shown: a `stable` that is no promise only leans to it."""
+    evidence: str
+    """What the verdict rests on; empty before the first message."""
+    learning: list[Line]
+    """How learning goes, what matters most first."""
     p_slip: float | None
     why: list[Line]
     grasp: int | None
     gate: str | None
     contact: list[str] | None
     judged: Judged | None
+    """The newest of `grasps`."""
+    grasps: list[Judged]
+    """The last grasps, the newest first."""
     fingers: list[FingerImage]
     joints: dict[str, float]
     """Angles, rad."""

@@ -29,6 +29,8 @@ GAP = 2
 """Columns between fingers."""
 JOINT = 15
 """Columns of a joint."""
+GRASPS = 26
+"""Columns of the list of the last grasps."""
 DIM = Style(dim=True)
 BOLD = Style(bold=True)
 
@@ -39,12 +41,12 @@ def draw(seen: Snapshot, width: int, height: int, canvas: Canvas) -> RenderableT
     rows: list[RenderableType] = [
         _header(seen),
         _verdict(seen, canvas, width),
-        Text(),
+        _line((seen.evidence, BOLD)),
         _why(seen, canvas),
         _hand(seen, canvas, large=large, width=width),
         _strip(seen, canvas, width),
         *_numbers(seen),
-        _session(seen),
+        _session(seen, width),
     ]
     left = height - (LINES_LARGE if large else LINES)
     return Group(*rows, *_health(seen, canvas, max(left, 1)), _footer(seen))
@@ -73,7 +75,12 @@ def _footer(seen: Snapshot) -> Text:
 
 def _verdict(seen: Snapshot, canvas: Canvas, width: int) -> Table:
     lines = [" " * BANNER] * BANNER_LINES
-    lines[BANNER_LINES // 2] = seen.verdict.upper().center(BANNER)
+    lines[BANNER_LINES // 2] = seen.headline.upper().center(BANNER)
+    last = seen.judged
+    same = last is not None and last.verdict != "unknown" and last.grasp == seen.grasp
+    if last is not None and same and seen.verdict == "unknown" and seen.tone is not Tone.SILENT:
+        was = f"({'judged' if last.held else 'past:'} {last.verdict}{_share(last.p_slip)})"
+        lines[BANNER_LINES // 2 + 1] = was.center(BANNER)
     banner = Text("\n".join(lines), canvas.banner(seen.tone))
     grid = Table.grid(padding=(0, 2))
     grid.add_column(width=BANNER, no_wrap=True)
@@ -99,12 +106,14 @@ def _facts(seen: Snapshot, canvas: Canvas, width: int) -> Text:
     last = seen.judged
     if last is None:
         return text.append("-")
-    share = "" if last.p_slip is None else f" {100 * last.p_slip:.0f} %"
-    text.append(f"{last.verdict}{share}", BOLD)
-    text.append(f", {last.ago_s:.0f} s ago", DIM)
-    if last.ended is not None:
-        text.append(f"\nlift ended: {last.ended}", BOLD)
-    return text
+    text.append(f"{last.verdict}{_share(last.p_slip)}", BOLD)
+    text.append(f", {last.ago_s:.0f} s ago{'' if last.held else ', past'}", DIM)
+    text.append("\nits lift ", DIM).append(last.lift, BOLD)
+    return text.append(", supervised" if last.supervised else "", DIM)
+
+
+def _share(p_slip: float | None) -> str:
+    return "" if p_slip is None else f" {100 * p_slip:.0f} %"
 
 
 def _why(seen: Snapshot, canvas: Canvas) -> Group:
@@ -130,8 +139,36 @@ def _hand(seen: Snapshot, canvas: Canvas, *, large: bool, width: int) -> Rendera
         grid.add_column(width=columns, no_wrap=True)
     left = max(width - len(cells) * (columns + GAP), 1)
     grid.add_column(width=left, no_wrap=True)
-    grid.add_row(*cells, Group(*_joints(seen, left, lines), _legend(seen, canvas)))
+    grid.add_row(*cells, Group(_beside(seen, left, lines), _legend(seen, canvas)))
     return grid
+
+
+def _beside(seen: Snapshot, width: int, lines: int) -> RenderableType:
+    """A title and so many lines: joints, and the last grasps where there is room."""
+    if not seen.grasps or width < GRASPS:
+        return Group(*_joints(seen, width, lines))
+    if width < GRASPS + JOINT - 1:
+        half = lines // 2
+        rows = (lines - half - 1, half) if seen.joints else (0, lines)
+        joints = _joints(seen, width, rows[0]) if seen.joints else []
+        return Group(*_grasps(seen, rows[1]), *joints)
+    grid = Table.grid()
+    grid.add_column(width=GRASPS + 1, no_wrap=True)
+    grid.add_column(width=width - GRASPS - 1, no_wrap=True)
+    joints = _joints(seen, width - GRASPS - 1, lines)
+    grid.add_row(Group(*_grasps(seen, lines)), Group(*joints))
+    return grid
+
+
+def _grasps(seen: Snapshot, lines: int) -> list[Text]:
+    """A title and so many lines, the newest grasp first."""
+    rows = [
+        f"{last.grasp:4} {last.verdict:7}{_share(last.p_slip):>5} {last.lift}"
+        f"{'*' if last.supervised else ''}"
+        for last in seen.grasps[:lines]
+    ]
+    rows += [""] * (lines - len(rows))
+    return [Text("last grasps (* watched)", DIM), *[_line((row, "")) for row in rows]]
 
 
 def _joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
@@ -139,7 +176,7 @@ def _joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
     named = sorted(seen.joints.items())
     columns = max(1, min(width // JOINT, math.ceil(len(named) / lines)))
     cells = [f"{_name(name, 5):5}{math.degrees(angle):6.1f}°".ljust(JOINT) for name, angle in named]
-    rows = ["".join(cells[row : lines * columns : lines]) for row in range(lines)]
+    rows = ["".join(cells[row : lines * columns : lines]).rstrip() for row in range(lines)]
     return [Text("joints" if named else "no joints", DIM), *[_line((row, "")) for row in rows]]
 
 
@@ -177,18 +214,25 @@ def _numbers(seen: Snapshot) -> list[Text]:
         (f"{timing.lost}", lost),
         ("  not understood ", DIM),
         (f"{timing.not_understood}", lost),
+        ("  repaired ", DIM),
+        (_name(", ".join(seen.repaired) or "nothing"), ""),
     )
     return [first, second]
 
 
-def _session(seen: Snapshot) -> Text:
+def _session(seen: Snapshot, width: int) -> Text:
     session = seen.session
     if session is None:
         known = "this model needs none"
     else:
         known = f"{session.grasps} grasps, {'' if session.calibrated else 'not '}calibrated"
-    repaired = _name(", ".join(seen.repaired) or "nothing", 2 * NAME_MAX)
-    return _line(("session ", DIM), (known, ""), ("  repaired ", DIM), (repaired, ""))
+    text = _line(("session ", DIM), (known, ""))
+    for line in seen.learning:
+        more = _line((f"  {line.what} ", DIM), (line.advice, ""))
+        if len(text) + len(more) > width:
+            break
+        text.append_text(more)
+    return text
 
 
 def _health(seen: Snapshot, canvas: Canvas, lines: int) -> list[Text]:

@@ -23,6 +23,7 @@ from daemon.publish.messages import (
     decode_tactile,
     decode_verdict,
 )
+from daemon.watch.evidence import WATCHED, doubt, learning, lift, rests_on
 from daemon.watch.fingers import FingerImage, Rest, image
 from daemon.watch.snapshot import TONE_CODE, Judged, Line, Session, Snapshot, Timing, Tone
 from models.layout import ELECTRODES
@@ -35,6 +36,10 @@ RATE_OVER = SNAPSHOTS_HZ
 """Snapshots that a rate is taken over: a second."""
 TACTILE_OLD_NS = 1_000_000_000
 """Images older than this are not shown: they would look alive."""
+GRASPS_MAX = 8
+"""Grasps that are shown after they were judged."""
+WITHHELD = {Reason.UNPROVEN, Reason.LOW_CONFIDENCE}
+"""Reasons of a grasp that nothing but the risk is against."""
 AS_IT_SHOULD_BE = {
     Reason.NO_CONTACT,
     Reason.MOVING,
@@ -74,8 +79,10 @@ class View:
         self._tactile: Tactile | None = None
         self._tactile_ns = 0
         self._status: Status | None = None
-        self._judged: tuple[Verdict, int] | None = None
-        self._outcome: OutcomeMessage | None = None
+        self._grasps: dict[tuple[str, int], tuple[Verdict, int]] = {}
+        """What each was judged to be last, and when, ns; the newest last."""
+        self._ended: dict[tuple[str, int], str] = {}
+        """How their lifts ended, of those that were told."""
         self._rests: dict[str, Rest] = {}
         self._received = self._lost = self._not_understood = 0
         self._rate_marks: deque[tuple[int, int]] = deque(maxlen=RATE_OVER + 1)
@@ -101,7 +108,9 @@ class View:
             case Tactile():
                 self._take_tactile(message, now_ns)
             case OutcomeMessage():
-                self._outcome = message
+                key = message.grasp_boot_id or message.boot_id, message.grasp
+                if key in self._grasps:
+                    self._ended[key] = message.outcome
             case Status():
                 self._status = message
 
@@ -113,8 +122,17 @@ class View:
             self._lost += verdict.seq - last.seq - 1
         self._received += 1
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
-        if verdict.judged and verdict.valid:
-            self._judged = verdict, now_ns
+        if verdict.judged and (verdict.valid or verdict.gate is not None):
+            self._keep(verdict, now_ns)
+
+    def _keep(self, verdict: Verdict, now_ns: int) -> None:
+        key = verdict.boot_id, verdict.grasp
+        self._grasps.pop(key, None)
+        self._grasps[key] = verdict, now_ns
+        if len(self._grasps) > GRASPS_MAX:
+            oldest = next(iter(self._grasps))
+            del self._grasps[oldest]
+            self._ended.pop(oldest, None)
 
     def _take_tactile(self, tactile: Tactile, now_ns: int) -> None:
         if not len(tactile.fingers) == len(tactile.counts) == len(tactile.faults):
@@ -133,25 +151,31 @@ class View:
         """What is to be seen at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
         tone, why = self._finding(now_ns)
         verdict = self._verdict
-        stands = verdict is not None and tone in {Tone.STABLE, Tone.SLIP}
+        stands = verdict is not None and tone in {Tone.STABLE, Tone.LEANS, Tone.SLIP}
         p_slip = verdict.p_slip if verdict is not None and stands else None
+        said = verdict.verdict.value if verdict is not None and stands else "unknown"
         self._history.append((TONE_CODE[tone], -1 if p_slip is None else round(100 * p_slip)))
         self._rate_marks.append((now_ns, self._received))
         silent = tone is Tone.SILENT
         status = self._status
+        grasps = self._last_grasps(now_ns, silent=silent)
         return Snapshot(
             endpoint=self._endpoint,
             link=self.link,
             hand=self._hand,
             t=self._wall(),
             tone=tone,
-            verdict=verdict.verdict.value if verdict is not None and stands else "unknown",
+            verdict=said,
+            headline="leans to stable" if tone is Tone.LEANS else said,
+            evidence="" if verdict is None else rests_on(verdict),
+            learning=learning(verdict, status),
             p_slip=p_slip,
             why=why,
             grasp=None if verdict is None else verdict.grasp,
             gate=None if self._gate is None or silent else self._gate.value,
             contact=None if verdict is None or silent else _names(verdict.contact),
-            judged=self._last_judgement(now_ns),
+            judged=grasps[0] if grasps else None,
+            grasps=grasps,
             fingers=[] if silent else self._images(now_ns),
             joints={} if self._tactile is None or silent else self._tactile.joints,
             health=[] if status is None or silent else _health(status),
@@ -177,14 +201,21 @@ class View:
             silence = Line("unknown", f"no message for {silent_ms:.0f} ms")
             return Tone.SILENT, [silence, Line("link", self.link)]
         if verdict.verdict is Decision.UNKNOWN:
-            quiet = all(reason in AS_IT_SHOULD_BE for reason in verdict.reasons)
             why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]
+            if verdict.supervised and WITHHELD.issuperset(verdict.reasons):
+                return Tone.LEARNING, [WATCHED, *why]
+            quiet = AS_IT_SHOULD_BE.issuperset(verdict.reasons)
             return Tone.WAITING if quiet else Tone.TROUBLE, why
-        less_sure = [Line("less sure", ADVICE[Reason.NOT_CALIBRATED])]
-        also = less_sure if verdict.session_calibrated is False else []
-        if verdict.verdict is Decision.STABLE:
-            return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
-        return Tone.SLIP, [Line("do not lift", "it is judged to slip; grasp again"), *also]
+        also = [WATCHED] if verdict.supervised else []
+        if verdict.session_calibrated is False:
+            also.append(Line("less sure", ADVICE[Reason.NOT_CALIBRATED]))
+        if verdict.verdict is Decision.SLIP:
+            what = "do not lift unwatched" if verdict.supervised else "do not lift"
+            return Tone.SLIP, [Line(what, "it is judged to slip; grasp again"), *also]
+        why_not = doubt(verdict)
+        if why_not is not None or verdict.supervised:
+            return Tone.LEANS, [Line("leans to stable", why_not or "supervised"), *also]
+        return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
 
     def _images(self, now_ns: int) -> list[FingerImage]:
         tactile, verdict = self._tactile, self._verdict
@@ -209,19 +240,24 @@ class View:
             )
         return images
 
-    def _last_judgement(self, now_ns: int) -> Judged | None:
-        if self._judged is None:
-            return None
-        verdict, judged_ns = self._judged
-        told = self._outcome
-        same = told and told.boot_id == verdict.boot_id and told.grasp == verdict.grasp
-        return Judged(
-            verdict=verdict.verdict.value,
-            p_slip=verdict.p_slip,
-            grasp=verdict.grasp,
-            ago_s=(now_ns - judged_ns) / 1e9,
-            ended=told.outcome if told and same else None,
-        )
+    def _last_grasps(self, now_ns: int, *, silent: bool) -> list[Judged]:
+        now = self._verdict
+        held = None if silent or now is None else (now.boot_id, now.grasp)
+        if self._gate in {GateState.IDLE, GateState.RELEASED}:
+            held = None
+        return [
+            Judged(
+                verdict=verdict.verdict.value,
+                p_slip=verdict.p_slip,
+                grasp=verdict.grasp,
+                ago_s=(now_ns - judged_ns) / 1e9,
+                ended=self._ended.get(key),
+                lift=lift(verdict, self._ended.get(key)),
+                supervised=verdict.supervised,
+                held=key == held,
+            )
+            for key, (verdict, judged_ns) in reversed(self._grasps.items())
+        ]
 
     def _timing(self) -> Timing:
         verdict, status = self._verdict, self._status

@@ -1,4 +1,4 @@
-"""The C++ example, compiled once."""
+"""The C++ example and the probe, compiled once."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.clients.building import compiled
+from tests.clients.building import compiled, compiled_probe
 
 
 @pytest.fixture(scope="session")
 def lift_gate(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The binary of deploy/clients/cpp/lift_gate.cpp."""
     return compiled("lift_gate", tmp_path_factory.mktemp("cpp"))
+
+
+@pytest.fixture(scope="session")
+def binary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The probe that tells what the header's rules say."""
+    return compiled_probe(tmp_path_factory.mktemp("probe"))

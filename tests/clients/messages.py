@@ -16,6 +16,13 @@ NEEDED = (
     "reasons", "age_ms", "silence_ms",
 )  # fmt: skip
 """Fields that a lift relies on."""
+RISK = {
+    "target": 0.05, "lifts": 41, "slips": 2, "outstanding": 1, "bound": 6.1, "warm_up_left": 0,
+}  # fmt: skip
+ADDED: dict[str, Any] = {
+    "p_slip_model": 0.3, "outcomes": 57, "supervised": False, "risk": RISK
+}  # fmt: skip
+"""What older daemons leave out, as it is of a known grasp."""
 
 
 def verdict(
@@ -27,8 +34,9 @@ def verdict(
     grasp: int = 1,
     age_ms: float = 1.0,
     silence_ms: float = 100.0,
+    **more: Any,  # noqa: ANN401
 ) -> dict[str, Any]:
-    """A message as the daemon makes it."""
+    """A message as a daemon makes it that knows nothing of outcomes, but for what is `more`."""
     known = outcome != "unknown"
     return {
         "v": 1,
@@ -48,7 +56,14 @@ def verdict(
         "model": "small-session",
         "model_sha": "0123456789ab",
         "of_a_later_version": [1.5],
+        **more,
     }
+
+
+def supervised(seq: int = 0, read_ns: int = 0, **more: Any) -> dict[str, Any]:  # noqa: ANN401
+    """One of the warm-up: unknown, to be lifted while a person watches."""
+    added = ADDED | {"p_slip_model": None, "supervised": True, "reasons": ["unproven"]}
+    return verdict(seq, read_ns, "unknown", **added | more)
 
 
 def frames(message: dict[str, Any]) -> list[bytes]:
@@ -77,6 +92,26 @@ _anything = st.one_of(
 
 
 @st.composite
+def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
+    """What daemons that know of outcomes add, or some of it."""
+    risk: dict[str, Any] = RISK | {"slips": draw(st.sampled_from([0, 2, 41, 42]))}
+    if draw(st.booleans()):
+        risk |= {draw(st.sampled_from(sorted(RISK))): draw(_anything)}
+    if draw(st.integers(0, 4)) == 0:
+        del risk[draw(st.sampled_from(sorted(RISK)))]
+    found: dict[str, Any] = {
+        "p_slip_model": draw(st.sampled_from([None, 0.3 if known else None, 0.3])),
+        "outcomes": draw(st.integers(0, 99)),
+        "supervised": draw(st.booleans()),
+        "risk": draw(st.sampled_from([None, RISK, RISK, risk])),
+    }
+    if not known:
+        reasons = [["moving"], ["unproven"], ["low-confidence"], ["unproven", "moving"]]
+        found["reasons"] = draw(st.sampled_from(reasons))
+    return {name: found[name] for name in found if draw(st.integers(0, 9))}
+
+
+@st.composite
 def events(draw: st.DrawFn, broken: bool = True) -> list[Event]:
     """What may come in a while that begins at 1 s; times of readings are those of one clock."""
     now_ns = 1000 * MS
@@ -88,14 +123,17 @@ def events(draw: st.DrawFn, broken: bool = True) -> list[Event]:
         seq = max(seqs[boot_id], 0)
         age_ms = draw(st.sampled_from([0, 1, 1, 1, 60, 120, 300]))
         behind_ns = draw(st.sampled_from([0, 0, 0, 30, 90, 110, -10])) * MS
+        outcome = draw(st.sampled_from(["stable"] * 4 + ["slip", "unknown", "unknown"]))
+        added = draw(_added(outcome != "unknown")) if draw(st.booleans()) else {}
         message = verdict(
             seq,
             max(now_ns - behind_ns - age_ms * MS, 0),
-            draw(st.sampled_from(["stable"] * 4 + ["slip", "unknown"])),
+            outcome,
             boot_id=boot_id,
             grasp=draw(st.integers(1, 2)),
             age_ms=age_ms,
             silence_ms=draw(st.sampled_from([100, 100, 20])),
+            **added,
         )
         sent = draw(_spoiled(message)) if broken and draw(st.booleans()) else frames(message)
         wait_ns = draw(st.sampled_from([0, 1, 10, 10, 40, 100, 101, 250])) * MS
@@ -106,7 +144,7 @@ def events(draw: st.DrawFn, broken: bool = True) -> list[Event]:
 
 @st.composite
 def _spoiled(draw: st.DrawFn, message: dict[str, Any]) -> list[bytes]:
-    name = draw(st.sampled_from(NEEDED))
+    name = draw(st.sampled_from([*NEEDED, *ADDED]))
     kind = draw(st.sampled_from(["field", "field", "field", "gone", "cut", "noise", "frames"]))
     if kind == "field":
         return frames(message | {name: draw(_anything)})

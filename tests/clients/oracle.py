@@ -11,6 +11,8 @@ from tests.clients.messages import MS, TOPIC
 
 MAX_AGE_NS = 100 * MS
 CLOCK_SLACK_NS = MS
+WITHHELD = {"unproven", "low-confidence"}
+"""What alone may be against a grasp that is to be lifted under supervision."""
 Whole = Annotated[int, msgspec.Meta(ge=0, le=2**60)]
 Duration = Annotated[float, msgspec.Meta(ge=0.0, le=1e12)]
 
@@ -22,8 +24,22 @@ SAME_THING = {
 """Verdict, code, validity, whether there is a probability, and reasons: what fits together."""
 
 
-class Told(msgspec.Struct):
-    """A message, as far as a lift relies on it."""
+Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+class RiskTold(msgspec.Struct):
+    """What lifts came to; all of it is needed."""
+
+    target: Share | None
+    lifts: Whole
+    slips: Whole
+    outstanding: Whole
+    bound: Duration | None
+    warm_up_left: Whole
+
+
+class Former(msgspec.Struct):
+    """A message, as far as a lift relied on it before there were outcomes."""
 
     v: Literal[1]
     boot_id: str
@@ -32,11 +48,25 @@ class Told(msgspec.Struct):
     grasp: Whole
     verdict: Literal["stable", "slip", "unknown"]
     verdict_code: int
-    p_slip: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] | None
+    p_slip: Share | None
     valid: bool
     reasons: list[str]
     age_ms: Duration
     silence_ms: Duration
+
+
+class Told(Former):
+    """A message, as far as a lift relies on it."""
+
+    p_slip_model: Share | None = None
+    outcomes: Whole = 0
+    supervised: bool = False
+    risk: RiskTold | None = None
+
+    @property
+    def teaches(self) -> bool:
+        """Whether it may be lifted while a person watches."""
+        return self.supervised and set(self.reasons) <= WITHHELD
 
 
 def told(payload: bytes) -> Told | None:
@@ -47,6 +77,8 @@ def told(payload: bytes) -> Told | None:
         return None
     whole = (found.verdict, found.verdict_code, found.valid)
     fits = (*whole, found.p_slip is not None, bool(found.reasons)) in SAME_THING
+    fits &= found.p_slip is not None or found.p_slip_model is None
+    fits &= found.risk is None or found.risk.slips <= found.risk.lifts
     return found if fits else None
 
 
@@ -72,9 +104,16 @@ def is_fresh(message: Told, now_ns: int) -> bool:
 
 
 def is_stable(came: Sequence[Sequence[bytes]], now_ns: int) -> bool:
-    """Whether all that came says so."""
+    """Whether all that came says so, and nobody need watch."""
     message = newest(came)
-    return message is not None and message.verdict == "stable" and is_fresh(message, now_ns)
+    known = message is not None and message.verdict == "stable" and not message.teaches
+    return known and message is not None and is_fresh(message, now_ns)
+
+
+def is_to_be_watched(came: Sequence[Sequence[bytes]], now_ns: int) -> bool:
+    """Whether all that came says that it may be lifted while a person watches."""
+    message = newest(came)
+    return message is not None and message.teaches and is_fresh(message, now_ns)
 
 
 def _is_repeat(message: Told, known: Sequence[Told]) -> bool:

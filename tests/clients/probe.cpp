@@ -1,11 +1,13 @@
 // The C++ client's rules, line by line, for comparison with the Python client's.
 //
 // `new MAX_AGE_NS SAME_COMPUTER` begins anew; `take EMPTY_NS NOW_NS FRAME...` (hex, `-` is empty)
-// takes a message; `at NOW_NS` answers with a line.
+// takes a message; `at NOW_NS` answers with a line. `client ENDPOINT ASK_ENDPOINT` makes one, `lift`
+// asks it and answers with a line, `tell` tells it that the lift held.
 #include "graspd_client.hpp"
 
 #include <iostream>
 #include <sstream>
+#include <type_traits>
 
 namespace {
 
@@ -21,15 +23,27 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
     for (const std::string& reason : verdict.reasons) std::cout << ' ' << reason;
     std::cout << ' ' << verdict.grasp.value_or(-1) << ' ' << verdict.seq.value_or(-1) << ' '
               << (verdict.boot_id.empty() ? "-" : verdict.boot_id) << ' '
-              << std::llrint(verdict.age_ms.value_or(-1) * 1e6) << ' ' << counts.messages << ' '
+              << std::llrint(verdict.age_ms.value_or(-1) * 1e6) << ' '
+              << std::llrint(verdict.p_slip.value_or(-1) * 1e9) << ' '
+              << std::llrint(verdict.p_slip_model.value_or(-1) * 1e9) << ' ' << verdict.outcomes
+              << ' ' << verdict.supervised << ' ' << static_cast<bool>(verdict) << ' ';
+    if (const auto& risk = verdict.risk)
+        std::cout << std::llrint(risk->target.value_or(-1) * 1e9) << ' ' << risk->lifts << ' '
+                  << risk->slips << ' ' << risk->outstanding << ' '
+                  << std::llrint(risk->bound.value_or(-1)) << ' ' << risk->warm_up_left << ' ';
+    std::cout << counts.messages << ' '
               << counts.lost << ' ' << counts.repeats << ' ' << counts.malformed << ' '
               << counts.restarts << ' ' << counts.former << std::endl;
 }
 
 }  // namespace
 
+static_assert(std::is_move_constructible_v<graspd::Client>, "whoever makes one may keep it");
+
 int main() {
     graspd::detail::Newest newest("verdict.right", 0, true);
+    std::optional<graspd::Client> client;
+    graspd::LiftAnswer answer;
     for (std::string line; std::getline(std::cin, line);) {
         std::istringstream words(line);
         std::string order;
@@ -45,6 +59,20 @@ int main() {
             std::vector<std::string> frames;
             for (std::string frame; words >> frame;) frames.push_back(unhexed(frame));
             newest.take({frames.begin(), frames.end()}, empty_ns, now_ns);
+        } else if (order == "client") {
+            graspd::Options options;
+            words >> options.endpoint >> options.ask_endpoint;
+            options.warn = [](const std::string& text) {
+                std::cout << "warn " << text << std::endl;
+            };
+            client.emplace(options);
+        } else if (order == "lift") {
+            answer = client.value().may_i_lift(30.0);
+            std::cout << static_cast<bool>(answer) << ' ' << answer.verdict.grasp.value_or(0) << ' '
+                      << client->unreported() << std::endl;
+        } else if (order == "tell") {
+            const bool taken{client.value().tell(answer.verdict, graspd::Outcome::held, {}, 30.0)};
+            std::cout << (taken ? "told" : "not taken") << std::endl;
         } else {
             graspd::Nanoseconds now_ns = 0;
             words >> now_ns;

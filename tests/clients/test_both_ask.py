@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 import zmq
 
-from deploy.clients.python.graspd_client import Graspd, OutcomeAnswer, Verdict
-from tests.clients.messages import TOPIC, verdict
+from deploy.clients.python.graspd_client import Graspd, Outcome, OutcomeAnswer, Verdict
+from tests.clients.messages import ADDED, TOPIC, verdict
 
 PERIOD_MS = 5
+TAKEN_FRAMES = [b'{"v":1,"ok":true}']
 DEADLINE_S = 0.3
 Answer = Callable[[dict[str, Any]], list[bytes]]
 """What is answered, from the message that has just been published."""
@@ -36,10 +37,12 @@ def of(outcome: str) -> Answer:
 
 
 @contextmanager
-def false_daemon(folder: Path, answer: Answer, outcome: str = "stable") -> Iterator[None]:
-    """Publishes that verdict all the time, and answers so."""
+def false_daemon(
+    folder: Path, answer: Answer, outcome: str = "stable", **more: object
+) -> Iterator[None]:
+    """Publishes that verdict all the time, with what is `more`, and answers so."""
     stop = threading.Event()
-    thread = threading.Thread(target=_serve, args=(folder, answer, outcome, stop))
+    thread = threading.Thread(target=_serve, args=(folder, answer, outcome, stop, more))
     thread.start()
     try:
         yield
@@ -48,7 +51,13 @@ def false_daemon(folder: Path, answer: Answer, outcome: str = "stable") -> Itera
         thread.join()
 
 
-def _serve(folder: Path, answer: Answer, outcome: str, stop: threading.Event) -> None:
+def _serve(
+    folder: Path,
+    answer: Answer,
+    outcome: str,
+    stop: threading.Event,
+    more: dict[str, Any],
+) -> None:
     with (
         zmq.Context() as context,
         context.socket(zmq.PUB) as out,
@@ -59,13 +68,15 @@ def _serve(folder: Path, answer: Answer, outcome: str, stop: threading.Event) ->
         asked.bind(f"ipc://{folder}/ask")
         seq = 0
         while not stop.is_set():
-            message = verdict(seq, time.monotonic_ns(), outcome)
+            grasp = 1 + seq // more.get("messages_each", 10**6)
+            message = verdict(seq, time.monotonic_ns(), outcome, **{"grasp": grasp, **more})
             out.send_multipart([TOPIC, json.dumps(message).encode()])
             seq += 1
             if asked.poll(PERIOD_MS):
                 who, *question = asked.recv_multipart()
-                assert question == [b"judge"]
-                asked.send_multipart([who, *answer(message)])
+                told_of = question[0].startswith(b"outcome ")
+                assert told_of or question == [b"judge"]
+                asked.send_multipart([who, *(TAKEN_FRAMES if told_of else answer(message))])
 
 
 ANSWERS: dict[str, tuple[Answer, str]] = {
@@ -107,6 +118,45 @@ def test_in_cpp_only_an_answer_that_fits_allows_a_lift(
         )
     assert result.stdout.split()[0] == expected
     assert (result.returncode == 0) == (expected == "stable")
+
+
+SUPERVISED: dict[str, tuple[Answer, bool]] = {
+    "the same": (told(), True),
+    "not supervised": (told(supervised=False), False),
+    "of another grasp": (told(grasp=2), False),
+    "moving too": (told(reasons=["unproven", "moving"]), False),
+    "of a later version": (told(v=2), False),
+    "a number": (told(supervised=1), False),
+    "without a risk's bound": (told(risk={"target": 0.05, "lifts": 1, "slips": 0}), False),
+    "stable": (of("stable"), False),
+}
+
+
+@pytest.mark.parametrize(("answer", "may"), SUPERVISED.values(), ids=SUPERVISED)
+def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
+    lift_gate: Path, tmp_path: Path, answer: Answer, may: bool
+) -> None:
+    places = [f"ipc://{tmp_path}/out", "30.0" if may else str(DEADLINE_S), f"ipc://{tmp_path}/ask"]
+    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
+    with (
+        false_daemon(tmp_path, answer, "unknown", **more),
+        Graspd(places[0], ask_endpoint=places[2]) as graspd,
+    ):
+        said = graspd.may_i_lift(float(places[1]), supervised=True)
+        assert (bool(said), said.supervised, bool(said.verdict)) == (may, may, False)
+        result = subprocess.run(
+            [lift_gate, "--supervised", *places],
+            capture_output=True,
+            text=True,
+            timeout=40,
+            check=False,
+        )
+        assert (result.returncode, "\nlift supervised after" in result.stdout) == (not may, may)
+        without = subprocess.run(
+            [lift_gate, places[0], str(DEADLINE_S), places[2]], capture_output=True, check=False
+        )
+        assert without.returncode == 1
+        assert not graspd.may_i_lift(DEADLINE_S)
 
 
 @pytest.mark.parametrize("outcome", ["unknown", "slip"])
@@ -154,7 +204,7 @@ def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
 
 def told_in_python(folder: Path, name: str | None) -> OutcomeAnswer:
     with Graspd(f"ipc://{folder}/out", ask_endpoint=f"ipc://{folder}/ask") as graspd:
-        return graspd.outcome(LIFTED_ON, True, name, wait_s=0.5)
+        return graspd.tell(LIFTED_ON, Outcome.SLIPPED, name)
 
 
 def told_in_cpp(lift_gate: Path, folder: Path, *words: str) -> tuple[int, str]:
@@ -174,6 +224,7 @@ TAKEN: dict[str, tuple[list[bytes], str]] = {
     "taken": ([b'{"v":1,"ok":true}'], ""),
     "with a later field": ([b'{"v":1,"ok":true,"later":[1]}'], ""),
     "refused": ([b'{"v":1,"ok":false,"why":"unknown grasp: no"}'], "unknown grasp: no"),
+    "not kept": ([b'{"v":1,"ok":false,"why":"not kept: no room"}'], "not kept: no room"),
     "of a later version": ([b'{"v":2,"ok":true}'], "version"),
     "without a version": ([b'{"ok":true}'], "malformed"),
     "refused without why": ([b'{"v":1,"ok":false}'], "malformed"),
@@ -232,6 +283,49 @@ def test_an_outcome_needs_a_grasp_somebody_to_tell_and_an_open_client(tmp_path: 
     assert asking.outcome(LIFTED_ON, True).why == "closed"
     with Graspd(f"ipc://{tmp_path}/out") as graspd, pytest.raises(ValueError, match="ask_endpoint"):
         graspd.outcome(LIFTED_ON, True)
+
+
+def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(
+    binary: Path, tmp_path: Path
+) -> None:
+    places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
+    with (
+        false_daemon(tmp_path, told(), messages_each=10),
+        subprocess.Popen(
+            [binary], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as probe,
+    ):
+        assert probe.stdin is not None
+        assert probe.stdout is not None
+        probe.stdin.write(f"client {places[0]} {places[1]}\n")
+        grasps: dict[str, bool] = {}
+        warned = []
+        while len(grasps) < 24:
+            tell = len(grasps) % 4 == 3
+            probe.stdin.write("lift\ntell\n" if tell else "lift\n")
+            probe.stdin.flush()
+            line = probe.stdout.readline().split()
+            while line[0] == "warn":
+                warned.append(line[1])
+                line = probe.stdout.readline().split()
+            may, grasp, unreported = line
+            assert may == "1"
+            before = [told_of for each, told_of in grasps.items() if each != grasp]
+            assert int(unreported) == before.count(False)
+            grasps[grasp] = grasps.get(grasp, False) or tell
+            assert not tell or probe.stdout.readline() == "told\n"
+        probe.communicate(timeout=20)
+        assert probe.returncode == 0, "the sanitizers found something"
+    assert warned == ["1", "11"]
+
+
+@pytest.mark.parametrize(("word", "sent"), [("held", "stable"), ("slipped", "slip")])
+def test_in_cpp_an_outcome_has_a_name(
+    lift_gate: Path, tmp_path: Path, word: str, sent: str
+) -> None:
+    with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
+        assert told_in_cpp(lift_gate, tmp_path, BOOT, "42", word)[0] == 0
+    assert found == [f"outcome {BOOT} 42 {sent}".encode()]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python.graspd_client import Newest
-from tests.clients.building import compiled_probe
 from tests.clients.messages import MS, TOPIC, Event, events
 from tests.clients.oracle import MAX_AGE_NS
 
@@ -46,11 +45,6 @@ class Probe:
         return self._process.returncode
 
 
-@pytest.fixture(scope="module")
-def binary(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return compiled_probe(tmp_path_factory.mktemp("probe"))
-
-
 @pytest.fixture
 def probe(binary: Path) -> Iterator[Probe]:
     made = Probe(binary)
@@ -64,8 +58,17 @@ def said(newest: Newest, now_ns: int) -> str:
     place = [-1 if number is None else number for number in (verdict.grasp, verdict.seq)]
     age_ns = round((-1.0 if verdict.age_ms is None else verdict.age_ms) * 1e6)
     words = [verdict.verdict, len(verdict.reasons), *verdict.reasons, *place]
-    words += [verdict.boot_id or "-", age_ns, *astuple(newest.counts)]
-    return " ".join(map(str, words))
+    words += [verdict.boot_id or "-", age_ns, fixed(verdict.p_slip), fixed(verdict.p_slip_model)]
+    words += [verdict.outcomes, int(verdict.supervised), int(bool(verdict))]
+    if risk := verdict.risk:
+        words += [fixed(risk.target), risk.lifts, risk.slips, risk.outstanding]
+        words += [-1 if risk.bound is None else round(risk.bound), risk.warm_up_left]
+    return " ".join(map(str, [*words, *astuple(newest.counts)]))
+
+
+def fixed(share: float | None) -> int:
+    """In the ninth place, as the probe writes it."""
+    return round((-1.0 if share is None else share) * 1e9)
 
 
 def as_hex(frame: bytes) -> str:

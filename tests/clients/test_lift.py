@@ -13,14 +13,44 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Graspd, Verdict
-from tests.clients.messages import MS, Event, events, frames, verdict
-from tests.clients.oracle import is_stable, newest, told
+from deploy.clients.python.graspd_client import Graspd, Outcome, Verdict
+from tests.clients.messages import ADDED, MS, Event, events, frames, supervised, verdict
+from tests.clients.oracle import is_stable, is_to_be_watched, newest, told
 
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
+TEACHES = ADDED | {"supervised": True}
+TAKEN = b'{"v":1,"ok":true}'
 LOOK_NS = 1000
 """What each look at the clock takes."""
+
+
+@dataclass
+class Call:
+    """What is asked or told, and the answers to it."""
+
+    world: World
+    answers: list[tuple[int, bytes]]
+    said: list[bytes] = field(default_factory=list)
+    answered: list[bytes] = field(default_factory=list)
+    due: tuple[int, bytes] | None = None
+
+    def ask(self, question: bytes) -> None:
+        assert self.due is None, "one question at a time"
+        self.said.append(question)
+        if self.answers:
+            delay_ns, payload = self.answers.pop(0)
+            self.due = self.world.now_ns + delay_ns, payload
+
+    def answer(self) -> bytes | None:
+        if self.due is None or self.due[0] > self.world.now_ns:
+            return None
+        self.answered.append(self.due[1])
+        self.due = None
+        return self.answered[-1]
+
+    def hang_up(self) -> None:
+        self.due = None
 
 
 @dataclass
@@ -31,14 +61,16 @@ class World:
     """When what comes, ns."""
     answers: list[tuple[int, bytes]] = field(default_factory=list)
     """How long after its question each comes, ns; then none any more."""
+    acknowledged: list[tuple[int, bytes]] = field(default_factory=list)
+    """The same of outcomes."""
     now_ns: int = START_NS
     slept_ns: int = 0
     """What the computer has slept: the monotonic clock does not count it."""
     came: list[list[bytes]] = field(default_factory=list)
-    answered: list[bytes] = field(default_factory=list)
-    questions: int = 0
     renewed: int = 0
-    _answer: tuple[int, bytes] | None = None
+
+    def __post_init__(self) -> None:
+        self.asking, self.telling = Call(self, self.answers), Call(self, self.acknowledged)
 
     def monotonic_ns(self) -> int:
         self.now_ns += LOOK_NS
@@ -54,25 +86,9 @@ class World:
         return self.came[-1]
 
     def wait(self, timeout_ms: int) -> None:
-        due_ns = [due for due, _ in self.coming[:1]] + ([self._answer[0]] if self._answer else [])
+        calls = (self.asking.due, self.telling.due)
+        due_ns = [due for due, _ in self.coming[:1]] + [due[0] for due in calls if due]
         self.now_ns = max(self.now_ns, min([self.now_ns + timeout_ms * MS, *due_ns]))
-
-    def ask(self, _question: bytes = b"judge") -> None:
-        assert self._answer is None, "one question at a time"
-        self.questions += 1
-        if self.answers:
-            delay_ns, payload = self.answers.pop(0)
-            self._answer = self.now_ns + delay_ns, payload
-
-    def answer(self) -> bytes | None:
-        if self._answer is None or self._answer[0] > self.now_ns:
-            return None
-        self.answered.append(self._answer[1])
-        self._answer = None
-        return self.answered[-1]
-
-    def hang_up(self) -> None:
-        self._answer = None
 
     def renew(self) -> None:
         self.renewed += 1
@@ -165,7 +181,7 @@ def test_a_closed_client_says_no_without_waiting() -> None:
         graspd.close()
         assert graspd.verdict().reasons == ("closed",)
         assert not graspd.may_i_lift(1.0)
-    assert world.questions == 0
+    assert len(world.asking.said) == 0
 
 
 def test_with_a_question_both_must_say_stable() -> None:
@@ -208,7 +224,7 @@ def test_an_unknown_answer_is_asked_for_again() -> None:
     world = World(stream(*["stable"] * 9), answers)
     with client(world, ask=True) as graspd:
         assert graspd.may_i_lift(0.1)
-    assert world.questions == 2
+    assert len(world.asking.said) == 2
 
 
 def test_an_answer_does_not_outlive_the_moment_in_which_nothing_is_known() -> None:
@@ -216,17 +232,165 @@ def test_an_answer_does_not_outlive_the_moment_in_which_nothing_is_known() -> No
     world = World(stream("unknown", *["stable"] * 9), answers)
     with client(world, ask=True) as graspd:
         assert not graspd.may_i_lift(0.09)
-    assert world.questions == 2
+    assert len(world.asking.said) == 2
 
 
 def test_while_an_outcome_is_answered_what_comes_is_read() -> None:
-    world = World(stream("unknown", *["stable"] * 9), [(45 * MS, b'{"v":1,"ok":true}')])
+    world = World(stream("unknown", *["stable"] * 9), acknowledged=[(45 * MS, TAKEN)])
     with client(world, ask=True) as graspd:
         before_ns = world.now_ns
         assert graspd.outcome(Verdict("stable", grasp=1, boot_id="a"), slipped=False)
         assert 45 * MS <= world.now_ns - before_ns < 47 * MS
         assert graspd.counts.messages == 5
         assert graspd.verdict().seq == 4
+
+
+def watched(outcome: str = "unknown", number: int = 20) -> list[tuple[int, list[bytes]]]:
+    """A stream of the warm-up."""
+    made = []
+    for seq in range(number):
+        at_ns = START_NS + seq * 10 * MS
+        known = verdict(seq, at_ns - MS, outcome, **TEACHES)
+        message = supervised(seq, at_ns - MS) if outcome == "unknown" else known
+        made.append((at_ns, frames(message)))
+    return made
+
+
+@pytest.mark.parametrize("outcome", ["unknown", "slip", "stable"])
+@pytest.mark.parametrize("ask", [False, True])
+def test_a_lift_under_supervision_is_none_unless_it_is_asked_for(outcome: str, ask: bool) -> None:
+    answers = [(5 * MS, frames(supervised(0, START_NS))[1])] * 2 if ask else []
+    with client(World(watched(outcome), list(answers)), ask) as graspd:
+        answer = graspd.may_i_lift(0.1)
+        assert (bool(answer), bool(answer.verdict), answer.supervised) == (False, False, False)
+    with client(World(watched(outcome), list(answers)), ask) as graspd:
+        answer = graspd.may_i_lift(0.1, supervised=True)
+        assert (bool(answer), bool(answer.verdict), answer.supervised) == (True, False, True)
+        assert answer.verdict.verdict == outcome
+        assert answer.waited_s < 0.02
+
+
+def test_without_supervision_it_is_still_told_why_not() -> None:
+    with client(World(watched())) as graspd:
+        answer = graspd.may_i_lift(0.02)
+    assert (answer.verdict.reasons, answer.verdict.supervised) == (("unproven",), True)
+
+
+@pytest.mark.parametrize("not_true", [1, "yes", "false", object()])
+def test_only_true_asks_for_supervised_lifts(not_true: object) -> None:
+    with client(World(watched())) as graspd:
+        assert not graspd.may_i_lift(0.02, supervised=not_true)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("watch", [True, False])
+@pytest.mark.parametrize("outcome", ["unknown", "stable"])
+def test_an_answer_of_the_other_kind_confirms_nothing(outcome: str, watch: bool) -> None:
+    """One says stable, the other that a person must watch."""
+    coming = stream(*["stable"] * 9) if outcome == "unknown" else watched()
+    answer = payload(1) if outcome == "stable" else frames(supervised(1, START_NS))[1]
+    with client(World(coming, [(MS, answer)]), ask=True) as graspd:
+        said = graspd.may_i_lift(0.08, supervised=watch)
+    assert (bool(said), said.supervised) == (False, False)
+
+
+def grasps(number: int) -> World:
+    """So many grasps, each stable for 10 ms."""
+    times = [START_NS + seq * 10 * MS for seq in range(number)]
+    coming = [
+        (at_ns, frames(verdict(seq, at_ns - MS, grasp=seq + 1))) for seq, at_ns in enumerate(times)
+    ]
+    answers = [(0, sent[1]) for _, sent in coming for _ in range(2)]
+    return World(coming, answers, [(MS, TAKEN)] * number)
+
+
+def test_a_lift_that_was_allowed_and_never_told_is_counted_and_warned_of_at_times(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    world = grasps(35)
+    with client(world, ask=True) as graspd:
+        for number in range(1, 35):
+            answer = graspd.may_i_lift(1.0)
+            assert answer.verdict.grasp == number
+            assert graspd.may_i_lift(0.002).verdict.grasp == number
+            told = sum(each % 3 == 0 for each in range(1, number))
+            assert graspd.unreported == number - 1 - told
+            if number % 3 == 0:
+                assert graspd.tell(answer.verdict, "held")
+            world.now_ns = START_NS + number * 10 * MS
+        assert len(caplog.messages) == 3
+    assert graspd.unreported == 23  # the last one is over too
+    assert caplog.messages == [
+        f"{number} lifts were allowed, and their outcome not told" for number in (1, 11, 21)
+    ]
+
+
+def test_lifts_are_remembered_in_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(graspd_client, "LIFTS_MAX", 4)
+    world = grasps(20)
+    with client(world) as graspd:
+        for _ in range(20):
+            assert graspd.may_i_lift(1.0)
+            world.now_ns += 10 * MS
+        assert graspd.unreported == 19
+        assert len(graspd._lifts) == 4  # noqa: SLF001
+
+
+def test_an_outcome_that_is_not_kept_stays_unreported_until_it_is() -> None:
+    not_kept = b'{"v":1,"ok":false,"why":"not kept: No space left on device"}'
+    world = grasps(3)
+    world.acknowledged[:] = [(50 * MS, not_kept), (50 * MS, TAKEN)]
+    with client(world, ask=True) as graspd:
+        first = graspd.may_i_lift(1.0).verdict
+        world.now_ns += 10 * MS
+        assert graspd.may_i_lift(1.0)
+        told = graspd.tell(first, Outcome.SLIPPED)
+        assert (bool(told), told.why) == (False, "not kept: No space left on device")
+        assert graspd.unreported == 1
+        assert graspd.tell(first, Outcome.SLIPPED)
+        assert graspd.unreported == 0
+    assert world.telling.said == [b"outcome a 1 slip"] * 2
+
+
+def test_who_does_not_wait_for_the_disk_may_ask_meanwhile_and_hears_of_it_later() -> None:
+    world = grasps(9)
+    world.acknowledged[:] = [(1000 * MS, TAKEN)]
+    with client(world, ask=True) as graspd:
+        first = graspd.may_i_lift(1.0).verdict
+        assert graspd.tell(first, "slipped", wait_s=0.0).why == "no-answer"
+        world.now_ns += 10 * MS
+        assert graspd.may_i_lift(1.0).waited_s < 0.02
+        assert graspd.unreported == 1
+        world.now_ns += 1000 * MS
+        graspd.verdict()
+        assert graspd.unreported == 0
+
+
+def test_an_outcome_has_time_to_be_written() -> None:
+    """To a disk that takes a second."""
+    world = World(stream("stable"), acknowledged=[(1900 * MS, TAKEN)])
+    with client(world, ask=True) as graspd:
+        assert graspd.tell(Verdict("stable", grasp=1, boot_id="a"), Outcome.HELD)
+
+
+@pytest.mark.parametrize("word", ["held", "stable", Outcome.HELD])
+@pytest.mark.parametrize("bad", ["slipped", "slip", Outcome.SLIPPED])
+def test_an_outcome_has_a_name(word: str | Outcome, bad: str | Outcome) -> None:
+    world = World(stream("stable"))
+    lifted_on = Verdict("stable", grasp=1, boot_id="a")
+    with client(world, ask=True) as graspd:
+        graspd.tell(lifted_on, word, wait_s=0.0)
+        graspd.tell(lifted_on, bad, "mug", wait_s=0.0)
+        graspd.outcome(lifted_on, False, wait_s=0.0)
+        graspd.outcome(lifted_on, True, "mug", wait_s=0.0)
+    assert world.telling.said == [b"outcome a 1 stable", b"outcome a 1 slip mug"] * 2
+
+
+@pytest.mark.parametrize("nothing", [True, False, None, 0, "", "Slip", "unknown", "true"])
+def test_what_is_no_outcome_is_not_told(nothing: object) -> None:
+    world = World(stream("stable"))
+    with client(world, ask=True) as graspd, pytest.raises(ValueError, match="Outcome"):
+        graspd.tell(Verdict("stable", grasp=1, boot_id="a"), nothing)  # type: ignore[arg-type]
+    assert world.telling.said == []
 
 
 def test_who_has_not_read_for_long_connects_anew() -> None:
@@ -298,12 +462,14 @@ def test_a_flood_does_not_hold_it_up() -> None:
     st.lists(st.tuples(st.integers(0, 60), events()), max_size=4),
     st.booleans(),
     st.sampled_from([0, 10, 150]),
+    st.booleans(),
 )
 def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     sequence: Sequence[Event],
     answers: Sequence[tuple[int, Sequence[Event]]],
     ask: bool,
     deadline_ms: int,
+    watch: bool,
 ) -> None:
     coming, at_ns = [], START_NS
     for event in sequence:
@@ -312,17 +478,21 @@ def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     said = [(delay * MS, sent[-1].frames[-1:]) for delay, sent in answers]
     world = World(coming, [(delay, found[0] if found else b"") for delay, found in said])
     with client(world, ask) as graspd:
-        answer = graspd.may_i_lift(deadline_ms / 1e3)
+        answer = graspd.may_i_lift(deadline_ms / 1e3, supervised=watch)
     assert answer.waited_s <= deadline_ms / 1e3 + 1e-3
+    assert not answer.supervised or watch
     if not answer:
         return
+    holds = is_to_be_watched if answer.supervised else is_stable
     # It looked at the clock a moment before it answered.
-    assert any(is_stable(world.came, world.now_ns - looks * LOOK_NS) for looks in range(21))
+    assert any(holds(world.came, world.now_ns - looks * LOOK_NS) for looks in range(21))
     last = newest(world.came)
     assert last is not None
     if ask:
-        told_so = told(world.answered[-1])
+        told_so = told(world.asking.answered[-1])
         assert told_so is not None
-        assert (told_so.verdict, told_so.boot_id) == ("stable", last.boot_id)
+        assert told_so.teaches == answer.supervised
+        assert told_so.verdict == "stable" or answer.supervised
+        assert told_so.boot_id == last.boot_id
         assert told_so.grasp == last.grasp
         assert told_so.seq <= last.seq

@@ -5,19 +5,33 @@ from __future__ import annotations
 import ast
 import dataclasses
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Newest, is_same_computer
-from tests.clients.messages import MS, TOPIC, Event, events, frames, verdict
-from tests.clients.oracle import MAX_AGE_NS, is_stable
+from deploy.clients.python.graspd_client import Newest, Risk, Verdict, is_same_computer
+from tests.clients.messages import (
+    ADDED,
+    MS,
+    RISK,
+    TOPIC,
+    Event,
+    events,
+    frames,
+    supervised,
+    verdict,
+)
+from tests.clients.oracle import MAX_AGE_NS, Former, is_stable, is_to_be_watched
 
 START_NS = 1000 * MS
+GOLDEN = Path(__file__).parents[1] / "daemon" / "publish" / "golden"
 
 
 def local() -> Newest:
@@ -32,9 +46,10 @@ def test_it_says_stable_exactly_when_all_that_came_says_so(sequence: Sequence[Ev
     for event in sequence:
         came.append(event.frames)
         newest.take(event.frames, now_ns, now_ns)
-        assert bool(newest.at(now_ns)) == is_stable(came, now_ns)
-        now_ns += event.wait_ns
-        assert bool(newest.at(now_ns)) == is_stable(came, now_ns)
+        for later_ns in (0, event.wait_ns):
+            now_ns += later_ns
+            assert bool(newest.at(now_ns)) == is_stable(came, now_ns)
+            assert newest.at(now_ns).supervised == is_to_be_watched(came, now_ns)
 
 
 @settings(max_examples=100)
@@ -94,6 +109,127 @@ def test_a_message_that_contradicts_itself_is_malformed(change: dict[str, object
     newest = local()
     newest.take(frames(verdict(0, START_NS) | change), START_NS, START_NS)
     assert newest.at(START_NS).reasons == ("malformed",)
+
+
+def said(message: dict[str, Any]) -> Verdict:
+    """What is known at once of a message."""
+    newest = local()
+    newest.take(frames(message), START_NS, START_NS)
+    return newest.at(START_NS)
+
+
+def test_what_a_verdict_rests_on_is_told() -> None:
+    found = said(verdict(0, START_NS, **ADDED))
+    assert found
+    assert (found.p_slip, found.p_slip_model, found.outcomes) == (0.125, 0.3, 57)
+    assert found.risk == Risk(0.05, 41, 2, 1, 6.1, 0)
+
+
+def test_a_daemon_that_knows_nothing_of_outcomes_is_understood() -> None:
+    found = said(verdict(0, START_NS))
+    assert found
+    assert (found.p_slip_model, found.outcomes, found.supervised, found.risk) == (
+        *(None, 0, False),
+        None,
+    )
+
+
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("verdict_*.json")), ids=lambda path: path.stem)
+def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Path) -> None:
+    """And who knows nothing of what was added finds all that it relied on as it was."""
+    golden = json.loads(path.read_text())
+    assert set(ADDED) < set(golden)
+    former = {name: value for name, value in golden.items() if name not in ADDED}
+    for message in (golden, former, golden | ADDED if golden["valid"] else golden):
+        found = Newest(TOPIC, MAX_AGE_NS, True)
+        now_ns = message["t_mono_ns"] + round(message["age_ms"] * 1e6)
+        found.take(frames(message), now_ns, now_ns)
+        seen = found.at(now_ns)
+        assert (seen.verdict, seen.reasons) == (message["verdict"], tuple(message["reasons"]))
+        assert msgspec.json.decode(frames(message)[1], type=Former) == msgspec.convert(
+            former, Former
+        )
+
+
+@pytest.mark.parametrize("outcome", ["stable", "slip"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"p_slip_model": 1.01},
+        {"p_slip_model": "0.3"},
+        {"p_slip_model": True},
+        {"outcomes": None},
+        {"outcomes": -1},
+        {"outcomes": 1.0},
+        {"outcomes": True},
+        {"supervised": None},
+        {"supervised": 1},
+        {"supervised": "false"},
+        {"risk": []},
+        {"risk": False},
+        {"risk": {}},
+        *({"risk": {key: RISK[key] for key in RISK if key != name}} for name in RISK),
+        {"risk": RISK | {"target": 1.5}},
+        {"risk": RISK | {"target": "0.05"}},
+        {"risk": RISK | {"lifts": None}},
+        {"risk": RISK | {"lifts": 1}},
+        {"risk": RISK | {"slips": 2.0}},
+        {"risk": RISK | {"bound": -1.0}},
+        {"risk": RISK | {"bound": True}},
+        {"risk": RISK | {"warm_up_left": -1}},
+    ],
+    ids=str,
+)
+def test_what_was_added_and_contradicts_itself_is_malformed(
+    outcome: str, change: dict[str, object]
+) -> None:
+    assert said(verdict(0, START_NS, outcome, **ADDED)).verdict == outcome
+    found = said(verdict(0, START_NS, outcome, **ADDED | change))
+    assert (found.reasons, found.supervised) == (("malformed",), False)
+
+
+@pytest.mark.parametrize("name", ["p_slip_model", "risk"])
+def test_nan_in_what_was_added_is_malformed(name: str) -> None:
+    value = math.nan if name == "p_slip_model" else RISK | {"bound": math.nan}
+    assert said(verdict(0, START_NS, **ADDED | {name: value})).reasons == ("malformed",)
+
+
+def test_a_lift_under_supervision_is_not_stable() -> None:
+    found = said(supervised(0, START_NS))
+    assert (bool(found), found.supervised, found.reasons) == (False, True, ("unproven",))
+    assert not said(verdict(0, START_NS, supervised=True))
+    assert said(verdict(0, START_NS, "slip", supervised=True)).supervised
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"reasons": ["unproven", "moving"]},
+        {"reasons": ["stale"]},
+        {"reasons": ["of-a-later-version"]},
+        {"v": 2},
+        {"v": None},
+        {"supervised": 1},
+        {"p_slip_model": 0.3},
+        {"outcomes": -1},
+        {"risk": {}},
+    ],
+    ids=str,
+)
+def test_what_is_not_only_unproven_is_not_to_be_lifted_under_supervision(
+    change: dict[str, Any],
+) -> None:
+    found = said(supervised(0, START_NS, **change))
+    assert (bool(found), found.supervised) == (False, False)
+
+
+@pytest.mark.parametrize("later_ms", [100, 101, 200])
+def test_a_lift_under_supervision_gets_old_as_any(later_ms: int) -> None:
+    newest = local()
+    newest.take(frames(supervised(0, START_NS)), START_NS, START_NS)
+    assert newest.at(START_NS + 99 * MS).supervised
+    found = newest.at(START_NS + MS + later_ms * MS)
+    assert (found.verdict, found.supervised) == ("unknown", False)
 
 
 def test_another_version_is_unknown_until_this_one_comes_again() -> None:

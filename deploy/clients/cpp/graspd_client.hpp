@@ -4,11 +4,12 @@
 // nlohmann-json3-dev, link with -lzmq). The messages are those of deploy/wire/README.md, version 1;
 // the rules are those of ../python/graspd_client.py, step by step.
 //
-//     graspd::Client client({"ipc:///run/graspd/right.ipc"});
-//     if (client.may_i_lift(0.5)) lift();
+//     graspd::Client client(options);  // with an endpoint and an ask_endpoint
+//     if (const auto answer = client.may_i_lift(0.5))
+//         client.tell(answer.verdict, lift() ? graspd::Outcome::held : graspd::Outcome::slipped);
 //
 // Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that
-// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `outcome(..., wait_s)` wait, and no
+// made it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `tell(..., wait_s)` wait, and no
 // longer than told.
 #pragma once
 
@@ -19,9 +20,9 @@
 #include <ctime>
 #include <deque>
 #include <fstream>
+#include <functional>
+#include <iostream>
 #include <iterator>
-#include <limits>
-#include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -38,6 +39,7 @@ using Nanoseconds = std::int64_t;
 
 constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not understood
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
+constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
 // A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 constexpr std::int64_t MESSAGE_MAX_BYTES = 1 << 16;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
@@ -59,15 +61,27 @@ constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembe
 // On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
 constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
+constexpr std::size_t LIFTS_MAX = 256;  // that are remembered: as many as graspd takes outcomes of
+constexpr std::int64_t WARN_EVERY = 10;  // lifts whose outcome was never told
 
-enum class Outcome { unknown = 0, stable = 1, slip = 2 };  // as `verdict_code`
+// Of a grasp, as `verdict_code`; and of its lift.
+enum class Outcome { unknown = 0, stable = 1, slip = 2, held = stable, slipped = slip };
 
 inline const char* name(Outcome outcome) {
     constexpr const char* names[] = {"unknown", "stable", "slip"};
     return names[static_cast<int>(outcome)];
 }
 
-// What is known of the grasp. True in an `if` exactly when it is stable.
+// What lifts of `stable` verdicts came to: of `lifts` that were told, so many `slips`.
+struct Risk {
+    std::optional<double> target;  // share of slips that is allowed; none: no risk is set
+    std::int64_t lifts = 0, slips = 0;
+    std::int64_t outstanding = 0;  // outcomes that can still come
+    std::optional<double> bound;   // of `slips`, but for one more each that is outstanding
+    std::int64_t warm_up_left = 0;  // outcomes until most grasps need no supervision
+};
+
+// What is known of the grasp. True in an `if` exactly when it is stable, and nobody need watch.
 struct Verdict {
     Outcome outcome = Outcome::unknown;
     // Why it is unknown: the daemon's reasons, or one of those in deploy/clients/README.md.
@@ -77,16 +91,32 @@ struct Verdict {
     std::optional<std::int64_t> seq;
     std::string boot_id;                 // empty before the first message
     std::optional<double> age_ms;        // since the reading's last byte, at least
+    std::optional<double> p_slip_model;  // what the network alone says
+    std::int64_t outcomes = 0;           // of lifts, that `p_slip` rests on
+    bool supervised = false;             // its lift would teach, but only while a person watches
+    std::optional<Risk> risk;
 
-    explicit operator bool() const { return outcome == Outcome::stable; }
+    explicit operator bool() const { return outcome == Outcome::stable && !supervised; }
+
+    // The same, but unknown, and not to be lifted.
+    Verdict unknown(std::vector<std::string> why) const {
+        Verdict same = *this;
+        same.outcome = Outcome::unknown;
+        same.reasons = std::move(why);
+        same.p_slip = same.p_slip_model = std::nullopt;
+        same.supervised = false;
+        return same;
+    }
 };
 
 // Whether to lift. True in an `if` exactly when the hand may.
 struct LiftAnswer {
     Verdict verdict;  // what it was decided by; besides its usual reasons `no-answer` and `late`
     double waited_s = 0.0;
+    // It may, but only while a person watches; never true unless such lifts were asked for.
+    bool supervised = false;
 
-    explicit operator bool() const { return static_cast<bool>(verdict); }
+    explicit operator bool() const { return static_cast<bool>(verdict) || supervised; }
 };
 
 // Whether graspd has taken how a lift ended. True in an `if` exactly when it has.
@@ -128,12 +158,16 @@ struct Options {
     std::string endpoint;
     std::string hand = "right";
     double max_age_ms = 100.0;  // how old a reading may be that a lift relies on
-    // `[ask]`; with it `may_i_lift` asks for a judgement as well, and `outcome` has whom to tell.
+    // `[ask]`; with it `may_i_lift` asks for a judgement as well, and `tell` has whom to tell.
     std::string ask_endpoint = {};
     // Whether the daemon's monotonic clock is one's own. Unless given, it is with ipc:// and on
     // loopback addresses: say false through a tunnel.
     std::optional<bool> same_computer = {};
     std::optional<Keys> keys = {};
+    // Is told of lifts that were allowed and whose outcome was not: of the first and each tenth.
+    std::function<void(const std::string&)> warn = [](const std::string& text) {
+        std::cerr << "graspd_client: " << text << '\n';
+    };
 };
 
 namespace detail {
@@ -160,11 +194,7 @@ inline bool is_same_computer(std::string_view endpoint) {
 
 // What matters of a verdict message.
 struct Message {
-    std::string boot_id;
-    std::int64_t seq = 0, grasp = 0;
-    Outcome outcome = Outcome::unknown;
-    std::optional<double> p_slip;
-    std::vector<std::string> reasons;
+    Verdict verdict;               // without its age
     Nanoseconds read_ns = 0;       // by the daemon's clock: when the reading's last byte came ...
     Nanoseconds published_ns = 0;  // ... and when the message went out
     Nanoseconds silence_ns = 0;
@@ -196,7 +226,12 @@ inline double number(const json& told, const char* name, double most) {
 }
 
 inline Nanoseconds milliseconds(const json& told, const char* name) {
-    return std::llrint(number(told, name, 1e12) * 1e6);  // at most thirty years
+    return std::llrint(number(told, name, REAL_MAX) * 1e6);
+}
+
+inline std::optional<double> maybe(const json& told, const char* name, double most) {
+    if (field(told, name).is_null()) return std::nullopt;
+    return number(told, name, most);
 }
 
 inline std::string text(const json& value) {
@@ -204,8 +239,35 @@ inline std::string text(const json& value) {
     return value.get<std::string>();
 }
 
+inline Risk risk(const json& told) {
+    if (!told.is_object()) throw Malformed{};
+    Risk found{maybe(told, "target", 1.0), integer(told, "lifts"), integer(told, "slips"),
+               integer(told, "outstanding"), maybe(told, "bound", REAL_MAX),
+               integer(told, "warm_up_left")};
+    if (found.slips > found.lifts) throw Malformed{};
+    return found;
+}
+
+// What daemons that know nothing of outcomes leave out.
+inline void trust(const json& told, Verdict& found) {
+    if (told.contains("p_slip_model")) found.p_slip_model = maybe(told, "p_slip_model", 1.0);
+    if (found.p_slip_model && !found.p_slip) throw Malformed{};
+    if (told.contains("outcomes")) found.outcomes = integer(told, "outcomes");
+    const auto risked = told.find("risk");
+    if (risked != told.end() && !risked->is_null()) found.risk = risk(*risked);
+    const auto watched = told.find("supervised");
+    if (watched == told.end()) return;
+    if (!watched->is_boolean()) throw Malformed{};
+    // Of an unknown grasp only if nothing but [risk] is against it.
+    found.supervised = watched->get<bool>() &&
+        std::all_of(found.reasons.begin(), found.reasons.end(), [](const std::string& reason) {
+            return reason == "unproven" || reason == "low-confidence";
+        });
+}
+
 inline Message message(const json& told) {
-    Message found;
+    Message all;
+    Verdict& found = all.verdict;
     const auto code = integer(told, "verdict_code");
     if (code > 2 || text(field(told, "verdict")) != name(static_cast<Outcome>(code)))
         throw Malformed{};
@@ -213,18 +275,19 @@ inline Message message(const json& told) {
     const bool known = found.outcome != Outcome::unknown;
     const json& valid = field(told, "valid");
     if (!valid.is_boolean() || valid.get<bool>() != known) throw Malformed{};
-    if (field(told, "p_slip").is_null() == known) throw Malformed{};
-    if (known) found.p_slip = number(told, "p_slip", 1.0);
+    found.p_slip = maybe(told, "p_slip", 1.0);
+    if (found.p_slip.has_value() != known) throw Malformed{};
     const json& reasons = field(told, "reasons");
     if (!reasons.is_array() || reasons.empty() != known) throw Malformed{};
     for (const json& reason : reasons) found.reasons.push_back(text(reason));
     found.boot_id = text(field(told, "boot_id"));
     found.seq = integer(told, "seq");
     found.grasp = integer(told, "grasp");
-    found.read_ns = integer(told, "t_mono_ns");
-    found.published_ns = found.read_ns + milliseconds(told, "age_ms");
-    found.silence_ns = milliseconds(told, "silence_ms");
-    return found;
+    trust(told, found);
+    all.read_ns = integer(told, "t_mono_ns");
+    all.published_ns = all.read_ns + milliseconds(told, "age_ms");
+    all.silence_ns = milliseconds(told, "silence_ms");
+    return all;
 }
 
 // A verdict message, or why it is none: `malformed` or `version`.
@@ -241,11 +304,13 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
 }
 
 // An outcome as it is sent. Throws `std::invalid_argument`.
-inline std::string telling(const Verdict& lifted_on, bool slipped, const std::string& object) {
+inline std::string telling(const Verdict& lifted_on, Outcome how, const std::string& object) {
+    if (how != Outcome::held && how != Outcome::slipped)
+        throw std::invalid_argument("a lift is held or slipped");
     if (lifted_on.boot_id.empty() || lifted_on.grasp.value_or(0) == 0)
         throw std::invalid_argument("nothing was lifted on a verdict that is of no grasp");
     const auto told = "outcome " + lifted_on.boot_id + ' ' + std::to_string(*lifted_on.grasp) +
-                      (slipped ? " slip" : " stable");
+                      ' ' + name(how);
     if (object.empty()) return told;
     const auto fits = [](char c) {
         return c > ' ' && c <= '~' && c != '"' && c != '\'' && c != ',';
@@ -303,7 +368,7 @@ public:
             why_ = why;
             return true;
         }
-        if (!is_new(*found)) return false;
+        if (!is_new(found->verdict)) return false;
         ++counts.messages;
         published_ns_ = same_computer_ ? found->published_ns
                                        : by_arrival(found->published_ns, empty_ns, now_ns);
@@ -313,30 +378,24 @@ public:
 
     // What is known at a time (own clock).
     Verdict at(Nanoseconds now_ns) const {
-        if (!message_) return {Outcome::unknown, {why_}, {}, {}, {}, {}, {}};
+        if (!message_) return Verdict{}.unknown({why_});
         const Nanoseconds age_ns = published_ns_ ? now_ns - *published_ns_ : 0;
         const Nanoseconds reading_age_ns = age_ns + message_->published_ns - message_->read_ns;
-        const bool known = message_->outcome != Outcome::unknown;
-        std::vector<std::string> reasons = message_->reasons;
-        if (!published_ns_) reasons = {"joining"};
-        else if (age_ns < -CLOCK_SLACK_NS) reasons = {"clock"};
-        else if (age_ns > message_->silence_ns) reasons = {"silent"};
-        else if (known && reading_age_ns > max_age_ns_) reasons = {"stale"};
-        const bool unknown = !reasons.empty();
-        return {unknown ? Outcome::unknown : message_->outcome,
-                std::move(reasons),
-                unknown ? std::nullopt : message_->p_slip,
-                message_->grasp,
-                message_->seq,
-                message_->boot_id,
-                static_cast<double>(reading_age_ns) / 1e6};
+        Verdict said = message_->verdict;
+        said.age_ms = static_cast<double>(reading_age_ns) / 1e6;
+        const bool counts_on_it = said.outcome != Outcome::unknown || said.supervised;
+        if (!published_ns_) return said.unknown({"joining"});
+        if (age_ns < -CLOCK_SLACK_NS) return said.unknown({"clock"});
+        if (age_ns > message_->silence_ns) return said.unknown({"silent"});
+        if (counts_on_it && reading_age_ns > max_age_ns_) return said.unknown({"stale"});
+        return said;
     }
 
     // An answer; none if it is not understood.
-    std::optional<Message> answered(std::string_view payload) {
-        auto found = read(payload).first;
-        if (!found) ++counts.malformed;
-        return found;
+    std::optional<Verdict> answered(std::string_view payload) {
+        if (auto found = read(payload).first) return found->verdict;
+        ++counts.malformed;
+        return std::nullopt;
     }
 
 private:
@@ -344,7 +403,7 @@ private:
         return std::find(former_.begin(), former_.end(), boot_id) != former_.end();
     }
 
-    bool is_new(const Message& found) {
+    bool is_new(const Verdict& found) {
         if (boot_id_ != found.boot_id) {
             if (is_former(found.boot_id)) return ++counts.former, false;
             if (boot_id_) {
@@ -353,13 +412,13 @@ private:
                 ++counts.restarts;
             }
             boot_id_ = found.boot_id;
-            seq_ = found.seq;
+            seq_ = *found.seq;
             best_.reset();
             return true;
         }
-        if (found.seq <= seq_) return ++counts.repeats, false;
-        counts.lost += static_cast<std::uint64_t>(found.seq - seq_ - 1);
-        seq_ = found.seq;
+        if (*found.seq <= seq_) return ++counts.repeats, false;
+        counts.lost += static_cast<std::uint64_t>(*found.seq - seq_ - 1);
+        seq_ = *found.seq;
         return true;
     }
 
@@ -391,44 +450,62 @@ private:
     std::optional<std::pair<Nanoseconds, Nanoseconds>> best_;  // of the clocks, and when
 };
 
+// The next message, if one waits.
+inline bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames) {
+    frames.clear();
+    try {
+        return zmq::recv_multipart(socket, std::back_inserter(frames), zmq::recv_flags::dontwait)
+            .has_value();
+    } catch (const zmq::error_t& error) {
+        if (error.num() != EINTR) throw;  // a signal; there will be another look
+        return false;
+    }
+}
+
+// Something that is said to the daemon, on a socket of its own, until it has answered.
+struct Call {
+    zmq::socket_t socket;
+
+    // The answer, if it is there; empty if it is none.
+    std::optional<std::string> answer() {
+        std::vector<zmq::message_t> frames;
+        if (!socket || !received(socket, frames)) return std::nullopt;
+        return frames.size() == 1 ? frames[0].to_string() : std::string();
+    }
+
+    // An answer that is late must not be taken for one to the next question.
+    void hang_up() {
+        socket.close();
+        socket = zmq::socket_t();
+    }
+};
+
 // The sockets.
 class Link {
 public:
     explicit Link(const Options& options)
         : options_(options), socket_(connected(zmq::socket_type::sub, options.endpoint)) {}
 
-    // The next message, if one waits.
     bool receive(std::vector<zmq::message_t>& frames) { return received(socket_, frames); }
 
     // Until a message or an answer waits, so long at most; a signal ends it sooner.
     void wait(std::int64_t timeout_ms) {
-        zmq_pollitem_t items[] = {{socket_.handle(), 0, ZMQ_POLLIN, 0},
-                                  {asking_.handle(), 0, ZMQ_POLLIN, 0}};
-        zmq_poll(items, asking_ ? 2 : 1, static_cast<long>(timeout_ms));
+        std::vector<zmq_pollitem_t> items;
+        for (zmq::socket_t* each : {&socket_, &asking.socket, &telling.socket})
+            if (*each) items.push_back({each->handle(), 0, ZMQ_POLLIN, 0});
+        zmq_poll(items.data(), static_cast<int>(items.size()), static_cast<long>(timeout_ms));
+    }
+
+    void ask(Call& call, const std::string& question) {
+        if (!call.socket)
+            call.socket = connected(zmq::socket_type::dealer, options_.ask_endpoint);
+        call.socket.send(zmq::buffer(question), zmq::send_flags::dontwait);
     }
 
     // Connect anew, and forget what waits.
     void renew() {
         socket_.close();
         socket_ = connected(zmq::socket_type::sub, options_.endpoint);
-    }
-
-    // Ask or tell; before the answer is there, not again.
-    void ask(const std::string& question = "judge") {
-        if (!asking_) asking_ = connected(zmq::socket_type::dealer, options_.ask_endpoint);
-        asking_.send(zmq::buffer(question), zmq::send_flags::dontwait);
-    }
-
-    // The answer, if it is there; empty if it is none.
-    std::optional<std::string> answer() {
-        std::vector<zmq::message_t> frames;
-        if (!asking_ || !received(asking_, frames)) return std::nullopt;
-        return frames.size() == 1 ? frames[0].to_string() : std::string();
-    }
-
-    void hang_up() {
-        asking_.close();
-        asking_ = zmq::socket_t();
     }
 
 private:
@@ -452,71 +529,66 @@ private:
         return made;
     }
 
-    static bool received(zmq::socket_t& socket, std::vector<zmq::message_t>& frames) {
-        frames.clear();
-        try {
-            return zmq::recv_multipart(socket, std::back_inserter(frames),
-                                       zmq::recv_flags::dontwait).has_value();
-        } catch (const zmq::error_t& error) {
-            if (error.num() != EINTR) throw;  // a signal; there will be another look
-            return false;
-        }
-    }
-
     Options options_;
     zmq::context_t context_;
-    zmq::socket_t socket_, asking_;
+    zmq::socket_t socket_;
+
+public:
+    Call asking, telling;  // closed before the context
 };
 
 // Whether the message that is the answer is still to come.
-inline bool is_behind(const Verdict& newest, const Message& answer) {
-    return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < answer.seq;
+inline bool is_behind(const Verdict& newest, const Verdict& answer) {
+    return newest.boot_id != answer.boot_id || !newest.seq || *newest.seq < *answer.seq;
 }
 
-// An answer that is late must not be taken for one to the next question.
-struct HangUp {
-    Link& link;
-    explicit HangUp(Link& asked) : link(asked) {}
-    HangUp(const HangUp&) = delete;
-    HangUp& operator=(const HangUp&) = delete;
-    ~HangUp() { link.hang_up(); }
-};
-
-// One question at a time, until the newest message confirms a stable answer.
+// One question at a time, until the newest message confirms the answer that permits a lift.
 class Question {
 public:
-    Question(Newest& newest, Link& link) : newest_(newest), link_(link), after_{link} {}
+    Question(Newest& newest, Link& link, bool asks, bool supervised)
+        : newest_(newest), link_(link), asks_(asks), supervised_(supervised) {}
+    Question(const Question&) = delete;
+    Question& operator=(const Question&) = delete;
+    ~Question() { link_.asking.hang_up(); }
 
-    // The newest message, if it confirms the answer; unknown otherwise. Asks if need be.
+    // Whether a verdict lets the hand lift.
+    bool permits(const Verdict& said) const { return said || (supervised_ && said.supervised); }
+
+    // Whether there is no need to wait.
+    bool is_over(const Verdict& said) const {
+        return said.outcome == Outcome::slip || permits(said);
+    }
+
+    // The newest message, if it confirms the answer; nothing to lift on otherwise. Asks.
     Verdict decided(Verdict newest) {
-        if (const auto payload = asked_ ? link_.answer() : std::nullopt) {
+        if (!asks_) return newest;
+        if (const auto payload = asked_ ? link_.asking.answer() : std::nullopt) {
             asked_ = false;
-            stable_ = newest_.answered(*payload);
-            if (stable_ && stable_->outcome == Outcome::slip)
-                return {Outcome::slip, {}, stable_->p_slip, stable_->grasp,
-                        stable_->seq,  stable_->boot_id, {}};
-            if (stable_ && stable_->outcome != Outcome::stable) stable_.reset();
+            answer_ = newest_.answered(*payload);
+            const bool permitted = answer_ && permits(*answer_);
+            if (answer_ && answer_->outcome == Outcome::slip && !permitted) return *answer_;
+            if (!permitted) answer_.reset();
         }
-        if (stable_ && !is_behind(newest, *stable_)) {
-            if (newest && newest.grasp == stable_->grasp) return newest;
-            stable_.reset();
+        if (answer_ && !is_behind(newest, *answer_)) {
+            if (permits(newest) && newest.grasp == answer_->grasp &&
+                newest.supervised == answer_->supervised)
+                return newest;
+            answer_.reset();
         }
-        if (!asked_ && !stable_) {
-            link_.ask();
+        if (!asked_ && !answer_) {
+            link_.ask(link_.asking, "judge");
             asked_ = true;
         }
-        if (newest.reasons.empty()) newest.reasons = {"no-answer"};
-        newest.outcome = Outcome::unknown;
-        newest.p_slip.reset();
-        return newest;
+        if (newest.outcome == Outcome::unknown && !permits(newest)) return newest;
+        return newest.unknown(newest.reasons.empty() ? std::vector<std::string>{"no-answer"}
+                                                     : newest.reasons);
     }
 
 private:
     Newest& newest_;
     Link& link_;
-    HangUp after_;
-    bool asked_ = false;
-    std::optional<Message> stable_;  // the answer that is to be confirmed
+    bool asks_, supervised_, asked_ = false;
+    std::optional<Verdict> answer_;  // that is to be confirmed
 };
 
 }  // namespace detail
@@ -528,15 +600,23 @@ public:
     explicit Client(const Options& options)
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
                   options.same_computer.value_or(detail::is_same_computer(options.endpoint))),
-          link_(options), asks_(!options.ask_endpoint.empty()) {}
+          link_(options), asks_(!options.ask_endpoint.empty()), warn_(options.warn) {}
 
     const Counts& counts() const { return newest_.counts; }
+
+    // Lifts that were allowed before the last one, and of which graspd has no outcome. It cannot
+    // learn from them, and they are in no bound of `risk`; `Options::warn` is told.
+    std::int64_t unreported() const {
+        std::int64_t found = forgotten_;
+        for (const auto& [grasp, told] : lifts_) found += !told && grasp != last_;
+        return found;
+    }
 
     // The newest verdict; waits at most `wait_s` seconds for a new message.
     Verdict verdict(double wait_s = 0.0) {
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
         while (!drain() && wait(due_ns)) {}
-        if (behind_) return {Outcome::unknown, {"behind"}, {}, {}, {}, {}, {}};
+        if (behind_) return Verdict{}.unknown({"behind"});
         return newest_.at(detail::now_ns());
     }
 
@@ -544,47 +624,50 @@ public:
     //
     // Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
     // answer and the newest message of the same grasp must both say so; an unknown answer is asked
-    // for again. Whatever else happens until the deadline is a no.
-    LiftAnswer may_i_lift(double deadline_s) {
+    // for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
+    // person watches: then what graspd wants to learn from (in the warm-up, and now and then after
+    // it) may be lifted too, and the answer says that it is such a lift.
+    LiftAnswer may_i_lift(double deadline_s, bool supervised = false) {
         const Nanoseconds began_ns = detail::now_ns();
         const Nanoseconds due_ns = began_ns + duration_ns(deadline_s);
-        std::optional<detail::Question> question;
-        if (asks_) question.emplace(newest_, link_);
-        const auto decide = [&] { return question ? question->decided(verdict()) : verdict(); };
-        Verdict decided = decide();
-        while (decided.outcome == Outcome::unknown && wait(due_ns)) {
-            decided = decide();
-            if (detail::now_ns() > due_ns && decided) {
-                decided.outcome = Outcome::unknown;
-                decided.reasons = {"late"};
-                decided.p_slip.reset();
-            }
+        detail::Question question(newest_, link_, asks_, supervised);
+        Verdict decided = question.decided(verdict());
+        while (!question.is_over(decided) && wait(due_ns)) {
+            decided = question.decided(verdict());
+            if (detail::now_ns() > due_ns && question.permits(decided))
+                decided = decided.unknown({"late"});
         }
         const auto waited_ns = static_cast<double>(detail::now_ns() - began_ns);
-        return {std::move(decided), waited_ns / 1e9};
+        const LiftAnswer answer{decided, waited_ns / 1e9, supervised && decided.supervised};
+        if (answer) allow(key(decided));
+        return answer;
     }
 
     // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
     //
-    // Waits at most `wait_s` seconds for the answer; without one tell it again, the later counts.
-    // Throws `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp,
-    // and for a name that is no 1 to 64 printable ASCII characters without blank, quotes and comma.
-    OutcomeAnswer outcome(const Verdict& lifted_on, bool slipped, const std::string& object = {},
-                          double wait_s = 0.5) {
-        const std::string telling = detail::telling(lifted_on, slipped, object);
+    // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
+    // comes later is taken in by later calls; without one, tell it again. Throws
+    // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, for
+    // `Outcome::unknown`, and for a name that is no 1 to 64 printable ASCII characters without
+    // blank, quotes and comma.
+    OutcomeAnswer tell(const Verdict& lifted_on, Outcome how, const std::string& object = {},
+                       double wait_s = 2.0) {
+        const std::string telling = detail::telling(lifted_on, how, object);
         if (!asks_) throw std::invalid_argument("an outcome needs an ask_endpoint");
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
-        const detail::HangUp after{link_};
-        link_.ask(telling);
-        auto payload = link_.answer();
-        while (!payload && wait(due_ns)) {
-            drain();
-            payload = link_.answer();
-        }
-        if (!payload) return {"no-answer"};
-        const auto taken = detail::taken(*payload);
-        if (!taken) newest_.counts.malformed++;
-        return taken.value_or(OutcomeAnswer{"malformed"});
+        link_.telling.hang_up();
+        link_.ask(link_.telling, telling);
+        told_.reset();
+        telling_ = key(lifted_on);
+        drain();
+        while (!told_ && wait(due_ns)) drain();
+        return told_.value_or(OutcomeAnswer{"no-answer"});
+    }
+
+    // Former name of `tell`, which took a bool.
+    OutcomeAnswer outcome(const Verdict& lifted_on, bool slipped, const std::string& object = {},
+                          double wait_s = 2.0) {
+        return tell(lifted_on, slipped ? Outcome::slipped : Outcome::held, object, wait_s);
     }
 
 private:
@@ -599,10 +682,43 @@ private:
         return std::llrint(seconds * 1e9);
     }
 
+    using Key = std::pair<std::string, std::int64_t>;  // names a grasp
+
+    static Key key(const Verdict& said) { return {said.boot_id, said.grasp.value_or(0)}; }
+
+    // The hand lifts this grasp; what was lifted before is over, and should have been told.
+    void allow(const Key& lift) {
+        last_ = lift;
+        if (std::none_of(lifts_.begin(), lifts_.end(),
+                         [&](const auto& each) { return each.first == lift; }))
+            lifts_.emplace_back(lift, false);
+        if (lifts_.size() > LIFTS_MAX) {
+            forgotten_ += !lifts_.front().second;
+            lifts_.pop_front();
+        }
+        if (unreported() < warn_at_) return;
+        warn_at_ = unreported() + WARN_EVERY;
+        if (warn_)
+            warn_(std::to_string(unreported()) +
+                  " lifts were allowed, and their outcome not told");
+    }
+
+    // Take in the answer to an outcome, if it is there.
+    void hear() {
+        const auto payload = link_.telling.answer();
+        if (!payload) return;
+        link_.telling.hang_up();
+        told_ = detail::taken(*payload);
+        newest_.counts.malformed += !told_;
+        if (!told_) told_ = OutcomeAnswer{"malformed"};
+        for (auto& [grasp, told] : lifts_) told = told || (*told_ && grasp == telling_);
+    }
+
     // Read all that waits, without waiting; whether there was anything new.
     bool drain() {
         bool anything_new = false;
         const Nanoseconds heard_ns = forget_what_is_old();
+        hear();
         behind_ = true;
         for (int taken = 0; behind_ && taken < QUEUE_MAX; ++taken) {
             const Nanoseconds before_ns = detail::now_ns();
@@ -654,6 +770,11 @@ private:
     detail::Newest newest_;
     detail::Link link_;
     bool asks_;
+    std::function<void(const std::string&)> warn_;
+    std::deque<std::pair<Key, bool>> lifts_;  // that were allowed, and whether graspd has it
+    Key last_, telling_;                      // of them, and that is being told
+    std::optional<OutcomeAnswer> told_;
+    std::int64_t forgotten_ = 0, warn_at_ = 1;
     bool behind_ = false;
     Nanoseconds read_ns_ = detail::now_ns(), empty_ns_ = read_ns_, heard_ns_ = read_ns_;
     Nanoseconds quiet_ns_ = QUIET_NS, slept_ns_ = detail::slept_ns();

@@ -1,8 +1,9 @@
 // Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not. Or tells it how the
 // lift ended: 0 it was taken, 1 it was not.
 //
-//     lift_gate ENDPOINT DEADLINE_S [ASK_ENDPOINT]    one question
-//     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP stable|slip [OBJECT]
+//     lift_gate [--supervised] ENDPOINT DEADLINE_S [ASK_ENDPOINT]
+//                                                     one question; a person watches the lift
+//     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]
 //                                                     `boot` and `grasp` are those of the answer
 //     lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]
 //                                                     each change of the verdict, until it is killed
@@ -29,16 +30,22 @@ int watch(const graspd::Options& options) {
     }
 }
 
-int ask(const graspd::Options& options, double deadline_s) {
+int ask(const graspd::Options& options, double deadline_s, bool supervised) {
     graspd::Client client(options);
-    const graspd::LiftAnswer answer = client.may_i_lift(deadline_s);
+    const graspd::LiftAnswer answer = client.may_i_lift(deadline_s, supervised);
     print(answer.verdict, client.counts());
-    std::cout << (answer ? "lift" : "do not lift") << " after " << answer.waited_s << " s\n";
+    std::cout << (answer ? "lift" : "do not lift") << (answer.supervised ? " supervised" : "")
+              << " after " << answer.waited_s << " s\n";
     return answer ? 0 : 1;
 }
 
+graspd::Outcome outcome(const std::string& word) {
+    if (word == "held" || word == "stable") return graspd::Outcome::held;
+    if (word == "slipped" || word == "slip") return graspd::Outcome::slipped;
+    throw std::invalid_argument("held or slipped");
+}
+
 int tell(const std::vector<std::string>& words) {
-    if (words[5] != "stable" && words[5] != "slip") throw std::invalid_argument("stable or slip");
     graspd::Options options;
     options.endpoint = words[1];
     options.ask_endpoint = words[2];
@@ -47,7 +54,7 @@ int tell(const std::vector<std::string>& words) {
     lifted_on.grasp = std::stoll(words[4]);
     graspd::Client client(options);
     const graspd::OutcomeAnswer answer =
-        client.outcome(lifted_on, words[5] == "slip", words.size() == 7 ? words[6] : "");
+        client.tell(lifted_on, outcome(words[5]), words.size() == 7 ? words[6] : "");
     std::cout << (answer ? "taken" : answer.why) << '\n';
     return answer ? 0 : 1;
 }
@@ -55,7 +62,9 @@ int tell(const std::vector<std::string>& words) {
 }  // namespace
 
 int main(int count, char** given) {
-    const std::vector<std::string> words(given + 1, given + count);
+    std::vector<std::string> words(given + 1, given + count);
+    const bool supervised = !words.empty() && words[0] == "--supervised";
+    if (supervised) words.erase(words.begin());
     graspd::Options options;
     try {
         if (!words.empty() && words[0] == "--watch" && (words.size() == 2 || words.size() == 4)) {
@@ -71,14 +80,14 @@ int main(int count, char** given) {
         if (words.size() == 2 || words.size() == 3) {
             options.endpoint = words[0];
             if (words.size() == 3) options.ask_endpoint = words[2];
-            return ask(options, std::stod(words[1]));
+            return ask(options, std::stod(words[1]), supervised);
         }
     } catch (const std::exception& error) {
         std::cerr << "lift_gate: " << error.what() << '\n';
         return 2;
     }
-    std::cerr << "lift_gate ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
-                 "lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP stable|slip [OBJECT]\n"
+    std::cerr << "lift_gate [--supervised] ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
+                 "lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]\n"
                  "lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]\n";
     return 2;
 }

@@ -3,24 +3,26 @@
 One file to copy: it needs Linux, Python 3.9 or newer and pyzmq, and nothing of graspd itself. The
 messages are those of deploy/wire/README.md, version 1.
 
-    with Graspd("ipc:///run/graspd/right.ipc") as graspd:
-        if graspd.may_i_lift(0.5):
-            lift()
+    with Graspd("ipc:///run/graspd/right.ipc", ask_endpoint=ASK) as graspd:
+        if answer := graspd.may_i_lift(0.5):
+            graspd.tell(answer.verdict, Outcome.HELD if lift() else Outcome.SLIPPED)
 
 Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that made
-it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `outcome(..., wait_s)` wait, and no longer
+it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `tell(..., wait_s)` wait, and no longer
 than they are told.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,8 +32,10 @@ from zmq.auth import load_certificate
 VERSION = 1  # of the messages; what has another is not understood
 STABLE, SLIP, UNKNOWN = "stable", "slip", "unknown"
 CODES = {UNKNOWN: 0, STABLE: 1, SLIP: 2}
+# The only reasons of a grasp that may be lifted under supervision: [risk] alone is against it.
+WITHHELD = {"unproven", "low-confidence"}
 INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
-MILLISECONDS_MAX = 1e12  # of a message: thirty years
+REAL_MAX = 1e12  # of a message: as a time, thirty years in ms
 # A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
 QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
@@ -54,16 +58,45 @@ FORMER_MAX = 16  # starts of the daemon that are remembered as over
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 # Name of an object: printable ASCII but blank, quotes and comma.
 OBJECT = re.compile(r"[!#-&(-+\--~]{1,64}")
+LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
+WARN_EVERY = 10  # lifts whose outcome was never told
+
+log = logging.getLogger("graspd_client")
+
+
+class Outcome(Enum):
+    """How a lift ended; `Outcome("held")` is understood as `Outcome("stable")`, a bool is not."""
+
+    HELD = STABLE
+    SLIPPED = SLIP
+
+    @classmethod
+    def _missing_(cls, value: object) -> Outcome | None:
+        return {"held": cls.HELD, "slipped": cls.SLIPPED}.get(str(value))
+
+
+@dataclass(frozen=True)
+class Risk:
+    """What lifts of `stable` verdicts came to: of `lifts` that were told, so many `slips`."""
+
+    target: float | None  # share of slips that is allowed; None: no risk is set
+    lifts: int
+    slips: int
+    outstanding: int  # outcomes that can still come
+    bound: float | None  # of `slips`, but for one more each that is outstanding
+    warm_up_left: int  # outcomes until most grasps need no supervision
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is known of the grasp. True in an `if` exactly when it is stable.
+    """What is known of the grasp. True in an `if` exactly when it is stable, nobody need watch.
 
     `verdict` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
-    unknown, `grasp` the number of the contact episode, `age_ms` the time since the reading's last
-    byte, ms, at least. What is not known before the first message is None.
+    unknown, and rests on so many `outcomes`; the network alone says `p_slip_model`. `grasp` is the
+    number of the contact episode, `age_ms` the time since the reading's last byte, ms, at least.
+    `supervised`: its lift would teach, but only while a person watches. What is not known before
+    the first message is None.
     """
 
     verdict: str
@@ -73,13 +106,18 @@ class Verdict:
     seq: int | None = None
     boot_id: str | None = None
     age_ms: float | None = None
+    p_slip_model: float | None = None
+    outcomes: int = 0
+    supervised: bool = False
+    risk: Risk | None = None
 
     def __bool__(self) -> bool:
-        return self.verdict == STABLE
+        return self.verdict == STABLE and not self.supervised
 
     def unknown(self, *reasons: str) -> Verdict:
-        """The same, but unknown."""
-        return replace(self, verdict=UNKNOWN, reasons=reasons, p_slip=None)
+        """The same, but unknown, and not to be lifted."""
+        held_back = replace(self, verdict=UNKNOWN, reasons=reasons, supervised=False)
+        return replace(held_back, p_slip=None, p_slip_model=None)
 
 
 @dataclass(frozen=True)
@@ -89,9 +127,11 @@ class LiftAnswer:
     verdict: Verdict
     """What it was decided by; besides its usual reasons `no-answer` and `late`."""
     waited_s: float
+    supervised: bool = False
+    """It may, but only while a person watches; never true unless such lifts were asked for."""
 
     def __bool__(self) -> bool:
-        return bool(self.verdict)
+        return bool(self.verdict) or self.supervised
 
 
 @dataclass(frozen=True)
@@ -151,11 +191,10 @@ class Graspd:
     ) -> None:
         """`max_age_ms` is how old a reading may be that a lift relies on, ms.
 
-        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `outcome` has
-        somebody to tell. `same_computer`
-        says whether the daemon's monotonic clock is one's own; unless given, it is with `ipc://`
-        and on loopback addresses: say False through a tunnel. Raises `zmq.ZMQError` for an endpoint
-        that is none, and `ValueError` for an age that is none.
+        With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `tell` has
+        somebody to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
+        unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
+        Raises `zmq.ZMQError` for an endpoint, `ValueError` for an age that is none.
         """
         if not 0.0 < max_age_ms < math.inf:
             raise ValueError(f"max_age_ms must be above 0 and finite, not {max_age_ms}")
@@ -165,6 +204,12 @@ class Graspd:
         self._newest = Newest(topic, round(max_age_ms * 1e6), same_computer)
         self._asks = ask_endpoint is not None
         self._closed = self._behind = False
+        self._lifts: dict[tuple[str, int], bool] = {}
+        """Grasps whose lift was allowed, the oldest first, and whether graspd has the outcome."""
+        self._last = self._telling = "", 0
+        """The one that was allowed last, and the one that is being told."""
+        self._told = OutcomeAnswer("no-answer")
+        self._forgotten, self._warn_at = 0, 1
         self._link = _Link(endpoint, topic, ask_endpoint, keys)
         self._read_ns = self._empty_ns = self._heard_ns = time.monotonic_ns()
         self._quiet_ns, self._slept_ns = QUIET_NS, _slept_ns()
@@ -173,6 +218,16 @@ class Graspd:
     def counts(self) -> Counts:
         """What came so far."""
         return self._newest.counts
+
+    @property
+    def unreported(self) -> int:
+        """Lifts that were allowed before the last one, and of which graspd has no outcome.
+
+        It cannot learn from them, and they are in no bound of `risk`. The logger `graspd_client`
+        warns of the first one and of each tenth.
+        """
+        untold = (key != self._last for key, told in self._lifts.items() if not told)
+        return self._forgotten + sum(untold)
 
     def verdict(self, wait_s: float = 0.0) -> Verdict:
         """The newest verdict; waits at most `wait_s` seconds for a new message."""
@@ -185,66 +240,80 @@ class Graspd:
             return Verdict(UNKNOWN, ("behind",))
         return self._newest.at(time.monotonic_ns())
 
-    def may_i_lift(self, deadline_s: float) -> LiftAnswer:
+    def may_i_lift(self, deadline_s: float, *, supervised: bool = False) -> LiftAnswer:
         """Whether the current grasp is stable, known within `deadline_s` seconds from now.
 
         Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
         answer and the newest message of the same grasp must both say so; an unknown answer is asked
-        for again. Whatever else happens until the deadline is a no.
+        for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
+        person watches: then what graspd wants to learn from (in the warm-up, and now and then
+        after it) may be lifted too, and the answer says that it is such a lift.
         """
         if not 0.0 <= deadline_s < math.inf:
             raise ValueError(f"the deadline must be 0 s or more and finite, not {deadline_s}")
         began_ns = time.monotonic_ns()
         due_ns = began_ns + round(deadline_s * 1e9)
-        question = _Question(self._newest, self._link, self._asks and not self._closed)
+        asking = self._link.asking if self._asks and not self._closed else None
+        question = _Question(self._newest, asking, supervised is True)
         try:
             decided = question.decided(self.verdict())
-            while decided.verdict == UNKNOWN and not self._closed and self._wait(due_ns):
+            while not question.is_over(decided) and not self._closed and self._wait(due_ns):
                 decided = question.decided(self.verdict())
-                if time.monotonic_ns() > due_ns and decided:
+                if time.monotonic_ns() > due_ns and question.permits(decided):
                     decided = decided.unknown("late")
         finally:
-            self._link.hang_up()
-        return LiftAnswer(decided, (time.monotonic_ns() - began_ns) / 1e9)
+            self._link.asking.hang_up()
+        waited_s = (time.monotonic_ns() - began_ns) / 1e9
+        answer = LiftAnswer(decided, waited_s, supervised is True and decided.supervised)
+        if answer:
+            self._allow(_key(decided))
+        return answer
 
-    def outcome(
+    def tell(
         self,
         lifted_on: Verdict,
-        slipped: bool,
+        how: Outcome | str,
         object_name: str | None = None,
-        wait_s: float = 0.5,
+        wait_s: float = 2.0,
     ) -> OutcomeAnswer:
         """Tell how the lift ended that was made on a verdict, and what was lifted.
 
-        Waits at most `wait_s` seconds for the answer; without one tell it again, the later counts.
-        Raises `ValueError` without an ask endpoint, for a verdict that is of no grasp, and for a
-        name that is no 1 to 64 printable ASCII characters without blank, quotes and comma.
+        Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
+        comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
+        without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` that is none,
+        and for a name that is no 1 to 64 printable ASCII characters without blank, quotes, comma.
         """
-        telling = _telling(lifted_on, slipped, object_name)
+        telling = _telling(lifted_on, Outcome(how), object_name)
         if not self._asks:
             raise ValueError("an outcome needs an ask_endpoint")
         if self._closed:
             return OutcomeAnswer("closed")
         due_ns = time.monotonic_ns() + round(wait_s * 1e9)
-        try:
-            self._link.ask(telling)
-            payload = self._link.answer()
-            while payload is None and self._wait(due_ns):
-                self._drain()
-                payload = self._link.answer()
-        finally:
-            self._link.hang_up()
-        if payload is None:
-            return OutcomeAnswer("no-answer")
-        taken = _taken(payload)
-        self.counts.malformed += taken is None
-        return OutcomeAnswer("malformed") if taken is None else taken
+        self._link.telling.hang_up()
+        self._link.telling.ask(telling)
+        self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
+        self._drain()
+        while self._telling[1] and self._wait(due_ns):
+            self._drain()
+        return self._told
+
+    def outcome(
+        self,
+        lifted_on: Verdict,
+        slipped: bool | str,
+        object_name: str | None = None,
+        wait_s: float = 2.0,
+    ) -> OutcomeAnswer:
+        """Former name of `tell`, with a bool for how it ended."""
+        how = slipped if isinstance(slipped, str) else SLIP if slipped else STABLE
+        return self.tell(lifted_on, how, object_name, wait_s)
 
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on."""
         if not self._closed:
             self._closed = True
             self._link.close()
+            self._allow(("", 0))
 
     def __enter__(self) -> Graspd:
         return self
@@ -252,9 +321,33 @@ class Graspd:
     def __exit__(self, *_details: object) -> None:
         self.close()
 
+    def _allow(self, lift: tuple[str, int]) -> None:
+        """The hand lifts this grasp; what was lifted before is over, and should have been told."""
+        self._last = lift
+        if lift[1]:
+            self._lifts.setdefault(lift, False)
+        if len(self._lifts) > LIFTS_MAX:
+            self._forgotten += not self._lifts.pop(next(iter(self._lifts)))
+        if self.unreported >= self._warn_at:
+            self._warn_at = self.unreported + WARN_EVERY
+            log.warning("%d lifts were allowed, and their outcome not told", self.unreported)
+
+    def _hear(self) -> None:
+        """Take in the answer to an outcome, if it is there."""
+        payload = self._link.telling.answer()
+        if payload is None:
+            return
+        self._link.telling.hang_up()
+        self._told = _taken(payload)
+        self.counts.malformed += self._told.why == "malformed"
+        if self._told and self._telling in self._lifts:
+            self._lifts[self._telling] = True
+        self._telling = "", 0
+
     def _drain(self) -> bool:
         """Read all that waits, without waiting; whether there was anything new."""
         self._forget_what_is_old()
+        self._hear()
         new, heard_ns, self._behind = False, self._heard_ns, True
         for _ in range(QUEUE_MAX):
             before_ns = time.monotonic_ns()
@@ -369,15 +462,21 @@ class Newest:
             return said.unknown("clock")
         if age_ns > message.silence_ns:
             return said.unknown("silent")
-        if said.verdict != UNKNOWN and reading_age_ns > self._max_age_ns:
+        if (said.verdict != UNKNOWN or said.supervised) and reading_age_ns > self._max_age_ns:
             return said.unknown("stale")
         return said
 
     def read(self, payload: bytes) -> _Message | str:
         """A message or an answer; `malformed` or `version` for what is not understood, counted."""
-        found = _read(payload)
-        self.counts.malformed += isinstance(found, str)
-        return found
+        try:
+            told = _parsed(payload)
+            if _number(told, "v") == VERSION:
+                return _message(told)
+            why = "version"
+        except (ValueError, KeyError, RecursionError):
+            why = "malformed"
+        self.counts.malformed += 1
+        return why
 
     def _is_new(self, said: Verdict) -> bool:
         boot_id, seq = said.boot_id or "", said.seq or 0
@@ -414,33 +513,47 @@ class Newest:
 
 
 class _Question:
-    """One question at a time, until the newest message confirms a stable answer."""
+    """One question at a time, until the newest message confirms the answer that permits a lift."""
 
-    def __init__(self, newest: Newest, link: _Link, asks: bool) -> None:
-        self._newest, self._link, self._asks = newest, link, asks
+    def __init__(self, newest: Newest, asking: _Call | None, supervised: bool) -> None:
+        self._newest, self._asking, self._supervised = newest, asking, supervised
         self._asked = False
-        self._stable: Verdict | None = None
-        """The answer that is to be confirmed."""
+        self._answer: Verdict | None = None
+        """That is to be confirmed."""
+
+    def permits(self, said: Verdict) -> bool:
+        """Whether a verdict lets the hand lift."""
+        return bool(said) or (self._supervised and said.supervised)
+
+    def is_over(self, said: Verdict) -> bool:
+        """Whether there is no need to wait."""
+        return said.verdict == SLIP or self.permits(said)
 
     def decided(self, newest: Verdict) -> Verdict:
-        """The newest message, if it confirms the answer; unknown otherwise. Asks if need be."""
-        if not self._asks:
+        """The newest message, if it confirms the answer; nothing to lift on otherwise. Asks."""
+        if self._asking is None:
             return newest
-        payload = self._link.answer() if self._asked else None
+        payload = self._asking.answer() if self._asked else None
         if payload is not None:
             self._asked = False
             answer = self._newest.read(payload)
             said = Verdict(UNKNOWN) if isinstance(answer, str) else answer.verdict
-            if said.verdict == SLIP:
+            if said.verdict == SLIP and not self.permits(said):
                 return said
-            self._stable = said if said else None
-        if self._stable is not None and _reaches(newest, self._stable):
-            if newest and newest.grasp == self._stable.grasp:
+            self._answer = said if self.permits(said) else None
+        if self._answer is not None and _reaches(newest, self._answer):
+            same = (newest.grasp, newest.supervised) == (
+                self._answer.grasp,
+                self._answer.supervised,
+            )
+            if same and self.permits(newest):
                 return newest
-            self._stable = None
-        if not self._asked and self._stable is None:
-            self._link.ask()
+            self._answer = None
+        if not self._asked and self._answer is None:
+            self._asking.ask(b"judge")
             self._asked = True
+        if newest.verdict == UNKNOWN and not self.permits(newest):
+            return newest
         return newest.unknown(*(newest.reasons or ("no-answer",)))
 
 
@@ -453,11 +566,11 @@ class _Link:
     """The sockets."""
 
     def __init__(self, endpoint: str, topic: bytes, ask: str | None, keys: Keys | None) -> None:
-        self._endpoint, self._topic, self._ask, self._keys = endpoint, topic, ask, keys
+        self._endpoint, self._topic, self._keys = endpoint, topic, keys
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._asking: zmq.Socket[bytes] | None = None
+        self.asking, self.telling = _Call(self, ask or ""), _Call(self, ask or "")
         try:
-            self._socket = self._connected(zmq.SUB, endpoint)
+            self._socket = self.connected(zmq.SUB, endpoint)
         except BaseException:
             self._context.destroy(0)
             raise
@@ -471,38 +584,18 @@ class _Link:
 
     def wait(self, timeout_ms: int) -> None:
         """Until a message or an answer waits, so long at most."""
-        wanted = [each for each in (self._socket, self._asking) if each is not None]
-        zmq.zmq_poll([(each, zmq.POLLIN) for each in wanted], timeout_ms)
+        sockets = (self._socket, self.asking.socket, self.telling.socket)
+        zmq.zmq_poll([(each, zmq.POLLIN) for each in sockets if each is not None], timeout_ms)
 
     def renew(self) -> None:
         """Connect anew, and forget what waits."""
         self._socket.close(0)
-        self._socket = self._connected(zmq.SUB, self._endpoint)
-
-    def ask(self, question: bytes = b"judge") -> None:
-        if self._ask is not None:
-            if self._asking is None:
-                self._asking = self._connected(zmq.DEALER, self._ask)
-            self._asking.send(question, zmq.NOBLOCK)
-
-    def answer(self) -> bytes | None:
-        """The answer, if it is there; empty if it is none."""
-        try:
-            frames = [] if self._asking is None else self._asking.recv_multipart(zmq.NOBLOCK)
-        except zmq.Again:
-            return None
-        return frames[0] if len(frames) == 1 else b""
-
-    def hang_up(self) -> None:
-        """An answer that is late must not be taken for one to the next question."""
-        if self._asking is not None:
-            self._asking.close(0)
-            self._asking = None
+        self._socket = self.connected(zmq.SUB, self._endpoint)
 
     def close(self) -> None:
         self._context.destroy(0)
 
-    def _connected(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+    def connected(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
         made = self._context.socket(kind)
         made.linger = 0
         made.rcvhwm = QUEUE_MAX
@@ -517,6 +610,33 @@ class _Link:
         return made
 
 
+class _Call:
+    """Something that is said to the daemon, on a socket of its own, until it has answered."""
+
+    def __init__(self, link: _Link, endpoint: str) -> None:
+        self._link, self._endpoint = link, endpoint
+        self.socket: zmq.Socket[bytes] | None = None
+
+    def ask(self, question: bytes) -> None:
+        if self.socket is None:
+            self.socket = self._link.connected(zmq.DEALER, self._endpoint)
+        self.socket.send(question, zmq.NOBLOCK)
+
+    def answer(self) -> bytes | None:
+        """The answer, if it is there; empty if it is none."""
+        try:
+            frames = [] if self.socket is None else self.socket.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+        return None if self.socket is None else frames[0] if len(frames) == 1 else b""
+
+    def hang_up(self) -> None:
+        """An answer that is late must not be taken for one to the next question."""
+        if self.socket is not None:
+            self.socket.close(0)
+            self.socket = None
+
+
 def is_same_computer(endpoint: str) -> bool:
     """Whether an endpoint can only be of this computer."""
     return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
@@ -525,15 +645,6 @@ def is_same_computer(endpoint: str) -> bool:
 def _slept_ns() -> int:
     """How long the computer has slept, and something constant: only the first clock counts that."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
-
-
-def _read(payload: bytes) -> _Message | str:
-    """A verdict message; `malformed` or `version` for what is not understood or contradicts."""
-    try:
-        told = _parsed(payload)
-        return _message(told) if _number(told, "v") == VERSION else "version"
-    except (ValueError, KeyError, RecursionError):
-        return "malformed"
 
 
 def _parsed(payload: bytes) -> dict[str, Any]:
@@ -546,35 +657,48 @@ def _parsed(payload: bytes) -> dict[str, Any]:
 
 
 def _message(told: dict[str, Any]) -> _Message:
-    verdict, reasons = told["verdict"], told["reasons"]
+    verdict, reasons, supervised = told["verdict"], told["reasons"], told.get("supervised", False)
     known = verdict in (STABLE, SLIP)
-    p_slip = _number(told, "p_slip", 1, (int, float)) if known else told["p_slip"]
     fits = (
         isinstance(verdict, str)
         and _number(told, "verdict_code") == CODES.get(verdict)
         and told["valid"] is known
-        and (known or p_slip is None)
+        and (told["p_slip"] is not None) is known
+        and (known or told.get("p_slip_model") is None)
         and isinstance(reasons, list)
         and all(isinstance(reason, str) for reason in reasons)
         and bool(reasons) is not known
         and isinstance(told["boot_id"], str)
+        and isinstance(supervised, bool)
     )
     if not fits:
         raise ValueError
-    boot_id, seq, grasp = told["boot_id"], _number(told, "seq"), _number(told, "grasp")
-    read_ns = _number(told, "t_mono_ns")
-    age_ms, silence_ms = (
-        _number(told, name, MILLISECONDS_MAX, (int, float)) for name in ("age_ms", "silence_ms")
-    )
-    said = Verdict(verdict, tuple(reasons), p_slip, grasp, seq, boot_id)
+    told = {"p_slip_model": None, "outcomes": 0, "risk": None, **told}  # older daemons have none
+    read_ns, seq, grasp, outcomes = _numbers(told, "t_mono_ns", "seq", "grasp", "outcomes")
+    age_ms, silence_ms = _real(told, "age_ms"), _real(told, "silence_ms")
+    p_slip, p_model = (_maybe(told, name, 1) for name in ("p_slip", "p_slip_model"))
+    said = Verdict(verdict, tuple(reasons), p_slip, grasp, seq, told["boot_id"])
+    supervised = supervised and WITHHELD.issuperset(reasons)
+    said = replace(said, p_slip_model=p_model, outcomes=outcomes, supervised=supervised)
+    said = replace(said, risk=None if told["risk"] is None else _risk(told["risk"]))
     return _Message(said, read_ns, read_ns + round(age_ms * 1e6), round(silence_ms * 1e6))
 
 
-def _telling(lifted_on: Verdict, slipped: bool, object_name: str | None) -> bytes:
+def _risk(told: Any) -> Risk:  # noqa: ANN401
+    if not isinstance(told, dict):
+        raise ValueError
+    lifts, slips, *rest = _numbers(told, "lifts", "slips", "outstanding", "warm_up_left")
+    if slips > lifts:
+        raise ValueError
+    return Risk(_maybe(told, "target", 1), lifts, slips, rest[0], _maybe(told, "bound"), rest[1])
+
+
+def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes:
     """What to send. Raises `ValueError`."""
-    if not lifted_on.boot_id or not lifted_on.grasp:
+    boot_id, grasp = _key(lifted_on)
+    if not boot_id or not grasp:
         raise ValueError("nothing was lifted on a verdict that is of no grasp")
-    words = ["outcome", lifted_on.boot_id, str(lifted_on.grasp), SLIP if slipped else STABLE]
+    words = ["outcome", boot_id, str(grasp), how.value]
     if object_name is not None:
         if OBJECT.fullmatch(object_name) is None:
             raise ValueError(f"{object_name!r} is no name of an object")
@@ -582,17 +706,34 @@ def _telling(lifted_on: Verdict, slipped: bool, object_name: str | None) -> byte
     return " ".join(words).encode()
 
 
-def _taken(payload: bytes) -> OutcomeAnswer | None:
-    """The answer to an outcome; None for what is not understood."""
+def _key(lifted_on: Verdict) -> tuple[str, int]:
+    """Names a grasp; empty and 0 where there is none."""
+    return lifted_on.boot_id or "", lifted_on.grasp or 0
+
+
+def _taken(payload: bytes) -> OutcomeAnswer:
+    """The answer to an outcome; `malformed` or `version` for what is not understood."""
     try:
         told = _parsed(payload)
         if _number(told, "v") != VERSION:
             return OutcomeAnswer("version")
         said, why = told["ok"], "" if told["ok"] is True else told["why"]
     except (ValueError, KeyError, RecursionError):
-        return None
+        return OutcomeAnswer("malformed")
     fits = isinstance(said, bool) and isinstance(why, str) and bool(why) is not said
-    return OutcomeAnswer(why) if fits else None
+    return OutcomeAnswer(why if fits else "malformed")
+
+
+def _numbers(told: dict[str, Any], *names: str) -> list[int]:
+    return [_number(told, name) for name in names]
+
+
+def _real(told: dict[str, Any], name: str, most: float = REAL_MAX) -> float:
+    return float(_number(told, name, most, (int, float)))
+
+
+def _maybe(told: dict[str, Any], name: str, most: float = REAL_MAX) -> float | None:
+    return None if told[name] is None else _real(told, name, most)
 
 
 def _number(

@@ -8,21 +8,26 @@ import math
 import random
 import time
 from pathlib import Path
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 import pytest
+from msgspec import structs
 from rich.console import Console
 
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
-from daemon.publish.messages import OutcomeMessage, encode
+from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
+from daemon.trust.ledger import Told
+from daemon.trust.risk import RiskReport
+from daemon.watch.evidence import WATCHED
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, Rest, image
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Line, Snapshot, Tone
 from daemon.watch.terminal import draw
 from daemon.watch.view import HISTORY, View
 from models.layout import D1
-from tests.daemon.watch.watch_fakes import BOOT, MS, status, tactile, verdict
+from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, status, tactile, verdict
 
 GOLDEN = sorted((Path(__file__).parents[1] / "publish" / "golden").glob("*.json"))
 ODD: tuple[object, ...] = (
@@ -163,6 +168,184 @@ def test_the_last_judgement_stays_and_gets_how_its_lift_ended() -> None:
         assert last is not None
         assert (last.verdict, last.p_slip, last.grasp, last.ago_s) == ("slip", 0.75, 42, 2.0)
         assert last.ended == ended
+
+
+def risk(**other: Any) -> RiskReport:  # noqa: ANN401
+    return structs.replace(RISK, **other)
+
+
+NOTHING_TOLD = risk(lifts=0, slips=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"p_slip": 0.44}, "a slip is too likely for a promise"),
+        ({"p_slip": 0.251}, "a slip is too likely for a promise"),
+        ({"risk": None, "outcomes": 0}, "no outcome told yet"),
+        ({"risk": NOTHING_TOLD, "outcomes": 0}, "no outcome told yet"),
+        ({"risk": NOTHING_TOLD}, "too few `stable` lifts"),
+        ({"risk": risk(lifts=9, slips=0)}, "too few `stable` lifts"),
+        ({"risk": risk(target=None, bound=None)}, "no target is set"),
+        ({"risk": risk(slips=5)}, "more `stable` lifts slipped"),
+    ],
+)
+def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why: str) -> None:
+    """Enough are ten lifts for a target of 10 %, of which one may slip."""
+    assert tone_of() is Tone.STABLE
+    assert tone_of(risk=risk(lifts=10, slips=1)) is Tone.STABLE
+    seen = after((b"verdict.right", verdict(0, Decision.STABLE, **change))).snapshot(0)
+    assert (seen.tone, seen.verdict, seen.headline) == (Tone.LEANS, "stable", "leans to stable")
+    assert seen.why[0].advice.startswith(why)
+    assert "lift" not in [line.what for line in seen.why]
+    assert "STABLE" not in text_of(seen, 80, 24, Canvas())[3].replace("LEANS TO STABLE", "")
+
+
+def tone_of(**other: Any) -> Tone:  # noqa: ANN401
+    return after((b"verdict.right", verdict(0, Decision.STABLE, **other))).snapshot(0).tone
+
+
+def test_messages_of_before_there_were_outcomes_are_never_a_promise() -> None:
+    former = json.loads((GOLDEN[0].parent / "verdict_stable.json").read_text())
+    for added in ("p_slip_model", "outcomes", "supervised", "risk"):
+        del former[added]
+    seen = after((b"verdict.right", json.dumps(former).encode())).snapshot(0)
+    assert (seen.tone, seen.evidence, seen.learning) == (Tone.LEANS, "no outcome told yet", [])
+
+
+@pytest.mark.parametrize(
+    ("change", "evidence"),
+    [
+        ({}, "network 30 %, rests on 57 lifts; of 41 `stable` ones 2 slipped, target 10 %"),
+        (
+            {"outcomes": 1, "risk": risk(lifts=0, slips=0, target=0.05)},
+            "network 30 %, rests on 1 lift; no `stable` one told yet, target 5 %",
+        ),
+        (
+            {"risk": risk(target=None)},
+            "network 30 %, rests on 57 lifts; of 41 `stable` ones 2 slipped",
+        ),
+        ({"risk": NOTHING_TOLD, "outcomes": 0}, "network 30 %, no outcome told yet"),
+        ({"risk": None, "outcomes": 0, "p_slip_model": None}, "no outcome told yet"),
+    ],
+)
+def test_a_verdict_says_what_it_rests_on(change: dict[str, Any], evidence: str) -> None:
+    seen = after((b"verdict.right", verdict(0, Decision.STABLE, **change))).snapshot(0)
+    assert seen.evidence == evidence
+    assert text_of(seen, 80, 24, Canvas())[6].rstrip() == evidence
+
+
+@pytest.mark.parametrize(
+    ("decision", "reasons", "tone"),
+    [
+        (Decision.UNKNOWN, [Reason.UNPROVEN], Tone.LEARNING),
+        (Decision.UNKNOWN, [Reason.LOW_CONFIDENCE], Tone.LEARNING),
+        (Decision.UNKNOWN, [Reason.UNPROVEN, Reason.STALE], Tone.TROUBLE),
+        (Decision.UNKNOWN, [Reason.MOVING], Tone.WAITING),
+        (Decision.SLIP, [], Tone.SLIP),
+        (Decision.STABLE, [], Tone.LEANS),
+    ],
+)
+def test_a_lift_to_be_watched_is_told_apart(
+    decision: Decision, reasons: list[Reason], tone: Tone
+) -> None:
+    message = verdict(0, decision, reasons=reasons, supervised=True)
+    seen = after((b"verdict.right", message)).snapshot(0)
+    asked = tone not in {Tone.TROUBLE, Tone.WAITING}
+    assert (seen.tone, WATCHED in seen.why) == (tone, asked)
+    assert "lift" not in [line.what for line in seen.why]
+
+
+def test_how_learning_goes_is_seen_what_nobody_told_first() -> None:
+    lifts = Lifts(reported=41, outstanding=1, unreported=3)
+    told = {Told.TAKEN: 57, Told.CONTRADICTS: 1}
+    learner = LearnerHealth(enabled=True, outcomes=57, told=told, uncertainty=0.41)
+    seen = after(
+        (b"status.right", status(0, lifts=lifts, learner=learner)),
+        (b"verdict.right", verdict(0, Decision.STABLE)),
+    ).snapshot(0)
+    assert seen.learning == [
+        Line("never told", "3"),
+        Line("warm-up left", "0"),
+        Line("still out", "1"),
+        Line("learner", "on"),
+        Line("learned from", "57 outcomes"),
+        Line("uncertainty", "41 %"),
+        Line("slips of `stable`", "2 of 41, at most 9.5"),
+        Line("outcomes taken", "57"),
+        Line("outcomes contradicts", "1"),
+    ]
+    text = "\n".join(text_of(seen, 80, 24, Canvas()))
+    assert "never told 3  warm-up left 0" in text
+    assert "slips of `stable` 2 of 41, at most 9.5" in "\n".join(text_of(seen, 200, 60, Canvas()))
+
+
+def test_the_verdict_stays_in_view_until_the_next_grasp_and_is_marked_as_past() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
+    view.take(b"verdict.right", verdict(1, grasp=41, gate=GateState.CLOSING), 0)
+    for seq, gate, word in ((2, GateState.JUDGED, "judged"), (3, GateState.RELEASED, "past:")):
+        view.take(b"verdict.right", verdict(seq, grasp=41, gate=gate), 0)
+        seen = view.snapshot(0)
+        field = [line[:24].strip() for line in text_of(seen, 80, 24, Canvas())[1:6]]
+        assert field == ["", "", "UNKNOWN", f"({word} stable 25 %)", ""]
+        assert seen.judged is not None
+        assert seen.judged.held == (gate is GateState.JUDGED)
+    assert "stable 25 %, 0 s ago, past" in "\n".join(text_of(seen, 80, 24, Canvas()))
+    view.take(b"verdict.right", verdict(4, grasp=42, gate=GateState.CLOSING), 0)
+    assert "(" not in text_of(view.snapshot(0), 80, 24, Canvas())[4]
+
+
+def test_silence_hides_what_was_judged_but_in_the_list() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE)))
+    seen = view.snapshot(101 * MS)
+    assert seen.tone is Tone.SILENT
+    assert [(last.verdict, last.held) for last in seen.grasps] == [("stable", False)]
+    assert text_of(seen, 80, 24, Canvas())[4][:24].strip() == ""
+
+
+def outcome(grasp: int, ended: Literal["stable", "slip"], judged_by: str | None = None) -> bytes:
+    told = OutcomeMessage(
+        boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome=ended, grasp_boot_id=judged_by
+    )
+    return encode(told)
+
+
+def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
+    view = a_view()
+    rested(view)
+    for grasp in range(1, 12):
+        seq = 100 + 2 * grasp
+        watched = grasp == 10
+        decision = Decision.UNKNOWN if watched else Decision.SLIP if grasp == 9 else Decision.STABLE
+        reasons = [Reason.UNPROVEN] if watched else []
+        message = verdict(
+            seq, decision, grasp=grasp, judged=True, supervised=watched, reasons=reasons
+        )
+        view.take(b"verdict.right", message, grasp * 1000 * MS)
+        view.take(b"verdict.right", verdict(seq + 1, grasp=grasp), grasp * 1000 * MS)
+    view.take(b"tactile.right", tactile(99, RESTING, RESTING), 11_000 * MS)
+    view.take(b"outcome.right", outcome(1, "slip"), 0)
+    view.take(b"outcome.right", outcome(8, "stable"), 0)
+    view.take(b"outcome.right", outcome(9, "slip", "another"), 0)
+    view.take(b"outcome.right", outcome(10, "slip", BOOT), 0)
+    seen = view.snapshot(11_000 * MS)
+    assert [(last.grasp, last.verdict, last.ended) for last in seen.grasps] == [
+        *((11, "stable", None), (10, "unknown", "slip"), (9, "slip", None)),
+        *((8, "stable", "stable"), (7, "stable", None), (6, "stable", None)),
+        *((5, "stable", None), (4, "stable", None)),
+    ]
+    assert [last.ago_s for last in seen.grasps[:3]] == [0.0, 1.0, 2.0]
+    lifts = [last.lift for last in seen.grasps[:4]]
+    assert lifts == ["not told", "slipped", "-", "held"]
+    lines = "\n".join(text_of(seen, 80, 24, Canvas()))
+    for row in ("11 stable  25 % not told", "10 unknown      slipped*", "8 stable  25 % held"):
+        assert row in lines
+    assert "FFJ3   28.6" in lines
+
+
+def test_a_grasp_that_is_judged_again_is_in_the_list_once() -> None:
+    view = after(*[(b"verdict.right", verdict(seq, Decision.SLIP)) for seq in range(3)])
+    assert len(view.snapshot(0).grasps) == 1
 
 
 def test_rates_and_the_last_half_minute_are_of_what_arrived() -> None:

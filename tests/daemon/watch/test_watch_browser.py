@@ -130,6 +130,57 @@ def test_the_page_shows_verdict_images_and_advice_in_both_themes(
     assert browser.complaints == []
 
 
+CARD = {"light": "rgb(255, 255, 255)", "dark": "rgb(23, 27, 34)"}
+"""What is behind the letters where nothing is promised."""
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_a_stable_that_lifts_have_not_earned_is_hollow(
+    page: Page, talker: Talker, browser: Browser, theme: Literal["light", "dark"]
+) -> None:
+    talker.more = {"p_slip": 0.44, "risk": None, "outcomes": 0}
+    talker.decision = Decision.STABLE
+    browser.look(1280, 800, theme)
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    see(browser, "leans")
+    assert text(browser, "verdict") == "LEANS TO STABLE"
+    assert browser.value("document.title") == "leans to stable - graspd"
+    assert browser.value(f"getComputedStyle({BANNER}).backgroundColor") == CARD[theme]
+    assert text(browser, "evidence") == "network 30 %, no outcome told yet"
+    assert "slip probability 44 %" in text(browser, "p")
+    assert not text(browser, "why").startswith("lift")
+    talker.more = {}
+    see(browser, "stable")
+    assert "rests on 57 lifts; of 41 `stable` ones 2 slipped" in text(browser, "evidence")
+    assert browser.value(f"getComputedStyle({BANNER}).backgroundColor") == COLOURS[theme]["stable"]
+    assert browser.complaints == []
+
+
+def test_past_grasps_stay_and_so_does_the_verdict_until_the_next_one(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    browser.look(1280, 800)
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    talker.decision = Decision.STABLE
+    see(browser, "stable")
+    assert text(browser, "was") == ""
+    talker.decision = Decision.UNKNOWN
+    see(browser, "waiting")
+    assert text(browser, "was") == "past: stable 25 %"
+    assert ", past; its lift not told" in text(browser, "judged")
+    talker.more = {"grasp": 8}
+    browser.wait_for("document.getElementById('was').innerText == ''")
+    talker.more = {"grasp": 8, "supervised": True}
+    talker.decision = Decision.SLIP
+    see(browser, "slip")
+    assert text(browser, "grasps").split("\n") == [
+        "8\tslip 75 %\tsupervised\tnot told",
+        "7\tstable 25 %\t\tnot told",
+    ]
+    assert "slips of `stable`\t2 of 41, at most 9.5" in text(browser, "learning")
+    assert browser.complaints == []
+
+
 def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
     page: Page, talker: Talker, browser: Browser
 ) -> None:

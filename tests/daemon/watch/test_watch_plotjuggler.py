@@ -51,6 +51,8 @@ def test_a_verdict_is_numbers_and_the_outcome_is_a_code() -> None:
         "verdict.right/latency_us": 500.0,
         "verdict.right/judged": 1.0,
         "verdict.right/silence_ms": 100.0,
+        "verdict.right/outcomes": 0.0,
+        "verdict.right/supervised": 0.0,
     }
 
 

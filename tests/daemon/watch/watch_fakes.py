@@ -8,7 +8,10 @@ from typing import Any, Self
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
 from daemon.publish.publisher import Publisher
+from daemon.trust.risk import RiskReport
 
+RISK = RiskReport(target=0.1, lifts=41, slips=2, outstanding=1, bound=9.5, warm_up_left=0)
+"""Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 MS = 1_000_000
 PERIOD_S = 0.02
@@ -35,6 +38,9 @@ def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> by
         "silence_ms": 100.0,
         "model": "small-session",
         "model_sha": "0123456789ab",
+        "p_slip_model": None if p_slip is None else 0.3,
+        "outcomes": 57,
+        "risk": RISK,
     }
     return encode(Verdict(**{**content, **other}))
 
@@ -88,6 +94,8 @@ class Talker:
     def __init__(self, endpoint: str) -> None:
         self.decision: Decision | None = Decision.UNKNOWN
         """What the verdicts are; none come if None."""
+        self.more: dict[str, Any] = {}
+        """What else they say."""
         self._publisher = Publisher(endpoint)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._talk)
@@ -112,5 +120,5 @@ class Talker:
             counts = [3000 - pressed] * 12 + [3000] * 12
             self._publisher.send(b"status.right", status(seq))
             self._publisher.send(b"tactile.right", tactile(seq, counts, counts, faulty=(6,)))
-            self._publisher.send(b"verdict.right", verdict(seq, decision))
+            self._publisher.send(b"verdict.right", verdict(seq, decision, **self.more))
             seq += 1
