@@ -109,7 +109,7 @@ class Bench:
         self._path = folder / "scene.toml"
         self._path.write_text(
             f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
-            f"rate_hz = {RATE_HZ}\n[risk]\nmax_slip_when_stable = 0.1\n"
+            f"rate_hz = {RATE_HZ}\n[risk]\nmax_slip_when_stable = 0.2\n"
             '[session]\nfile = "right.session.json"\nkeep = true\nlearn = false\n'
             f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
         )
@@ -121,6 +121,10 @@ class Bench:
         self._log.connect(f"ipc://{folder}/graspd")
         self._log.subscribe("tactile.")
         self._log.subscribe("verdict.")
+        self._slipped = {
+            row.counts.tobytes(): bool(row.annotation.slipped)
+            for row in read_rows(DEMO_TABLE, self._scene.hand.fingers)
+        }
         self._counts: dict[int, NDArray[np.uint16]] = {}
         self._known: dict[GraspId, tuple[NDArray[np.uint16], bool]] = {}
         self._client = stack.enter_context(
@@ -167,8 +171,8 @@ class Bench:
         return self.found
 
     def _lift(self, grasp: GraspId, said: Verdict) -> None:
-        slipped = self._choose.random() < (0.5 if said.p_slip is None else said.p_slip)
         counts, stable = self._known[grasp]
+        slipped = self._slipped[counts.tobytes()]
         self._reference.note(grasp, counts, stable=stable)
         began_s = time.monotonic()
         while not (answer := self._client.outcome(said, slipped, wait_s=ANSWER_S)):
