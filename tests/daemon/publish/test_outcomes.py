@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jsonschema
+import numpy as np
 import pytest
 import zmq
 from hypothesis import given, settings
@@ -21,6 +22,8 @@ from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
+from daemon.trust.ledger import GraspId, Told
+from daemon.trust.trust import Trust
 from tests.daemon.fakes import FINGERS, Clock
 
 BOOT = "0123456789abcdef" * 2
@@ -104,6 +107,19 @@ def test_an_outcome_of_a_grasp_that_an_earlier_start_judged_says_which() -> None
         assert sender.outcome(boot_id, 3, "slip", known=True) is None
         message = decode_outcome(output.sent[-1][1])
         assert (message.boot_id, message.grasp, message.grasp_boot_id) == (BOOT, 3, judged_by)
+
+
+def test_no_grasp_is_remembered_longer_than_its_outcome_could_teach() -> None:
+    trust, sender = Trust("fake", 0), outbox(Output())
+    for number in range(3 * JUDGED_MAX):
+        judge(sender, number)
+        grasp = GraspId(BOOT, number)
+        trust.note(grasp, trust.judge(grasp, 0.5, 0.0, np.empty(0)), stable=False)
+    taken = [sender.outcome(BOOT, number, "slip") is None for number in range(3 * JUDGED_MAX)]
+    assert sum(taken) > 100
+    for number, was_taken in enumerate(taken):
+        told = trust.outcome(GraspId(BOOT, number), slipped=True)
+        assert told is Told.TAKEN or not was_taken
 
 
 def test_only_so_many_grasps_are_remembered() -> None:
