@@ -20,6 +20,11 @@ REPEAT_DISTANCE = 0.05
 """A reading that is nearer to the last one than this (root mean square, in spreads) is the same
 grasp still held: the sensor's noise alone moves it by 0.02."""
 
+SPREAD_RATIOS = (0.2, 3.0)
+"""Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
+by 0.7 to 1.3 times from twenty grasps of the published tables on; those of a dead finger by 0.06
+times."""
+
 
 class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Statistics as they are kept between two starts of the daemon."""
@@ -126,3 +131,13 @@ class SessionStatistics:
         self.spread: NDArray[np.float64] = np.sqrt(
             share * self._prior_spread**2 + self._squares / total
         )
+
+
+def is_odd(spread: NDArray[np.float64], training_spread: NDArray[np.float64]) -> bool:
+    """Whether what a session took in cannot have been grasps: a finger is dead or sees noise alone.
+
+    Of the spreads of each electrode in the session and in the training, counts, (fingers, 24).
+    """
+    ratio = np.median(spread / training_spread, axis=1)
+    least, most = SPREAD_RATIOS
+    return not bool(((ratio >= least) & (ratio <= most)).all())

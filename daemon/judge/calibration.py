@@ -10,12 +10,7 @@ from numpy.typing import NDArray
 from drivers.base import COUNT_MAX
 from models.contract import SessionInput
 from models.inputs import raw_features
-from models.session_statistics import SessionState, SessionStatistics
-
-SPREAD_RATIOS = (0.2, 3.0)
-"""Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
-by 0.7 to 1.3 times from twenty grasps of the published tables on; those of a dead finger by 0.06
-times."""
+from models.session_statistics import SessionState, SessionStatistics, is_odd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,10 +105,8 @@ class SessionCalibration:
         features, shape = len(self._wanted.mean), self._training_mean.shape
         mean, spread = self._statistics.mean, self._statistics.spread
         counts_spread = spread[features:].reshape(shape)
-        ratio = np.median(counts_spread / self._training_spread, axis=1)
-        least, most = SPREAD_RATIOS
         enough = self.grasps >= self._wanted.calibrated_from
-        odd = enough and not bool(((ratio >= least) & (ratio <= most)).all())
+        odd = enough and is_odd(counts_spread, self._training_spread)
         steps, grasps = self._wanted.sharpness, 0 if odd else self.grasps
         return Calibration(
             features_mean=mean[:features],

@@ -1,0 +1,120 @@
+"""Grasps of another day, judged one after the other as the daemon does, none of them labelled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.contract import FEATURES_PER_FINGER
+from models.electrodes import Electrodes
+from models.inputs import builder, raw_features
+from models.novelty import CONTRADICTING_MAX, NoveltyCheck
+from models.session_statistics import SessionStatistics, is_odd
+from models.training.arrays import Bools, Floats, Floats32, Ints, Numbers
+from models.training.data.datasets import COUNT_MAX, Grasps
+from models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
+from models.training.fitting.standards import PRIOR_GRASPS as PRIOR
+from models.training.fitting.trained import Trained
+from models.training.systems.system import SessionFeatures
+
+CALIBRATED_FROM = 20
+"""Grasps from which on a session counts as calibrated: more of them gain two points at most."""
+
+Judged = tuple[dict[str, Floats], dict[str, Bools], dict[str, Ints]]
+"""By variant: log-odds of slip, which are refused, and how old the session was at each grasp."""
+
+
+def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judged:
+    """How a trained system judges the rows `test` of grasps; each table is a session from nothing.
+
+    A session system judges each table in random order, and object by object. The daemon calls what
+    is refused `unknown`; what the system would have said of it is given all the same.
+    """
+    takes, fingers = trained.system.input, len(trained.system.fingers)
+    counts, table_of = grasps.counts[test], grasps.table_of[test]
+    if not isinstance(takes, SessionFeatures):
+        day = Day(trained)
+        looks = [day.look(reading) for reading in counts]
+        inputs, _ = builder(takes, fingers).build_batch(np.stack([look[0] for look in looks]))
+        return {NONE: trained.fitted.margins(inputs)}, {NONE: ~np.array([o[1] for o in looks])}, {}
+    random = np.random.default_rng(seed)
+    judged: Judged = {}, {}, {}
+    for variant in (RUNNING, RUNNING_SORTED):
+        days = [SessionDay(trained) for _ in grasps.files]
+        features = np.empty((len(test), fingers * FEATURES_PER_FINGER), np.float32)
+        refused, ages = np.empty(len(test), np.bool_), np.empty(len(test), np.int64)
+        order = random.permutation(len(test))
+        if variant == RUNNING_SORTED:
+            names = np.array(grasps.objects)[test[order]]
+            several = random.permutation(np.unique(names))
+            order = np.concatenate([order[names == name] for name in several])
+        for place in order.tolist():
+            day = days[table_of[place]]
+            ages[place] = day.session.grasps
+            features[place], refused[place] = day.judge(counts[place], takes.clip)
+        judged[0][variant] = trained.fitted.margins(features)
+        judged[1][variant], judged[2][variant] = refused, ages
+    return judged
+
+
+class Day:
+    """What the daemon's `Plausibility` finds in sound readings."""
+
+    def __init__(self, trained: Trained) -> None:
+        seen = trained.seen()
+        self.electrodes, self._novelty = Electrodes(seen), NoveltyCheck(seen)
+        self._sound = np.zeros(self.electrodes.centre.shape, np.bool_)
+
+    def look(self, counts: Numbers, session: Standards | None = None) -> tuple[Numbers, bool, bool]:
+        """Counts (fingers, 24), repaired; whether they were seen; whether a session learns of them.
+
+        `session` is mean and spread of the counts in it.
+        """
+        now = session or Standards(self.electrodes.centre, self.electrodes.spread)
+        scale = self.electrodes.spread / now.spread
+        values = self.electrodes.centre + (counts - now.mean) * scale
+        found = self.electrodes.implausible(values, self._sound, CONTRADICTING_MAX + 1)
+        number = int(found.sum())
+        if number > CONTRADICTING_MAX:
+            return counts, False, False
+        if number:
+            values = self.electrodes.repaired(values, found)
+            expected = now.mean + (values - self.electrodes.centre) / scale
+            counts = np.where(found, np.clip(expected, 0.0, COUNT_MAX), counts)
+        if session is None:
+            return counts, self._novelty.is_seen(values, number), True
+        if self.electrodes.moved_finger(values):
+            return counts, False, False
+        is_near = self._novelty.is_near(values, number)
+        return counts, is_near, is_near or self._novelty.is_learned(values, number)
+
+
+class SessionDay:
+    """A session from nothing, as the daemon's `SessionCalibration` has it."""
+
+    def __init__(self, trained: Trained) -> None:
+        """Of a session system."""
+        if trained.standards is None:
+            raise ValueError("a session system needs standards")
+        self._day, prior = Day(trained), trained.standards.prior
+        self._training = Standards(self._day.electrodes.centre, self._day.electrodes.spread)
+        self._features = len(prior.mean)
+        mean = np.concatenate((prior.mean, self._training.mean.ravel()))
+        spread = np.concatenate((prior.spread, self._training.spread.ravel()))
+        self.session = SessionStatistics(mean, spread, PRIOR)
+
+    def judge(self, counts: Numbers, clip: float) -> tuple[Floats32, bool]:
+        """Features (fingers * 26,) of a grasp, and whether it is refused; then learn from it."""
+        session, shape = self.session, counts.shape
+        mean, spread = session.mean, session.spread
+        now = Standards(
+            mean[self._features :].reshape(shape), spread[self._features :].reshape(shape)
+        )
+        calibrated = session.grasps >= CALIBRATED_FROM
+        odd = calibrated and is_odd(now.spread, self._training.spread)
+        repaired, seen, learned = self._day.look(counts, now)
+        seen = seen and not odd
+        by = Standards(mean[: self._features], spread[: self._features])
+        features = by.apply(raw_features(repaired if seen else counts), clip)
+        if learned or odd or not calibrated:
+            session.observe(np.concatenate((raw_features(counts), counts.ravel())))
+        return features, not seen
