@@ -32,7 +32,7 @@ class Calibration:
     calibrated: bool
     """Whether the grasps are enough for what the model's card says, and can have been grasps."""
     odd: bool
-    """Whether what came cannot have been grasps: a finger that is dead or sees only noise."""
+    """Whether what came cannot have been grasps of these fingers: see `is_odd`."""
     temperature: float
     """What the margin of a verdict must be divided by, with so few grasps."""
 
@@ -78,10 +78,10 @@ class SessionCalibration:
         """Whether they are enough for what the model's card says, and can have been grasps."""
         return self.now.calibrated
 
-    def observe(self, counts: NDArray[np.generic]) -> None:
-        """Take in the counts (fingers, 24) of a grasp that was judged, or could have been."""
+    def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
+        """Take in the counts (fingers, 24) of a grasp; `slip` is how it was judged, if it was."""
         values = np.concatenate((raw_features(counts), counts.ravel()))
-        if self._statistics.observe(values):
+        if self._statistics.observe(values, slip=slip):
             self.now = self._calibration()
 
     def reset(self) -> None:
@@ -104,14 +104,18 @@ class SessionCalibration:
     def _calibration(self) -> Calibration:
         features, shape = len(self._wanted.mean), self._training_mean.shape
         mean, spread = self._statistics.mean, self._statistics.spread
-        counts_spread = spread[features:].reshape(shape)
+        counts_mean, counts_spread = (
+            mean[features:].reshape(shape),
+            spread[features:].reshape(shape),
+        )
         enough = self.grasps >= self._wanted.calibrated_from
-        odd = enough and is_odd(counts_spread, self._training_spread)
+        training = self._training_mean, self._training_spread
+        odd = is_odd(counts_mean, counts_spread, *training, enough=enough)
         steps, grasps = self._wanted.sharpness, 0 if odd else self.grasps
         return Calibration(
             features_mean=mean[:features],
             features_spread=spread[:features],
-            counts_mean=mean[features:].reshape(shape),
+            counts_mean=counts_mean,
             counts_spread=counts_spread,
             training_mean=self._training_mean,
             scale=self._training_spread / counts_spread,

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.contract import FEATURES_PER_FINGER
 from models.electrodes import Electrodes
 from models.inputs import builder, raw_features
 from models.novelty import CONTRADICTING_MAX, NoveltyCheck
 from models.session_statistics import SessionStatistics, is_odd
-from models.training.arrays import Bools, Floats, Floats32, Ints, Numbers
+from models.training.arrays import Bools, Floats, Ints, Numbers
 from models.training.data.datasets import COUNT_MAX, Grasps
 from models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
 from models.training.fitting.standards import PRIOR_GRASPS as PRIOR
@@ -40,8 +39,8 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judg
     judged: Judged = {}, {}, {}
     for variant in (RUNNING, RUNNING_SORTED):
         days = [SessionDay(trained) for _ in grasps.files]
-        features = np.empty((len(test), fingers * FEATURES_PER_FINGER), np.float32)
-        refused, ages = np.empty(len(test), np.bool_), np.empty(len(test), np.int64)
+        margins, refused = np.empty(len(test)), np.empty(len(test), np.bool_)
+        ages = np.empty(len(test), np.int64)
         order = random.permutation(len(test))
         if variant == RUNNING_SORTED:
             names = np.array(grasps.objects)[test[order]]
@@ -50,9 +49,9 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judg
         for place in order.tolist():
             day = days[table_of[place]]
             ages[place] = day.session.grasps
-            features[place], refused[place] = day.judge(counts[place], takes.clip)
-        judged[0][variant] = trained.fitted.margins(features)
-        judged[1][variant], judged[2][variant] = refused, ages
+            margins[place], refused[place] = day.judge(counts[place])
+        for figures, values in zip(judged, (margins, refused, ages), strict=True):
+            figures[variant] = values
     return judged
 
 
@@ -93,8 +92,10 @@ class SessionDay:
 
     def __init__(self, trained: Trained) -> None:
         """Of a session system."""
-        if trained.standards is None:
-            raise ValueError("a session system needs standards")
+        takes = trained.system.input
+        if trained.standards is None or not isinstance(takes, SessionFeatures):
+            raise ValueError(f"{trained.system.name} has no sessions")
+        self._fitted, self._clip = trained.fitted, takes.clip
         self._day, prior = Day(trained), trained.standards.prior
         self._training = Standards(self._day.electrodes.centre, self._day.electrodes.spread)
         self._features = len(prior.mean)
@@ -102,19 +103,22 @@ class SessionDay:
         spread = np.concatenate((prior.spread, self._training.spread.ravel()))
         self.session = SessionStatistics(mean, spread, PRIOR)
 
-    def judge(self, counts: Numbers, clip: float) -> tuple[Floats32, bool]:
-        """Features (fingers * 26,) of a grasp, and whether it is refused; then learn from it."""
+    def judge(self, counts: Numbers) -> tuple[float, bool]:
+        """Log-odds of slip of a grasp, and whether it is refused; then learn from it."""
         session, shape = self.session, counts.shape
         mean, spread = session.mean, session.spread
         now = Standards(
             mean[self._features :].reshape(shape), spread[self._features :].reshape(shape)
         )
         calibrated = session.grasps >= CALIBRATED_FROM
-        odd = calibrated and is_odd(now.spread, self._training.spread)
+        training = self._training.mean, self._training.spread
+        odd = is_odd(now.mean, now.spread, *training, enough=calibrated)
         repaired, seen, learned = self._day.look(counts, now)
         seen = seen and not odd
         by = Standards(mean[: self._features], spread[: self._features])
-        features = by.apply(raw_features(repaired if seen else counts), clip)
+        features = by.apply(raw_features(repaired if seen else counts), self._clip)
+        (margin,) = self._fitted.margins(features[np.newaxis]).tolist()
         if learned or odd or not calibrated:
-            session.observe(np.concatenate((raw_features(counts), counts.ravel())))
-        return features, not seen
+            values = np.concatenate((raw_features(counts), counts.ravel()))
+            session.observe(values, slip=margin > 0.0 if seen else None)
+        return margin, not seen
