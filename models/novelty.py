@@ -15,6 +15,11 @@ LEARNED_DISTANCES = 2.0
 """A session takes in what is up to so many times farther than `distance_max`: if it took in only
 what it would judge, its mean would move towards what is left, and the rest look ever stranger."""
 
+CONTRADICTED_DISTANCES = 0.75
+"""Of a session's reading, some of whose electrodes contradict the others, the rest must be as near
+as so many times `distance_max`: of readings with each electrode from another grasp a tenth have two
+or fewer that contradict, and all but a twentieth of these are farther; of real ones a tenth is."""
+
 
 class NoveltyCheck:
     """Tells readings that are far from all training data: for them a network's answer is noise.
@@ -53,9 +58,16 @@ class NoveltyCheck:
         inside = (values >= self._low) & (values <= self._high)
         return np.count_nonzero(inside) == self._electrodes and self.is_near(values, repaired)
 
-    def is_near(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
-        """Whether counts (fingers, 24) fit the training covariance; ranges do not matter."""
-        return self._square_min <= self._square(values, repaired) <= self._square_max
+    def is_near(
+        self, values: NDArray[np.float64], repaired: int = 0, contradicted: int = 0
+    ) -> bool:
+        """Whether counts (fingers, 24) fit the training covariance; ranges do not matter.
+
+        So many of the `repaired` electrodes `contradicted` the others.
+        """
+        share = CONTRADICTED_DISTANCES if contradicted else 1.0
+        square = self._square(values, repaired)
+        return self._square_min <= square <= share**2 * self._square_max
 
     def is_learned(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
         """Whether a session may take in counts (fingers, 24) that were mapped by it."""

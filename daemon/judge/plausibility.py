@@ -48,7 +48,8 @@ class Plausibility:
             return Examined((Reason.FLAT,), counts)
         values = counts.astype(np.float64) if session is None else session.to_training(counts)
         grasp, values = self._repair(counts, values, broken, session)
-        at_most = int(np.count_nonzero(broken)) + CONTRADICTING_MAX + 1
+        known = int(np.count_nonzero(broken))
+        at_most = known + CONTRADICTING_MAX + 1
         found = self._electrodes.implausible(values, broken, at_most)
         number = int(np.count_nonzero(found))
         # With so many, the reading as a whole is like nothing in the training.
@@ -61,7 +62,8 @@ class Plausibility:
                 seen = learned = False
             else:
                 learned = self._novelty.is_learned(values, number)
-                seen = not session.odd and self._novelty.is_near(values, number)
+                near = self._novelty.is_near(values, number, number - known)
+                seen = near and not session.odd
         if not seen:
             # A young session learns from all, for that is how drift begins; later on a sensor that
             # fails would slowly become its own standard.

@@ -50,8 +50,7 @@ def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judg
             day = days[table_of[place]]
             ages[place] = day.session.grasps
             margins[place], refused[place] = day.judge(counts[place])
-        for figures, values in zip(judged, (margins, refused, ages), strict=True):
-            figures[variant] = values
+        judged[0][variant], judged[1][variant], judged[2][variant] = margins, refused, ages
     return judged
 
 
@@ -70,7 +69,7 @@ class Day:
         """
         now = session or Standards(self.electrodes.centre, self.electrodes.spread)
         scale = self.electrodes.spread / now.spread
-        values = self.electrodes.centre + (counts - now.mean) * scale
+        values = self.electrodes.centre + (counts.astype(np.float64) - now.mean) * scale
         found = self.electrodes.implausible(values, self._sound, CONTRADICTING_MAX + 1)
         number = int(found.sum())
         if number > CONTRADICTING_MAX:
@@ -83,8 +82,8 @@ class Day:
             return counts, self._novelty.is_seen(values, number), True
         if self.electrodes.moved_finger(values):
             return counts, False, False
-        is_near = self._novelty.is_near(values, number)
-        return counts, is_near, is_near or self._novelty.is_learned(values, number)
+        is_near = self._novelty.is_near(values, number, number)
+        return counts, is_near, self._novelty.is_learned(values, number)
 
 
 class SessionDay:
@@ -103,22 +102,26 @@ class SessionDay:
         spread = np.concatenate((prior.spread, self._training.spread.ravel()))
         self.session = SessionStatistics(mean, spread, PRIOR)
 
+    def look(self, counts: Numbers) -> tuple[Numbers, bool, bool]:
+        """What `Day.look` finds, of a session that may be odd."""
+        mean, spread = (
+            values[self._features :].reshape(counts.shape)
+            for values in (self.session.mean, self.session.spread)
+        )
+        training = self._training.mean, self._training.spread
+        young = self.session.grasps < CALIBRATED_FROM
+        odd = is_odd(mean, spread, *training, enough=not young)
+        repaired, seen, learned = self._day.look(counts, Standards(mean, spread))
+        return repaired, seen and not odd, learned or odd or young
+
     def judge(self, counts: Numbers) -> tuple[float, bool]:
         """Log-odds of slip of a grasp, and whether it is refused; then learn from it."""
-        session, shape = self.session, counts.shape
-        mean, spread = session.mean, session.spread
-        now = Standards(
-            mean[self._features :].reshape(shape), spread[self._features :].reshape(shape)
-        )
-        calibrated = session.grasps >= CALIBRATED_FROM
-        training = self._training.mean, self._training.spread
-        odd = is_odd(now.mean, now.spread, *training, enough=calibrated)
-        repaired, seen, learned = self._day.look(counts, now)
-        seen = seen and not odd
-        by = Standards(mean[: self._features], spread[: self._features])
-        features = by.apply(raw_features(repaired if seen else counts), self._clip)
-        (margin,) = self._fitted.margins(features[np.newaxis]).tolist()
-        if learned or odd or not calibrated:
-            values = np.concatenate((raw_features(counts), counts.ravel()))
-            session.observe(values, slip=margin > 0.0 if seen else None)
+        repaired, seen, learned = self.look(counts)
+        features = slice(self._features)
+        by = Standards(self.session.mean[features], self.session.spread[features])
+        inputs = by.apply(raw_features(repaired if seen else counts)[np.newaxis], self._clip)
+        (margin,) = self._fitted.margins(inputs).tolist()
+        if learned:
+            values = np.concatenate((raw_features(counts), counts.ravel().astype(np.float64)))
+            self.session.observe(values, slip=margin > 0.0 if seen else None)
         return margin, not seen
