@@ -186,7 +186,7 @@ def test_a_finger_that_moved_as_a_whole_is_noticed_and_no_electrode_of_it() -> N
     random = np.random.default_rng(8)
     electrodes = Electrodes(seen)
     of_finger = np.repeat(np.eye(3), 24, axis=1)
-    precision = np.linalg.inv(covariance)
+    precision: NDArray[np.float64] = np.linalg.inv(covariance).astype(np.float64)
     for reading in random.multivariate_normal(mean, covariance, 20):
         values = reading.reshape(SHAPE)
         assert not electrodes.moved_finger(values)
