@@ -71,24 +71,19 @@ class Stream:
 
 
 def trained_margins(
-    training: Grasps, streams: list[NDArray[np.uint16]], seed: int, copies: int
+    training: Grasps, streams: list[NDArray[np.uint16]], seed: int, epochs: int
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-    """Margins (N,) and features (N, 78) of streams of counts by a network trained for other days.
-
-    One epoch over so many augmented copies is as many epochs with new augmentation in each.
-    """
+    """Margins (N,) and features (N, 78) of streams of counts by `small-session`, so trained."""
     from models.training.fitting.fit import fit
     from models.training.fitting.standards import TrainingStandards
     from models.training.systems.registry import SYSTEMS
     from models.training.systems.system import with_recipes
 
-    random = np.random.default_rng(seed)
     table_of = training.table_of
     standards = TrainingStandards.of(raw_features(training.counts), table_of)
     inputs = standards.apply(raw_features(training.counts), table_of, CLIP)
-    system = with_recipes(SYSTEMS["small-session"], epochs=1, input_noise=0.0)
-    many = np.concatenate([_another_day(inputs, random) for _ in range(copies)])
-    network = fit(system, many, np.tile(training.slipped, copies), seed=seed)
+    system = with_recipes(SYSTEMS["small-session"], epochs=epochs)
+    network = fit(system, inputs, training.slipped, seed=seed)
     found = []
     for counts in streams:
         session = standards.statistics()
@@ -102,19 +97,7 @@ def trained_margins(
     return found
 
 
-def _another_day(inputs: NDArray[np.float32], random: np.random.Generator) -> NDArray[np.float32]:
-    """Standardised features (N, fingers * 26) as other sensors might have shown them."""
-    grasps, width = inputs.shape
-    fingers = width // 26
-    gain = np.exp(random.normal(0.0, 0.3, inputs.shape))
-    per_finger = np.exp(random.normal(0.0, 0.3, (grasps, fingers)))
-    gain[:, : 24 * fingers] *= np.repeat(per_finger, 24, axis=1)
-    shifted = inputs * gain
-    shifted[:, 24 * fingers :] += random.normal(0.0, 0.7, (grasps, 2 * fingers))
-    return (shifted + random.normal(0.0, 0.4, inputs.shape)).astype(np.float32)
-
-
-def all_streams(folder: Path, cache: Path, seeds: int, copies: int) -> Iterator[Stream]:
+def all_streams(folder: Path, cache: Path, seeds: int, epochs: int) -> Iterator[Stream]:
     """All streams; networks that were trained before are not trained again."""
     grasps = read_all(folder / "bts3")
     objects = np.array(grasps.objects)
@@ -130,7 +113,7 @@ def all_streams(folder: Path, cache: Path, seeds: int, copies: int) -> Iterator[
                     inside = np.flatnonzero((names == table) & (fold_of == fold))
                     kinds.append((table, order))
                     rows.append(_ordered(inside, objects, order, random))
-                scores = _scores(grasps, train, rows, cache, fold_seed(seed, fold), copies)
+                scores = _scores(grasps, train, rows, cache, fold_seed(seed, fold), epochs)
                 for (table, order), chosen, score in zip(kinds, rows, scores, strict=True):
                     yield Stream(protocol, table, order, *score, grasps.slipped[chosen])
 
@@ -151,16 +134,16 @@ def _scores(
     rows: list[NDArray[np.int64]],
     cache: Path,
     seed: int,
-    copies: int,
+    epochs: int,
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
     """What `trained_margins` gives, from the cache where it has it."""
     training = grasps.rows(train)
-    asked = [training.digest(), seed, copies, [chosen.tolist() for chosen in rows]]
+    asked = [training.digest(), seed, epochs, [chosen.tolist() for chosen in rows]]
     key = hashlib.sha256(json.dumps(asked).encode()).hexdigest()[:24]
     path = cache / f"{key}.npz"
     if not path.exists():
         counts = [grasps.counts[chosen] for chosen in rows]
-        found = trained_margins(training, counts, seed, copies)
+        found = trained_margins(training, counts, seed, epochs)
         cache.mkdir(parents=True, exist_ok=True)
         named: dict[str, Any] = {f"m{i}": margins for i, (margins, _) in enumerate(found)}
         named |= {f"x{i}": features for i, (_, features) in enumerate(found)}
@@ -368,8 +351,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one seed, three epochs")
     parser.add_argument("--outcomes", type=int, default=1_000_000, help="of the endurance run")
     options = parser.parse_args()
-    seeds, copies = (1, 3) if options.quick else (2, 40)
-    found = list(all_streams(options.data, options.cache, seeds, copies))
+    seeds, epochs = (1, 3) if options.quick else (2, 40)
+    found = list(all_streams(options.data, options.cache, seeds, epochs))
     width = found[0].features.shape[1]
     lines = (
         *(cost_lines(width), learning_lines(found), risk_lines(found)),

@@ -352,6 +352,44 @@ def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
     assert np.mean([judgement.decision is Decision.UNKNOWN for judgement in judgements]) > 0.95
 
 
+@pytest.mark.parametrize("order", [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
+def test_fingers_exchanged_from_the_first_grasp_are_unknown(
+    bts3_dir: Path, order: list[int]
+) -> None:
+    rows = read_table(bts3_dir / "palm_side.csv").counts
+    rows = rows[np.random.default_rng(6).permutation(len(rows))[:200]]
+    pipeline = session_pipeline()
+    decisions = [judgement.decision for judgement in judge(pipeline, rows[:, order])]
+    assert set(decisions[5:]) == {Decision.UNKNOWN}
+    assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
+
+
+def test_a_grasp_held_fifty_times_leaves_the_session_as_it_was(bts3_dir: Path) -> None:
+    rows = read_table(bts3_dir / "palm_side.csv").counts
+    pipeline = session_pipeline()
+    held = rows[7] + np.random.default_rng(7).normal(0.0, 5.0, (50, 3, 24))
+    judge(pipeline, np.clip(held, 0.0, 4095.0))
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 1
+
+
+def test_slips_alone_make_no_slip_stable(bts3_dir: Path) -> None:
+    """After 900 slips hardly any more of a day's slips are called stable than without them."""
+    table = read_table(bts3_dir / "palm_side.csv")
+    random = np.random.default_rng(8)
+    mixed = random.permutation(len(table.counts))
+    first, test, rest = mixed[:100], mixed[100:400], mixed[400:]
+    slips = np.resize(rest[table.slipped[rest]], 900)
+    missed = []
+    for poison in (first, np.concatenate((first, slips))):
+        pipeline = session_pipeline()
+        judge(pipeline, table.counts[poison])
+        judgements = judge(pipeline, table.counts[test])
+        said = [judgement.decision is Decision.STABLE for judgement in judgements]
+        missed.append(np.mean(np.array(said)[table.slipped[test]]))
+    assert missed[1] <= missed[0] + 0.02
+
+
 @pytest.mark.parametrize("name", ["cnn1", "small-session"])
 def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
     model = TactileModel(zoo.find(name))
