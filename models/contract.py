@@ -47,7 +47,7 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     protocol: str
-    """`cv`: known objects; `unknown`, `objects`: others; `session`: others on another day."""
+    """`cv`: known objects; `unknown`, `objects`: others; `session`, `days`: on other days."""
     folds: int
     f1_mean: Fraction
     f1_std: Fraction

@@ -29,7 +29,10 @@ class Electrodes:
         whitening = seen.whitening_matrix()
         self._precision = whitening @ whitening.T
         self._limits = IMPLAUSIBLE * np.sqrt(np.diag(self._precision))
-        self.centre = self._centre.reshape(np.shape(seen.centre))
+        self._shape = np.shape(seen.centre)
+        of_fingers = self._precision.reshape(self._shape * 2).sum(axis=(1, 3))
+        self._finger_limits = IMPLAUSIBLE * np.sqrt(np.diag(of_fingers))
+        self.centre = self._centre.reshape(self._shape)
         """Mean of each electrode in the training, counts, shape (fingers, 24)."""
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
         """Standard deviation of each electrode in the training, counts, shape (fingers, 24)."""
@@ -60,6 +63,15 @@ class Electrodes:
             found[worst] = True
             others.forget(worst)
         return found.reshape(broken.shape)
+
+    def moved_finger(self, values: NDArray[np.float64]) -> bool:
+        """Whether one number, added to all electrodes of a finger, made `values` what they are.
+
+        Of counts (fingers, 24): that number, as the electrodes let expect it, is further from zero
+        than `IMPLAUSIBLE` of its standard deviations. No single electrode need contradict.
+        """
+        residuals = (self._precision @ (values.ravel() - self._centre)).reshape(self._shape)
+        return not bool((np.abs(residuals.sum(axis=1)) <= self._finger_limits).all())
 
     def repaired(
         self, values: NDArray[np.float64], broken: NDArray[np.bool_]

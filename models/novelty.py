@@ -7,13 +7,28 @@ from numpy.typing import NDArray
 
 from models.contract import SeenCounts
 
+CONTRADICTING_MAX = 2
+"""Electrodes that may contradict the others without anything else being known against them. Of
+held-out grasps 99 % are judged with it; of readings with each electrode from another grasp none is,
+and with a limit of four a tenth would be."""
+LEARNED_DISTANCES = 2.0
+"""A session takes in what is up to so many times farther than `distance_max`: if it took in only
+what it would judge, its mean would move towards what is left, and the rest look ever stranger."""
+
+CONTRADICTED_DISTANCES = 0.75
+"""Of a session's reading, some of whose electrodes contradict the others, the rest must be as near
+as so many times `distance_max`: of readings with each electrode from another grasp a tenth have two
+or fewer that contradict, and all but a twentieth of these are farther; of real ones a tenth is."""
+
 
 class NoveltyCheck:
     """Tells readings that are far from all training data: for them a network's answer is noise.
 
     Two tests, each of which catches what the other lets through: every electrode must lie in its
     range of training counts, with a margin (drifted or broken electrodes), and all together must
-    fit the training covariance (values that are each possible, but not with one another).
+    fit the training covariance (values that are each possible, but not with one another). For a
+    session model, whose counts were mapped to the training's sensors, only the second: ranges hold
+    good grasps of another day for unlike, and few that are none.
     """
 
     def __init__(self, seen: SeenCounts) -> None:
@@ -41,14 +56,22 @@ class NoveltyCheck:
     def is_seen(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
         """The opposite of `never_seen` for one reading, (fingers, 24), in a third of the time."""
         inside = (values >= self._low) & (values <= self._high)
-        return (
-            np.count_nonzero(inside) == self._electrodes
-            and self._square_min <= self._square(values, repaired) <= self._square_max
-        )
+        return np.count_nonzero(inside) == self._electrodes and self.is_near(values, repaired)
 
-    def is_far(self, counts: NDArray[np.float64]) -> bool:
-        """Whether counts (fingers, 24) do not fit the training covariance; ranges do not matter."""
-        return not self._square(counts, 0) <= self._square_max
+    def is_near(
+        self, values: NDArray[np.float64], repaired: int = 0, contradicted: int = 0
+    ) -> bool:
+        """Whether counts (fingers, 24) fit the training covariance; ranges do not matter.
+
+        So many of the `repaired` electrodes `contradicted` the others.
+        """
+        share = CONTRADICTED_DISTANCES if contradicted else 1.0
+        square = self._square(values, repaired)
+        return self._square_min <= square <= share**2 * self._square_max
+
+    def is_learned(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
+        """Whether a session may take in counts (fingers, 24) that were mapped by it."""
+        return self._square(values, repaired) <= LEARNED_DISTANCES**2 * self._square_max
 
     def _square(self, values: NDArray[np.float64], repaired: int) -> float:
         deviations = (values.ravel() - self._centre) @ self._whitening

@@ -6,7 +6,7 @@ session models, so that a network trained on other days sees what it knows.
 
 from __future__ import annotations
 
-import math
+import itertools
 from typing import Annotated
 
 import msgspec
@@ -16,9 +16,27 @@ from numpy.typing import NDArray
 HORIZON_GRASPS = 300.0
 """Older grasps fade once so many have been seen. Without it, 400 grasps of one object would bias
 the next thousand; with it the session forgets them, and a fresh sensor's slow drift is followed."""
-REPEAT_DISTANCE = 0.05
-"""A reading that is nearer to the last one than this (root mean square, in spreads) is the same
-grasp still held: the sensor's noise alone moves it by 0.02."""
+REPEAT_DISTANCE, REPEAT_IN_PRIOR = 0.05, 0.15
+"""A reading that is nearer to the last one than this (root mean square, in the session's spreads or
+in the training's) is the same grasp again: the session's own fall with every repetition. Noise of 5
+counts moves it by 0.11 of the training's at most; of 100 grasps of one object 98 differ by more."""
+BALANCED_FROM = 20
+"""Grasps from which on verdicts are sound enough to tell what a session is made of."""
+SHARE_GRASPS = 50.0
+"""Grasps over which the share of slips is counted."""
+LEAST_WEIGHT = 0.02
+"""Of a slip where nearly all are slips: so a session that began wrongly finds back."""
+
+SPREAD_RATIOS = (0.2, 3.0)
+"""Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
+by 0.4 to 1.5 times from twenty grasps of the published tables on; those of a dead finger by 0.06
+times."""
+AWAY_MAX = 8.0
+"""Electrodes of a session read, in the mean, at most so many of the training's spreads away from
+the training's mean (root mean square): 1.3 to 4.1 on the published days."""
+AWAY_MIN, ORDER_RATIO = 1.0, 1.2
+"""Fingers are exchanged if they are further away than the first, and in another order nearer by
+more than the second: in their own they are the nearer by 1.5 to 2.6 on the published days."""
 
 
 class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -31,6 +49,8 @@ class SessionState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mean: tuple[float, ...]
     squares: tuple[Annotated[float, msgspec.Meta(ge=0.0)], ...]
     """Sum of the squared deviations from the mean."""
+    slip_share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.5
+    """Of the latest grasps, as they were judged."""
     last: tuple[float, ...] | None = None
     """The grasp that was taken in last: still held, it is not taken in again."""
 
@@ -67,19 +87,25 @@ class SessionStatistics:
         self._weight = 0.0
         self._mean = np.zeros_like(self._prior_mean)
         self._squares = np.zeros_like(self._prior_mean)
+        self._slip_share = 0.5
         self._last: NDArray[np.float64] | None = None
         self._settle()
 
-    def observe(self, values: NDArray[np.float64]) -> bool:
-        """Take in one grasp; False if it is the one before, still held, or is not finite."""
+    def observe(self, values: NDArray[np.float64], *, slip: bool | None = None) -> bool:
+        """Take in one grasp; False if it is the one before, still held, or is not finite.
+
+        `slip` is how it was judged, None if it was not. Among many slips each weighs the less: a
+        session's mean that moved to what slips would make the next slip look stable.
+        """
         if not np.isfinite(values).all() or self._is_held(values):
             return False
         self._last = values.copy()
+        weight = self._balance(slip)
         self.grasps += 1
-        self._weight += 1.0
+        self._weight += weight
         deviation = values - self._mean
-        self._mean += deviation / self._weight
-        self._squares += deviation * (values - self._mean)
+        self._mean += deviation * (weight / self._weight)
+        self._squares += weight * deviation * (values - self._mean)
         if self._weight > HORIZON_GRASPS:
             self._squares *= HORIZON_GRASPS / self._weight
             self._weight = HORIZON_GRASPS
@@ -93,6 +119,7 @@ class SessionStatistics:
             self.grasps,
             tuple(self._mean.tolist()),
             tuple(self._squares.tolist()),
+            self._slip_share,
             None if self._last is None else tuple(self._last.tolist()),
         )
 
@@ -104,19 +131,31 @@ class SessionStatistics:
             raise ValueError(f"is of {len(mean)} values, not of {len(self._prior_mean)}")
         if not np.isfinite((mean, squares, last)).all():
             raise ValueError("holds numbers that are not finite")
-        if state.weight != min(state.grasps, HORIZON_GRASPS):
+        least = min(state.grasps, BALANCED_FROM + LEAST_WEIGHT * (state.grasps - BALANCED_FROM))
+        if not min(least, HORIZON_GRASPS) <= state.weight <= state.grasps:
             raise ValueError(f"says that {state.grasps} grasps weigh {state.weight:g}")
         self.reset()
         self.grasps, self._weight = state.grasps, state.weight
-        self._mean, self._squares = mean, squares
+        self._mean, self._squares, self._slip_share = mean, squares, state.slip_share
         self._last = None if state.last is None else last
         self._settle()
+
+    def _balance(self, slip: bool | None) -> float:
+        """The weight of the next grasp, after its verdict was counted."""
+        if self.grasps < BALANCED_FROM:
+            return 1.0
+        if slip is not None:
+            self._slip_share += (slip - self._slip_share) / SHARE_GRASPS
+        if slip is False or self._slip_share <= 0.5:
+            return 1.0
+        return max(((1.0 - self._slip_share) / self._slip_share) ** 2, LEAST_WEIGHT)
 
     def _is_held(self, values: NDArray[np.float64]) -> bool:
         if self._last is None:
             return False
-        steps = (values - self._last) / self.spread
-        return math.sqrt(float(steps @ steps) / len(steps)) < REPEAT_DISTANCE
+        step = values - self._last
+        kinds = (self.spread, REPEAT_DISTANCE), (self._prior_spread, REPEAT_IN_PRIOR)
+        return any(float(np.mean((step / spread) ** 2)) < distance**2 for spread, distance in kinds)
 
     def _settle(self) -> None:
         """Blend session and prior, as if the prior were `prior_grasps` grasps around its mean."""
@@ -126,3 +165,32 @@ class SessionStatistics:
         self.spread: NDArray[np.float64] = np.sqrt(
             share * self._prior_spread**2 + self._squares / total
         )
+
+
+def is_odd(
+    mean: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    training_mean: NDArray[np.float64],
+    training_spread: NDArray[np.float64],
+    *,
+    enough: bool,
+) -> bool:
+    """Whether what a session took in cannot have been grasps of these fingers.
+
+    The sensors are far off; the fingers are exchanged; or, of `enough` grasps, a finger is dead or
+    sees noise alone. Of mean and spread of each electrode in the session, and in the training,
+    counts, shape (fingers, 24).
+    """
+    ratio = np.median(spread / training_spread, axis=1)
+    least, most = SPREAD_RATIOS
+    # Of each finger of the session from each of the training.
+    deviations = (mean[:, np.newaxis] - training_mean) / training_spread
+    away = np.mean(deviations**2, axis=2)
+    own, *others = (
+        sum(row[finger] for row, finger in zip(away.tolist(), order, strict=True))
+        for order in itertools.permutations(range(len(away)))
+    )
+    if enough and not bool(((ratio >= least) & (ratio <= most)).all()):
+        return True
+    exchanged = own > ORDER_RATIO**2 * min(others, default=own) and own > len(away) * AWAY_MIN**2
+    return exchanged or not own <= len(away) * AWAY_MAX**2

@@ -77,12 +77,13 @@ class Assembly:
             assembly.open_driver(driver)
 
     def keep_session(self) -> None:
-        """Restore and keep the session, if model and scene want that and there is a place for it.
+        """Restore and keep the session and what outcomes teach, if model and scene want that and
+        there is a place for it.
 
         The file is saved for the last time when the stack closes.
         """
         scene, pipeline = self._parts.scene, self._parts.pipeline
-        if pipeline.session is None or not scene.keeps_session:
+        if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return
         from daemon.session.file import SessionFile, SessionFileError
         from daemon.session.keeper import SessionKeeper
@@ -99,6 +100,7 @@ class Assembly:
             self._parts.drivers[0],
             file,
             on_exchange=pipeline.sensors_exchanged,
+            trust=pipeline.trust,
         )
         self._stack.callback(keeper.save)
         self.companions.append(keeper)

@@ -19,6 +19,7 @@ TITLES = {
     "objects": "other objects",
     "objects-whole": "other objects, same days",
     "session": "other objects, another day",
+    "days": "other objects, each day by others",
 }
 """What each protocol asks, for people."""
 
@@ -26,6 +27,7 @@ SHOWN = {
     "known objects": ("cv",),
     "other objects": ("objects", "objects-whole"),
     "another day": ("session",),
+    "each other day": ("days",),
 }
 """Columns of the list: the first of these protocols that a card has."""
 

@@ -1,4 +1,5 @@
-"""`graspd session show|reset|seed SCENE`: what the daemon knows of today's sensors."""
+"""`graspd session show|reset|seed SCENE`: what the daemon knows of today's sensors, and has learned
+from how lifts ended."""
 
 from __future__ import annotations
 
@@ -7,19 +8,24 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Reason
+from daemon.process.extras import needs
 from daemon.process.text import complain, printable
 from daemon.scene import drivers as scene_drivers
-from daemon.session.file import KeptSession, SessionFile, SessionFileError, load
-from drivers.base import DriverError, JointReading
+from daemon.session.file import KeptSession, SessionFile, SessionFileError, former_of, load, read
+from daemon.trust.ledger import GraspId, Ledger
+from daemon.trust.trust import Trust, TrustState, decode
+from drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
 from models.session_statistics import SessionState
@@ -29,9 +35,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     for action, text in (
-        ("show", "say how many grasps are known, of which sensors, since when"),
-        ("reset", "forget the session: after a sensor was refilled or exchanged"),
-        ("seed", "start the session from recorded grasps; needs no labels"),
+        ("show", "say how many grasps are known, of which sensors, and what outcomes have taught"),
+        ("reset", "forget the session and what was learned: after a sensor was refilled"),
+        ("seed", "start the session from recorded grasps; learn from those whose outcome is known"),
     ):
         command = actions.add_parser(action, help=text, description=f"{text[0].upper()}{text[1:]}.")
         command.add_argument("scene", type=Path, help="scene file (TOML)")
@@ -43,7 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                 nargs="+",
                 type=Path,
                 metavar="RECORDING",
-                help="grasp tables (CSV): twenty grasps of different objects or more",
+                help="grasp tables (CSV), or recordings with outcomes (MCAP): twenty grasps of "
+                "different objects or more",
             )
 
 
@@ -52,10 +59,11 @@ def run(args: argparse.Namespace) -> int:
     try:
         wanted = scene.load(args.scene)
         model = assembly.load_model(wanted)
-        if not isinstance(model.contract.input, SessionInput):
+        learns = wanted.learn.enabled or wanted.risk is not None
+        if not (learns or isinstance(model.contract.input, SessionInput)):
             raise ModelError(f"the model {model.contract.name} keeps no session")
         if args.action == "show":
-            _show(wanted, model.contract.input, as_json=args.json)
+            _show(wanted, model, as_json=args.json)
         elif args.action == "reset":
             _reset(wanted)
         else:
@@ -66,29 +74,87 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _show(wanted: scene.Scene, needs: SessionInput, *, as_json: bool) -> None:
-    path = wanted.session_path
+def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
+    path, given = wanted.session_path, model.contract.input
     kept = load(path)
+    from_on = given.calibrated_from if isinstance(given, SessionInput) else None
     if as_json:
+        calibrated = kept is not None and from_on is not None and _grasps(kept) >= from_on
         known = None if kept is None else msgspec.to_builtins(kept)
-        calibrated = kept is not None and kept.statistics.grasps >= needs.calibrated_from
-        document = {"file": str(path), "calibrated": calibrated, "session": known}
+        document = {
+            "file": str(path),
+            "calibrated": calibrated,
+            "session": None if known is None else {**known, "trust": _learned(kept)},
+            "former_saved_at": None if (former := _former(path)) is None else former.saved_at,
+        }
         sys.stdout.write(json.dumps(document) + "\n")
         return
-    sys.stdout.write("\n".join(_lines(path, kept, needs)) + "\n")
+    sys.stdout.write("\n".join(_lines(path, kept, from_on)) + "\n")
 
 
-def _lines(path: Path, kept: KeptSession | None, needs: SessionInput) -> Iterator[str]:
+def _grasps(kept: KeptSession) -> int:
+    return 0 if kept.statistics is None else kept.statistics.grasps
+
+
+def _former(path: Path) -> KeptSession | None:
+    """What was kept before, if that is whole."""
+    with contextlib.suppress(SessionFileError):
+        return read(former_of(path))
+    return None
+
+
+def _lines(path: Path, kept: KeptSession | None, from_on: float | None) -> Iterator[str]:
     if kept is None:
         yield f"{printable(str(path))}: no session is kept"
         return
-    grasps = kept.statistics.grasps
-    state = "calibrated" if grasps >= needs.calibrated_from else "not calibrated yet"
-    yield f"{printable(str(path))}: {grasps} grasps, {state} (from {needs.calibrated_from:g} on)"
-    saved = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(kept.saved_at))
-    yield f"  saved    {saved}"
+    grasps, state = _grasps(kept), ""
+    if from_on is not None:
+        state = "calibrated" if grasps >= from_on else "not calibrated yet"
+        state = f", {state} (from {from_on:g} on)"
+    yield f"{printable(str(path))}: {grasps} grasps{state}"
+    yield f"  saved    {_when(kept)}"
+    former = _former(path)
+    if former is not None and former != kept:
+        yield f"  before   {_when(former)}, {_grasps(former)} grasps"
     for finger in kept.fingers:
         yield f"  {finger:8} sensor {printable(kept.serials.get(finger, 'of unknown serial'))}"
+    learned = _learned(kept)
+    if learned is None:
+        yield "  learned  nothing"
+        return
+    yield f"  learned  {learned['outcomes']} outcomes, by the model {learned['model'][:12]}"
+    yield (
+        f"  stable   {learned['lifts']} lifts reported, {learned['slips']} slipped, "
+        f"{learned['outstanding']} outstanding, {learned['unreported']} never reported"
+    )
+
+
+def _when(kept: KeptSession) -> str:
+    saved = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(kept.saved_at))
+    return f"{saved}, {max(time.time() - kept.saved_at, 0.0) / 60.0:.0f} minutes ago"
+
+
+def _learned(kept: KeptSession | None) -> dict[str, Any] | None:
+    """What outcomes have taught; None if that is nothing, or cannot be read."""
+    if kept is None or kept.trust is None:
+        return None
+    try:
+        state = decode(kept.trust)
+    except ValueError as error:
+        complain(f"what was learned {error}")
+        return None
+    records = state.ledger.records
+    return {
+        "model": state.model,
+        "outcomes": state.learner.outcomes,
+        "told": {str(told): number for told, number in state.ledger.told.items()},
+        "max_slip_when_stable": state.risk.max_slip_when_stable,
+        "lifts": state.risk.lifts,
+        "slips": state.risk.slips,
+        "outstanding": sum(each.stable and each.slipped is None for each in records),
+        "unreported": state.ledger.unreported,
+        "proven": state.risk.proven,
+    }
 
 
 def _reset(wanted: scene.Scene) -> None:
@@ -99,23 +165,41 @@ def _reset(wanted: scene.Scene) -> None:
 
 
 def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> None:
-    """Judge the recordings as the daemon does, and keep the session that comes out."""
+    """Judge the recordings as the daemon does, tell their outcomes, and keep what comes out."""
     wanted = _on_recordings(wanted, recordings)
     pipeline = assembly.build_pipeline(wanted, model)
-    session = pipeline.session
-    if session is None:
-        raise ModelError(f"the model {model.contract.name} keeps no session")
+    session, trust = pipeline.session, pipeline.trust
     with SessionFile(wanted.session_path) as file:
         read = len(_judge(wanted, pipeline))
-        if not session.calibrated:
-            raise DriverError(
-                f"{session.grasps} grasps of {read} readings are too few, or they are no grasps"
-            )
-        _check(wanted, model, session.state())
+        outcomes = 0 if trust is None else trust.learner.outcomes
+        if session is None and not outcomes:
+            raise DriverError(f"of {read} readings none is a grasp whose outcome is known")
+        if session is not None:
+            if not session.calibrated:
+                raise DriverError(
+                    f"{session.grasps} grasps of {read} readings are too few, or they are no grasps"
+                )
+            _check(wanted, model, session.state())
         # Of which sensors they are is not known before the daemon hears from them.
-        file.save(session.state(), wanted.hand.fingers, {})
-    where = printable(str(wanted.session_path))
-    sys.stdout.write(f"{where}: {session.grasps} grasps of {read} readings taken in\n")
+        state = None if session is None else session.state()
+        file.save(state, wanted.hand.fingers, {}, None if trust is None else _taught(trust))
+        file.remove_former()
+    grasps = outcomes if session is None else session.grasps
+    sys.stdout.write(
+        f"{printable(str(wanted.session_path))}: {grasps} grasps of {read} readings taken in, "
+        f"{outcomes} outcomes learned\n"
+    )
+
+
+def _taught(trust: Trust) -> TrustState:
+    """What recorded outcomes have taught, also that the warm-up is over.
+
+    None of their lifts counts as one of a `stable` verdict: they were not made on one, and `[risk]`
+    had no say. So the bound begins with the first lift that the daemon is told of.
+    """
+    state = trust.state()
+    risk = msgspec.structs.replace(state.risk, lifts=0, slips=0)
+    return msgspec.structs.replace(state, risk=risk, ledger=Ledger().state())
 
 
 def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> None:
@@ -130,25 +214,61 @@ def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> Non
 
 
 def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:
-    """The scene with recordings in place of its sensors: tables are judged row by row."""
+    """The scene with recordings in place of its sensors: tables are judged row by row.
+
+    Without its `[risk]`, which has no say in lifts that are over.
+    """
     replay = scene_drivers.ReplayTactile(
         driver="replay", recordings=tuple(path.absolute() for path in recordings), pace="fast"
     )
-    gate = wanted.gate.model_copy(update={"mode": None, "sweeps": None})
-    return wanted.model_copy(update={"tactile": replay, "joints": None, "gate": gate})
+    mode = "every" if assembly.is_mcap(replay) else None
+    gate = wanted.gate.model_copy(update={"mode": mode, "sweeps": None})
+    changes = {"tactile": replay, "joints": None, "gate": gate, "risk": None}
+    return wanted.model_copy(update=changes)
 
 
 def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
-    """What is judged of the recordings, grasp by grasp."""
-    (driver,) = assembly.build_drivers(wanted)
+    """What is judged of the recordings, grasp by grasp; then its outcome is told if it is known."""
     judgements: list[Judgement] = []
+    for reading in _readings(wanted):
+        if isinstance(reading, JointReading):
+            pipeline.observe_joints(reading)
+            continue
+        judgement = pipeline.judge(reading)
+        if not judgement.judged:
+            continue
+        judgements.append(judgement)
+        slipped = None if reading.annotation is None else reading.annotation.slipped
+        if slipped is not None:
+            pipeline.outcome(GraspId(pipeline.boot_id, judgement.grasp), slipped=slipped)
+    return judgements
+
+
+def _readings(wanted: scene.Scene) -> Iterator[Reading]:
+    tactile = wanted.tactile
+    if isinstance(tactile, scene_drivers.ReplayTactile) and assembly.is_mcap(tactile):
+        yield from _recorded_grasps(tactile.recordings, wanted.hand.fingers)
+        return
+    (driver,) = assembly.build_drivers(wanted)
     with contextlib.closing(driver):
         assembly.open_driver(driver)
         while not driver.exhausted:
-            readings = driver.read_ready()
-            for reading in readings:
-                if isinstance(reading, JointReading):
-                    pipeline.observe_joints(reading)
-                else:
-                    judgements.append(pipeline.judge(reading))
-    return [judgement for judgement in judgements if judgement.judged]
+            yield from driver.read_ready()
+
+
+def _recorded_grasps(paths: Sequence[Path], fingers: Sequence[str]) -> Iterator[TactileReading]:
+    """The grasps of recordings whose outcome was told. Raises `SceneError` or `RecordingError`."""
+    try:
+        from daemon.record.export import collect
+    except ModuleNotFoundError as error:
+        raise scene.SceneError(needs("seeding from MCAP", "record", error)) from error
+    found = collect(paths)
+    if found.fingers != tuple(fingers):
+        raise scene.SceneError(
+            f"{paths[0]}: is of the fingers {', '.join(found.fingers)}, "
+            f"the hand has {', '.join(fingers)}"
+        )
+    for number, grasp in enumerate(found.grasps.values(), 1):
+        told = Annotation(paths[0], number, grasp.object_name, grasp.slipped)
+        faults = np.zeros(grasp.counts.shape, dtype=np.uint8)
+        yield TactileReading(time.monotonic_ns(), number, grasp.counts, faults, told)

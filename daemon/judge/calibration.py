@@ -10,12 +10,7 @@ from numpy.typing import NDArray
 from drivers.base import COUNT_MAX
 from models.contract import SessionInput
 from models.inputs import raw_features
-from models.session_statistics import SessionState, SessionStatistics
-
-SPREAD_RATIOS = (0.2, 3.0)
-"""Electrodes of a finger vary, in the median, by so many times the training's, or no grasps came:
-by 0.7 to 1.3 times from twenty grasps of the published tables on; those of a dead finger by 0.06
-times."""
+from models.session_statistics import SessionState, SessionStatistics, is_odd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +32,7 @@ class Calibration:
     calibrated: bool
     """Whether the grasps are enough for what the model's card says, and can have been grasps."""
     odd: bool
-    """Whether what came cannot have been grasps: a finger that is dead or sees only noise."""
+    """Whether what came cannot have been grasps of these fingers: see `is_odd`."""
     temperature: float
     """What the margin of a verdict must be divided by, with so few grasps."""
 
@@ -83,10 +78,10 @@ class SessionCalibration:
         """Whether they are enough for what the model's card says, and can have been grasps."""
         return self.now.calibrated
 
-    def observe(self, counts: NDArray[np.generic]) -> None:
-        """Take in the counts (fingers, 24) of a grasp that was judged, or could have been."""
+    def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
+        """Take in the counts (fingers, 24) of a grasp; `slip` is how it was judged, if it was."""
         values = np.concatenate((raw_features(counts), counts.ravel()))
-        if self._statistics.observe(values):
+        if self._statistics.observe(values, slip=slip):
             self.now = self._calibration()
 
     def reset(self) -> None:
@@ -109,16 +104,18 @@ class SessionCalibration:
     def _calibration(self) -> Calibration:
         features, shape = len(self._wanted.mean), self._training_mean.shape
         mean, spread = self._statistics.mean, self._statistics.spread
-        counts_spread = spread[features:].reshape(shape)
-        ratio = np.median(counts_spread / self._training_spread, axis=1)
-        least, most = SPREAD_RATIOS
+        counts_mean, counts_spread = (
+            mean[features:].reshape(shape),
+            spread[features:].reshape(shape),
+        )
         enough = self.grasps >= self._wanted.calibrated_from
-        odd = enough and not bool(((ratio >= least) & (ratio <= most)).all())
+        training = self._training_mean, self._training_spread
+        odd = is_odd(counts_mean, counts_spread, *training, enough=enough)
         steps, grasps = self._wanted.sharpness, 0 if odd else self.grasps
         return Calibration(
             features_mean=mean[:features],
             features_spread=spread[:features],
-            counts_mean=mean[features:].reshape(shape),
+            counts_mean=counts_mean,
             counts_spread=counts_spread,
             training_mean=self._training_mean,
             scale=self._training_spread / counts_spread,

@@ -138,7 +138,7 @@ class Pipeline:
 
             self.grip = Grip(fingers, grip)
         self.memory = PipelineMemory()
-        self._to_learn: NDArray[np.generic] | None = None
+        self._to_learn: tuple[NDArray[np.generic], bool | None] | None = None
         self._latest: TactileReading | None = None
         self.on_exchange: Callable[[], None] | None = None
         """Called when the sensors were exchanged."""
@@ -268,8 +268,8 @@ class Pipeline:
         judged by what came before it.
         """
         if self._session is not None and self._to_learn is not None:
-            counts, self._to_learn = self._to_learn, None
-            self._session.observe(counts)
+            (counts, slip), self._to_learn = self._to_learn, None
+            self._session.observe(counts, slip=slip)
 
     def _assess(self, opinion: Opinion, grasp: int) -> Opinion:
         """The opinion with what it is worth by the outcomes that are known."""
@@ -295,7 +295,9 @@ class Pipeline:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
         if self._session is not None and grasp != self.memory.learnt_grasp:
             self.memory.learnt_grasp = grasp
-            self._to_learn = counts
+            p_slip = self.memory.opinion.p_slip
+            slip = None if p_slip is None else p_slip >= self._limits.slip_threshold
+            self._to_learn = counts, slip
 
     def _observe(self, reading: TactileReading, watched: Watched) -> Felt:
         grip = self.grip

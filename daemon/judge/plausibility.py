@@ -14,15 +14,11 @@ from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger, SeenCounts
 from models.electrodes import Electrodes
-from models.novelty import NoveltyCheck
+from models.novelty import CONTRADICTING_MAX, NoveltyCheck
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import Calibration
 
-CONTRADICTING_MAX = 2
-"""Electrodes that may contradict the others without anything else being known against them. Of
-held-out grasps 99 % are judged with it; of readings with each electrode from another grasp none is,
-and with a limit of four a tenth would be."""
 FLAT_SPREAD_COUNTS = 70.0
 """Standard deviation of a finger's electrodes below which it is not touching, or not working: half
 of the smallest of 4682 real grasps, 148."""
@@ -52,32 +48,28 @@ class Plausibility:
             return Examined((Reason.FLAT,), counts)
         values = counts.astype(np.float64) if session is None else session.to_training(counts)
         grasp, values = self._repair(counts, values, broken, session)
-        at_most = int(np.count_nonzero(broken)) + CONTRADICTING_MAX + 1
+        known = int(np.count_nonzero(broken))
+        at_most = known + CONTRADICTING_MAX + 1
         found = self._electrodes.implausible(values, broken, at_most)
         number = int(np.count_nonzero(found))
         # With so many, the reading as a whole is like nothing in the training.
-        never_seen = number == at_most or too_many(found)
-        if not never_seen:
+        seen = learned = number < at_most and not too_many(found)
+        if seen:
             repaired, values = self._repair(counts, values, found, session)
-            never_seen = (
-                session is not None and self._is_odd(session, repaired)
-            ) or not self._novelty.is_seen(values, number)
-        if never_seen:
-            # A session learns from it only while it is young, for that is how drift begins; later
-            # on a sensor that fails would slowly become its own standard.
-            young = session is None or not session.calibrated
-            return Examined((Reason.NEVER_SEEN,), counts, (), grasp if young else None)
+            if session is None:
+                seen = self._novelty.is_seen(values, number)
+            elif self._electrodes.moved_finger(values):
+                seen = learned = False
+            else:
+                learned = self._novelty.is_learned(values, number)
+                near = self._novelty.is_near(values, number, number - known)
+                seen = near and not session.odd
+        if not seen:
+            # A young session learns from all, for that is how drift begins; later on a sensor that
+            # fails would slowly become its own standard.
+            learned |= session is None or not session.calibrated
+            return Examined((Reason.NEVER_SEEN,), counts, (), grasp if learned else None)
         return Examined((), repaired, self._names(found) if number else (), grasp)
-
-    def _is_odd(self, session: Calibration, counts: NDArray[np.generic]) -> bool:
-        """Whether session or reading cannot be of grasps, whatever the session's spreads make it.
-
-        The reading is compared once more with only the session's mean taken off: how much the
-        electrodes of a finger vary, and with one another, hardly differs from day to day.
-        """
-        return session.odd or self._novelty.is_far(
-            self._electrodes.centre + (counts.astype(np.float64) - session.counts_mean)
-        )
 
     def _repair(
         self,

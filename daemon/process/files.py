@@ -24,11 +24,14 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     return content
 
 
-def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
+def write_atomically(
+    path: Path, content: bytes, mode: int = 0o600, *, former: Path | None = None
+) -> None:
     """Put `content` at `path` in one step, in place of what is there; `mode` as in chmod(2).
 
     Whoever looks, also after a power cut, sees the former file or the whole new one. Raises
-    `OSError` and leaves the former then.
+    `OSError` and leaves the former then. What is there is kept at `former` if that is given: at
+    every moment one of the two is there, and whole.
     """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -38,6 +41,9 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o600) -> None:
             file.flush()
             os.fchmod(handle, mode)
             os.fsync(handle)
+        if former is not None:
+            with suppress(FileNotFoundError):
+                os.replace(path, former)
         os.replace(part, path)
     except OSError:
         with suppress(OSError):

@@ -13,6 +13,9 @@ from drivers.base import JointReading, TactileReading
 P = ParamSpec("P")
 R = TypeVar("R")
 
+Answer = Callable[[str | None], None]
+"""Takes None for yes, or why not."""
+
 
 class Requests(Protocol):
     """Takes what others want of the loop."""
@@ -28,6 +31,9 @@ class Requests(Protocol):
         object_name: str | None = None,
     ) -> str | None:
         """The lift of a grasp has ended so; None if that is of use, else why not."""
+
+    def keep(self, answer: Answer) -> None:
+        """Call `answer` once what was told is kept, or is known not to be."""
 
 
 class Companion:
@@ -64,6 +70,9 @@ class Companion:
         self, grasp: int, outcome: Literal["stable", "slip"], object_name: str | None
     ) -> None:
         """The outcome of a judged grasp was told and published."""
+
+    def keep(self, answer: Answer) -> None:
+        """Call `answer` once what was told until now is on the disk, or is known not to be."""
 
     def on_answer(self, payload: bytes) -> None:
         """A verdict is about to be told that answers who has asked; `payload` is it, encoded."""

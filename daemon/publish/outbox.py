@@ -26,6 +26,7 @@ from daemon.publish.messages import (
     Verdict,
     encode,
 )
+from daemon.trust.ledger import GRASPS_MAX
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
     from daemon.trust.trust import Trust
 
 SHA_DIGITS = 12
-JUDGED_MAX = 1024
-"""Grasps of which it is remembered that they were judged: those of hours, or of ten seconds where
-every reading is one."""
+JUDGED_MAX = GRASPS_MAX
+"""Grasps of which it is remembered that they were judged. No more than what learns remembers, so
+that no outcome is taken in vain."""
 
 
 class Output(Protocol):

@@ -103,7 +103,9 @@ class Sockets(Companion):
     def before_wait(self, requests: Requests) -> None:
         """See to peers that come; pass on what they ask and tell."""
         self.take()
-        if self.questions is not None and self.questions.take(self._clock(), requests.outcome):
+        if self.questions is not None and self.questions.take(
+            self._clock(), requests.outcome, requests.keep
+        ):
             requests.ask()
 
     def take(self) -> None:

@@ -12,7 +12,7 @@ from typing import Literal
 from daemon.judge.pipeline import Pipeline
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
-from daemon.publish.companion import Companion, overridden
+from daemon.publish.companion import Answer, Companion, overridden
 from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
@@ -97,6 +97,7 @@ class Loop:
         self._on_skipped = overridden(companions, Companion.on_skipped)
         self._on_asked = overridden(companions, Companion.on_asked)
         self._on_outcome = overridden(companions, Companion.on_outcome)
+        self._keep = overridden(companions, Companion.keep)
         self._on_answer = overridden(companions, Companion.on_answer)
         self._on_verdict = overridden(companions, Companion.on_verdict)
         self._on_judged = overridden(companions, Companion.on_judged)
@@ -165,6 +166,13 @@ class Loop:
             for on_outcome in self._on_outcome:
                 on_outcome(grasp, outcome, object_name)
         return refused
+
+    def keep(self, answer: Answer) -> None:
+        """Call `answer` once what was told is on the disk; at once where nothing is kept there."""
+        if not self._keep:
+            answer(None)
+        for keep in self._keep:
+            keep(answer)
 
     def _go_round(self, selector: selectors.BaseSelector) -> None:
         # Now, and not when the descriptors say so: sending quietens them.

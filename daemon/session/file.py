@@ -1,23 +1,30 @@
-"""The session's statistics between two starts of the daemon, with the sensors they belong to."""
+"""The session between two starts of the daemon: its statistics, what outcomes have taught, and the
+sensors that both belong to, in one file that is always whole, beside the one before it."""
 
 from __future__ import annotations
 
 import fcntl
+import glob
+import hashlib
+import logging
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Literal, Self
+from typing import Final, Self
 
 import msgspec
 
 from daemon.process.files import read_regular, write_atomically
+from daemon.trust.trust import TrustState, encode
 from models.session_statistics import SessionState
 
-VERSION: Final = 1
-MAX_BYTES = 1 << 20
-"""A kept session has 7 kB."""
+log = logging.getLogger("graspd")
+
+MAX_BYTES: Final = 2 << 20
+"""A kept session has 7 kB, and up to 330 kB more with what outcomes have taught."""
 
 
 class SessionFileError(Exception):
@@ -27,14 +34,30 @@ class SessionFileError(Exception):
 class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Content of the file."""
 
-    version: Literal[1]
     fingers: tuple[str, ...]
     """Order of the fingers in the statistics."""
     serials: dict[str, str]
     """Serial number of each finger's sensor, as far as it was known."""
     saved_at: float
     """Wall-clock seconds since 1970, for people."""
-    statistics: SessionState
+    statistics: SessionState | None
+    """None if no model has needed any."""
+    trust: bytes | None = None
+    """What outcomes have taught, as `daemon.trust.trust.encode` gives it; None if nothing learns.
+    """
+
+
+class _Version1(KeptSession, frozen=True, tag_field="version", tag=1):
+    """A file of a graspd that did not learn from outcomes."""
+
+
+class _Version2(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="version", tag=2
+):
+    """The file: what is kept, and the SHA-256 of its text."""
+
+    sha256: str
+    kept: msgspec.Raw
 
 
 class SessionFile:
@@ -43,6 +66,8 @@ class SessionFile:
     def __init__(self, path: Path) -> None:
         """Take the file. Raises `SessionFileError` if it is in use or its folder is not there."""
         self.path = path
+        self._newest_is_whole = False
+        """Only what was found whole, or was written, may take the place of the former one."""
         lock = path.with_name(path.name + ".lock")
         try:
             flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
@@ -56,6 +81,9 @@ class SessionFile:
             raise SessionFileError(
                 f"{path}: in use by another graspd, stop that one first"
             ) from error
+        for part in path.parent.glob(f"{glob.escape(path.name)}.{'[0-9a-f]' * 8}"):
+            with suppress(OSError):  # a daemon was killed while it wrote this
+                part.unlink()
 
     def close(self) -> None:
         """Let others have it. May be called more than once."""
@@ -77,35 +105,92 @@ class SessionFile:
         self.close()
 
     def load(self) -> KeptSession | None:
-        """What is kept; None if nothing is. Raises `SessionFileError` for what is not a session."""
-        return load(self.path)
+        """As the function `load`."""
+        self._newest_is_whole = False
+        found = _newest_whole(self.path)
+        if found is None:
+            return None
+        kept, path = found
+        self._newest_is_whole = path == self.path
+        return kept
 
     def save(
-        self, statistics: SessionState, fingers: Sequence[str], serials: Mapping[str, str]
+        self,
+        statistics: SessionState | None,
+        fingers: Sequence[str],
+        serials: Mapping[str, str],
+        trust: TrustState | None = None,
     ) -> None:
-        """Replace the file in one step. Raises `SessionFileError`."""
-        kept = KeptSession(VERSION, tuple(fingers), dict(serials), time.time(), statistics)
-        data = msgspec.json.format(msgspec.json.encode(kept), indent=1) + b"\n"
+        """Replace the file in one step, keeping the former one. Raises `SessionFileError`."""
+        learned = None if trust is None else encode(trust)
+        kept = KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned)
+        content = msgspec.json.encode(kept)
+        sealed = _Version2(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
+        former = former_of(self.path) if self._newest_is_whole else None
         try:
-            write_atomically(self.path, data)
+            write_atomically(self.path, msgspec.json.encode(sealed) + b"\n", former=former)
         except OSError as error:
+            self._newest_is_whole = False
             raise SessionFileError(
                 f"{self.path}: cannot keep the session: {error.strerror}"
             ) from error
+        self._newest_is_whole = True
 
     def remove(self) -> bool:
         """Forget what is kept; False if nothing was. Raises `SessionFileError`."""
+        # The former one first: it must not come back where this is interrupted.
+        return bool(self.remove_former() + self._remove(self.path))
+
+    def remove_former(self) -> bool:
+        """Forget what was kept before; False if nothing was. Raises `SessionFileError`."""
+        return self._remove(former_of(self.path))
+
+    def _remove(self, path: Path) -> bool:
         try:
-            self.path.unlink()
+            path.unlink()
         except FileNotFoundError:
             return False
         except OSError as error:
-            raise SessionFileError(f"{self.path}: cannot remove: {error.strerror}") from error
+            raise SessionFileError(f"{path}: cannot remove: {error.strerror}") from error
         return True
 
 
+def former_of(path: Path) -> Path:
+    """Where what was kept at `path` before is kept."""
+    return path.with_name(path.name + ".former")
+
+
 def load(path: Path) -> KeptSession | None:
-    """What is kept at `path`, None if nothing is. Raises `SessionFileError`."""
+    """What is kept at `path`, None if nothing is.
+
+    If that is damaged or not there, what was kept before, and a warning. Raises `SessionFileError`
+    if that is neither.
+    """
+    found = _newest_whole(path)
+    return None if found is None else found[0]
+
+
+def _newest_whole(path: Path) -> tuple[KeptSession, Path] | None:
+    """What is kept, and which of the two files holds it. Raises `SessionFileError`."""
+    problem: SessionFileError | None = None
+    for each in (path, former_of(path)):
+        try:
+            kept = read(each)
+        except SessionFileError as error:
+            problem = problem or error
+            continue
+        if kept is not None:
+            if each != path:
+                why = problem or f"{path}: is not there"
+                log.warning("%s; what was kept before it goes on", why)
+            return kept, each
+    if problem is not None:
+        raise problem
+    return None
+
+
+def read(path: Path) -> KeptSession | None:
+    """What one file holds, None if there is none. Raises `SessionFileError`."""
     try:
         data = read_regular(path, MAX_BYTES)
     except FileNotFoundError:
@@ -113,7 +198,12 @@ def load(path: Path) -> KeptSession | None:
     except OSError as error:
         raise SessionFileError(f"{path}: cannot read the session: {error.strerror}") from error
     try:
-        return msgspec.json.decode(data, type=KeptSession)
+        found = msgspec.json.decode(data, type=_Version1 | _Version2)
+        if isinstance(found, _Version1):
+            return found
+        if hashlib.sha256(found.kept).hexdigest() != found.sha256:
+            raise SessionFileError(f"{path}: not a session: its checksum is wrong")
+        return msgspec.json.decode(found.kept, type=KeptSession)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise SessionFileError(f"{path}: not a session: {error}") from error
 
@@ -124,10 +214,12 @@ def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 
 def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
-    """What is kept of these fingers. Raises `SessionFileError` if it is of others."""
+    """What is kept of these fingers. Raises `SessionFileError` if it is of others, or nothing."""
     if kept.fingers != tuple(fingers):
         raise SessionFileError(
             f"the kept session is of the fingers {', '.join(kept.fingers)}, "
             f"the hand has {', '.join(fingers)}"
         )
+    if kept.statistics is None:
+        raise SessionFileError("the kept session is of a model that needs no statistics")
     return kept.statistics

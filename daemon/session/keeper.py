@@ -1,17 +1,23 @@
-"""Keeps the session of a running daemon in a file, and begins a new one for other sensors."""
+"""Keeps the session of a running daemon, and what outcomes taught in it, in a file; begins a new
+one for other sensors, and says when what was told is on the disk."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 import os
+import select
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from typing import Final, NamedTuple
 
 from daemon.judge.calibration import SessionCalibration
-from daemon.publish.companion import Companion
-from daemon.session.file import SessionFile, SessionFileError, exchanged, statistics_of
+from daemon.publish.companion import Answer, Companion, Requests
+from daemon.session.file import KeptSession, SessionFile, SessionFileError, exchanged, statistics_of
+from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Driver
 from models.session_statistics import SessionState
 
@@ -20,7 +26,19 @@ log = logging.getLogger("graspd")
 WAIT_S = 0.4
 """How long the end waits for the disk, s: the daemon is given a second to stop."""
 SAVE_PERIOD_NS = 10_000_000_000
-"""Between two saves, ns: a power cut costs the grasps of ten seconds."""
+"""Between two saves where nobody waits for one, ns: a power cut costs the grasps of ten seconds."""
+WAITING_MAX: Final = 64
+"""Answers that wait for the disk; the oldest is given up for a newer one."""
+BUSY: Final = "busy: too many wait for the disk, tell it again"
+HANGS: Final = "not kept: the disk does not answer"
+
+
+class Known(NamedTuple):
+    """What is kept, as it is at one moment."""
+
+    serials: dict[str, str]
+    statistics: SessionState | None = None
+    trust: TrustState | None = None
 
 
 class SessionKeeper(Companion):
@@ -28,101 +46,182 @@ class SessionKeeper(Companion):
 
     def __init__(
         self,
-        session: SessionCalibration,
+        session: SessionCalibration | None,
         fingers: Sequence[str],
         tactile: Driver,
         file: SessionFile,
         clock: Callable[[], int] = time.monotonic_ns,
         on_exchange: Callable[[], None] | None = None,
+        trust: Trust | None = None,
     ) -> None:
         """Restore what `file` holds; if that is no session of these fingers, warn and begin anew.
 
-        `tactile` knows the serial numbers of the sensors. `on_exchange` is called when one of them
-        is another than before, and must reset the session; unless given, only that is done.
+        `session` is None for a model without one, `trust` where nothing learns: what is kept for
+        those stays as it is. `tactile` knows the serial numbers of the sensors. `on_exchange` is
+        called when one of them is another than before, and must reset session and trust; unless
+        given, only that is done.
         """
         self._session = session
-        self._on_exchange = on_exchange or session.reset
+        self._trust = trust
+        self._on_exchange = on_exchange or self._reset
         self._fingers = tuple(fingers)
         self._tactile = tactile
         self._file = file
         self._clock = clock
         self._serials: dict[str, str] = {}
+        self._unused = Known({})
+        """What was kept and this run has no use for."""
         self._restore()
-        self._saved = self._what_is_known()
+        self._saved = self._known()
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._warned = False
+        self._waiting: deque[Answer] = deque()
+        self._in_writing = 0
+        """How many of them, the first ones, wait for what is being written."""
+        self._jobs: SimpleQueue[tuple[Known, int] | None] = SimpleQueue()
+        """What the thread is to write, and where to say so, one at a time; None ends it."""
+        self._written: int | None = None
+        """While it writes: the descriptor that becomes readable when it has done what it could."""
+        self._failure: str | None = None
+        """Why it failed."""
         self._thread: threading.Thread | None = None
+        """From the first save on: a disk may take its time, and readings do not wait."""
+
+    def filenos(self) -> list[int]:
+        """Becomes readable when a save has ended."""
+        return [] if self._written is None else [self._written]
+
+    def before_wait(self, requests: Requests) -> None:
+        """Answer those whose save has ended, and begin the next one if others wait."""
+        self.wait(0.0)
+        if self._waiting and self._written is None:
+            self._begin_to_save()
 
     def before_readings(self) -> None:
         """Drop the session if a sensor has been exchanged; save it if it is time."""
         self._check_serials()
-        if self._clock() >= self._save_due_ns and not self._saving():
+        if self._clock() >= self._save_due_ns and self._written is None:
+            self._begin_to_save()
+
+    def keep(self, answer: Answer) -> None:
+        """Call `answer` once what is known now is on the disk, with None, or with why it is not."""
+        if len(self._waiting) == WAITING_MAX:
+            self._waiting.popleft()(BUSY)
+            self._in_writing = max(self._in_writing - 1, 0)
+        self._waiting.append(answer)
+        if self._written is None:
             self._begin_to_save()
 
     def save(self) -> None:
-        """Save now if there is anything new; a failure is one warning."""
+        """Save what is new, for the last time; whoever waits is answered. At most `2 * WAIT_S`."""
         self.wait()
-        self._begin_to_save()
-        self.wait()
-
-    def wait(self) -> None:
-        """Wait until saving has ended, for `WAIT_S` at most."""
+        if self._written is None:
+            self._begin_to_save()
+            self.wait()
+        self._answer(len(self._waiting), HANGS)
         if self._thread is not None:
-            self._thread.join(WAIT_S)
+            self._jobs.put(None)
+            if self._written is None:
+                self._thread.join()
             self._thread = None
 
-    def _saving(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
+    def wait(self, seconds: float = WAIT_S) -> None:
+        """Wait until saving has ended, for so long at most, and answer those who waited for it."""
+        if self._written is None or not select.select([self._written], [], [], seconds)[0]:
+            return
+        os.close(self._written)
+        self._written = None
+        failure = self._failure
+        if failure is not None and not self._warned:
+            log.warning("%s; the next start begins without what is new", failure)
+        self._warned = failure is not None
+        self._answer(self._in_writing, None if failure is None else f"not kept: {failure}")
 
     def _begin_to_save(self) -> None:
-        """In a thread: a disk may take its time, and readings do not wait."""
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
-        known = self._what_is_known()
+        known = self._known()
         if known == self._saved:
+            self._answer(len(self._waiting), None)
             return
-        what = (self._session.state(), dict(self._serials), known)
-        self._thread = threading.Thread(target=self._write, args=what, name="session", daemon=True)
-        self._thread.start()
+        self._in_writing = len(self._waiting)
+        self._written = os.eventfd(0, os.EFD_CLOEXEC)
+        self._jobs.put((known, self._written))
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._write, name="session", daemon=True)
+            self._thread.start()
 
-    def _write(
-        self, state: SessionState, serials: dict[str, str], known: tuple[int, dict[str, str]]
-    ) -> None:
+    def _write(self) -> None:
         with contextlib.suppress(OSError):  # a thread begins with the priority of the loop
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        try:
-            self._file.save(state, self._fingers, serials)
-        except SessionFileError as error:
-            if not self._warned:
-                log.warning("%s; the next start begins a new session", error)
-            self._warned = True
-        else:
-            self._saved = known
-            self._warned = False
+        while (job := self._jobs.get()) is not None:
+            known, written = job
+            self._failure = None
+            try:
+                self._file.save(known.statistics, self._fingers, known.serials, known.trust)
+                self._saved = known
+            except SessionFileError as error:
+                self._failure = str(error)
+            os.eventfd_write(written, 1)
 
-    def _what_is_known(self) -> tuple[int, dict[str, str]]:
-        return self._session.grasps, dict(self._serials)
+    def _answer(self, number: int, why: str | None) -> None:
+        """Answer those who have waited longest."""
+        self._in_writing = 0
+        for _ in range(number):
+            self._waiting.popleft()(why)
+
+    def _known(self) -> Known:
+        statistics, trust = self._unused.statistics, self._unused.trust
+        if self._session is not None:
+            statistics = self._session.state()
+        if self._trust is not None:
+            trust = self._trust.state()
+        return Known(dict(self._serials), statistics, trust)
 
     def _restore(self) -> None:
         try:
             kept = self._file.load()
             if kept is None:
                 return
-            self._session.restore(statistics_of(kept, self._fingers))
+            if self._session is None:
+                self._unused = self._unused._replace(statistics=kept.statistics)
+            else:
+                self._session.restore(statistics_of(kept, self._fingers))
         except (SessionFileError, ValueError) as error:
             log.warning("%s; a new session begins", error)
             return
         self._serials = dict(kept.serials)
-        log.info("session of %d grasps restored from %s", self._session.grasps, self._file.path)
+        grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
+        log.info("session%s restored from %s", grasps, self._file.path)
+        self._restore_trust(kept)
+
+    def _restore_trust(self, kept: KeptSession) -> None:
+        if kept.trust is None:
+            return
+        try:
+            learned = decode(kept.trust)
+            if self._trust is None:
+                self._unused = self._unused._replace(trust=learned)
+            else:
+                self._trust.restore(learned)
+                log.info("%d outcomes restored", learned.learner.outcomes)
+        except ValueError as error:
+            log.warning("%s: what was learned %s; learning begins anew", self._file.path, error)
+
+    def _reset(self) -> None:
+        if self._session is not None:
+            self._session.reset()
+        if self._trust is not None:
+            self._trust.sensors_exchanged()
 
     def _check_serials(self) -> None:
         serials = self._tactile.serials
         changed = exchanged(self._serials, serials)
         if changed:
+            grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
             log.warning(
-                "new sensor on %s: the session's %d grasps no longer count",
-                ", ".join(changed),
-                self._session.grasps,
+                "new sensor on %s: the session%s no longer count", ", ".join(changed), grasps
             )
+            self._unused = Known({})
             self._on_exchange()
             self._save_due_ns = self._clock()
         self._serials.update(serials)

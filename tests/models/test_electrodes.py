@@ -179,3 +179,35 @@ def test_a_repaired_electrode_of_a_real_grasp_is_nearer_than_its_mean(side: Gras
         errors.append(np.sqrt(np.mean((repaired - truth) ** 2)))
         spreads.append(truth.std())
     assert np.median(np.array(errors) / np.array(spreads)) < 0.6
+
+
+def test_a_finger_that_moved_as_a_whole_is_noticed_and_no_electrode_of_it() -> None:
+    mean, covariance, seen = correlated()
+    random = np.random.default_rng(8)
+    electrodes = Electrodes(seen)
+    of_finger = np.repeat(np.eye(3), 24, axis=1)
+    precision: NDArray[np.float64] = np.linalg.inv(covariance).astype(np.float64)
+    for reading in random.multivariate_normal(mean, covariance, 20):
+        values = reading.reshape(SHAPE)
+        assert not electrodes.moved_finger(values)
+        # By generalised least squares: what was added to a finger, and how far that may be off.
+        for finger, chosen in enumerate(of_finger):
+            spread = 1.0 / np.sqrt(chosen @ precision @ chosen)
+            known = (chosen @ precision @ (reading - mean)) * spread**2
+            for excess, expected in ((-0.1, False), (0.1, True)):
+                moved = values.copy()
+                moved[finger] += (IMPLAUSIBLE + excess) * spread - known
+                others = [o for o in range(3) if o != finger]
+                if all(_moved_by(moved, mean, precision, of_finger[o]) < 7.9 for o in others):
+                    assert electrodes.moved_finger(moved) is expected
+
+
+def _moved_by(
+    values: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    precision: NDArray[np.float64],
+    chosen: NDArray[np.float64],
+) -> float:
+    """In its standard deviations."""
+    along = chosen @ precision
+    return float(abs(along @ (values.ravel() - mean)) / np.sqrt(along @ chosen))

@@ -97,3 +97,25 @@ def test_a_contract_that_contradicts_itself_is_refused(
     assert ModelContract.from_json(msgspec.json.encode(content).decode()).seen == seen()
     with pytest.raises(ModelError, match=says):
         ModelContract.from_json(msgspec.json.encode(content | change).decode())
+
+
+@pytest.mark.parametrize(
+    ("distance", "near", "near_though_contradicted", "learned"),
+    [(1.0, True, True, True), (1.9, True, False, True), (2.6, False, False, True),
+     (5.1, False, False, False)],
+)  # fmt: skip
+def test_a_session_judges_what_is_near_and_learns_of_twice_as_far(
+    distance: float, near: bool, near_though_contradicted: bool, learned: bool
+) -> None:
+    check = NoveltyCheck(seen(spread=1 / 100))
+    values = np.full((3, 24), 2000.0 + 100.0 * distance)
+    assert check.is_near(values) is near
+    assert check.is_near(values, 2, 1) is near_though_contradicted
+    assert check.is_learned(values) is learned
+
+
+def test_a_reading_that_is_not_finite_is_neither_near_nor_learned() -> None:
+    check, values = NoveltyCheck(seen(spread=1 / 100)), np.full((3, 24), 2000.0)
+    values[0, 0] = np.nan
+    assert not check.is_near(values)
+    assert not check.is_learned(values)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics
+from models.session_statistics import HORIZON_GRASPS, SessionState, SessionStatistics, is_odd
 
 WIDTH = 5
 
@@ -142,3 +142,92 @@ def test_an_electrode_that_never_moves_leaves_numbers_that_can_be_divided_by() -
         session.observe(row)
     assert (session.spread > 0.05).all()
     assert np.isfinite(session.mean).all()
+
+
+def test_the_same_grasp_again_and_again_counts_once_however_little_the_session_varies() -> None:
+    session = SessionStatistics(np.full(WIDTH, 500.0), np.full(WIDTH, 30.0))
+    random = np.random.default_rng(2)
+    again = [session.observe(520.0 + random.normal(0.0, 1.0, WIDTH)) for _ in range(50)]
+    assert again == [True] + [False] * 49
+    np.testing.assert_allclose(session.mean, 510.0, atol=3.0)
+
+
+def halves(slips: int) -> tuple[SessionStatistics, float]:
+    """A session of a hundred grasps, half of them slips, then of so many slips; what these read."""
+    session, random = statistics(), np.random.default_rng(3)
+    for number in range(100 + slips):
+        slip = number >= 100 or number % 2 == 0
+        assert session.observe(random.normal(600.0 if slip else 400.0, 30.0, WIDTH), slip=slip)
+    return session, 600.0
+
+
+@pytest.mark.parametrize("slips", [300, 900])
+def test_slips_alone_hardly_move_a_session(slips: int) -> None:
+    before, _ = halves(0)
+    after, reading = halves(slips)
+    np.testing.assert_allclose(before.mean, 500.0, atol=10.0)
+    assert (after.mean < 530.0).all()
+    assert (after.mean < reading - 2.0 * 30.0).all()
+
+
+def test_a_session_of_both_kinds_weighs_each_grasp_alike() -> None:
+    balanced, plain = statistics(), statistics()
+    for number, row in enumerate(grasps(200)):
+        assert balanced.observe(row, slip=number % 2 == 1)
+        assert plain.observe(row)
+    np.testing.assert_allclose(balanced.mean, plain.mean, atol=0.5)
+    np.testing.assert_allclose(balanced.spread, plain.spread, rtol=0.02)
+
+
+def test_a_session_that_began_wrongly_finds_back() -> None:
+    """All are called slips, though none is: what they read becomes the mean all the same."""
+    session, random = statistics(), np.random.default_rng(4)
+    observe(session, grasps(20, mean=900.0))
+    for _ in range(5000):
+        session.observe(random.normal(500.0, 30.0, WIDTH), slip=True)
+    np.testing.assert_allclose(session.mean, 500.0, atol=60.0)
+
+
+def test_an_unbalanced_session_goes_on_where_it_was() -> None:
+    session, _ = halves(300)
+    other = statistics()
+    other.restore(msgspec.json.decode(msgspec.json.encode(session.state()), type=SessionState))
+    row = np.full(WIDTH, 610.0)
+    assert session.observe(row, slip=True)
+    assert other.observe(row, slip=True)
+    assert other.state() == session.state()
+
+
+MEAN = np.array([[1000.0] * 24, [1800.0] * 24, [2600.0] * 24])
+SPREAD = np.full((3, 24), 100.0)
+
+
+@pytest.mark.parametrize(
+    ("mean", "spread", "enough", "odd"),
+    [
+        (MEAN, SPREAD, True, False),
+        (MEAN + 700.0, SPREAD, True, False),  # all sensors drifted alike: no order fits better
+        (MEAN + 900.0, SPREAD, False, True),
+        (MEAN[[1, 0, 2]], SPREAD, False, True),
+        (MEAN[[2, 0, 1]] + 100.0, SPREAD, False, True),
+        (MEAN, SPREAD * 0.1, True, True),
+        (MEAN, SPREAD * 0.1, False, False),
+        (MEAN, SPREAD * 4.0, True, True),
+    ],
+)
+def test_what_cannot_have_been_grasps_is_odd(
+    mean: NDArray[np.float64], spread: NDArray[np.float64], enough: bool, odd: bool
+) -> None:
+    assert is_odd(mean, spread, MEAN, SPREAD, enough=enough) is odd
+
+
+def test_fingers_that_read_alike_are_in_any_order() -> None:
+    alike = np.full((3, 24), 2000.0)
+    random = np.random.default_rng(5)
+    for _ in range(50):
+        mean = alike + random.normal(0.0, 50.0, (3, 24))
+        assert not is_odd(mean, SPREAD, alike, SPREAD, enough=True)
+
+
+def test_one_finger_alone_cannot_be_exchanged() -> None:
+    assert not is_odd(MEAN[:1] + 700.0, SPREAD[:1], MEAN[:1], SPREAD[:1], enough=True)

@@ -1,8 +1,7 @@
 """Grasps of another day, as they come: what networks say that saw neither their objects nor pose.
 
-A: palm_down and palm_side, then palm_45. B: palm_45, then palm_down or palm_side. C: palm_45 and
-one of the others, then the other one. The session's statistics run as in the daemon, from nothing,
-and every grasp is judged, none refused.
+The days are those of the protocol `days`. The session's statistics run as in the daemon, from
+nothing, and every grasp is judged, none refused.
 """
 
 from __future__ import annotations
@@ -22,20 +21,13 @@ from numpy.typing import NDArray
 from models.inputs import SessionBuilder, builder, raw_features
 from models.training.data.datasets import Grasps
 from models.training.data.folds import fold_seed, object_folds
+from models.training.data.protocols import DAYS, DAYS_FOLDS
 from models.training.fitting.trained import train
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import SessionFeatures, System, digest, with_recipes
 
 OWN, PUBLISHED = "small-session", "cnn1"
 """Systems that judge: graspd's default, and the published network on the plain image."""
-FOLDS: Final = 4
-DAYS: Final = (
-    ("A", ("palm_down", "palm_side"), ("palm_45",)),
-    ("B", ("palm_45",), ("palm_down", "palm_side")),
-    ("C", ("palm_45", "palm_down"), ("palm_side",)),
-    ("C", ("palm_45", "palm_side"), ("palm_down",)),
-)
-"""Protocol, tables of the training, tables of a stream each."""
 RANDOM, BY_OBJECT = "random", "object by object"
 ORDERS: Final = (RANDOM, BY_OBJECT)
 DRAWS: Final = 2
@@ -70,7 +62,7 @@ class Plan:
 
     seeds: int
     """Splits of the objects, and trainings of each fold."""
-    folds: int = FOLDS
+    folds: int = DAYS_FOLDS
     """Of each split, that are judged."""
     epochs: int | None = None
     """Instead of the systems' own: does it run?"""
@@ -83,7 +75,7 @@ def streams(grasps: Grasps, plan: Plan) -> Iterator[Stream]:
     objects = np.array(grasps.objects)
     names = np.array([file.name for file in grasps.files])[grasps.table_of]
     for seed, fold in itertools.product(range(plan.seeds), range(plan.folds)):
-        fold_of = object_folds(grasps.objects, FOLDS, seed)
+        fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
         for protocol, training, tables in DAYS:
             seen = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             random = np.random.default_rng([seed, fold])

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--protocol",
         action="append",
         choices=PROTOCOLS,
-        help="may be repeated (default: the first five). "
+        help="may be repeated (default: the first six). "
         + "; ".join(f"{name}: {text}" for name, text in ABOUT.items()),
     )
     parser.add_argument(

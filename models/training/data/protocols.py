@@ -18,10 +18,10 @@ from models.training.data.datasets import Grasps, lab_table_names
 from models.training.data.folds import TooFewGraspsError, folds_of, object_folds
 
 EvalProtocol = Literal[
-    "cv", "unknown", "objects", "objects-whole", "session", "cv-palm-down", "cv-palm-side"
+    "cv", "unknown", "objects", "objects-whole", "session", "days", "cv-palm-down", "cv-palm-side"
 ]
 PROTOCOLS: tuple[EvalProtocol, ...] = get_args(EvalProtocol)
-STANDARD = PROTOCOLS[:5]
+STANDARD = PROTOCOLS[:6]
 """What `graspd evaluate` runs by default."""
 ABOUT: dict[EvalProtocol, str] = {
     "cv": "known objects: stratified folds of palm_down + palm_side (the paper's)",
@@ -29,6 +29,8 @@ ABOUT: dict[EvalProtocol, str] = {
     "objects": "objects left out in groups, palm_down + palm_side + palm_45",
     "objects-whole": "objects left out in groups, palm_down + palm_side",
     "session": "palm_45 by palm_down + palm_side, its objects left out in groups",
+    "days": "tables by others (A: palm_45 by palm_down + palm_side; B: palm_down and palm_side by "
+    "palm_45; C: each of these by the other and palm_45), their objects left out in groups",
     "cv-palm-down": "stratified folds of palm_down alone",
     "cv-palm-side": "stratified folds of palm_side alone",
 }
@@ -37,6 +39,16 @@ UNKNOWN_OBJECTS = frozenset(
 )
 """Left out by the authors' notebooks: 485 of 2549 grasps. The paper's text counts 6 objects."""
 FOLDS = 10
+DAYS = (
+    ("A", WHOLE, (NEW_SESSION,)),
+    ("B", (NEW_SESSION,), WHOLE),
+    ("C", (NEW_SESSION, WHOLE[1]), WHOLE[:1]),
+    ("C", (NEW_SESSION, WHOLE[0]), WHOLE[1:]),
+)
+"""Of `days`: name, tables that are trained on, tables that are judged."""
+DAYS_FOLDS = 4
+"""Of objects in `days`, at most: with more, no table would have enough grasps of a fold's objects
+to say what a session is worth that runs for hundreds of grasps."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +60,7 @@ class Split:
     test: Ints
     calibration: Ints | None = None
     """In `session`: grasps of the test's session but of other objects. They may calibrate the
-    session; their labels are not used."""
+    session; their labels are not used. In `days` a session starts from nothing, in each table."""
 
 
 def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS) -> list[Split]:
@@ -101,12 +113,30 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
     return made
 
 
+def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
+    """The same groups of objects leave all days: so many splits of each of `DAYS`."""
+    folds = min(folds, DAYS_FOLDS)
+    every = _rows(grasps, *WHOLE, NEW_SESSION)
+    fold_of = np.full(len(grasps), -1)
+    fold_of[every] = _object_folds(grasps, every, folds, seed)
+    made = []
+    for day, training, judged in DAYS:
+        train, test = _rows(grasps, *training), _rows(grasps, *judged)
+        for fold in range(folds):
+            inside = test[fold_of[test] == fold]
+            if not len(inside):
+                raise TooFewGraspsError(f"{judged[0]} has no grasp of the objects of fold {fold}")
+            made.append(Split(f"{day}, fold {fold}", train[fold_of[train] != fold], inside))
+    return made
+
+
 _MAKERS: dict[EvalProtocol, _Maker] = {
     "cv": _stratified(*WHOLE, with_lab=True),
     "unknown": _unknown,
     "objects": _grouped(*WHOLE, NEW_SESSION),
     "objects-whole": _grouped(*WHOLE),
     "session": _session,
+    "days": _days,
     "cv-palm-down": _stratified(WHOLE[0]),
     "cv-palm-side": _stratified(WHOLE[1]),
 }

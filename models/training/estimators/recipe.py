@@ -12,6 +12,7 @@ from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from models.training.arrays import Bools, Floats, Floats32
+from models.training.estimators.day_shift import DayShift, on_another_day
 from models.training.estimators.networks import AnyNetwork, build
 
 THREADS = 1
@@ -19,6 +20,7 @@ THREADS = 1
 that share busy cores wait for each other, and many trainings at once use a machine better."""
 INFERENCE_BATCH = 512
 """Inputs per forward pass: bounds memory, changes nothing else."""
+DAY_SHIFT = DayShift()
 KERAS_ADAM_EPSILON = 1e-8
 """Of Keras 2.0.8, with which the published networks were trained."""
 
@@ -46,6 +48,16 @@ class Recipe:
     norm_momentum: float = 0.1
     """Weight of a new batch in the running statistics of a batch norm."""
     threads: int = THREADS
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRecipe(Recipe):
+    """For session features: each batch is seen as it might have been on other days."""
+
+    epochs: int = 40
+    weight_decay: float = 1.0
+    input_noise: float = 0.4
+    day_shift: DayShift = DAY_SHIFT
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +138,8 @@ def _fit(
         for batch in batches:
             chosen = order[batch]
             seen = inputs[chosen]
+            if isinstance(recipe, SessionRecipe):
+                seen = on_another_day(seen, recipe.day_shift)
             if recipe.input_noise > 0.0:
                 seen = seen + recipe.input_noise * torch.randn(seen.shape)
             optimizer.zero_grad()

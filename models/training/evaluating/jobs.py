@@ -21,28 +21,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.inputs import builder, raw_features
-from models.training.arrays import Floats, Ints, Numbers
+from models.training.arrays import Bools, Floats, Ints, Numbers
 from models.training.data.datasets import Grasps
 from models.training.data.folds import fold_seed
 from models.training.data.protocols import FOLDS, EvalProtocol, Split, splits
+from models.training.evaluating.days import judged_days
 from models.training.evaluating.files import write_whole
 from models.training.fitting.fit import fit
 from models.training.fitting.fitted import Fitted
 from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
+from models.training.fitting.trained import train
 from models.training.systems.system import SessionFeatures, System, digest, with_recipes
 
 FORMAT = 1
 """Goes up when a job gives another result for the same configuration, or is written otherwise."""
 MAX_FILE_BYTES = 64 * 2**20
 """A larger file is no result: 4682 grasps in 8 variants take 0.4 MB."""
-_META, _TEST, _MARGINS, _AGES = "meta", "test", "margins.", "ages."
+_META, _TEST, _MARGINS, _AGES, _REFUSED = "meta", "test", "margins.", "ages.", "refused."
 _INTERRUPTED = "Training interrupted"
 _ONE_AT_A_TIME = threading.Lock()
 """torch's random state and its number of threads belong to the process."""
 
 _log = logging.getLogger(__name__)
 
-Number = TypeVar("Number", np.float64, np.int64)
+Number = TypeVar("Number", np.float64, np.int64, np.bool_)
 
 
 class BrokenResultError(Exception):
@@ -95,6 +97,8 @@ class JobResult:
     """How many numbers the trained system consists of."""
     ages: dict[str, Ints] = field(default_factory=dict)
     """By running variant: grasps (n,) that the session had seen before."""
+    refused: dict[str, Bools] = field(default_factory=dict)
+    """In `days`, by variant: which grasps (n,) the daemon would hold for never seen."""
 
     def to_bytes(self) -> bytes:
         """A .npz file without pickled objects."""
@@ -107,6 +111,7 @@ class JobResult:
         arrays = {_TEST: self.test, _META: np.frombuffer(json.dumps(meta).encode(), np.uint8)}
         arrays |= {_MARGINS + variant: values for variant, values in self.margins.items()}
         arrays |= {_AGES + variant: values for variant, values in self.ages.items()}
+        arrays |= {_REFUSED + variant: values for variant, values in self.refused.items()}
         file = io.BytesIO()
         np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
         return file.getvalue()
@@ -134,14 +139,20 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     # A forest would otherwise send its trees back to the cluster that this job came from.
     with _ONE_AT_A_TIME, joblib.parallel_config("sequential"), _interruptible():
         started_s = time.perf_counter()
-        if isinstance(system.input, SessionFeatures):
+        refused: dict[str, Bools] = {}
+        if job.protocol == "days":
+            trained = train(system, grasps.rows(split.train), seed)
+            fitted = trained.fitted
+            margins, refused, ages = judged_days(trained, grasps, split.test, seed)
+        elif isinstance(system.input, SessionFeatures):
             fitted, margins, ages = _run_session(system, system.input, grasps, split, seed)
         else:
             inputs = builder(system.input, len(system.fingers)).build_batch(grasps.counts)[0]
             fitted = fit(system, inputs[split.train], grasps.slipped[split.train], seed=seed)
             margins, ages = {NONE: fitted.margins(inputs[split.test])}, {}
         seconds = time.perf_counter() - started_s
-    return JobResult(split.test, margins, len(split.train), seconds, fitted.parameters, ages)
+    numbers = len(split.train), seconds, fitted.parameters
+    return JobResult(split.test, margins, *numbers, ages, refused)
 
 
 def run_numbered(index: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
@@ -215,12 +226,14 @@ def _result(arrays: dict[str, Numbers]) -> JobResult:
     ages = _named(arrays, _AGES, np.int64)
     if test.ndim != 1 or not margins:
         raise ValueError("has no margins")
-    if any(values.shape != test.shape for values in (*margins.values(), *ages.values())):
+    refused = _named(arrays, _REFUSED, np.bool_)
+    columns = (*margins.values(), *ages.values(), *refused.values())
+    if any(values.shape != test.shape for values in columns):
         raise ValueError("has margins or ages of another number of grasps")
     if not all(np.isfinite(values).all() for values in margins.values()):
         raise ValueError("has margins that are not finite")
     numbers = int(meta["train_grasps"]), float(meta["seconds"]), int(meta["parameters"])
-    return JobResult(test, margins, *numbers, ages)
+    return JobResult(test, margins, *numbers, ages, refused)
 
 
 def _named(

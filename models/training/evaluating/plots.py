@@ -34,7 +34,8 @@ def draw(summaries: Sequence[Summary], folder: Path) -> list[Path]:
         here = [summary for summary in summaries if summary.protocol == protocol]
         if len(here) > 1:
             written += _save(_comparison(here), folder / f"coverage.{protocol}")
-    sessions = [summary for summary in summaries if len(summary.variants) > 1]
+    sessions = [summary for summary in summaries if summary.protocol == "session"]
+    sessions = [summary for summary in sessions if len(summary.variants) > 1]
     if sessions:
         written += _save(_calibration(sessions), folder / "session-calibration")
     return written

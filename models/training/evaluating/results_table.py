@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
+from models.training.evaluating.day_figures import GROUPS, DayFigures
 from models.training.evaluating.metrics import Difference, Spread, paired_difference
 from models.training.evaluating.summaries import HEADLINE, Summary, Variant
-from models.training.fitting.standards import RUNNING, SESSION_VARIANTS
+from models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import Published, SessionFeatures, System
 
@@ -41,6 +42,7 @@ def results_table(summaries: Sequence[Summary], made: Made) -> str:
         _paper(found),
         _systems(found),
         _sessions(found),
+        _days(found),
         _differences(found),
         _everything(summaries),
         _how(summaries, made),
@@ -142,8 +144,51 @@ def _sessions(found: Found) -> Iterator[str]:
         yield _table(("system", *map(str, bounds)), rows)
 
 
+def _days(found: Found) -> Iterator[str]:
+    yield "## 4. Other days"
+    here = [found[name, "days"] for name in SYSTEMS if (name, "days") in found]
+    trainings = ", ".join(f"`{one.system}` {len(one.seeds)} x {one.folds}" for one in here)
+    yield (
+        "Protocol `days`: each table is a session from nothing, its grasps judged one after the "
+        "other before they count, none of them labelled. F1 / slips among what is called stable, "
+        "%, every grasp judged, in random order; seeds times trainings: " + (trainings or NOT_RUN)
+    )
+    order = {RUNNING: "random", RUNNING_SORTED: "object by object"}
+    rows, more = [], []
+    for one in here:
+        days = one.main.days
+        cells = (
+            f"{_percent(each.every.f1)} / {_percent(each.every.slips_among_stable)}"
+            for each in days.values()
+        )
+        rows.append((f"`{one.system}`", *cells))
+        for name, variant in one.variants.items():
+            whole = variant.days["all"]
+            more.append((f"`{one.system}`", order.get(name, "any"), *_day_row(whole)))
+    yield _table(("system", *GROUPS), rows)
+    yield (
+        "All streams together. The daemon calls `unknown` what is like nothing in the training: "
+        "those grasps are in the first columns and not in those of `judged`."
+    )
+    head = ("F1", "slips among stable", "slips called stable", "stable called slip")
+    judged = ("judged", "F1 of judged", "slips among stable of judged", "slips among refused")
+    yield _table(("system", "order", *head, *judged), more)
+
+
+def _day_row(figures: DayFigures) -> Iterator[str]:
+    every, judged = figures.every, figures.judged
+    yield from map(
+        _percent,
+        (
+            *(every.f1, every.slips_among_stable, every.slips_called_stable),
+            *(every.stable_called_slip, figures.coverage),
+            *(judged.f1, judged.slips_among_stable, figures.refused_slipped),
+        ),
+    )
+
+
 def _differences(found: Found) -> Iterator[str]:
-    yield "## 4. Differences on the same splits"
+    yield "## 5. Differences on the same splits"
     yield (
         f"F1 of the system less that of `{REFERENCE}`, and less that of the protocol's best, in "
         "percentage points, with the standard error over all folds of all seeds, corrected for "
@@ -188,7 +233,7 @@ def _of(summary: Summary, figure: str, seed: int) -> list[float | None]:
 
 
 def _everything(summaries: Sequence[Summary]) -> Iterator[str]:
-    yield "## 5. Every figure"
+    yield "## 6. Every figure"
     yield (
         "Accuracy, precision, recall and F1 in %; AUC, Brier score and expected calibration error "
         "(ECE) as fractions, probabilities calibrated by a temperature of the other folds; "
@@ -247,6 +292,10 @@ def _trainings(summary: Summary) -> int:
 
 def _f1(variant: Variant | None) -> Spread | None:
     return None if variant is None else variant.spreads["f1"]
+
+
+def _percent(fraction: float | None) -> str:
+    return NOT_RUN if fraction is None else f"{100 * fraction:.1f}"
 
 
 def _value(spread: Spread | None) -> str:

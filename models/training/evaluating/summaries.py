@@ -8,7 +8,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -18,6 +18,7 @@ from models.contract import Dataset
 from models.training.arrays import Bools, Ints
 from models.training.data.datasets import Grasps
 from models.training.data.protocols import PROTOCOLS, EvalProtocol
+from models.training.evaluating.day_figures import DayFigures, day_figures
 from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import (
@@ -94,6 +95,8 @@ class Variant:
     """Mean slip probability, share that slipped, grasps."""
     ages: list[AgeFigures]
     """Of running variants."""
+    days: dict[str, DayFigures] = field(default_factory=dict)
+    """Of the protocol `days`, by group of streams."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +214,7 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
     rows = np.concatenate([pool.rows for pool in pools])
     margins = np.concatenate([pool.margins for pool in pools])
     probability = np.concatenate([pool.probability for pool in pools])
+    judged_days = any(result.refused for folds in results.values() for result in folds)
     slipped, verdict = grasps.slipped[rows], margins > 0.0
     objects, tables = np.array(grasps.objects)[rows], grasps.table_of[rows]
 
@@ -243,6 +247,7 @@ def _variant(name: str, results: Results, grasps: Grasps) -> Variant:
         thresholds={f"{a:g}": reject_threshold(probability, slipped, a) for a in WANTED_ACCURACIES},
         bins=reliability_bins(probability, slipped),
         ages=[by_age(group, groups == group) for group in np.unique(groups)],
+        days=day_figures(name, list(results.values()), grasps) if judged_days else {},
     )
 
 

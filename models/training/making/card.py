@@ -14,6 +14,7 @@ from models.contract import Dataset, ModelContract
 from models.training.data.datasets import Grasps, lab_table_names, unpublished
 from models.training.estimators.graphs import OPSET
 from models.training.evaluating.broken import Study
+from models.training.evaluating.day_figures import DayFigures
 from models.training.evaluating.metrics import CurvePoint, Fraction, Spread
 from models.training.evaluating.summaries import ObjectFigures, Summary, Variant
 from models.training.making.export import Parity
@@ -82,6 +83,8 @@ class Measured(msgspec.Struct, frozen=True):
     """By wanted accuracy: from which confidence on."""
     calibrated_by: dict[str, Spread]
     """F1 by how the session was calibrated; empty where no session is left out."""
+    days: dict[str, DayFigures]
+    """Of the protocol `days`, by group of streams."""
 
     @classmethod
     def of(cls, summary: Summary) -> Measured:
@@ -100,6 +103,7 @@ class Measured(msgspec.Struct, frozen=True):
             accuracy_at_coverage=main.coverages,
             thresholds=main.thresholds,
             calibrated_by={name: variant.spreads["f1"] for name, variant in several.items()},
+            days=main.days,
         )
 
 
@@ -151,6 +155,15 @@ def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]
                 f"New objects do worse than known ones: F1 {f1:.1f} %; the worst is {worst[0]}, "
                 f"of which {100 * worst[1].share.accuracy:.0f} % are judged rightly."
             )
+        elif summary.protocol == "days":
+            figures = summary.main.days["all"].every
+            among, missed = figures.slips_among_stable, figures.slips_called_stable
+            if among is not None and missed is not None:
+                texts.append(
+                    f"On days that it was not trained on, with new objects, {100 * among:.0f} % of "
+                    f"what it calls stable slips, and {100 * missed:.0f} % of the slips are called "
+                    "stable, as long as it is told no outcomes."
+                )
         elif summary.protocol == "session" and len(summary.variants) > 1:
             none = 100 * summary.variants["none"].spreads["f1"].mean
             texts.append(

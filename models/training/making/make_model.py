@@ -21,6 +21,7 @@ from models.contract import (
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
 from models.training.evaluating.broken import broken_study
+from models.training.evaluating.days import CALIBRATED_FROM
 from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import FEWEST_JUDGED
@@ -42,8 +43,6 @@ from models.training.making.export import export
 from models.training.making.plan import TrainingPlan
 from models.training.systems.system import SessionFeatures, System, configuration
 
-CALIBRATED_FROM = 20.0
-"""Grasps from which on a session counts as calibrated: more of them gain two points at most."""
 EXTRA_TRAININGS = 2
 """Beside the folds: one for the repeatability, one for the model itself. The study of broken
 electrodes, three more, comes last."""
@@ -103,14 +102,15 @@ def _calibrator(summaries: list[Summary]) -> Summary:
 
 
 def _summaries(plan: TrainingPlan, grasps: Grasps, found: list[JobResult]) -> list[Summary]:
+    results = list(zip(plan.jobs(grasps), found, strict=True))
     return [
         summarise(
             plan.system,
             protocol,
-            {plan.seed: found[index * plan.folds : (index + 1) * plan.folds]},
+            {plan.seed: [result for job, result in results if job.protocol == protocol]},
             grasps,
         )
-        for index, protocol in enumerate(plan.protocols(grasps))
+        for protocol in plan.protocols(grasps)
     ]
 
 
@@ -157,7 +157,7 @@ def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
         spread=tuple(prior.spread.tolist()),
         clip=system.input.clip,
         prior_grasps=PRIOR_GRASPS,
-        calibrated_from=CALIBRATED_FROM,
+        calibrated_from=float(CALIBRATED_FROM),
         sharpness=_sharpness(summaries),
     )
 
@@ -165,7 +165,7 @@ def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
 def _sharpness(summaries: list[Summary]) -> tuple[Sharpness, ...]:
     """How much less sure a young session is than the calibrated model, never more sure."""
     base = _calibrator(summaries).main.temperature
-    later = next((s for s in summaries if s.protocol == "session"), None)
+    later = next((s for s in summaries if s.protocol == "days"), None)
     if later is None:
         return (Sharpness(0.0, 1.0),)
     steps: list[Sharpness] = []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from models.bts3 import NEW_SESSION, TABLES, WHOLE
 from models.training.data.datasets import Grasps
-from models.training.data.protocols import EvalProtocol
+from models.training.data.protocols import EvalProtocol, splits
 from models.training.evaluating.jobs import Job
 from models.training.systems.system import System
 
@@ -36,14 +36,14 @@ class TrainingPlan:
         if NEW_SESSION not in there:
             return ("cv", "objects-whole")
         objects: EvalProtocol = "objects" if NEW_SESSION in self.system.tables else "objects-whole"
-        return ("cv", objects, "session")
+        return ("cv", objects, "session", "days")
 
     def jobs(self, grasps: Grasps) -> list[Job]:
         """Every training that is judged: the folds of each protocol, in the order of both."""
         return [
             Job(self.system, protocol, self.seed, fold, self.folds)
             for protocol in self.protocols(grasps)
-            for fold in range(self.folds)
+            for fold in range(len(splits(protocol, grasps, self.seed, self.folds)))
         ]
 
     def chosen(self, grasps: Grasps) -> Grasps:

@@ -50,7 +50,8 @@ def _trainings(plan: TrainingPlan, grasps: Grasps) -> Iterator[tuple[str, Grasps
     """
     for protocol in plan.protocols(grasps):
         for split in splits(protocol, grasps, plan.seed, plan.folds):
-            test = split.test if split.calibration is None else split.test[:0]
+            alone = protocol == "days" or split.calibration is not None
+            test = split.test[:0] if alone else split.test
             yield f"{protocol}, {split.name},", grasps, split.train, test
     if plan.only is None:
         kept = plan.chosen(grasps)

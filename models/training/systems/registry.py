@@ -22,7 +22,7 @@ from models.training.estimators.networks import (
     NetworkConfig,
     SecondConvolution,
 )
-from models.training.estimators.recipe import PublishedRecipe, Recipe
+from models.training.estimators.recipe import PublishedRecipe, Recipe, SessionRecipe
 from models.training.systems.system import (
     BlendConfig,
     DistilConfig,
@@ -54,11 +54,11 @@ NARROW = ((4, 32), (8, 64), (16, 64))
 """Filters and hidden units."""
 SHARP_SVM = Svm(c=5.0, gamma=0.02)
 SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
-SMALL_RECIPE = Recipe(epochs=20, weight_decay=1.0, input_noise=0.2)
+SESSION_RECIPE = SessionRecipe()
 SESSION_SVM = Svm(c=3.0, gamma=0.003)
 SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
 SESSION_BLEND = BlendConfig(
-    (Member(SESSION_SVM), Member(SESSION_BOOSTING), Member(SMALL_SESSION, SMALL_RECIPE, copies=2))
+    (Member(SESSION_SVM), Member(SESSION_BOOSTING), Member(SMALL_SESSION, SESSION_RECIPE, copies=2))
 )
 
 
@@ -257,14 +257,14 @@ _SESSION = (
         "CNN1 on session-calibrated features.",
         SESSION,
         replace(CNN1, dropout=0.3),
-        SMALL_RECIPE,
+        Recipe(weight_decay=1.0, input_noise=0.2),
     ),
     System(
         "small-session",
         "Conv16 - FC64 on session-calibrated features: under 100,000 parameters.",
         SESSION,
         SMALL_SESSION,
-        SMALL_RECIPE,
+        SESSION_RECIPE,
         tables=EVERY_TABLE,
     ),
     System(
@@ -279,7 +279,7 @@ _SESSION = (
         "Conv16 - FC64 that has learned from the blend, session-calibrated.",
         SESSION,
         DistilConfig(SESSION_BLEND, SMALL_SESSION, inner_folds=3),
-        SMALL_RECIPE,
+        SESSION_RECIPE,
     ),
 )
 

@@ -138,9 +138,10 @@ def test_a_session_that_cannot_be_had_is_one_line(arguments: tuple[str, ...], sa
     assert len(result.stderr.splitlines()) == 1
 
 
-def test_a_model_without_session_says_so(tmp_path: Path, bts3_dir: Path) -> None:
+def test_a_model_that_learns_nothing_says_so(tmp_path: Path, bts3_dir: Path) -> None:
     path = tmp_path / "scene.toml"
-    path.write_text(SCENE.format(recording=bts3_dir / "palm_45.csv", model="cnn1"))
+    scene = SCENE.format(recording=bts3_dir / "palm_45.csv", model="cnn1")
+    path.write_text(scene + "[learn]\nenabled = false\n")
     result = graspd("session", "show", path)
     assert result.returncode == 2
     assert result.stderr == "graspd: the model cnn1 keeps no session\n"

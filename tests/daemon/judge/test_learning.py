@@ -40,7 +40,7 @@ def pipeline() -> Pipeline:
 def learnt(monkeypatch: pytest.MonkeyPatch) -> Learnt:
     """What the session took in, in turn."""
     taken: Learnt = []
-    monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts: taken.append(counts))
+    monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
     return taken
 
 

@@ -231,6 +231,7 @@ def test_a_table_whose_readings_are_grasps_has_no_gate_and_no_joints(
 
 def test_a_model_without_a_session_brings_no_statistics(tmp_path: Path, measured: Measured) -> None:
     text = '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
+    text += "[learn]\nenabled = false\n"  # else what outcomes teach is kept
     found = measured(written(tmp_path, f'{text}[model]\nname = "mlp"\n'))
     assert below(STATISTICS | KEPT, found.modules) == []
     assert set(found.modules) >= GATE

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jsonschema
+import numpy as np
 import pytest
 import zmq
 from hypothesis import given, settings
@@ -17,9 +18,12 @@ from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Reason
+from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
+from daemon.trust.ledger import GraspId, Told
+from daemon.trust.trust import Trust
 from tests.daemon.fakes import FINGERS, Clock
 
 BOOT = "0123456789abcdef" * 2
@@ -105,6 +109,19 @@ def test_an_outcome_of_a_grasp_that_an_earlier_start_judged_says_which() -> None
         assert (message.boot_id, message.grasp, message.grasp_boot_id) == (BOOT, 3, judged_by)
 
 
+def test_no_grasp_is_remembered_longer_than_its_outcome_could_teach() -> None:
+    trust, sender = Trust("fake", 0), outbox(Output())
+    for number in range(3 * JUDGED_MAX):
+        judge(sender, number)
+        grasp = GraspId(BOOT, number)
+        trust.note(grasp, trust.judge(grasp, 0.5, 0.0, np.empty(0)), stable=False)
+    taken = [sender.outcome(BOOT, number, "slip") is None for number in range(3 * JUDGED_MAX)]
+    assert sum(taken) > 100
+    for number, was_taken in enumerate(taken):
+        told = trust.outcome(GraspId(BOOT, number), slipped=True)
+        assert told is Told.TAKEN or not was_taken
+
+
 def test_only_so_many_grasps_are_remembered() -> None:
     sender = outbox(Output())
     for grasp in range(1, JUDGED_MAX + 2):
@@ -158,6 +175,42 @@ def test_an_outcome_is_answered_at_once(questions: Questions, teller: zmq.Socket
     assert questions.counters["outcomes"] == 2
     assert questions.counters["outcomes_refused"] == 1
     assert questions.counters["malformed"] == 0
+
+
+def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    waiting: list[Answer] = []
+    deadline_s = time.monotonic() + 10.0
+    for grasp in (7, 8, 7):
+        teller.send(f"outcome {BOOT} {grasp} slip".encode())
+    while len(waiting) < 2:
+        assert questions.take(0, takes_the_seventh, waiting.append) == 0
+        assert time.monotonic() < deadline_s
+    assert json.loads(teller.recv()) == {"v": 1, "ok": False, "why": "no such"}
+    assert not teller.poll(50)
+    assert questions.counters == {"asked": 0, "outcomes_refused": 1}
+    waiting[0]("not kept: full")
+    waiting[1](None)
+    assert json.loads(teller.recv()) == {"v": 1, "ok": False, "why": "not kept: full"}
+    assert json.loads(teller.recv()) == {"v": 1, "ok": True}
+    assert questions.counters == {"asked": 0, "outcomes_refused": 2, "outcomes": 1}
+    questions.close()
+    waiting[0](None)  # nobody hears it, and nothing breaks
+
+
+def test_answers_are_on_their_way_before_the_socket_closes(tmp_path: Path) -> None:
+    waiting: list[Answer] = []
+    with zmq.Context() as context, context.socket(zmq.DEALER) as teller:
+        teller.linger = 0
+        with Questions(f"ipc://{tmp_path}/ask", 10**9) as taker:
+            teller.connect(taker.endpoint)
+            teller.send(f"outcome {BOOT} 7 slip".encode())
+            while not waiting:
+                taker.take(0, takes_the_seventh, waiting.append)
+            waiting[0](None)
+        assert teller.poll(5000)
+        assert json.loads(teller.recv()) == {"v": 1, "ok": True}
 
 
 @pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "a/b;c=1", "x" * 64, "-", "~"])

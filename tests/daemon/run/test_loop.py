@@ -14,7 +14,7 @@ import pytest
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
-from daemon.publish.companion import Companion, Requests, overridden
+from daemon.publish.companion import Answer, Companion, Requests, overridden
 from daemon.publish.messages import Lifts, State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
@@ -462,6 +462,27 @@ def test_a_companion_asks_and_tells_and_hears_what_comes_of_it(stop: StopSignal)
     assert peer.heard == ["asked", first, "asked", (1, "slip", "mug"), second]
     assert [topic for topic, _ in bench.output.sent[:-1]].count(b"outcome.right") == 1
     assert bench.output.statuses()[-1].drivers["peer"] == {"outcomes": 1}
+
+
+class Keeper(Companion):
+    """Keeps what was told, and says so later."""
+
+    def __init__(self) -> None:
+        self.waiting: list[Answer] = []
+
+    def keep(self, answer: Answer) -> None:
+        self.waiting.append(answer)
+
+
+def test_what_was_told_is_kept_by_whoever_keeps_it_and_at_once_by_nobody(stop: StopSignal) -> None:
+    keeper = Keeper()
+    heard: list[str | None] = []
+    for companions in ([], [keeper]):
+        clock = Clock()
+        bench = Bench(FakeDriver([], clock), clock, stop, companions=companions)
+        bench.loop.keep(heard.append)
+    assert heard == [None]
+    assert keeper.waiting == [heard.append]
 
 
 def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status(stop: StopSignal) -> None:

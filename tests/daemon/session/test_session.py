@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
@@ -28,28 +27,11 @@ from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from models import zoo
-from models.contract import Finger, SessionInput, Sharpness
 from models.inputs import SessionBuilder, raw_features
 from models.runtime import TactileModel
 from models.training.data.datasets import read_table
-from tests.daemon.fakes import Clock, FakeDriver
-
-FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
-SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
-
-
-def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
-    return np.random.default_rng(seed).integers(500, 3500, (number, 3, 24), dtype=np.uint16)
-
-
-def calibration() -> SessionCalibration:
-    wanted = SessionInput((0.0,) * 78, (1.0,) * 78, 3.0, 1.0, 20.0, SHARPNESS)
-    return SessionCalibration(wanted, np.full((3, 24), 2000.0), np.full((3, 24), 300.0))
-
-
-def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
-    for reading in counts(number, seed):
-        session.observe(reading)
+from tests.daemon.fakes import Clock
+from tests.daemon.session.learning import FINGERS, calibration, counts, grasps_of, observe, sensors
 
 
 def test_the_input_follows_the_session() -> None:
@@ -78,22 +60,6 @@ def test_a_young_session_is_less_sure(grasps: int, temperature: float, calibrate
     assert session.calibrated is calibrated
 
 
-class SensorDriver(FakeDriver):
-    """A driver that knows its sensors."""
-
-    known: dict[str, str] = {}  # noqa: RUF012 - set by the test
-
-    @property
-    def serials(self) -> dict[str, str]:
-        return self.known
-
-
-def sensors(**serials: str) -> SensorDriver:
-    driver = SensorDriver([], Clock())
-    driver.known = serials
-    return driver
-
-
 def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
     clock, first = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
@@ -104,6 +70,8 @@ def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
         clock.now_ns += SAVE_PERIOD_NS
         keeper.before_readings()
         keeper.wait()
+        assert load(file.path) is not None
+        keeper.save()
     second = calibration()
     with SessionFile(tmp_path / "right.json") as file:
         SessionKeeper(second, FINGERS, sensors(), file, clock)
@@ -135,8 +103,9 @@ def test_an_exchanged_sensor_ends_the_session(
         assert again.grasps == 0
         assert "new sensor on mf" in caplog.text
         kept = file.load()
+        keeper.save()
     assert kept is not None
-    assert kept.statistics.grasps == 0
+    assert grasps_of(kept) == 0
     assert kept.serials["mf"] == "X"
 
 
@@ -232,7 +201,7 @@ def test_a_full_disk_is_one_warning_and_no_crash(
         keeper.save()
         kept = file.load()
     assert kept is not None
-    assert kept.statistics.grasps == 9
+    assert grasps_of(kept) == 9
     assert sorted(path.name for path in tmp_path.iterdir()) == ["right.json", "right.json.lock"]
 
 
@@ -257,7 +226,7 @@ def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.M
         keeper.save()
         kept = file.load()
     assert kept is not None
-    assert kept.statistics.grasps == 9
+    assert grasps_of(kept) == 9
     assert len(asked) == 2
 
 
@@ -289,7 +258,7 @@ def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None
             process.send_signal(signal.SIGKILL)
         kept = load(path)
         assert kept is not None
-        assert kept.statistics.grasps >= 20
+        assert grasps_of(kept) >= 20
 
 
 def session_pipeline(*, learns: bool = True) -> Pipeline:
@@ -383,6 +352,44 @@ def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
     assert np.mean([judgement.decision is Decision.UNKNOWN for judgement in judgements]) > 0.95
 
 
+@pytest.mark.parametrize("order", [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
+def test_fingers_exchanged_from_the_first_grasp_are_unknown(
+    bts3_dir: Path, order: list[int]
+) -> None:
+    rows = read_table(bts3_dir / "palm_side.csv").counts
+    rows = rows[np.random.default_rng(6).permutation(len(rows))[:200]]
+    pipeline = session_pipeline()
+    decisions = [judgement.decision for judgement in judge(pipeline, rows[:, order])]
+    assert set(decisions[5:]) == {Decision.UNKNOWN}
+    assert pipeline.health()["session"] is Reason.NOT_CALIBRATED
+
+
+def test_a_grasp_held_fifty_times_leaves_the_session_as_it_was(bts3_dir: Path) -> None:
+    rows = read_table(bts3_dir / "palm_side.csv").counts
+    pipeline = session_pipeline()
+    held = rows[7] + np.random.default_rng(7).normal(0.0, 5.0, (50, 3, 24))
+    judge(pipeline, np.clip(held, 0.0, 4095.0))
+    assert pipeline.session is not None
+    assert pipeline.session.grasps == 1
+
+
+def test_slips_alone_make_no_slip_stable(bts3_dir: Path) -> None:
+    """After 900 slips hardly any more of a day's slips are called stable than without them."""
+    table = read_table(bts3_dir / "palm_side.csv")
+    random = np.random.default_rng(8)
+    mixed = random.permutation(len(table.counts))
+    first, test, rest = mixed[:100], mixed[100:400], mixed[400:]
+    slips = np.resize(rest[table.slipped[rest]], 900)
+    missed = []
+    for poison in (first, np.concatenate((first, slips))):
+        pipeline = session_pipeline()
+        judge(pipeline, table.counts[poison])
+        judgements = judge(pipeline, table.counts[test])
+        said = [judgement.decision is Decision.STABLE for judgement in judgements]
+        missed.append(np.mean(np.array(said)[table.slipped[test]]))
+    assert missed[1] <= missed[0] + 0.02
+
+
 @pytest.mark.parametrize("name", ["cnn1", "small-session"])
 def test_the_mean_of_all_grasps_is_nobodys_grasp(name: str) -> None:
     model = TactileModel(zoo.find(name))
@@ -434,7 +441,7 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
         later = calibration()
         keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
         keeper.before_readings()
-        keeper.wait()
+        keeper.save()
     assert later.grasps == 0
 
 

@@ -46,11 +46,12 @@ def test_a_quick_run_writes_summaries_and_table(
     out, table = tmp_path / "out", tmp_path / "tables" / "RESULTS.md"
     options = ["--data", str(data), "--out", str(out), "--table", str(table), "--quick"]
     assert graspd_evaluate("svm", "svm-session", *options) == 0
-    protocols = ("cv", "unknown", "objects", "objects-whole", "session")
+    protocols = ("cv", "unknown", "objects", "objects-whole", "session", "days")
     assert {path.name for path in out.glob("*.json")} == {
         f"{name}.{protocol}.json" for name in ("svm", "svm-session") for protocol in protocols
     }
-    assert len(list((out / "jobs").iterdir())) == 2 * (4 * 2 + 1)  # unknown has one split
+    # Unknown has one split, days have two of each of four.
+    assert len(list((out / "jobs").iterdir())) == 2 * (4 * 2 + 1 + 8)
     text = table.read_text()
     assert "graspd evaluate svm svm-session --data DIR --out DIR --quick --table FILE" in text
     assert "mean nothing" in text

@@ -65,7 +65,7 @@ def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
     assert card["command"] == f"graspd train {SYSTEM} --data DIR --seed 3 --folds 2"
     assert card["file"]["parity"]["grasps"] == 2 * GRASPS
     assert card["same_seed_same_margins"] is True
-    assert list(card["protocols"]) == ["cv", "objects-whole", "session"]
+    assert list(card["protocols"]) == ["cv", "objects-whole", "session", "days"]
     assert [m["protocol"] for m in card["contract"]["measured"]] == list(card["protocols"])
     assert [file["rows"] for file in card["contract"]["datasets"]] == [GRASPS, GRASPS]
     digest = hashlib.sha256((data / "palm_side.csv").read_bytes()).hexdigest()
@@ -73,6 +73,10 @@ def test_a_session_model_comes_with_all_that_the_daemon_and_its_user_need(
     assert card["data"]["not_published"] == ["palm_down", "palm_side", "palm_45"]
     assert set(card["protocols"]["objects-whole"]["objects"]) == set(OBJECTS)
     assert "running" in card["protocols"]["session"]["calibrated_by"]
+    days = card["protocols"]["days"]
+    assert {"A palm_45", "B palm_side", "C palm_down", "A and C", "all"} < set(days["days"])
+    assert days["days"]["all"]["every"]["grasps"] == 5 * GRASPS
+    assert any("of what it calls stable slips" in point for point in card["weak_points"])
     printed = capsys.readouterr()
     assert printed.out.startswith(f"{out / SYSTEM}.onnx: cv F1 ")
     assert printed.out.count("\n") == 1
@@ -124,8 +128,8 @@ def test_an_interrupted_training_goes_on_where_it_was(
     done, ran[:] = len(ran), []
     assert done == 4
     assert graspd_train(*options) == 0
-    # Six folds in all, less the four that are kept, and one again to see that it is the same.
-    assert len(ran) == 6 - 4 + 1
+    # Six folds and two of each of four days, less those kept, and one again: is it the same?
+    assert len(ran) == 6 + 8 - 4 + 1
 
 
 def test_the_same_seed_makes_the_same_file(data: Path, tmp_path: Path) -> None:
@@ -183,6 +187,7 @@ def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
         "cv": {"palm_down", "palm_side", "lab 1"},
         "objects-whole": {"palm_down", "palm_side", "lab 1"},
         "session": {"palm_45"},
+        "days": {"palm_down", "palm_side", "palm_45"},
     }
     assert card["data"]["licence"].startswith("MIT")
     assert "lab 1" in card["data"]["not_published"]

@@ -40,7 +40,7 @@ def real(bts3_dir: Path) -> Grasps:
     return read_all(bts3_dir)
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", JUDGED)
 def test_every_grasp_of_a_protocol_is_judged_once_by_who_never_saw_it(
     real: Grasps, protocol: EvalProtocol
 ) -> None:
@@ -89,6 +89,25 @@ def test_a_session_is_judged_by_other_days_and_calibrated_by_other_objects(real:
         assert not calibrating & {real.objects[row] for row in split.test}
 
 
+def test_each_day_is_judged_by_other_days_and_other_objects(real: Grasps) -> None:
+    made = splits("days", real, seed=1)
+    days = [(0, 1), (2,), (1, 2), (0, 2)], [(2,), (0, 1), (0,), (1,)]
+    for split, trained, judged in zip(
+        made, *([day for day in each for _ in range(4)] for each in days), strict=True
+    ):
+        assert set(real.table_of[split.train].tolist()) == set(trained)
+        assert set(real.table_of[split.test].tolist()) == set(judged)
+        objects = {real.objects[row] for row in split.test}
+        assert not objects & {real.objects[row] for row in split.train}
+    counted = Counter(np.concatenate([split.test for split in made]).tolist())
+    assert [len(split.name) for split in made] == [9] * 16
+    assert Counter(counted.values()) == {1: 2133, 2: 2549}
+
+
+def test_days_have_four_groups_of_objects_at_most(real: Grasps) -> None:
+    assert [len(splits("days", real, 0, folds)) for folds in (2, 4, 10)] == [8, 16, 16]
+
+
 def test_only_a_session_has_grasps_to_calibrate_with(real: Grasps) -> None:
     for protocol in PROTOCOLS:
         made = splits(protocol, real, seed=0)
@@ -124,7 +143,7 @@ def test_more_folds_than_objects_are_refused() -> None:
         splits("objects-whole", sessions(100), seed=0, folds=21)
 
 
-@pytest.mark.parametrize("protocol", ["objects", "session"])
+@pytest.mark.parametrize("protocol", ["objects", "session", "days"])
 def test_a_protocol_whose_table_is_missing_is_refused(protocol: EvalProtocol) -> None:
     with pytest.raises(TooFewGraspsError, match="the data lack palm_side"):
         splits(protocol, table("palm_down", 40, 0), seed=0)

@@ -13,10 +13,12 @@ from torch import nn
 
 from models.inputs import VectorBuilder
 from models.tactile_image import TactileImager
+from models.training.estimators.day_shift import DayShift
 from models.training.estimators.networks import DenseConfig, NetworkConfig, build
 from models.training.estimators.recipe import (
     PublishedRecipe,
     Recipe,
+    SessionRecipe,
     logits,
     optimization,
     reproducible,
@@ -210,6 +212,17 @@ def test_input_noise_is_drawn_from_the_seed(
     first = _weights(train_network(PLAIN, vectors, slipped, noisy, seed=1))
     assert first == _weights(train_network(PLAIN, vectors, slipped, noisy, seed=1))
     assert first != _weights(train_network(PLAIN, vectors, slipped, Recipe(epochs=2), seed=1))
+
+
+def test_days_are_drawn_from_the_seed_and_change_what_is_learned(
+    slipped: NDArray[np.bool_],
+) -> None:
+    features = np.random.default_rng(0).normal(size=(len(slipped), 26)).astype(np.float32)
+    shifted = SessionRecipe(epochs=2)
+    first = _weights(train_network(PLAIN, features, slipped, shifted, seed=1))
+    assert first == _weights(train_network(PLAIN, features, slipped, shifted, seed=1))
+    same_day = SessionRecipe(epochs=2, day_shift=DayShift(0.0, 0.0, 0.0))
+    assert first != _weights(train_network(PLAIN, features, slipped, same_day, seed=1))
 
 
 def test_weight_decay_spares_biases_and_norms() -> None:

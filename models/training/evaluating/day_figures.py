@@ -1,0 +1,97 @@
+"""What verdicts are worth on another day: how many slips are among what is called stable."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.bts3 import NEW_SESSION, WHOLE
+from models.training.arrays import Bools
+from models.training.data.datasets import Grasps
+from models.training.data.protocols import DAYS
+from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.metrics import score
+
+A, B_DOWN, B_SIDE = f"A {NEW_SESSION}", f"B {WHOLE[0]}", f"B {WHOLE[1]}"
+C_DOWN, C_SIDE = f"C {WHOLE[0]}", f"C {WHOLE[1]}"
+GROUPS = {name: (name,) for name in (A, B_DOWN, B_SIDE, C_DOWN, C_SIDE)} | {
+    "A and C": (A, C_DOWN, C_SIDE),
+    "all": (A, B_DOWN, B_SIDE, C_DOWN, C_SIDE),
+}
+"""By name: the streams, each `A`, `B` or `C` and the table that is judged."""
+
+
+@dataclass(frozen=True, slots=True)
+class VerdictFigures:
+    """Figures of some verdicts as fractions, slip positive; None where nothing was called so."""
+
+    grasps: int
+    f1: float
+    slips_among_stable: float | None
+    """Of what is called stable."""
+    slips_called_stable: float | None
+    """Of what slips."""
+    stable_called_slip: float | None
+    """Of what stays."""
+
+    @classmethod
+    def of(cls, called_slip: Bools, slipped: Bools) -> VerdictFigures:
+        """Of verdicts (N,) and what came of them."""
+        missed, alarms = ~called_slip & slipped, called_slip & ~slipped
+        return cls(
+            len(slipped),
+            score(np.where(called_slip, 1.0, -1.0), slipped).f1 if len(slipped) else 0.0,
+            _share(missed, ~called_slip),
+            _share(missed, slipped),
+            _share(alarms, ~slipped),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DayFigures:
+    """Figures of grasps of another day."""
+
+    every: VerdictFigures
+    """With those that the daemon would refuse."""
+    judged: VerdictFigures
+    """Without them."""
+    coverage: float
+    """Fraction that is judged."""
+    refused_slipped: float | None
+    """Fraction that slipped of what is refused; None if nothing is."""
+
+
+def day_figures(
+    variant: str, folds: Sequence[Sequence[JobResult]], grasps: Grasps
+) -> dict[str, DayFigures]:
+    """By group of streams; `folds` has, for each seed, the results of `days` in their order."""
+    parts: dict[str, list[JobResult]] = {}
+    for results in folds:
+        for index, result in enumerate(results):
+            parts.setdefault(DAYS[index * len(DAYS) // len(results)][0], []).append(result)
+    streams = {}
+    for day, results in parts.items():
+        test = np.concatenate([result.test for result in results])
+        slip = np.concatenate([result.margins[variant] for result in results]) > 0.0
+        refused = np.concatenate([result.refused[variant] for result in results])
+        for table in np.unique(grasps.table_of[test]):
+            inside = grasps.table_of[test] == table
+            name = f"{day} {grasps.files[table].name}"
+            streams[name] = slip[inside], grasps.slipped[test][inside], refused[inside]
+    made = {}
+    for group, names in GROUPS.items():
+        several = [streams[name] for name in names]
+        slip, slipped, refused = (np.concatenate(columns) for columns in zip(*several, strict=True))
+        made[group] = DayFigures(
+            VerdictFigures.of(slip, slipped),
+            VerdictFigures.of(slip[~refused], slipped[~refused]),
+            float(1.0 - refused.mean()),
+            _share(slipped & refused, refused),
+        )
+    return made
+
+
+def _share(some: Bools, of: Bools) -> float | None:
+    return float(some.sum() / of.sum()) if of.any() else None

@@ -1,0 +1,127 @@
+"""Grasps of another day, judged one after the other as the daemon does, none of them labelled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from models.electrodes import Electrodes
+from models.inputs import builder, raw_features
+from models.novelty import CONTRADICTING_MAX, NoveltyCheck
+from models.session_statistics import SessionStatistics, is_odd
+from models.training.arrays import Bools, Floats, Ints, Numbers
+from models.training.data.datasets import COUNT_MAX, Grasps
+from models.training.fitting.standards import NONE, RUNNING, RUNNING_SORTED, Standards
+from models.training.fitting.standards import PRIOR_GRASPS as PRIOR
+from models.training.fitting.trained import Trained
+from models.training.systems.system import SessionFeatures
+
+CALIBRATED_FROM = 20
+"""Grasps from which on a session counts as calibrated: more of them gain two points at most."""
+
+Judged = tuple[dict[str, Floats], dict[str, Bools], dict[str, Ints]]
+"""By variant: log-odds of slip, which are refused, and how old the session was at each grasp."""
+
+
+def judged_days(trained: Trained, grasps: Grasps, test: Ints, seed: int) -> Judged:
+    """How a trained system judges the rows `test` of grasps; each table is a session from nothing.
+
+    A session system judges each table in random order, and object by object. The daemon calls what
+    is refused `unknown`; what the system would have said of it is given all the same.
+    """
+    takes, fingers = trained.system.input, len(trained.system.fingers)
+    counts, table_of = grasps.counts[test], grasps.table_of[test]
+    if not isinstance(takes, SessionFeatures):
+        day = Day(trained)
+        looks = [day.look(reading) for reading in counts]
+        inputs, _ = builder(takes, fingers).build_batch(np.stack([look[0] for look in looks]))
+        return {NONE: trained.fitted.margins(inputs)}, {NONE: ~np.array([o[1] for o in looks])}, {}
+    random = np.random.default_rng(seed)
+    judged: Judged = {}, {}, {}
+    for variant in (RUNNING, RUNNING_SORTED):
+        days = [SessionDay(trained) for _ in grasps.files]
+        margins, refused = np.empty(len(test)), np.empty(len(test), np.bool_)
+        ages = np.empty(len(test), np.int64)
+        order = random.permutation(len(test))
+        if variant == RUNNING_SORTED:
+            names = np.array(grasps.objects)[test[order]]
+            several = random.permutation(np.unique(names))
+            order = np.concatenate([order[names == name] for name in several])
+        for place in order.tolist():
+            day = days[table_of[place]]
+            ages[place] = day.session.grasps
+            margins[place], refused[place] = day.judge(counts[place])
+        judged[0][variant], judged[1][variant], judged[2][variant] = margins, refused, ages
+    return judged
+
+
+class Day:
+    """What the daemon's `Plausibility` finds in sound readings."""
+
+    def __init__(self, trained: Trained) -> None:
+        seen = trained.seen()
+        self.electrodes, self._novelty = Electrodes(seen), NoveltyCheck(seen)
+        self._sound = np.zeros(self.electrodes.centre.shape, np.bool_)
+
+    def look(self, counts: Numbers, session: Standards | None = None) -> tuple[Numbers, bool, bool]:
+        """Counts (fingers, 24), repaired; whether they were seen; whether a session learns of them.
+
+        `session` is mean and spread of the counts in it.
+        """
+        now = session or Standards(self.electrodes.centre, self.electrodes.spread)
+        scale = self.electrodes.spread / now.spread
+        values = self.electrodes.centre + (counts.astype(np.float64) - now.mean) * scale
+        found = self.electrodes.implausible(values, self._sound, CONTRADICTING_MAX + 1)
+        number = int(found.sum())
+        if number > CONTRADICTING_MAX:
+            return counts, False, False
+        if number:
+            values = self.electrodes.repaired(values, found)
+            expected = now.mean + (values - self.electrodes.centre) / scale
+            counts = np.where(found, np.clip(expected, 0.0, COUNT_MAX), counts)
+        if session is None:
+            return counts, self._novelty.is_seen(values, number), True
+        if self.electrodes.moved_finger(values):
+            return counts, False, False
+        is_near = self._novelty.is_near(values, number, number)
+        return counts, is_near, self._novelty.is_learned(values, number)
+
+
+class SessionDay:
+    """A session from nothing, as the daemon's `SessionCalibration` has it."""
+
+    def __init__(self, trained: Trained) -> None:
+        """Of a session system."""
+        takes = trained.system.input
+        if trained.standards is None or not isinstance(takes, SessionFeatures):
+            raise ValueError(f"{trained.system.name} has no sessions")
+        self._fitted, self._clip = trained.fitted, takes.clip
+        self._day, prior = Day(trained), trained.standards.prior
+        self._training = Standards(self._day.electrodes.centre, self._day.electrodes.spread)
+        self._features = len(prior.mean)
+        mean = np.concatenate((prior.mean, self._training.mean.ravel()))
+        spread = np.concatenate((prior.spread, self._training.spread.ravel()))
+        self.session = SessionStatistics(mean, spread, PRIOR)
+
+    def look(self, counts: Numbers) -> tuple[Numbers, bool, bool]:
+        """What `Day.look` finds, of a session that may be odd."""
+        mean, spread = (
+            values[self._features :].reshape(counts.shape)
+            for values in (self.session.mean, self.session.spread)
+        )
+        training = self._training.mean, self._training.spread
+        young = self.session.grasps < CALIBRATED_FROM
+        odd = is_odd(mean, spread, *training, enough=not young)
+        repaired, seen, learned = self._day.look(counts, Standards(mean, spread))
+        return repaired, seen and not odd, learned or odd or young
+
+    def judge(self, counts: Numbers) -> tuple[float, bool]:
+        """Log-odds of slip of a grasp, and whether it is refused; then learn from it."""
+        repaired, seen, learned = self.look(counts)
+        features = slice(self._features)
+        by = Standards(self.session.mean[features], self.session.spread[features])
+        inputs = by.apply(raw_features(repaired if seen else counts)[np.newaxis], self._clip)
+        (margin,) = self._fitted.margins(inputs).tolist()
+        if learned:
+            values = np.concatenate((raw_features(counts), counts.ravel().astype(np.float64)))
+            self.session.observe(values, slip=margin > 0.0 if seen else None)
+        return margin, not seen

@@ -1,0 +1,75 @@
+"""A session and what learns in it, small, with synthetic grasps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.calibration import SessionCalibration
+from daemon.session.file import KeptSession
+from daemon.trust.learner import sigmoid
+from daemon.trust.ledger import GraspId, Told
+from daemon.trust.risk import Permission, RiskLimits
+from daemon.trust.trust import Trust
+from models.contract import Finger, SessionInput, Sharpness
+from tests.daemon.fakes import Clock, FakeDriver
+
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
+SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
+BOOT = "0123456789abcdef" * 2
+INPUTS = 78
+
+
+def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
+    return np.random.default_rng(seed).integers(500, 3500, (number, 3, 24), dtype=np.uint16)
+
+
+def calibration() -> SessionCalibration:
+    wanted = SessionInput((0.0,) * 78, (1.0,) * 78, 3.0, 1.0, 20.0, SHARPNESS)
+    return SessionCalibration(wanted, np.full((3, 24), 2000.0), np.full((3, 24), 300.0))
+
+
+def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
+    for reading in counts(number, seed):
+        session.observe(reading)
+
+
+def trust(model: str = "model", inputs: int = INPUTS) -> Trust:
+    return Trust(model, inputs, RiskLimits(0.1))
+
+
+def judge(part: Trust, grasp: int, boot: str = BOOT) -> None:
+    """Judge and note a grasp; about half are likely to hold."""
+    draw = np.random.default_rng(grasp)
+    width = part.learner.state().mean
+    inputs = np.clip(draw.normal(0.0, 1.0, len(width) // 8 - 2), -3.0, 3.0).astype(np.float32)
+    margin = float(draw.normal(0.0, 4.0))
+    name = GraspId(boot, grasp)
+    found = part.judge(name, sigmoid(margin), margin, inputs)
+    part.note(name, found, stable=found.permission is Permission.ALLOWED and found.p_slip < 0.5)
+
+
+def tell(part: Trust, grasp: int, boot: str = BOOT) -> Told:
+    """Its outcome, always the same."""
+    return part.outcome(GraspId(boot, grasp), slipped=grasp % 3 == 0)
+
+
+def grasps_of(kept: KeptSession | None) -> int:
+    """Of the kept statistics; 0 if there are none."""
+    return 0 if kept is None or kept.statistics is None else kept.statistics.grasps
+
+
+class SensorDriver(FakeDriver):
+    """A driver that knows its sensors."""
+
+    known: dict[str, str] = {}  # noqa: RUF012 - set by the test
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return self.known
+
+
+def sensors(**serials: str) -> SensorDriver:
+    driver = SensorDriver([], Clock())
+    driver.known = serials
+    return driver

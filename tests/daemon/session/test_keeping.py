@@ -1,0 +1,377 @@
+"""What outcomes taught is kept with the session, and who told one is answered when it is."""
+
+from __future__ import annotations
+
+import os
+import select
+import stat
+import threading
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import cast
+
+import pytest
+
+from daemon.publish.companion import Requests
+from daemon.session.file import SessionFile, load
+from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAITING_MAX, SessionKeeper
+from daemon.trust.ledger import GRASPS_MAX, Told
+from daemon.trust.trust import Trust, TrustState, decode
+from tests.daemon.fakes import Clock
+from tests.daemon.session.learning import (
+    FINGERS,
+    calibration,
+    judge,
+    observe,
+    sensors,
+    tell,
+    trust,
+)
+
+KeeperOf = Callable[..., SessionKeeper]
+NOBODY = cast(Requests, None)
+"""Of whom nothing is requested here."""
+
+
+class Disk:
+    """Holds or refuses every file that is written, until told otherwise."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.goes_on = threading.Event()
+        self.goes_on.set()
+        self.is_full = False
+        self.written = 0
+        real = os.fsync
+
+        def fsync(descriptor: int) -> None:
+            if stat.S_ISREG(os.fstat(descriptor).st_mode):  # and not the folder, after the file
+                self.goes_on.wait()
+                if self.is_full:
+                    raise OSError(28, "No space left on device")
+                self.written += 1
+            real(descriptor)
+
+        monkeypatch.setattr(os, "fsync", fsync)
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
+    return Disk(monkeypatch)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Iterator[SessionFile]:
+    with SessionFile(tmp_path / "right.json") as file:
+        yield file
+
+
+@pytest.fixture
+def keeper_of(file: SessionFile) -> Iterator[Callable[..., SessionKeeper]]:
+    """Makes keepers, and ends them."""
+    made: list[SessionKeeper] = []
+
+    def make(part: Trust, clock: Clock | None = None) -> SessionKeeper:
+        made.append(SessionKeeper(None, FINGERS, sensors(), file, clock or Clock(), trust=part))
+        return made[-1]
+
+    yield make
+    for keeper in made:
+        keeper.save()
+
+
+def go_round(keeper: SessionKeeper) -> None:
+    """As the loop does, until nothing is being written any more."""
+    keeper.before_wait(NOBODY)
+    while keeper.filenos():
+        ready, _, _ = select.select(keeper.filenos(), [], [], 10.0)
+        assert ready
+        keeper.before_wait(NOBODY)
+
+
+def kept_trust(file: SessionFile) -> TrustState | None:
+    kept = load(file.path)
+    return None if kept is None or kept.trust is None else decode(kept.trust)
+
+
+def outcomes(file: SessionFile) -> int:
+    kept = kept_trust(file)
+    return 0 if kept is None else kept.learner.outcomes
+
+
+def test_an_outcome_is_answered_when_it_is_on_the_disk(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part = trust()
+    found: list[tuple[str | None, TrustState | None]] = []
+    keeper = keeper_of(part)
+    judge(part, 1)
+    tell(part, 1)
+    disk.goes_on.clear()
+    keeper.keep(lambda why: found.append((why, kept_trust(file))))
+    for _ in range(3):
+        keeper.before_wait(NOBODY)
+        keeper.before_readings()
+    assert found == []
+    disk.goes_on.set()
+    go_round(keeper)
+    assert found == [(None, part.state())]
+
+
+def test_outcomes_that_come_while_one_is_written_share_the_next_save(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part = trust()
+    found: list[tuple[int, str | None, int]] = []
+    keeper = keeper_of(part)
+
+    def answer(grasp: int, why: str | None) -> None:
+        found.append((grasp, why, outcomes(file)))
+
+    disk.goes_on.clear()
+    for grasp in range(5):
+        judge(part, grasp)
+        tell(part, grasp)
+        keeper.keep(partial(answer, grasp))
+    assert (found, disk.written) == ([], 0)
+    disk.goes_on.set()
+    go_round(keeper)
+    assert [(grasp, why) for grasp, why, _ in found] == [(grasp, None) for grasp in range(5)]
+    assert disk.written == 2
+    assert [outcomes for _, _, outcomes in found] == [1, 5, 5, 5, 5]
+
+
+def test_what_is_kept_already_is_answered_at_once(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part = trust()
+    found: list[str | None] = []
+    keeper = keeper_of(part)
+    judge(part, 1)
+    tell(part, 1)
+    keeper.keep(found.append)
+    go_round(keeper)
+    keeper.keep(found.append)
+    assert found == [None, None]
+    assert disk.written == 1
+
+
+def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
+    file: SessionFile, disk: Disk, caplog: pytest.LogCaptureFixture, keeper_of: KeeperOf
+) -> None:
+    part: Trust = trust()
+    found: list[str | None] = []
+    keeper = keeper_of(part)
+    judge(part, 1)
+    assert tell(part, 1) is Told.TAKEN
+    disk.is_full = True
+    keeper.keep(found.append)
+    go_round(keeper)
+    assert tell(part, 1) is Told.REPEATED
+    keeper.keep(found.append)
+    go_round(keeper)
+    where = f"{file.path}: cannot keep the session: No space left on device"
+    assert found == [f"not kept: {where}"] * 2
+    assert caplog.text.count("No space left on device") == 1
+    assert load(file.path) is None
+    disk.is_full = False
+    assert tell(part, 1) is Told.REPEATED
+    keeper.keep(found.append)
+    go_round(keeper)
+    assert found[2:] == [None]
+    assert kept_trust(file) == part.state()
+
+
+def test_a_disk_that_hangs_holds_neither_the_loop_nor_too_many_answers(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part = trust()
+    found: list[tuple[int, str | None]] = []
+    keeper = keeper_of(part)
+
+    def answer(grasp: int, why: str | None) -> None:
+        found.append((grasp, why))
+
+    disk.goes_on.clear()
+    told = WAITING_MAX + 6
+    for grasp in range(told):
+        judge(part, grasp)
+        tell(part, grasp)
+        keeper.keep(partial(answer, grasp))
+        keeper.before_wait(NOBODY)
+    assert found == [(grasp, BUSY) for grasp in range(6)]
+    disk.goes_on.set()
+    go_round(keeper)
+    assert found[6:] == [(grasp, None) for grasp in range(6, told)]
+    assert disk.written == 2
+    assert kept_trust(file) == part.state()
+
+
+def test_at_the_end_what_was_told_is_written_and_answered(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part: Trust = trust()
+    found: list[str | None] = []
+    keeper = keeper_of(part)
+    for grasp in range(3):
+        judge(part, grasp)
+        tell(part, grasp)
+        keeper.keep(found.append)
+    keeper.save()
+    assert found == [None] * 3
+    assert kept_trust(file) == part.state()
+
+
+def test_a_disk_that_hangs_does_not_hold_up_the_end(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part: Trust = trust()
+    found: list[str | None] = []
+    keeper = keeper_of(part)
+    disk.goes_on.clear()
+    for grasp in range(3):
+        judge(part, grasp)
+        tell(part, grasp)
+        keeper.keep(found.append)
+    began_s = time.monotonic()
+    keeper.save()
+    assert found == [HANGS] * 3
+    assert time.monotonic() - began_s < 0.9
+    disk.goes_on.set()
+    go_round(keeper)
+    assert found[3:] == []
+
+
+def test_session_and_what_was_learned_are_restored_together(tmp_path: Path) -> None:
+    path, session, part = tmp_path / "right.json", calibration(), trust()
+    with SessionFile(path) as file:
+        keeper = SessionKeeper(session, FINGERS, sensors(), file, Clock(), trust=part)
+        observe(session, 30)
+        for grasp in range(20):
+            judge(part, grasp)
+            tell(part, grasp)
+        judge(part, 20)
+        keeper.save()
+    again, other = calibration(), trust()
+    with SessionFile(path) as file:
+        SessionKeeper(again, FINGERS, sensors(), file, Clock(), trust=other)
+    assert (again.state(), other.state()) == (session.state(), part.state())
+    assert tell(other, 20) is Told.TAKEN  # of a grasp of the former start
+    assert tell(other, 3) is Told.REPEATED
+
+
+def test_with_another_model_the_session_stays_and_learning_begins_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, session, part = tmp_path / "right.json", calibration(), trust("a")
+    observe(session, 30)
+    judge(part, 1)
+    tell(part, 1)
+    with SessionFile(path) as file:
+        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        again, other = calibration(), trust("b")
+        SessionKeeper(again, FINGERS, sensors(), file, Clock(), trust=other)
+    assert again.state() == session.state()
+    assert other.state() == trust("b").state()
+    assert caplog.text.count("what was learned is of another model; learning begins anew") == 1
+
+
+def test_what_a_run_has_no_use_for_is_kept_as_it_is(tmp_path: Path) -> None:
+    path, session, part, clock = tmp_path / "right.json", calibration(), trust(), Clock()
+    observe(session, 30)
+    judge(part, 1)
+    tell(part, 1)
+    with SessionFile(path) as file:
+        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        image = trust("of images", inputs=0)
+        keeper = SessionKeeper(
+            None, FINGERS, sensors(), file, clock, trust=image
+        )  # a model without session
+        judge(image, 2)
+        tell(image, 2)
+        keeper.save()
+        kept = file.load()
+        assert kept is not None
+        assert kept.statistics == session.state()
+        assert kept_trust(file) == image.state()
+        off = calibration()
+        keeper = SessionKeeper(off, FINGERS, sensors(), file, clock)  # learning is switched off
+        observe(off, 1, seed=5)
+        keeper.save()
+        assert kept_trust(file) == image.state()
+        keeper = SessionKeeper(off, FINGERS, sensors(ff="B"), file, clock)
+        keeper.before_readings()  # and none of it is left once a sensor is exchanged
+        keeper.save()
+    assert (off.grasps, kept_trust(file)) == (0, None)
+
+
+def test_an_exchanged_sensor_ends_what_was_learned(tmp_path: Path) -> None:
+    path, session, part = tmp_path / "right.json", calibration(), trust()
+    driver = sensors(ff="A")
+    with SessionFile(path) as file:
+        keeper = SessionKeeper(session, FINGERS, driver, file, Clock(), trust=part)
+        keeper.before_readings()
+        observe(session, 30)
+        for grasp in range(20):
+            judge(part, grasp)
+            tell(part, grasp)
+        lifts = part.risk.lifts
+        driver.known = {"ff": "B"}
+        keeper.before_readings()
+        keeper.save()
+    again, other = calibration(), trust()
+    with SessionFile(path) as file:
+        SessionKeeper(again, FINGERS, driver, file, Clock(), trust=other)
+    assert (again.grasps, other.learner.outcomes, other.risk.proven) == (0, 0, 0)
+    assert other.risk.lifts == lifts > 0  # slips that were counted stay counted
+
+
+def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
+    file: SessionFile, disk: Disk, keeper_of: KeeperOf
+) -> None:
+    part, clock = trust(), Clock()
+    keeper = keeper_of(part, clock)
+    judge(part, 1)
+    keeper.before_readings()
+    assert not keeper.filenos()
+    for _ in range(3):
+        clock.now_ns += SAVE_PERIOD_NS
+        keeper.before_readings()
+        go_round(keeper)
+    assert disk.written == 1  # nothing is written where nothing is new
+    assert kept_trust(file) == part.state()
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 100, b'{"version":2,"sha256":"","kept":{}}'])
+def test_two_damaged_files_are_one_warning_and_a_new_beginning(
+    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, part = tmp_path / "right.json", trust()
+    path.write_bytes(content)
+    path.with_name("right.json.former").write_bytes(content)
+    with SessionFile(path) as file:
+        keeper = SessionKeeper(calibration(), FINGERS, sensors(), file, Clock(), trust=part)
+        assert [record.levelname for record in caplog.records] == ["WARNING"]
+        judge(part, 1)
+        keeper.save()
+        assert kept_trust(file) == part.state()
+
+
+def test_saving_takes_less_than_two_mebibytes_with_every_outcome_out(
+    file: SessionFile, keeper_of: KeeperOf
+) -> None:
+    judge(trust(), 0)  # what is imported on the way is none of it
+    part = trust()
+    tracemalloc.start()
+    try:
+        keeper = keeper_of(part)
+        for grasp in range(GRASPS_MAX):
+            judge(part, grasp)
+        keeper.save()
+        judge(part, GRASPS_MAX)
+        keeper.save()
+        assert tracemalloc.get_traced_memory()[1] < 2 << 20
+    finally:
+        tracemalloc.stop()

@@ -1,0 +1,230 @@
+"""The session's file: whole whenever it is cut off, damage found, the one before it at hand."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import random
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from unittest import mock
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.session.file import SessionFile, SessionFileError, former_of, load, read
+from daemon.trust.ledger import GRASPS_MAX
+from daemon.trust.trust import decode
+from models.session_statistics import SessionState
+from tests.daemon.session.learning import (
+    FINGERS,
+    calibration,
+    grasps_of,
+    judge,
+    observe,
+    tell,
+    trust,
+)
+
+STEPS = ("open", "fchmod", "fsync", "replace")
+"""Functions of `os` by which a file is written; a kill comes before or after a call of one."""
+CALLS = 7
+"""Of these in a save: open, fchmod and fsync of the part, two replacements, the folder's two."""
+
+
+class Killed(BaseException):
+    """Ends a save as a kill does: nothing is tidied up."""
+
+
+@contextmanager
+def killed(call: int, *, after: bool) -> Iterator[None]:
+    """Kill what runs inside before or after so many calls."""
+    left = itertools.count(-call)
+
+    def deadly(real: Callable[..., object]) -> Callable[..., object]:
+        def run(*arguments: object) -> object:
+            dies = next(left) == 0
+            if dies and not after:
+                raise Killed
+            result = real(*arguments)
+            if dies:
+                if isinstance(result, int):
+                    os.close(result)
+                raise Killed
+            return result
+
+        return run
+
+    with ExitStack() as stack:
+        for name in STEPS:
+            stack.enter_context(mock.patch.object(os, name, deadly(getattr(os, name))))
+        yield
+
+
+def state(grasps: int) -> SessionState:
+    """Statistics that can be told from all others."""
+    return SessionState(float(grasps), grasps, (float(grasps),), (1.0,))
+
+
+def save(file: SessionFile, grasps: int) -> None:
+    file.save(state(grasps), FINGERS, {})
+
+
+def test_a_kill_at_any_step_of_a_save_leaves_the_former_or_the_new_one(tmp_path: Path) -> None:
+    found = set()
+    for call, after, before in itertools.product(range(CALLS), (False, True), (1, 2)):
+        path = tmp_path / f"{call}{after}{before}.json"
+        with SessionFile(path) as file:
+            for grasps in range(1, before + 1):
+                save(file, grasps)
+            with pytest.raises(Killed), killed(call, after=after):
+                save(file, before + 1)
+        with SessionFile(path) as file:  # the next start
+            kept = grasps_of(file.load())
+            found.add(kept - before)
+            assert kept in (before, before + 1)
+            save(file, 9)
+            assert grasps_of(file.load()) == 9
+            assert sorted(each.name for each in tmp_path.glob(f"{path.name}*")) in (
+                [path.name, f"{path.name}.former", f"{path.name}.lock"],
+                [path.name, f"{path.name}.lock"],
+            )
+    assert found == {0, 1}
+    with SessionFile(path) as file, killed(CALLS, after=False):
+        save(file, 1)  # there are no more calls
+
+
+Plan = list[tuple[int | None, bool, bool]]
+"""Of each life of a daemon: at which call its last save is killed, before or after, and whether the
+disk damages the newest file then."""
+PLANS = st.lists(
+    st.tuples(st.none() | st.integers(0, CALLS - 1), st.booleans(), st.booleans()),
+    min_size=1,
+    max_size=8,
+)
+
+
+@settings(max_examples=60)
+@given(PLANS)
+def test_whatever_is_killed_and_damaged_nothing_that_was_kept_twice_is_lost(
+    tmp_path_factory: pytest.TempPathFactory, plan: Plan
+) -> None:
+    path = tmp_path_factory.mktemp("session") / "right.json"
+    written, kept = 0, 0
+    for call, after, damaged in plan:
+        with SessionFile(path) as file:
+            assert kept <= grasps_of(file.load()) <= written
+            for _ in range(2):
+                written += 1
+                save(file, written)
+            kept = written
+            with suppress(Killed), killed(CALLS if call is None else call, after=after):
+                written += 1
+                save(file, written)
+                kept = written
+        if damaged and path.exists():
+            path.write_bytes(path.read_bytes()[:-20])
+            kept = kept - 1  # the one before it is whole
+    assert kept <= grasps_of(load(path)) <= written
+
+
+def learned(path: Path) -> bytes:
+    """A file as it is after a day, with grasps whose outcome is still out."""
+    session, part = calibration(), trust()
+    observe(session, 30)
+    for grasp in range(40):
+        judge(part, grasp)
+        if grasp % 4:
+            tell(part, grasp)
+    with SessionFile(path) as file:
+        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+    return path.read_bytes()
+
+
+def damage(data: bytes, choose: random.Random) -> bytes:
+    """Flip bits, cut, overwrite, repeat or leave out."""
+    place, length = choose.randrange(len(data)), choose.choice((1, 8, 512, 4096))
+    kind = choose.randrange(6)
+    if kind <= 1:
+        flipped = bytearray(data)
+        for _ in range(choose.choice((1, 1, 2, 50))):
+            flipped[choose.randrange(len(data))] ^= 1 << choose.randrange(8)
+        return bytes(flipped)
+    return (
+        data[:place],
+        data[:place] + bytes(length) + data[place + length :],
+        data[:place] + data[place : place + length] + data[place:],
+        data[:place] + data[place + length :],
+    )[kind - 2]
+
+
+def test_a_thousand_damaged_files_never_become_a_state_that_was_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "right.json"
+    data = learned(path)
+    written, choose, refused = read(path), random.Random(16), 0
+    for _ in range(1000):
+        damaged = damage(data, choose)
+        path.write_bytes(damaged)
+        try:
+            assert read(path) == written, damaged
+        except SessionFileError:
+            refused += 1
+        else:
+            assert damaged.strip() == data.strip()
+    assert refused > 990
+
+
+def test_what_was_kept_before_takes_the_place_of_what_is_damaged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "right.json"
+    with SessionFile(path) as file:
+        save(file, 1)
+        save(file, 2)
+        assert grasps_of(file.load()) == 2
+        assert not caplog.text
+        path.write_bytes(path.read_bytes().replace(b'"grasps":2', b'"grasps":5'))
+        assert grasps_of(file.load()) == 1
+        assert caplog.text.count("its checksum is wrong; what was kept before it goes on") == 1
+        save(file, 3)  # the damaged one does not become the former one
+        assert grasps_of(read(former_of(path))) == 1
+        former_of(path).write_bytes(b"")
+        path.write_bytes(b"x")
+        with pytest.raises(SessionFileError, match=r"right\.json: not a session"):
+            file.load()
+        assert file.remove()
+        assert not file.remove()
+        assert file.load() is None
+
+
+def test_a_file_of_the_first_version_is_still_read(tmp_path: Path) -> None:
+    session = calibration()
+    observe(session, 30)
+    path = tmp_path / "right.json"
+    kept = {"version": 1, "fingers": FINGERS, "serials": {"ff": "A"}, "saved_at": 5.0}
+    statistics = msgspec.to_builtins(session.state())
+    path.write_bytes(msgspec.json.format(json.dumps(kept | {"statistics": statistics}).encode()))
+    found = load(path)
+    assert found is not None
+    assert (found.statistics, found.serials, found.trust) == (session.state(), {"ff": "A"}, None)
+    with SessionFile(path) as file:
+        file.load()
+        save(file, 1)
+    assert read(former_of(path)) == found
+
+
+def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_path: Path) -> None:
+    part = trust(inputs=5 * 26)
+    for grasp in range(GRASPS_MAX + 1):
+        judge(part, grasp)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(calibration().state(), FINGERS, {}, part.state())
+        kept = file.load()
+    assert kept is not None
+    assert kept.trust is not None
+    assert decode(kept.trust) == part.state()
+    assert (tmp_path / "right.json").stat().st_size < 1 << 20
