@@ -10,6 +10,7 @@ from typing import Any
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.judge.pipeline import Pipeline
+from daemon.publish.companion import Companion
 from daemon.scene import Scene, SceneError
 from daemon.scene.drivers import CanTactile, SpiTactile
 from drivers.recordings.link_log_player import CANDUMP, SERIAL, LinkLogDriver
@@ -68,6 +69,9 @@ class LinkLogs:
 
     def restore(self, pipeline: Pipeline) -> None:
         """Nothing: a link log does not know the session."""
+
+    def tell(self, companion: Companion) -> None:
+        """Nothing: a link log has no outcomes."""
 
 
 def changed(

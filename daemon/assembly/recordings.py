@@ -12,6 +12,8 @@ from daemon.assembly import assembly
 from daemon.assembly.link_logs import changed
 from daemon.judge.memory import recall
 from daemon.judge.pipeline import Pipeline
+from daemon.publish.companion import Companion
+from daemon.publish.messages import OutcomeMessage
 from daemon.record.mcap import header_of
 from daemon.record.player import McapReplayDriver
 from daemon.record.topics import Topic
@@ -112,3 +114,16 @@ class RecordedRun:
                     pipeline.trust.restore(learned)
         except ValueError as error:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
+
+    def tell(self, companion: Companion) -> None:
+        """Tell a companion outcomes of this run where they were told, once the judge is built."""
+        driver = self._driver
+        if driver is None or (learn := driver.on_outcome) is None:
+            return
+
+        def both(told: OutcomeMessage) -> None:
+            learn(told)
+            if told.grasp_boot_id is None:
+                companion.on_outcome(told.grasp, told.outcome, told.object)
+
+        driver.on_outcome = both

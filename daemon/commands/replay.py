@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,15 +21,21 @@ from daemon.process.sleep import Sleep
 from daemon.process.text import complain
 from daemon.publish.binding import PublishError
 from daemon.publish.companion import Companion
-from daemon.publish.messages import Verdict
 from daemon.publish.sockets import Sockets
+from daemon.run.demo import PUBLISHED, Demo
 from daemon.run.loop import Loop, Timing
 from daemon.run.printer import Printer
+from daemon.run.replaying import Comparison, Controller, trained_on
+from daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, Summary
 from daemon.scene import Scene, SceneError
 from daemon.scene.endpoints import check_endpoint, is_private
 from daemon.session.file import SessionFileError, load, statistics_of
-from drivers.base import Driver, DriverError, TactileReading
-from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.base import Driver, DriverError
+from drivers.recordings.csv_columns import SLIPPED
+from drivers.recordings.csv_player import DEMO_DAY
+from drivers.recordings.csv_rows import columns_of
+from models import zoo
+from models.bts3 import FINGERS
 from models.contract import ModelError
 from models.runtime import TactileModel
 
@@ -40,6 +47,7 @@ NO_SILENCE_NS = 3_600_000_000_000
 
 WAIT_MAX_S = 3600
 RUNNING, OFF = "running", "off"
+DEMO_RISK = 0.05
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,8 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="RECORDING",
         help="grasp tables or streams (CSV); what `graspd run` has recorded (.mcap); what came "
-        "over a link (candump text .log, serial bytes .serial); without any, the synthetic demo "
-        "recording",
+        "over a link (candump text .log, serial bytes .serial); without any, the demo: a synthetic "
+        "day, with --outcomes and --max-slip-when-stable 0.05",
     )
     parser.add_argument(
         "--scene", type=Path, help="of .log and .serial: the scene that says how to decode them"
@@ -82,6 +90,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"come, '{OFF}' by nothing, or the file of a kept session",
     )
     parser.add_argument(
+        "--outcomes",
+        action="store_true",
+        help="of tables and streams: tell how each lift ended after its verdict, as a controller "
+        "would; what graspd has recorded has its outcomes inside",
+    )
+    parser.add_argument(
+        "--only-lifted",
+        action="store_true",
+        help="with --outcomes: only of lifts that a controller would make, which are those of "
+        "`stable` verdicts and where supervision is asked for",
+    )
+    parser.add_argument(
+        "--max-slip-when-stable",
+        type=within(0.001, 0.5),
+        metavar="SHARE",
+        help="of tables and streams: say `stable` only as far as no more of these lifts slip",
+    )
+    parser.add_argument(
+        "--warm-up",
+        type=int,
+        metavar="N",
+        help="with it: outcomes until which every lift is supervised (default: 50)",
+    )
+    parser.add_argument(
+        "--explore",
+        type=within(0.0, 1.0),
+        metavar="SHARE",
+        help="with it: grasps that are not `stable` to lift under supervision (default: 0.05)",
+    )
+    parser.add_argument(
+        "--min-confidence",
+        type=within(0.0, 0.999),
+        metavar="P",
+        help="of tables and streams: call less sure verdicts `unknown`",
+    )
+    parser.add_argument(
         "--gate",
         choices=("settled", "every"),
         help="judge each grasp once it has settled, or every reading as a grasp of its own "
@@ -99,12 +143,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json", action="store_true", help="verdict messages on stdout, summary on stderr"
     )
+    parser.add_argument(
+        "--verbose", action="store_true", help="of the demo: each verdict, as of other recordings"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay; 0 when the recordings were played to their end."""
     if args.wait is not None and args.publish is None:
         complain("--wait is for subscribers: it needs --publish")
+        return 2
+    if args.only_lifted and not args.outcomes:
+        complain("--only-lifted says which outcomes are told: it needs --outcomes")
         return 2
     try:
         with StopSignal() as stop:
@@ -119,19 +169,33 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
+    is_demo = not args.recordings
+    if is_demo:
+        _choose_demo(args)
     recorded = _recorded(args)
     wanted = _scene(args, recorded)
     model = assembly.load_model(wanted)
     if recorded is None:
         wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
         drivers = assembly.build_drivers(wanted)
+        _need_labels(args, wanted)
     else:
         drivers = [recorded.build_driver(wanted, args.speed)]
     pipeline = _pipeline(args, wanted, model, recorded)
-    printer = Printer(as_json=args.json, prompt=args.speed is not None)
-    told: list[Companion] = [printer]
-    if pipeline.session is not None and args.session != OFF:
-        told.append(_Comparison(wanted, printer))
+    prompt = args.speed is not None
+    shown: Printer | Demo
+    if is_demo and not (args.json or args.verbose) and model.contract.fingers == FINGERS:
+        shown = Demo(TactileModel(zoo.find(PUBLISHED)), prompt=prompt)
+        told: list[Companion] = [shown]
+    else:
+        shown = Printer(as_json=args.json, prompt=prompt)
+        shown.result.trained_on = [] if recorded else trained_on(args.recordings, model)
+        told = [shown, *_comparisons(args, wanted, pipeline, recorded, shown.result)]
+    controller = Controller(only_lifted=args.only_lifted)
+    if args.outcomes:
+        told.append(controller)
+    if recorded is not None:
+        recorded.tell(shown)
     timing = Timing(
         wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
@@ -146,10 +210,51 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
             _wait(sockets, args.wait, stop)
         companions = [*around.companions, *told]
         loop = Loop(drivers, pipeline, around.build_outbox(), stop, companions, timing)
-        stack.callback(printer.summary)
+        stack.callback(lambda: shown.summary(pipeline.trust))
         stack.callback(loop.close)
+        stack.callback(controller.tell)
         loop.run()
     return 0 if stop.received is None else 128 + stop.received
+
+
+def _choose_demo(args: argparse.Namespace) -> None:
+    """What is replayed, and how, where nobody says it."""
+    args.recordings = [DEMO_DAY]
+    args.outcomes = True
+    if args.max_slip_when_stable is None:
+        args.max_slip_when_stable = DEMO_RISK
+
+
+def _need_labels(args: argparse.Namespace, wanted: Scene) -> None:
+    """Raise `SceneError` if outcomes are to be told and a recording has none."""
+    for path in args.recordings if args.outcomes else ():
+        if columns_of(path, wanted.hand.fingers).slipped is None:
+            raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
+
+
+def _comparisons(
+    args: argparse.Namespace,
+    wanted: Scene,
+    pipeline: Pipeline,
+    recorded: Recorded | None,
+    result: Summary,
+) -> Iterator[Companion]:
+    """What judges the same grasps without a session, and without what outcomes teach."""
+    # What they judge is what the other one judged: they have no joints to know the moment by.
+    update = {
+        "gate": wanted.gate.model_copy(update={"mode": "every"}),
+        "learn": wanted.learn.model_copy(update={"enabled": False}),
+        "risk": None,
+    }
+    alone = wanted.model_copy(update=update)
+    if pipeline.session is not None and args.session != OFF:
+        found = assembly.build_pipeline(alone, assembly.load_model(wanted), learns=False)
+        yield Comparison(WITHOUT_SESSION, found, result)
+    if pipeline.trust is not None and (args.outcomes or recorded is not None):
+        learns = args.session != OFF and wanted.session_learns
+        found = assembly.build_pipeline(alone, assembly.load_model(wanted), learns=learns)
+        _begin(args, found, wanted, recorded)
+        yield Comparison(WITHOUT_LEARNING, found, result)
 
 
 class Recorded(Protocol):
@@ -167,6 +272,9 @@ class Recorded(Protocol):
     def restore(self, pipeline: Pipeline) -> None:
         """Begin with the session that the daemon began with, if that is known."""
 
+    def tell(self, companion: Companion) -> None:
+        """Tell a companion outcomes as they were told then."""
+
 
 def _recorded(args: argparse.Namespace) -> Recorded | None:
     """What graspd has recorded, if that is replayed. Imported only where it is."""
@@ -174,7 +282,15 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
     if endings.isdisjoint({assembly.MCAP, *assembly.LINK_LOGS}):
         if args.scene is not None:
             raise SceneError("--scene is for what came over a link")
+        if args.max_slip_when_stable is None and (args.warm_up or args.explore) is not None:
+            raise SceneError("--warm-up and --explore need --max-slip-when-stable")
         return None
+    given = args.max_slip_when_stable, args.warm_up, args.explore, args.min_confidence
+    if args.outcomes or given != (None, None, None, None):
+        raise SceneError(
+            "what graspd has recorded is judged under its own risk: no --outcomes, "
+            "--max-slip-when-stable, --warm-up, --explore or --min-confidence"
+        )
     if args.loop or args.strict:
         raise SceneError("what graspd has recorded is played as it is: no --loop or --strict")
     if assembly.MCAP not in endings:
@@ -200,12 +316,20 @@ def _pipeline(
         pipeline = assembly.build_pipeline(wanted, model, learns=learns)
     else:
         pipeline = recorded.pipeline(wanted, model, learns=learns)
+    if args.session not in (RUNNING, OFF) and pipeline.session is None:
+        raise ModelError(f"the model {model.contract.name} keeps no session")
+    _begin(args, pipeline, wanted, recorded)
+    return pipeline
+
+
+def _begin(
+    args: argparse.Namespace, pipeline: Pipeline, wanted: Scene, recorded: Recorded | None
+) -> None:
+    """Give a judge the session that it begins with, if it begins with any."""
     if args.session == RUNNING and recorded is not None:
         recorded.restore(pipeline)
-    if args.session in (RUNNING, OFF):
-        return pipeline
-    if pipeline.session is None:
-        raise ModelError(f"the model {model.contract.name} keeps no session")
+    if args.session in (RUNNING, OFF) or pipeline.session is None:
+        return
     path = Path(args.session)
     kept = load(path)
     if kept is None:
@@ -214,23 +338,6 @@ def _pipeline(
         pipeline.session.restore(statistics_of(kept, wanted.hand.fingers))
     except ValueError as error:
         raise SessionFileError(f"{path}: {error}") from error
-    return pipeline
-
-
-class _Comparison(Companion):
-    """Judges every reading once more without session calibration, for the summary alone."""
-
-    def __init__(self, wanted: Scene, printer: Printer) -> None:
-        model = assembly.load_model(wanted)
-        # What it judges is what the other one judged: it has no joints to know the moment by.
-        every = wanted.model_copy(update={"gate": wanted.gate.model_copy(update={"mode": "every"})})
-        self._pipeline = assembly.build_pipeline(every, model, learns=False)
-        self._printer = printer
-
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        """Count what a verdict would have been."""
-        if reading is not None and verdict.judged:
-            self._printer.without_session(self._pipeline.judge(reading), reading, verdict.grasp)
 
 
 def _wait(sockets: Sockets, timeout_s: float, stop: StopSignal) -> None:
@@ -245,20 +352,27 @@ def _scene(args: argparse.Namespace, recorded: Recorded | None) -> Scene:
     model = {} if args.model is None else _model(args.model)
     if recorded is not None:
         return recorded.scene(publish, model, args.gate)
+    if args.min_confidence is not None:
+        model["min_confidence"] = args.min_confidence
     data = {
         "tactile": {
             "driver": "replay",
-            "recordings": [path.absolute() for path in args.recordings or [DEMO_RECORDING]],
+            "recordings": [path.absolute() for path in args.recordings],
             "pace": "realtime" if args.speed else "fast",
             "speed": args.speed or 1.0,
             "rate_hz": args.rate,
             "loop": args.loop,
             "strict": args.strict,
         },
-        "model": model or {"name": assembly.DEFAULT_MODEL},
+        "model": {"name": assembly.DEFAULT_MODEL} | model if args.model is None else model,
         "gate": {"max_age_ms": MAX_AGE_MS, "mode": args.gate},
         "publish": publish,
     }
+    if args.max_slip_when_stable is not None:
+        given = {"warm_up": args.warm_up, "explore": args.explore}
+        data["risk"] = {"max_slip_when_stable": args.max_slip_when_stable} | {
+            name: value for name, value in given.items() if value is not None
+        }
     return scene.parse(data, Path("command line"))
 
 

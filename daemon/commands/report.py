@@ -14,6 +14,10 @@ REPORTS = {
         "daemon.measure.stability.report",
         "numerical error of the whole chain on stiff and extreme readings",
     ),
+    "worth": (
+        "daemon.measure.worth.report",
+        "what `stable` is worth on another day, by how many outcomes were told",
+    ),
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import sys
 import time
+from typing import Literal
 
-from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateState
 from daemon.process.text import printable
 from daemon.publish.companion import Companion
 from daemon.publish.messages import Verdict
 from daemon.run.summary import Summary
+from daemon.trust.trust import Trust
 from drivers.base import Annotation, TactileReading
 
 NAME_MAX = 80
@@ -28,14 +29,14 @@ class Printer(Companion):
         """
         self._prompt = prompt
         self._as_json = as_json
-        self._summary = Summary()
+        self.result = Summary()
         self._start_s = time.monotonic()
         self._gate: GateState | None = None
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Write one verdict, and how the lift of its grasp ended if the recording says so."""
         annotation = reading.annotation if reading else None
-        self._summary.add(verdict, annotation.slipped if annotation else None)
+        self.result.add(verdict, annotation.slipped if annotation else None)
         if not self._as_json and not self._is_news(verdict):
             return
         line = payload.decode() if self._as_json else _line(verdict, annotation)
@@ -50,19 +51,20 @@ class Printer(Companion):
             return True
         return False
 
-    def without_session(self, judgement: Judgement, reading: TactileReading, grasp: int) -> None:
-        """Count what would have been judged of this grasp without session calibration."""
-        annotation = reading.annotation
-        self._summary.compare(judgement, annotation.slipped if annotation else None, grasp)
+    def on_outcome(
+        self, grasp: int, outcome: Literal["stable", "slip"], object_name: str | None
+    ) -> None:
+        """Count how a lift ended that was judged before."""
+        self.result.outcome(grasp, slipped=outcome == "slip")
 
-    def summary(self) -> None:
-        """Write the summary of everything since the start."""
+    def summary(self, trust: Trust | None = None) -> None:
+        """Write the summary of everything since the start; `trust` is what outcomes have taught."""
         wall_s = time.monotonic() - self._start_s
         if self._as_json:
             sys.stdout.flush()
-            sys.stderr.write(json.dumps(self._summary.as_dict(wall_s)) + "\n")
+            sys.stderr.write(json.dumps(self.result.as_dict(wall_s, trust)) + "\n")
         else:
-            sys.stdout.write("\n" + "\n".join(self._summary.lines(wall_s)) + "\n")
+            sys.stdout.write("\n" + "\n".join(self.result.lines(wall_s, trust)) + "\n")
 
 
 def _line(verdict: Verdict, annotation: Annotation | None) -> str:

@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator
-from typing import Any
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import msgspec
 
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import Verdict
+from daemon.trust.trust import Trust
+
+WINDOW: Final = 50
+"""Lifts of `stable` verdicts in a row, of which the worst are told."""
+WAITING_MAX: Final = 1024
+"""Grasps whose outcome can still come; those before them count as unknown."""
+WITHOUT_SESSION, WITHOUT_LEARNING = "without session calibration", "without learning"
+WORTH: Final = {
+    "coverage": "coverage",
+    "slips_among_stable": "slips among stable",
+    "worst_window": f"worst {WINDOW} in a row",
+    "slips_called_stable": "slips called stable",
+    "stable_called_slip": "stable called slip",
+}
+"""What the figures of `Tally.worth` are called, in their order."""
 
 
 class Tally:
@@ -20,16 +37,42 @@ class Tally:
         self.reasons: Counter[Reason] = Counter()
         self.confusion: Counter[tuple[bool, bool]] = Counter()
         """(recorded slip, judged slip) of the judged grasps whose outcome was recorded."""
-        self.labelled = 0
+        self.held = self.slipped = 0
+        """Lifts whose outcome is known, judged or not."""
+        self._latest: deque[bool] = deque(maxlen=WINDOW)
+        """Whether the latest lifts of `stable` verdicts slipped."""
+        self.worst: int | None = None
+        """Most slips among `WINDOW` lifts of `stable` verdicts in a row; None before there are so
+        many."""
+
+    @property
+    def labelled(self) -> int:
+        """Lifts whose outcome is known, judged or not."""
+        return self.held + self.slipped
+
+    @property
+    def stable(self) -> tuple[int, int]:
+        """How many lifts of `stable` verdicts have a known outcome, and slips among them."""
+        slips = self.confusion[True, False]
+        return slips + self.confusion[False, False], slips
 
     def add(self, decision: Decision, reasons: Iterable[Reason], slipped: bool | None) -> None:
-        """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
+        """Count one verdict; `slipped` is how the lift ended, None where it is not known yet."""
         self.decisions[decision] += 1
         self.reasons.update(reasons)
         if slipped is not None:
-            self.labelled += 1
-            if decision is not Decision.UNKNOWN:
-                self.confusion[slipped, decision is Decision.SLIP] += 1
+            self.outcome(decision, slipped=slipped)
+
+    def outcome(self, decision: Decision, *, slipped: bool) -> None:
+        """Count how the lift of a grasp ended that was judged so."""
+        self.slipped += slipped
+        self.held += not slipped
+        if decision is not Decision.UNKNOWN:
+            self.confusion[slipped, decision is Decision.SLIP] += 1
+        if decision is Decision.STABLE:
+            self._latest.append(slipped)
+            if len(self._latest) == WINDOW:
+                self.worst = max(sum(self._latest), self.worst or 0)
 
     def scores(self) -> dict[str, float] | None:
         """Accuracy, precision, recall and F1 over judged, labelled grasps; None if there are none.
@@ -41,13 +84,32 @@ class Tally:
         total = hit + miss + false_alarm + rest
         if not total:
             return None
-        fractions = {
-            "accuracy": (hit + rest, total),
-            "precision": (hit, hit + false_alarm),
-            "recall": (hit, hit + miss),
-            "f1": (2 * hit, 2 * hit + false_alarm + miss),
-        }
-        return {name: part / whole for name, (part, whole) in fractions.items() if whole}
+        return _fractions(
+            {
+                "accuracy": (hit + rest, total),
+                "precision": (hit, hit + false_alarm),
+                "recall": (hit, hit + miss),
+                "f1": (2 * hit, 2 * hit + false_alarm + miss),
+            }
+        )
+
+    def worth(self) -> dict[str, float] | None:
+        """What `stable` is worth, by lifts whose outcome is known; None if there are none.
+
+        `coverage` is the share of the lifts that held which were called `stable`.
+        """
+        if not self.labelled:
+            return None
+        (stable, slips), held = self.stable, self.confusion[False, False]
+        return _fractions(
+            {
+                "coverage": (held, self.held),
+                "slips_among_stable": (slips, stable),
+                "worst_window": (self.worst or 0, 0 if self.worst is None else WINDOW),
+                "slips_called_stable": (slips, self.slipped),
+                "stable_called_slip": (self.confusion[False, True], self.held),
+            }
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Everything as JSON-ready values."""
@@ -57,6 +119,7 @@ class Tally:
             "labelled": self.labelled,
             "judged_and_labelled": self.confusion.total(),
             "scores": self.scores(),
+            "stable": self.worth(),
         }
 
     def counts(self) -> str:
@@ -74,6 +137,14 @@ class Tally:
                 f"against {self.confusion.total()} recorded outcomes (slip positive): "
                 + ", ".join(f"{name} {100 * value:.1f} %" for name, value in scores.items())
             )
+        worth = self.worth()
+        if worth is not None:
+            yield ", ".join(f"{WORTH[name]} {100 * value:.1f} %" for name, value in worth.items())
+
+
+def _fractions(parts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
+    """Each part over its whole, where there is a whole."""
+    return {name: part / whole for name, (part, whole) in parts.items() if whole}
 
 
 class Summary:
@@ -84,8 +155,12 @@ class Summary:
 
     def __init__(self) -> None:
         self.tally = Tally()
-        self.without_session = Tally()
-        """The same readings without session calibration; empty where that was not tried."""
+        self.compared = {WITHOUT_SESSION: Tally(), WITHOUT_LEARNING: Tally()}
+        """The same grasps judged otherwise; empty where that was not tried."""
+        self.trained_on: Sequence[str] = ()
+        """Recordings that the model was trained on."""
+        self._waiting: dict[int, list[tuple[Tally, Decision]]] = {}
+        """By grasp: what was said of those whose outcome is not known yet."""
         self.repaired = 0
         """Verdicts made with at least one repaired electrode."""
         self.latency = LatencyHistogram()
@@ -96,7 +171,6 @@ class Summary:
         self.again = 0
         """Judgements of grasps that had changed since they were judged."""
         self._judged_grasp: int | None = None
-        self._compared_grasp: int | None = None
 
     def add(self, verdict: Verdict, slipped: bool | None) -> None:
         """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
@@ -110,23 +184,48 @@ class Summary:
                 self.again += 1
                 return
             self._judged_grasp = verdict.grasp
-        self.tally.add(verdict.verdict, verdict.reasons, slipped)
+        self._add(self.tally, verdict.grasp, verdict.verdict, verdict.reasons, slipped)
         self.repaired += verdict.valid and bool(verdict.repaired)
 
-    def compare(self, judgement: Judgement, slipped: bool | None, grasp: int) -> None:
-        """Count what would have been judged of a grasp without session calibration, once."""
-        if grasp != self._compared_grasp:
-            self._compared_grasp = grasp
-            self.without_session.add(judgement.decision, judgement.reasons, slipped)
+    def compare(self, how: str, judgement: Judgement, slipped: bool | None, grasp: int) -> None:
+        """Count what would have been judged of a grasp, once for each way in `compared`."""
+        tally = self.compared[how]
+        self._add(tally, grasp, judgement.decision, judgement.reasons, slipped)
 
-    def as_dict(self, wall_s: float) -> dict[str, Any]:
-        """Everything as JSON-ready values; `wall_s` is how long the replay took, s."""
-        compared = bool(self.without_session.decisions)
+    def outcome(self, grasp: int, *, slipped: bool) -> None:
+        """How the lift of a grasp ended whose verdict is out, unless that is known already."""
+        for tally, decision in self._waiting.pop(grasp, ()):
+            tally.outcome(decision, slipped=slipped)
+
+    def _add(
+        self,
+        tally: Tally,
+        grasp: int,
+        decision: Decision,
+        reasons: Iterable[Reason],
+        slipped: bool | None,
+    ) -> None:
+        tally.add(decision, reasons, slipped)
+        if slipped is None:
+            self._waiting.setdefault(grasp, []).append((tally, decision))
+            if len(self._waiting) > WAITING_MAX:
+                del self._waiting[next(iter(self._waiting))]
+
+    def as_dict(self, wall_s: float, trust: Trust | None) -> dict[str, Any]:
+        """Everything as JSON-ready values.
+
+        `wall_s` is how long the replay took, s; `trust` what outcomes have taught by its end.
+        """
+        compared = {how: tally.as_dict() for how, tally in self._compared(trust)}
         return {
             **self.tally.as_dict(),
             "gated": self._gated(),
             "repaired": self.repaired,
-            "without_session": self.without_session.as_dict() if compared else None,
+            "without_session": compared.get(WITHOUT_SESSION),
+            "without_learning": compared.get(WITHOUT_LEARNING),
+            "outcomes": 0 if trust is None else trust.learner.outcomes,
+            "risk": None if trust is None else msgspec.to_builtins(trust.report()),
+            "trained_on": list(self.trained_on),
             "latency_us": {
                 "p50": self.latency.quantile_us(0.5),
                 "p99": self.latency.quantile_us(0.99),
@@ -135,12 +234,19 @@ class Summary:
             "wall_s": wall_s,
         }
 
+    def _compared(self, trust: Trust | None) -> Iterator[tuple[str, Tally]]:
+        """What was tried; without learning only where something was learned."""
+        for how, tally in self.compared.items():
+            learned = trust is not None and bool(trust.ledger.told)
+            if tally.decisions and (learned or how != WITHOUT_LEARNING):
+                yield how, tally
+
     def _gated(self) -> dict[str, int] | None:
         if not self.readings:
             return None
         return {"readings": self.readings, "grasps": self.grasps, "judged_again": self.again}
 
-    def lines(self, wall_s: float) -> list[str]:
+    def lines(self, wall_s: float, trust: Trust | None) -> list[str]:
         """The same for people."""
         total = self.tally.decisions.total()
         if self.readings:
@@ -154,11 +260,31 @@ class Summary:
         lines += self.tally.lines()
         if self.repaired:
             lines.append(f"{self.repaired} of them with repaired electrodes")
-        if self.without_session.decisions:
-            lines.append(f"without session calibration: {self.without_session.counts()}")
-            lines += [f"  {line}" for line in self.without_session.lines()]
+        for how, tally in self._compared(trust):
+            lines.append(f"{how}: {tally.counts()}")
+            lines += [f"  {line}" for line in tally.lines()]
+        lines += _learned(trust)
+        if self.trained_on:
+            lines.append(
+                f"the model was trained on {', '.join(self.trained_on)}: it judges other grasps "
+                "worse than these"
+            )
         lines.append(
             f"reading to verdict: p50 {self.latency.quantile_us(0.5):.0f} us, "
             f"p99 {self.latency.quantile_us(0.99):.0f} us, max {self.latency.max_us:.0f} us"
         )
         return lines
+
+
+def _learned(trust: Trust | None) -> Iterator[str]:
+    """What outcomes have taught, and what became of the risk, for people."""
+    if trust is None or not trust.ledger.told:
+        return
+    yield f"learned from {trust.learner.outcomes} outcomes"
+    report = trust.report()
+    if report.target is not None and report.bound is not None:
+        yield (
+            f"risk: of {report.lifts} lifts of `stable` {report.slips} slipped, allowed are "
+            f"{100 * report.target:g} % and so at most {report.bound:.1f}"
+            + (f"; {report.outstanding} outcomes are still out" if report.outstanding else "")
+        )

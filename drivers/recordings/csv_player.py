@@ -26,6 +26,8 @@ from drivers.recordings.player import RecordedDriver, Timeline
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Synthetic grasps, drawn by `drivers.twins.grasps.synthetic`: nobody ever grasped these."""
+DEMO_DAY = Path(__file__).parent / "demo" / "synthetic_day.csv"
+"""Synthetic grasps of sensors that drift, drawn by the same."""
 DEMO_RECORDING = Path(__file__).parent / "demo" / "synthetic_stream.csv"
 """Whole synthetic grasps, made by `drivers.twins.grasps.whole_grasps`."""
 RATE_MIN_HZ, RATE_MAX_HZ = 1e-3, 1e5

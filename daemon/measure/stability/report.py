@@ -25,6 +25,7 @@ from daemon.measure.stability.repair import repair_row
 from daemon.measure.stability.session import session_rows
 from daemon.measure.stability.steps import StepRow
 from daemon.measure.stability.time import clock_rows, wrap_rows
+from daemon.measure.stability.trust import trust_rows
 from daemon.process.extras import needs
 from daemon.process.text import complain, markdown_table, printable
 from drivers.base import RecordingError
@@ -100,6 +101,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="folder of the real grasps: all of them too"
     )
+    parser.add_argument("--quick", action="store_true", help="10^4 outcomes instead of 10^6")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables here too")
 
@@ -107,7 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure and print; 1 if a bound is broken, 2 if something is not there or not known."""
     try:
-        report = measured(args.model or zoo.names(), args.data, BOUNDS)
+        report = measured(args.model or zoo.names(), args.data, BOUNDS, quick=args.quick)
         if args.markdown is not None:
             args.markdown.write_text("\n".join(_markdown(report)) + "\n", "utf-8")
     except ModuleNotFoundError as error:
@@ -123,8 +125,10 @@ def run(args: argparse.Namespace) -> int:
     return BROKEN if report.broken else 0
 
 
-def measured(names: Sequence[str], folder: Path | None, bounds: Bounds) -> StabilityReport:
-    """Measure the models of these names, and all steps.
+def measured(
+    names: Sequence[str], folder: Path | None, bounds: Bounds, *, quick: bool = False
+) -> StabilityReport:
+    """Measure the models of these names, and all steps; `quick` is as in `trust_rows`.
 
     Raises `ModelError`, `RecordingError` for a missing table in `folder`, and
     `ModuleNotFoundError` without the extra `train`.
@@ -145,6 +149,7 @@ def measured(names: Sequence[str], folder: Path | None, bounds: Bounds) -> Stabi
     report.steps.extend(repair_row(model.path.stem, model.contract.seen) for model in models)
     for several in (session_rows, joint_rows, calibration_rows, gate_rows, clock_rows, wrap_rows):
         report.steps.extend(several())
+    report.steps.extend(trust_rows(quick=quick))
     report.steps.extend(network_rows(models[0].contract, bounds.p_slip))
     worst = max((row.network_error for row in quantised), default=0.0)
     of_these = list(dict.fromkeys(row.model for row in quantised))

@@ -4,8 +4,8 @@ The model describes the BioTac SP Stability Set (palm down and palm side; MIT li
 Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by a few parameters per class and holds none
 of its grasps. Each class is a mixture of Gaussians with few axes over the raw counts of ff, mf, th.
 
-`python -m drivers.twins.grasps.synthetic` writes the demo table again, byte for byte, and with
-`--fit FOLDER` first fits the model again to the tables in that folder.
+`python -m drivers.twins.grasps.synthetic` writes the demo table again, byte for byte, with `--day`
+the demo day, and with `--fit FOLDER` first fits the model again to the tables in that folder.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES, RecordingError
+from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
 from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
-from drivers.recordings.csv_player import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
 from drivers.recordings.csv_rows import read_rows
 
 FINGERS = ("ff", "mf", "th")
@@ -34,7 +34,14 @@ AXES = 24
 """Mixture components per class, and axes per component: 5763 parameters per class (`parameters`),
 against 92,000 counts or so that a class of the data set has."""
 DEMO_GRASPS = 200
+DAY_GRASPS = 300
 DEMO_SEED = 0
+DRIFT_ENDS = 0.6
+"""Share of a day after which its sensors drift no more."""
+DRIFT_TO_STABLE = 1.2
+"""By how many times the difference between the classes a drifting hand comes to read firmer."""
+DRIFT_COUNTS, DRIFT_GAIN = 60.0, 0.1
+"""Standard deviation, over the electrodes, of a further offset, and of the logarithm of a gain."""
 FIT_SEED = 0
 KMEANS_PASSES = 50
 OBJECT_PREFIX = "synthetic"
@@ -111,6 +118,26 @@ def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticG
     return SyntheticGrasps(counts, slipped, component)
 
 
+def draw_day(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
+    """As `draw`, but by sensors that drift: slips come to read as stable grasps did in the morning.
+
+    At first the grasps are those of `draw`. Real sensors drift by hundreds of counts from month to
+    month; that it happens within a day, and in the direction that misleads, is made up.
+    """
+    drawn = draw(model, rng, grasps)
+    means = [
+        sum((part.weight * part.mean for part in model[label].components), np.zeros(COUNTS))
+        for label in (False, True)
+    ]
+    offset = DRIFT_TO_STABLE * (means[0] - means[1]) + rng.normal(0.0, DRIFT_COUNTS, COUNTS)
+    gain = np.exp(rng.normal(0.0, DRIFT_GAIN, COUNTS))
+    centre = (means[0] + means[1]) / 2.0
+    drift = np.minimum(np.arange(grasps)[:, np.newaxis] / (DRIFT_ENDS * grasps), 1.0)
+    counts = centre + (drawn.counts - centre) * gain**drift + offset * drift
+    readable = np.clip(np.rint(counts), 1, COUNT_MAX - 1).astype(np.uint16)
+    return SyntheticGrasps(readable, drawn.slipped, drawn.component)
+
+
 def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
     """Write a grasp table in the layout of the BioTac SP Stability Set."""
     electrodes = [name for finger in FINGERS for name in electrode_columns(finger)]
@@ -183,8 +210,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--fit", type=Path, metavar="FOLDER", help=f"fit to {', '.join(TABLES)}")
     parser.add_argument("--model", type=Path, default=MODEL, help="JSON file of the model")
-    parser.add_argument("--out", type=Path, default=DEMO_TABLE, help="CSV file to write")
-    parser.add_argument("--grasps", type=int, default=DEMO_GRASPS)
+    parser.add_argument("--day", action="store_true", help="a day in which the sensors drift")
+    parser.add_argument("--out", type=Path, help="CSV file to write (default: the demo's)")
+    parser.add_argument("--grasps", type=int, help=f"(default: {DEMO_GRASPS}, a day {DAY_GRASPS})")
     parser.add_argument("--seed", type=int, default=DEMO_SEED)
     options = parser.parse_args(arguments)
     try:
@@ -192,8 +220,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             tables = [options.fit / table for table in TABLES]
             write_model(fit(*read_tables(tables)), options.model)
         rng = np.random.default_rng(options.seed)
-        grasps = draw(read_model(options.model), rng, options.grasps)
-        with options.out.open("w", encoding="utf-8", newline="") as file:
+        model = read_model(options.model)
+        if options.day:
+            grasps, out = draw_day(model, rng, options.grasps or DAY_GRASPS), DEMO_DAY
+        else:
+            grasps, out = draw(model, rng, options.grasps or DEMO_GRASPS), DEMO_TABLE
+        with (options.out or out).open("w", encoding="utf-8", newline="") as file:
             write_table(grasps, file)
     except (RecordingError, OSError, ValueError) as error:
         parser.error(str(error))

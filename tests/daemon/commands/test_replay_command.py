@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import os
+import pty
+import re
 import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
+from operator import and_
 from pathlib import Path
+from typing import Any
 
 import jsonschema
 import pytest
 
 from daemon.publish.messages import decode_verdict, schema
-from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
+from drivers.recordings.csv_rows import read_rows
+from models import zoo
+from models.runtime import TactileModel
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 
@@ -25,8 +34,8 @@ def demo_rows() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_replay_without_arguments_judges_each_grasp_of_the_demo_recording_once() -> None:
-    people, program = graspd("replay"), graspd("replay", "--json")
+def test_each_grasp_of_the_demo_recording_is_judged_once() -> None:
+    people, program = graspd("replay", DEMO_RECORDING), graspd("replay", DEMO_RECORDING, "--json")
     assert people.returncode == program.returncode == 0, people.stderr
     verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
     with DEMO_RECORDING.open(newline="") as file:
@@ -49,6 +58,188 @@ def test_replay_says_so_when_streams_and_tables_are_mixed() -> None:
     assert result.returncode == 2
     assert "both grasp tables and streams" in result.stderr
     assert graspd("replay", DEMO_RECORDING, "--gate", "every", "--json").returncode == 0
+
+
+DEMO_LINE = re.compile(
+    r"(?P<grasps>\S+) +(?P<stable>\d+) +(?P<slips>\d+) +(?:\d+ %|-) +\d+ %"
+    r" +(?P<own_stable>\d+) +(?P<own_slips>\d+) +(?:\d+ %|-) +(?P<kept>\d+) %"
+)
+
+
+def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift() -> None:
+    demo, program = graspd("replay"), graspd("replay", "--json")
+    assert demo.returncode == program.returncode == 0, demo.stderr
+    text = demo.stdout
+    assert "synthetic" in text.splitlines()[0]
+    assert "\x1b" not in text
+    assert len(text.splitlines()) <= 24
+    assert max(map(len, text.splitlines())) <= 100
+    lines = [match.groupdict() for match in map(DEMO_LINE.fullmatch, text.splitlines()) if match]
+    *blocks, whole = lines
+    assert whole["grasps"] == "all"
+    assert len(blocks) == 12
+    for name in ("stable", "slips", "own_stable", "own_slips"):
+        assert sum(int(block[name]) for block in blocks) == int(whole[name])
+    # The day begins as the training was, and ends where the published method is a coin.
+    assert int(blocks[0]["slips"]) <= 0.15 * int(blocks[0]["stable"])
+    assert all(int(block["slips"]) >= 0.4 * int(block["stable"]) for block in blocks[-5:])
+    # The bound of the rule, 0.05 N + 4.75, and nothing bought by silence.
+    stable, slips = int(whole["own_stable"]), int(whole["own_slips"])
+    assert slips <= 0.05 * stable + 4.75
+    assert max(int(block["kept"]) for block in blocks) > 50
+    # The verdicts are those that programs get.
+    verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
+    with DEMO_DAY.open(newline="") as file:
+        slipped = [row["slipped"] == "1" for row in csv.DictReader(file)]
+    said = [verdict.verdict == "stable" for verdict in verdicts]
+    assert (stable, slips) == (sum(said), sum(map(and_, said, slipped)))
+
+
+def test_the_published_method_of_the_demo_is_its_network_on_every_grasp() -> None:
+    model, rows = TactileModel(zoo.find("cnn1")), list(read_rows(DEMO_DAY, ("ff", "mf", "th")))
+    stable = []
+    for row in rows:
+        model.inputs.build(row.counts, model.input)
+        stable.append(model.run()[1] < 0.5)
+    slips = sum(
+        said and bool(row.annotation.slipped) for said, row in zip(stable, rows, strict=True)
+    )
+    (whole,) = [
+        match for line in graspd("replay").stdout.splitlines()
+        if (match := DEMO_LINE.fullmatch(line)) and match["grasps"] == "all"
+    ]  # fmt: skip
+    assert (int(whole["stable"]), int(whole["slips"])) == (sum(stable), slips)
+
+
+@pytest.mark.parametrize("no_colour", [None, "1"])
+def test_the_demo_is_in_colour_on_a_terminal_unless_that_is_not_wanted(
+    no_colour: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if no_colour is None:
+        monkeypatch.delenv("NO_COLOR", raising=False)
+    else:
+        monkeypatch.setenv("NO_COLOR", no_colour)
+    own, terminal = pty.openpty()
+    with subprocess.Popen([*GRASPD, "replay"], stdout=terminal, stderr=terminal) as process:
+        os.close(terminal)
+        text = b""
+        with contextlib.suppress(OSError):  # the end of a terminal that nobody holds any more
+            while part := os.read(own, 1 << 16):
+                text += part
+    os.close(own)
+    assert process.returncode == 0
+    assert (b"\x1b[31m" in text) == (no_colour is None)
+
+
+def test_the_demo_shows_each_verdict_to_who_wants_it() -> None:
+    result = graspd("replay", "--verbose")
+    assert result.returncode == 0, result.stderr
+    lines = result.stdout.splitlines()
+    assert lines.index("") == 300
+    assert any(line.startswith("risk: of ") for line in lines)
+
+
+def summary_of(*arguments: object) -> dict[str, Any]:
+    result = graspd("replay", *arguments, "--json")
+    assert result.returncode == 0, result.stderr
+    summary: dict[str, Any] = json.loads(result.stderr)
+    return summary
+
+
+def test_outcomes_told_after_their_verdicts_teach_and_both_are_shown() -> None:
+    told, silent = summary_of(DEMO_DAY, "--outcomes"), summary_of(DEMO_DAY)
+    assert silent["outcomes"] == 0
+    assert silent["without_learning"] is None
+    assert told["outcomes"] == 300 - told["reasons"].get("never-seen", 0)
+    without = told["without_learning"]
+    for same in ("verdicts", "scores", "stable"):
+        assert without[same] == silent[same]  # over the same grasps, with the same session
+    assert told["without_session"] == silent["without_session"]
+    assert told["scores"]["f1"] > without["scores"]["f1"] + 0.1
+    assert told["stable"]["slips_among_stable"] < 0.6 * without["stable"]["slips_among_stable"]
+
+
+def test_a_verdict_is_told_before_its_outcome_is() -> None:
+    result = graspd("replay", DEMO_DAY, "--outcomes", "--json")
+    outcomes = [json.loads(line)["outcomes"] for line in result.stdout.splitlines()]
+    assert outcomes[:2] == [0, 1]
+    assert {later - former for former, later in pairwise(outcomes)} == {0, 1}  # 0: never seen
+
+
+def test_a_risk_is_kept_on_a_table_and_reported() -> None:
+    risk = ("--outcomes", "--max-slip-when-stable", "0.05")
+    every, lifted = summary_of(DEMO_DAY, *risk), summary_of(DEMO_DAY, *risk, "--only-lifted")
+    for summary in (every, lifted):
+        report = summary["risk"]
+        assert report["target"] == 0.05
+        assert report["lifts"] == summary["verdicts"]["stable"] > 0
+        assert report["slips"] <= report["bound"]
+        assert report["bound"] == pytest.approx(0.05 * report["lifts"] + 4.75, abs=0.005)
+        assert report["slips"] / report["lifts"] == summary["stable"]["slips_among_stable"]
+        assert summary["reasons"]["unproven"] > 0
+        assert summary["without_learning"]["verdicts"]["stable"] > summary["verdicts"]["stable"]
+    # Supervised are the warm-up, some of the rest, and what is stable: not every lift.
+    assert lifted["outcomes"] < 0.7 * every["outcomes"]
+    bare = summary_of(DEMO_DAY, *risk, "--only-lifted", "--warm-up", "0", "--explore", "0")
+    assert bare["outcomes"] == bare["verdicts"]["stable"] < 30
+    assert bare["reasons"].get("unproven") is None
+
+
+def test_the_outcome_of_a_grasp_in_a_stream_is_told_once_when_it_is_over() -> None:
+    result = graspd("replay", DEMO_RECORDING, "--outcomes", "--json")
+    verdicts = [decode_verdict(line.encode()) for line in result.stdout.splitlines()]
+    summary = json.loads(result.stderr)
+    judged = {verdict.grasp for verdict in verdicts if verdict.valid}
+    assert summary["outcomes"] == len(judged)
+    # While a grasp is held nothing more is known, however often it is judged.
+    for grasp in judged:
+        assert len({v.outcomes for v in verdicts if v.grasp == grasp and v.judged}) == 1
+
+
+def test_less_sure_verdicts_are_unknown_if_that_is_wanted() -> None:
+    summary = summary_of(DEMO_DAY, "--min-confidence", "0.9")
+    assert summary["reasons"]["low-confidence"] > 0
+    assert summary_of(DEMO_DAY)["reasons"].get("low-confidence") is None
+
+
+def test_a_model_on_its_own_training_is_warned_of(bts3_dir: Path) -> None:
+    table = bts3_dir / "palm_45.csv"
+    assert "the model was trained on palm_45.csv" in graspd("replay", table).stdout
+    assert summary_of(table)["trained_on"] == ["palm_45.csv"]
+    assert summary_of(table, "--model", "cnn1")["trained_on"] == []
+    assert summary_of(DEMO_TABLE)["trained_on"] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--warm-up", "5"), "need --max-slip-when-stable"),
+        (("--only-lifted",), "it needs --outcomes"),
+        (("--max-slip-when-stable", "0.6"), "not a number from 0.001 to 0.5"),
+        (("--max-slip-when-stable", "0.1", "--warm-up", "-1"), "risk.warm_up"),
+        (("--min-confidence", "1"), "not a number from"),
+    ],
+)
+def test_options_of_outcomes_and_risk_that_do_not_fit_are_one_line(
+    arguments: tuple[str, ...], says: str
+) -> None:
+    result = graspd("replay", DEMO_TABLE, *arguments)
+    assert result.returncode == 2
+    assert says in result.stderr.splitlines()[-1]
+
+
+def test_outcomes_of_a_table_that_has_none_are_one_line(tmp_path: Path) -> None:
+    bare = tmp_path / "bare.csv"
+    with DEMO_TABLE.open(newline="") as file, bare.open("w", newline="") as out:
+        rows = list(csv.DictReader(file))
+        names = [name for name in rows[0] if name != "slipped"]
+        writer = csv.DictWriter(out, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    assert graspd("replay", bare).returncode == 0
+    result = graspd("replay", bare, "--outcomes")
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == f"graspd: {bare}: no column `slipped`: there are no outcomes to tell\n"
 
 
 def test_a_grasp_table_is_judged_row_by_row() -> None:

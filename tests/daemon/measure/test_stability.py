@@ -33,6 +33,10 @@ from daemon.measure.reference.reference import Reference
 from daemon.measure.stability import report as stability
 from daemon.measure.stability.cases import StabilityCase, recorded
 from daemon.measure.stability.model import Bounds, ModelStability
+from daemon.measure.stability.trust import trust_rows
+from daemon.trust import learner
+from daemon.trust.learner import Learner
+from daemon.trust.risk import Risk
 from models import zoo
 from models.contract import ModelError, SessionInput
 from models.inputs import builder
@@ -77,6 +81,19 @@ STEPS = (
     "gate, readings at 10 kHz",
     "CAN sweep number (16 bits) and tick (32 bits) at their wrap",
     "SPI bridge's sweep number (32 bits) at its wrap",
+    "learner, 1e+04 outcomes, all of these in turns",
+    "learner, 500 outcomes, constant features",
+    "learner, 500 outcomes, features at the clip",
+    "learner, 500 outcomes, features at the largest that is taken",
+    "learner, 500 outcomes, contradicting labels",
+    "learner, what is not finite or too large",
+    "risk of 0.001 against adversaries, 20000 grasps each",
+    "risk of 0.5 against adversaries, 20000 grasps each",
+    "risk, threshold after 20000 lifts",
+    "learner and risk, kept and restored",
+    "learner and risk, time of a grasp judged and noted",
+    "learner and risk, time of an outcome",
+    "learner and risk, memory with all outcomes out, while it is kept",
     "batch norm, variances from 0 to 1e38, folded",
     "logits to +-1e4 and softmax underflow",
     "int8 saturation",
@@ -114,7 +131,7 @@ def run(*arguments: str) -> tuple[int, str]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """The report over the whole zoo."""
     path = tmp_path_factory.mktemp("report") / "stability.md"
-    code, text = run("--json", "--markdown", str(path))
+    code, text = run("--quick", "--json", "--markdown", str(path))
     return Run(code, json.loads(text), path.read_text("utf-8"))
 
 
@@ -156,6 +173,23 @@ def test_a_bound_that_nothing_keeps_makes_the_exit_code_1(monkeypatch: pytest.Mo
     assert code == 1
     assert "BROKEN: p_slip" in text
     assert max(map(len, text.splitlines())) < 400
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "value", "broken"),
+    [
+        (Learner, "learn", lambda *_, **__: None, "learner, 500 outcomes, varied"),
+        (learner, "MEAN_SPREADS_MAX", 60.0, "learner, 1e+04 outcomes, all of these in turns"),
+        (learner, "INPUT_MAX", 1e4, "learner, what is not finite or too large"),
+        (Risk, "bound", 3.0, "risk of 0.001 against adversaries, 20000 grasps each"),
+        (Risk, "restore", lambda *_: None, "learner and risk, kept and restored"),
+    ],
+)
+def test_a_learner_or_a_risk_that_is_wrong_breaks_its_bound(
+    monkeypatch: pytest.MonkeyPatch, where: object, name: str, value: object, broken: str
+) -> None:
+    monkeypatch.setattr(where, name, value)
+    assert not next(row for row in trust_rows(quick=True) if row.step == broken).held
 
 
 def test_a_wrong_reference_breaks_the_bounds(monkeypatch: pytest.MonkeyPatch) -> None:

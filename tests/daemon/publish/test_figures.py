@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
 
 from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import BUCKETS, LatencyHistogram
 from daemon.publish.messages import DECISION_CODE, Verdict
-from daemon.run.summary import Summary
+from daemon.run.summary import WITHOUT_LEARNING, Summary, Tally
+from daemon.trust.ledger import GraspId
+from daemon.trust.trust import Trust
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -75,18 +78,72 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
         {"accuracy": 0.85, "precision": 8 / 9, "recall": 0.8, "f1": 2 / (9 / 8 + 10 / 8)}
     )
     assert summary.tally.labelled == 23
-    assert summary.as_dict(1.0)["judged_and_labelled"] == 20
-    assert summary.as_dict(1.0)["reasons"] == {"stale": 3}
+    assert summary.as_dict(1.0, None)["judged_and_labelled"] == 20
+    assert summary.as_dict(1.0, None)["reasons"] == {"stale": 3}
 
 
 def test_no_labels_means_no_scores() -> None:
     summary = Summary()
     summary.add(verdict(Decision.STABLE), None)
     assert summary.tally.scores() is None
-    assert not any("recorded" in line for line in summary.lines(1.0))
+    assert not any("recorded" in line for line in summary.lines(1.0, None))
 
 
 def test_a_score_without_a_denominator_is_left_out() -> None:
     summary = Summary()
     summary.add(verdict(Decision.STABLE), False)
     assert summary.tally.scores() == {"accuracy": 1.0}
+
+
+def test_what_stable_is_worth_counts_each_lift_of_known_outcome() -> None:
+    tally = Tally()
+    cases = [
+        (Decision.STABLE, False, 60),
+        (Decision.STABLE, True, 4),
+        (Decision.STABLE, False, 30),
+        (Decision.SLIP, True, 10),
+        (Decision.SLIP, False, 5),
+        (Decision.UNKNOWN, True, 6),
+        (Decision.UNKNOWN, False, 5),
+    ]
+    for decision, slipped, number in cases:
+        for _ in range(number):
+            tally.add(decision, (), slipped)
+    assert tally.stable == (94, 4)
+    # By hand: 90 of 100 good lifts, 4 of 20 slips; four in a row are in one window of 50.
+    assert tally.worth() == pytest.approx(
+        {
+            "coverage": 0.9,
+            "slips_among_stable": 4 / 94,
+            "worst_window": 0.08,
+            "slips_called_stable": 0.2,
+            "stable_called_slip": 0.05,
+        }
+    )
+
+
+def test_an_outcome_that_comes_later_counts_as_if_it_had_been_recorded() -> None:
+    early, late = Summary(), Summary()
+    for grasp, slipped in enumerate((True, False, True, False), 1):
+        said = verdict(Decision.STABLE if grasp < 3 else Decision.SLIP)
+        said = msgspec.structs.replace(said, grasp=grasp)
+        early.add(said, slipped)
+        late.add(said, None)
+        late.outcome(grasp, slipped=slipped)
+        late.outcome(grasp, slipped=not slipped)  # told twice: the first counts
+    assert late.tally.labelled == 4
+    assert late.tally.as_dict() == early.tally.as_dict()
+
+
+def test_without_learning_is_shown_where_something_was_learned() -> None:
+    summary, trust = Summary(), Trust("model", 2)
+    grasp = GraspId("boot", 1)
+    summary.add(verdict(Decision.STABLE), True)
+    summary.compared[WITHOUT_LEARNING].add(Decision.SLIP, (), slipped=True)
+    assert not any("without learning" in line for line in summary.lines(1.0, trust))
+    trust.note(grasp, trust.judge(grasp, 0.1, -2.0, np.zeros(2)), stable=True)
+    trust.outcome(grasp, slipped=True)
+    lines = summary.lines(1.0, trust)
+    assert "without learning: 0 stable, 1 slip, 0 unknown" in lines
+    assert "learned from 1 outcomes" in lines
+    assert summary.as_dict(1.0, trust)["without_learning"]["verdicts"]["slip"] == 1

@@ -113,6 +113,18 @@ def test_what_outcomes_teach_is_in_the_replay_as_it_was(rotated: Lab) -> None:
     assert any(verdict["supervised"] for verdict in now)
 
 
+def test_the_summary_of_a_replay_counts_the_outcomes_in_the_recording(rotated: Lab) -> None:
+    result = graspd("replay", "--json", *rotated.files)
+    summary = json.loads(result.stderr)
+    assert summary["labelled"] == len(rotated.told) > 0
+    assert summary["outcomes"] == max(v["outcomes"] for v in again(*rotated.files))
+    without = summary["without_learning"]
+    assert sum(without["verdicts"].values()) == sum(summary["verdicts"].values())
+    assert without["labelled"] == summary["labelled"]
+    assert "unproven" not in without["reasons"]
+    assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
+
+
 def test_each_file_of_a_run_is_judged_as_then_without_those_before_it(rotated: Lab) -> None:
     for path in rotated.files:
         now = again(path)

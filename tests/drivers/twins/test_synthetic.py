@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.base import RecordingError
-from drivers.recordings.csv_player import DEMO_TABLE
+from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
 from drivers.twins.grasps import synthetic
 
 RANGE_MARGIN_COUNTS = 250
@@ -41,6 +41,32 @@ def test_the_demo_is_made_again_byte_for_byte(tmp_path: Path) -> None:
     out = tmp_path / "demo.csv"
     synthetic.main(["--out", str(out)])
     assert out.read_bytes() == DEMO_TABLE.read_bytes()
+
+
+def test_the_demo_day_is_made_again_byte_for_byte_and_called_synthetic(tmp_path: Path) -> None:
+    out = tmp_path / "day.csv"
+    synthetic.main(["--day", "--out", str(out)])
+    assert out.read_bytes() == DEMO_DAY.read_bytes()
+    counts, slipped = load(DEMO_DAY)
+    assert counts.shape == (300, 72)
+    assert slipped.sum() == 150
+    assert counts.min() >= 1
+    assert counts.max() <= 4094
+    with DEMO_DAY.open(newline="") as file:
+        assert all(row["object"].startswith("synthetic") for row in csv.DictReader(file))
+
+
+def test_a_day_begins_as_ever_drifts_and_then_stays() -> None:
+    model = synthetic.read_model()
+    day = synthetic.draw_day(model, np.random.default_rng(3), 3000)
+    drawn = synthetic.draw(model, np.random.default_rng(3), 3000)
+    np.testing.assert_array_equal(day.slipped, drawn.slipped)
+    np.testing.assert_array_equal(day.counts[0], drawn.counts[0])
+    moved = (day.counts.astype(float) - drawn.counts).reshape(10, 300, 72).mean(axis=1)
+    far = np.abs(moved).mean(axis=1)
+    assert (np.diff(far[:6]) > 0.0).all()
+    assert far[-1] > 60.0
+    np.testing.assert_allclose(far[6:], far[6], rtol=0.1)  # the gain is on other grasps
 
 
 def test_the_demo_is_small_labelled_and_called_synthetic() -> None:

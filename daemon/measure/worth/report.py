@@ -1,0 +1,165 @@
+"""`graspd report worth`: what `stable` is worth on another day, by how many outcomes were told.
+
+Trains graspd's default and the published network on some days and judges another one with objects
+that nobody trained on, grasp by grasp, each outcome told before the next.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import itertools
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from daemon.measure.worth.lives import live
+from daemon.measure.worth.streams import RANDOM, Plan, Stream, streams
+from daemon.process.text import complain, markdown_table
+from daemon.trust.risk import RiskLimits
+from models.training.data.datasets import DatasetError, read_all
+
+ALLOWED: Final = 0.05
+TOLD: Final = (0, 10, 25, 50, 75, 100, 150, 200, 250, 300)
+"""Outcomes, between which the figures are means."""
+LEAST: Final = 100
+"""Grasps of a part, of all streams together, below which it is left out."""
+QUICK_GRASPS: Final = 240
+PUBLISHED, ALONE, LEARNING, RISK = (
+    "the published method (cnn1)",
+    "graspd, nothing told",
+    "graspd, learning",
+    f"graspd, at most {100 * ALLOWED:g} % slips allowed",
+)
+COLOURS: Final = {PUBLISHED: "#c65d21", ALONE: "#9a8f2f", LEARNING: "#1f6f8b", RISK: "#123f50"}
+STYLES: Final = {PUBLISHED: "s-", ALONE: "o:", LEARNING: "o-", RISK: "o-"}
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """What was said of the grasps after so many outcomes."""
+
+    told: int
+    """Outcomes, in the mean."""
+    slips_among_stable: float
+    """Fraction; NaN where nothing was called so."""
+    coverage: float
+    """Of the grasps that held, the fraction that was called stable."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the report's arguments."""
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/worth"),
+        metavar="DIR",
+        help="folder for the picture and the table, and for what networks said (runs/worth)",
+    )
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the object folds")
+    parser.add_argument("--quick", action="store_true", help="few grasps, one epoch: does it run?")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, draw, print; 2 if data or folder are wrong."""
+    try:
+        grasps = read_all(args.data)
+        plan = Plan(args.seeds, cache=args.out / "networks")
+        if args.quick:
+            plan = Plan(seeds=1, folds=1, epochs=1)
+            chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))
+            grasps = grasps.rows(chosen.astype(np.int64))
+        args.out.mkdir(parents=True, exist_ok=True)
+        curves = measured([one for one in streams(grasps, plan) if one.order == RANDOM])
+        text = "\n".join(table(curves)) + "\n"
+        (args.out / "worth.md").write_text(text)
+        (args.out / "worth.svg").write_text(draw(curves))
+    except (DatasetError, OSError) as error:
+        complain(error)
+        return 2
+    sys.stdout.write(text)
+    return 0
+
+
+Curves = dict[str, list[Point]]
+"""By method."""
+
+
+def measured(several: Sequence[Stream]) -> Curves:
+    """How often `stable` was said and slipped, over all streams together."""
+    learning = [live(one, RiskLimits(), every=True) for one in several]
+    risk = [live(one, RiskLimits(ALLOWED), every=True) for one in several]
+    said = {
+        PUBLISHED: [one.published < 0.0 for one in several],
+        ALONE: [one.margins < 0.0 for one in several],
+        LEARNING: [life.stable for life in learning],
+        RISK: [life.stable for life in risk],
+    }
+    slipped = [one.slipped for one in several]
+    return {name: _curve(stable, slipped) for name, stable in said.items()}
+
+
+def _curve(
+    stable: Sequence[NDArray[np.bool_]], slipped: Sequence[NDArray[np.bool_]]
+) -> list[Point]:
+    points = []
+    for first, last in itertools.pairwise(TOLD):
+        said = np.concatenate([one[first:last] for one in stable])
+        slips = np.concatenate([one[first:last] for one in slipped])
+        if len(said) < LEAST:
+            break
+        among = float(slips[said].mean()) if said.any() else float("nan")
+        points.append(Point((first + last) // 2, among, float(said[~slips].mean())))
+    return points
+
+
+def table(curves: Curves) -> list[str]:
+    """Slips among stable / good lifts kept, in %."""
+    told = [point.told for point in curves[PUBLISHED]]
+    rows = [
+        [name, *(f"{100 * p.slips_among_stable:.0f} / {100 * p.coverage:.0f}" for p in points)]
+        for name, points in curves.items()
+    ]
+    titles = ("slips among `stable` / good lifts kept, %, by outcomes told", *map(str, told))
+    return list(markdown_table(titles, rows))
+
+
+def draw(curves: Curves) -> str:
+    """Both figures against outcomes told, as SVG."""
+    mpl.rcParams["svg.hashsalt"] = "graspd"
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name, points in curves.items():
+        told = [point.told for point in points]
+        slips = [100 * point.slips_among_stable for point in points]
+        kept = [100 * point.coverage for point in points]
+        for axes, values in ((left, slips), (right, kept)):
+            axes.plot(told, values, STYLES[name], color=COLOURS[name], label=name, markersize=5)
+    left.axhline(100 * ALLOWED, color="#888", ls=":", lw=1)
+    left.text(1.0, 100 * ALLOWED, "allowed ", transform=left.get_yaxis_transform(), ha="right",
+              va="bottom", fontsize=8, color="#666")  # fmt: skip
+    _dress(left, "slips among 'stable', %")
+    _dress(right, "good lifts that are called 'stable', %")
+    right.set_ylim(0, 100)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4,
+                  frameon=False, fontsize=9)  # fmt: skip
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return text.getvalue()
+
+
+def _dress(axes: Any, title: str) -> None:  # noqa: ANN401 - matplotlib's own
+    axes.set_xlabel("outcomes of lifts told, on a day and of objects that nobody trained on")
+    axes.set_ylabel(title)
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.25)

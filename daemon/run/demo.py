@@ -1,0 +1,105 @@
+"""The demo's table: the published method beside graspd on the same grasps, some in each line."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from daemon.judge.findings import Examined
+from daemon.judge.network import Network
+from daemon.judge.reasons import Decision
+from daemon.publish.companion import Companion
+from daemon.publish.messages import Verdict
+from daemon.run.summary import Tally
+from daemon.trust.trust import Trust
+from drivers.base import TactileReading
+from models.runtime import TactileModel
+
+GRASPS = 25
+"""In a line."""
+PUBLISHED = "cnn1"
+"""The published network, in the zoo."""
+COLUMNS = f"{'stable':>8}{'slipped':>15}{'good lifts kept':>18}"
+BOLD, RED, GREEN = 1, 31, 32
+"""As terminals number them."""
+
+
+class Demo(Companion):
+    """Writes a line for every `GRASPS` grasps, and what it comes to at the end."""
+
+    def __init__(self, published: TactileModel, *, prompt: bool) -> None:
+        """`published` judges every grasp as it comes, without session, outcomes or refusal.
+
+        With `prompt`, each line is flushed.
+        """
+        self._published = Network(published, 0.5)
+        self._prompt = prompt
+        self._part = Tally(), Tally()
+        self._whole = Tally(), Tally()
+        self._grasps = 0
+        # As others have it who colour what they write: https://no-color.org
+        self._in_colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
+        self._write(
+            "A day on which the sensors drift. All grasps are synthetic: nobody ever grasped them.",
+            "",
+            self._coloured(
+                f"{'':10}{f'the published method ({PUBLISHED})':>{len(COLUMNS)}}"
+                f"{'graspd':>{len(COLUMNS)}}",
+                BOLD,
+            ),
+            self._coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", BOLD),
+        )
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Count a grasp."""
+        note = None if reading is None else reading.annotation
+        if reading is None or note is None or note.slipped is None:
+            return
+        p_slip = self._published.judge(Examined((), reading.counts)).p_slip
+        if p_slip is None:
+            said = Decision.UNKNOWN
+        else:
+            said = Decision.SLIP if p_slip >= 0.5 else Decision.STABLE
+        for tallies in (self._part, self._whole):
+            tallies[0].add(said, (), note.slipped)
+            tallies[1].add(verdict.verdict, verdict.reasons, note.slipped)
+        self._grasps += 1
+        if self._grasps % GRASPS == 0:
+            allowed = None if verdict.risk is None else verdict.risk.target
+            self._line(f"{self._grasps - GRASPS + 1}-{self._grasps}", self._part, allowed)
+            self._part = Tally(), Tally()
+
+    def summary(self, trust: Trust | None) -> None:
+        """Write the last lines; `trust` is what outcomes have taught."""
+        if trust is None:
+            raise ValueError("the demo shows what outcomes teach")
+        report = trust.report()
+        self._line("all", self._whole, report.target)
+        self._write("", f"graspd learned from {trust.learner.outcomes} outcomes of lifts.")
+        if report.target is not None and report.bound is not None:
+            self._write(
+                f"Of its {report.lifts} `stable` {report.slips} slipped; "
+                f"{100 * report.target:g} % may, so at most {int(report.bound)}, whatever drifts."
+            )
+        self._write("Each verdict: --verbose. Real grasps: `graspd data`.")
+
+    def _line(self, grasps: str, tallies: tuple[Tally, Tally], allowed: float | None) -> None:
+        self._write(f"{grasps:10}{''.join(self._cells(tally, allowed) for tally in tallies)}")
+
+    def _cells(self, tally: Tally, allowed: float | None) -> str:
+        """How often `stable` was said, how many of these slipped, share of the good lifts kept."""
+        (stable, slips), worth = tally.stable, tally.worth() or {}
+        share, kept = worth.get("slips_among_stable"), worth.get("coverage")
+        slipped = f"{slips:9}" + (f"{100 * share:4.0f} %" if share is not None else f"{'-':>6}")
+        if share is not None and allowed is not None:
+            slipped = self._coloured(slipped, RED if share > allowed else GREEN)
+        good = f"{100 * kept:.0f} %" if kept is not None else "-"
+        return f"{stable:8}{slipped}{good:>18}"
+
+    def _coloured(self, text: str, colour: int) -> str:
+        return f"\x1b[{colour}m{text}\x1b[0m" if self._in_colour else text
+
+    def _write(self, *lines: str) -> None:
+        sys.stdout.writelines(f"{line}\n" for line in lines)
+        if self._prompt:
+            sys.stdout.flush()

@@ -1,0 +1,104 @@
+"""What goes along with a replay: who tells how lifts ended, and who judges the same otherwise."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from daemon.judge.pipeline import Pipeline
+from daemon.publish.companion import Companion, Requests
+from daemon.publish.messages import Verdict
+from daemon.run.summary import Summary
+from drivers.base import TactileReading
+from models.runtime import TactileModel
+
+
+class _Lift(NamedTuple):
+    boot_id: str
+    grasp: int
+    outcome: Literal["stable", "slip"]
+    object_name: str | None
+    allowed: bool
+    """Whether `stable` was said, or a lift under supervision asked for."""
+    over: bool
+    """Whether the next reading is another grasp in any case."""
+
+
+class Controller(Companion):
+    """Tells how the lift of each judged grasp ended, as far as the recording says, once it is over.
+
+    As a robot's controller would over `[ask]`: after the verdict, and before the next grasp.
+    """
+
+    def __init__(self, *, only_lifted: bool) -> None:
+        """With `only_lifted` it lifts on `stable` and where it is asked to supervise: what became
+        of the other grasps nobody knows."""
+        self._only_lifted = only_lifted
+        self._requests: Requests | None = None
+        self._lift: _Lift | None = None
+
+    def before_wait(self, requests: Requests) -> None:
+        """Remember whom to tell."""
+        self._requests = requests
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Take note of a grasp; the lift of the one before it is over."""
+        if self._lift is not None and self._lift.grasp != verdict.grasp:
+            self.tell()
+        note = None if reading is None else reading.annotation
+        if note is None or note.slipped is None or not verdict.judged:
+            return
+        again = self._lift is not None and self._lift.allowed
+        self._lift = _Lift(
+            boot_id=verdict.boot_id,
+            grasp=verdict.grasp,
+            outcome="slip" if note.slipped else "stable",
+            object_name=note.object_name,
+            allowed=again or verdict.verdict == "stable" or verdict.supervised,
+            over=verdict.gate is None,
+        )
+
+    def after_round(self) -> None:
+        """Where each reading is a grasp, its lift is over with it."""
+        if self._lift is not None and self._lift.over:
+            self.tell()
+
+    def tell(self) -> None:
+        """Tell the outcome of the lift at hand, if there is one."""
+        lift, self._lift = self._lift, None
+        if lift is None or self._requests is None or (self._only_lifted and not lift.allowed):
+            return
+        self._requests.outcome(lift.boot_id, lift.grasp, lift.outcome, lift.object_name)
+
+
+class Comparison(Companion):
+    """Judges every judged grasp once more in another way, for the summary alone."""
+
+    def __init__(self, how: str, pipeline: Pipeline, result: Summary) -> None:
+        """`how` is a key of `Summary.compared`; to `pipeline` each reading is a grasp."""
+        self._how = how
+        self._pipeline = pipeline
+        self._result = result
+        self._grasp: int | None = None
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        """Count what the first verdict on a grasp would have been."""
+        if reading is None or not verdict.judged or verdict.grasp == self._grasp:
+            return
+        self._grasp = verdict.grasp
+        slipped = None if reading.annotation is None else reading.annotation.slipped
+        judgement = self._pipeline.judge(reading)
+        self._result.compare(self._how, judgement, slipped, verdict.grasp)
+
+
+def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:
+    """Names of the recordings that a model was trained on."""
+    digests, found = {dataset.sha256 for dataset in model.contract.datasets}, []
+    for path in recordings:
+        if path.is_file():
+            with path.open("rb") as file:
+                if hashlib.file_digest(file, "sha256").hexdigest() in digests:
+                    found.append(path.name)
+    return found
