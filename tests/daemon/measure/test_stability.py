@@ -135,6 +135,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return Run(code, json.loads(text), path.read_text("utf-8"))
 
 
+@pytest.mark.timeout(240)  # the report takes a minute
 def test_every_model_of_the_zoo_keeps_every_bound(whole: Run) -> None:
     broken = [row for row in whole.json["cases"] if row["problems"]]
     broken += [row for row in whole.json["steps"] if not row["held"]]
