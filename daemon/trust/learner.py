@@ -22,7 +22,7 @@ float32 output is taken for."""
 INPUT_MAX: Final = 1e3
 """Inputs whose root of the sum of squares is larger are refused: standardised features have a few
 units each."""
-MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.3, 0.5, 0.2
+MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.3, 0.5, 0.3
 """Standard deviations of the prior: of the margin's weight, the bias, and each feature's weight."""
 DRIFT: Final = 2e-3
 """Share of the prior's variances by which an outcome widens the posterior: what was learned fades

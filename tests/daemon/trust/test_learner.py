@@ -44,7 +44,7 @@ def covariance(learner: Learner) -> NDArray[np.float64]:
 def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_open() -> None:
     learner = Learner(2)
     found = learner.log_odds(learner.features(-3.0, np.array([1.0, -2.0])))
-    variance = 2.0**2 * 0.3**2 + 0.5**2 + 0.2**2 * (1.0 + 4.0)
+    variance = 2.0**2 * 0.3**2 + 0.5**2 + 0.3**2 * (1.0 + 4.0)
     assert found == pytest.approx(-2.0 / math.sqrt(1.0 + math.pi * variance / 8.0), rel=1e-14)
 
 
@@ -71,7 +71,7 @@ def test_it_is_the_information_filter_in_long_double(inputs: int) -> None:
 
 def test_float64_is_long_double_after_2000_outcomes_of_three_fingers() -> None:
     learner = Learner(THREE_FINGERS)
-    prior = np.array([0.3**2, 0.5**2] + [0.2**2] * THREE_FINGERS, dtype=np.longdouble)
+    prior = np.array([0.3**2, 0.5**2] + [0.3**2] * THREE_FINGERS, dtype=np.longdouble)
     mean = np.zeros(len(prior), dtype=np.longdouble)
     mean[0] = 1.0
     spread, drift = np.diag(prior), np.longdouble(2e-3) * prior
@@ -100,14 +100,14 @@ def test_without_drift_it_ends_where_a_batch_fit_ends(monkeypatch: pytest.Monkey
     x = np.array([x for _, x, _ in stream])
     slipped = np.array([slipped for *_, slipped in stream])
     # The same prior as a penalty: each feature in units of its weight's standard deviation.
-    scaled = np.hstack((np.full((len(x), 1), 0.5), 0.2 * x))
+    scaled = np.hstack((np.full((len(x), 1), 0.5), 0.3 * x))
     batch = LogisticRegression(C=1.0, fit_intercept=False, tol=1e-10, max_iter=10_000)
     batch.fit(scaled, slipped)
     weights = np.frombuffer(learner.state().mean)[1:]
-    np.testing.assert_allclose(weights, batch.coef_[0] * ([0.5] + [0.2] * 6), atol=0.02)
+    np.testing.assert_allclose(weights, batch.coef_[0] * ([0.5] + [0.3] * 6), atol=0.02)
     p = scaled @ batch.coef_[0]
     w = np.exp(-np.abs(p)) / (1.0 + np.exp(-np.abs(p))) ** 2
-    unscaled = scaled / ([0.5] + [0.2] * 6)
+    unscaled = scaled / ([0.5] + [0.3] * 6)
     laplace = np.linalg.inv(np.diag([4.0] + [25.0] * 6) + unscaled.T @ (w[:, None] * unscaled))
     np.testing.assert_allclose(covariance(learner)[1:, 1:], laplace, atol=0.05 * laplace.max())
 
@@ -191,7 +191,7 @@ def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
     kind: Stream, number: int
 ) -> None:
     learner = Learner(ONE_FINGER)
-    prior = np.array([0.3**2, 0.5**2] + [0.2**2] * ONE_FINGER)
+    prior = np.array([0.3**2, 0.5**2] + [0.3**2] * ONE_FINGER)
     start = np.array([1.0, *([0.0] * (ONE_FINGER + 1))])
     for index, (margin, x, slipped) in enumerate(kind(np.random.default_rng(0), number), 1):
         learner.learn(learner.features(margin, x), slipped=slipped)
@@ -199,7 +199,7 @@ def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
             matrix, weights = covariance(learner), np.frombuffer(learner.state().mean)
             np.testing.assert_array_equal(matrix, matrix.T)
             assert (np.diag(matrix) <= prior * (1.0 + 1e-12)).all()
-            assert np.linalg.eigvalsh(matrix)[0] >= 0.99 * 2e-3 * 0.2**2
+            assert np.linalg.eigvalsh(matrix)[0] >= 0.99 * 2e-3 * 0.3**2
             assert (np.abs(weights - start) <= 50 * prior**0.5).all()
     assert learner.outcomes == number
     Learner(ONE_FINGER).restore(learner.state())
@@ -233,11 +233,11 @@ def test_a_weight_stops_at_fifty_times_its_priors_deviation_whatever_is_told() -
         features = learner.features(30.0 * sign, np.array([-999.0 * sign, 3.0]))
         learner.learn(features, slipped=learner.log_odds(features) < 0.0)
     weights = np.frombuffer(learner.state().mean)
-    limits = 50.0 * np.array([0.3, 0.5, 0.2, 0.2])
+    limits = 50.0 * np.array([0.3, 0.5, 0.3, 0.3])
     assert (np.abs(weights - [1.0, 0.0, 0.0, 0.0]) <= limits).all()
     features = learner.features(0.0, np.array([1000.0, 0.0]))
     learner.learn(features, slipped=learner.log_odds(features) < 0.0)
-    assert np.abs(np.frombuffer(learner.state().mean)[2]) == pytest.approx(10.0)
+    assert np.abs(np.frombuffer(learner.state().mean)[2]) == pytest.approx(15.0)
     assert np.isfinite(learner.log_odds(features))
     Learner(2).restore(learner.state())
 
@@ -283,8 +283,8 @@ def spoilt(state: LearnerState) -> Iterator[tuple[str, LearnerState]]:
     yield "values", LearnerState(3, state.mean + bytes(8), state.covariance)
     yield "not finite", with_mean(math.nan)
     yield "not finite", with_entry(1, 1, math.inf)
-    yield "no outcomes", with_mean(10.1)
-    yield "before the first", with_entry(2, 2, 0.041)
+    yield "no outcomes", with_mean(15.1)
+    yield "before the first", with_entry(2, 2, 0.091)
     yield "no covariance", with_entry(2, 3, 0.01)  # not symmetric
     yield "no covariance", with_entry(2, 2, -0.01)
     yield "no covariance", LearnerState(3, state.mean, (0.0 * matrix).tobytes())
