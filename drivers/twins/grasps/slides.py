@@ -39,12 +39,12 @@ SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
 """The same of a slide: along one, along a second, and along others."""
 STANDSTILL_S = (0.0, 0.2)
 """For so long nothing slides at the beginning, and again at the end, s."""
-SPEED_COUNTS_PER_S = 66.0
+SPEED_COUNTS_PER_S = 88.0
 """Root mean square of an electrode's speed in the median slide, counts/s ..."""
-SLIDE_SPREAD, MOMENT_SPREAD = 0.5, 0.8
+SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.45
 """... and by which factor slides, and moments of a slide, differ: standard deviations of the
 logarithm. These and the times fit the quantiles of slides."""
-MOMENT_TAU_S = 0.05
+MOMENT_TAU_S = 0.2
 """An object sticks and slips: its speed is another one after this time, s ..."""
 TURN_TAU_S = 0.1
 """... and its direction after this time, s."""
@@ -60,12 +60,22 @@ class Hold:
     """How far the electrodes of some fingers have moved since a hold began."""
 
     def __init__(
-        self, sliding: Sequence[bool], rng: np.random.Generator, seconds: float = SECONDS
+        self,
+        sliding: Sequence[bool],
+        rng: np.random.Generator,
+        seconds: float = SECONDS,
+        rest_s: float = 0.0,
     ) -> None:
-        """`sliding` says of each finger whether the object slides along it, or is held."""
+        """`sliding` says of each finger whether the object slides along it, or is held.
+
+        For the first `rest_s` nothing has begun: all stand still.
+        """
         self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
         ways = [
-            (*_relaxation(self._times, rng), *(_slide(self._times, rng) if slides else ()))
+            (
+                *_relaxation(self._times - rest_s, rng),
+                *(_slide(self._times, rest_s, rng) if slides else ()),
+            )
             for slides in sliding
         ]
         self._ways = [[(along, way) for along, way in finger] for finger in ways]
@@ -103,20 +113,21 @@ def held(
     *,
     seconds: float = SECONDS,
     rate_hz: float = RATE_HZ,
+    rest_s: float = 0.0,
     sampling: Sampling = Sampling.FRESH,
     seed: int = 0,
 ) -> Iterator[tuple[float, Counts]]:
     """Times, s, and counts, shape (fingers, 24), of fingers that hold, or along which it slides.
 
-    The same seed gives the same stream. Raises `ValueError` for a rate that is not positive or,
-    held, not 100 Hz.
+    Nothing moves for the first `rest_s`. The same seed gives the same stream. Raises `ValueError`
+    for a rate that is not positive or, held, not 100 Hz.
     """
     if not 0.0 < rate_hz < float("inf"):
         raise ValueError(f"rate_hz is {rate_hz}, must be positive")
     if sampling is Sampling.HELD and rate_hz != RATE_HZ:
         raise ValueError(f"held values come at {RATE_HZ:g} Hz, not {rate_hz}")
     rng = np.random.default_rng([seed, 3])
-    hold, noise = Hold(sliding, rng, seconds), HeldNoise(len(sliding), rng)
+    hold, noise = Hold(sliding, rng, seconds, rest_s), HeldNoise(len(sliding), rng)
     sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
     sample = sampler(np.full((len(sliding), ELECTRODES), LEVEL_COUNTS), noise).sample
     for row in range(math.ceil(seconds * rate_hz)):
@@ -130,14 +141,14 @@ Way = tuple[NDArray[np.float64], NDArray[np.float64]]
 def _relaxation(times: NDArray[np.float64], rng: np.random.Generator) -> Iterator[Way]:
     factor = np.exp(rng.normal(0.0, RELAXATION_SPREAD))
     along = RELAXATION_COUNTS_PER_S * factor * RELAXATION_TAU_S
-    along = along * (1.0 - np.exp(-times / RELAXATION_TAU_S))
+    along = along * (1.0 - np.exp(-np.maximum(times, 0.0) / RELAXATION_TAU_S))
     for share in RELAXATION_DIRECTIONS:
         yield np.sqrt(share) * along, _direction(rng)
 
 
-def _slide(times: NDArray[np.float64], rng: np.random.Generator) -> Iterator[Way]:
+def _slide(times: NDArray[np.float64], rest_s: float, rng: np.random.Generator) -> Iterator[Way]:
     begins_s, ends_s = rng.uniform(*STANDSTILL_S, 2)
-    slides = (times >= begins_s) & (times < times[-1] - ends_s)
+    slides = (times >= rest_s + begins_s) & (times < times[-1] - ends_s)
     speed = SPEED_COUNTS_PER_S * np.exp(
         rng.normal(0.0, SLIDE_SPREAD) + MOMENT_SPREAD * _wander(len(times), MOMENT_TAU_S, rng)
     )

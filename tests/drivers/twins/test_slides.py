@@ -130,3 +130,10 @@ def test_held_values_repeat_in_two_of_seven_rows() -> None:
 def test_no_stream_has_such_a_rate(rate_hz: float) -> None:
     with pytest.raises(ValueError, match="rate_hz"):
         next(held([True], rate_hz=rate_hz))
+
+
+def test_nothing_moves_while_the_fingers_rest() -> None:
+    hold = Hold([True, False], np.random.default_rng(0), seconds=3.0, rest_s=1.0)
+    assert (hold.deviation(np.asarray(1.0)) == 0.0).all()
+    later = np.abs(hold.deviation(np.asarray(2.5))).mean(axis=1)
+    assert (later > 2.0).all()
