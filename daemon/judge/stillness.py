@@ -317,8 +317,8 @@ class Motion:
         squares = np.sort(self.memory.blocks[:number], axis=0)[number // 4]
         low, high = SIGMA_COUNTS
         correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
-        variance = np.clip(squares[-1] / 2.0, low**2, high**2)
-        return variance, np.clip(correlations, 0.0, 1.0)
+        variance = np.minimum(np.maximum(squares[-1] / 2.0, low**2), high**2)
+        return variance, np.minimum(np.maximum(correlations, 0.0), 1.0)
 
     def _decide(self) -> None:
         memory = self.memory
