@@ -1,7 +1,7 @@
 """Whole grasps made from real end points, through the judge behind its gate: when, and how right.
 
-`python -m tests.bench.gate DIR --grasps 500` prints one line per rate; DIR is the folder that holds
-`bts3/` and `untouched/`.
+`python -m tests.bench.gate DIR --grasps 500` prints a few lines per rate, and what is made of
+generated slides; DIR is the folder that holds `bts3/` and `untouched/`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import Limits
-from daemon.judge.limits import GripLimits, JointLimits
+from daemon.judge.gate import Gate
+from daemon.judge.limits import GateLimits, GripLimits, JointLimits
+from daemon.judge.median import FreshMedian
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision
-from drivers.base import JointReading, TactileReading
+from daemon.judge.reasons import Decision, Reason
+from drivers.base import ELECTRODES, JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
+from drivers.twins.grasps.slides import SECONDS, held
 from drivers.twins.grasps.whole_grasps import (
     Moment,
     Sampling,
@@ -187,11 +190,66 @@ def _shown(p_slip: float | None) -> str:
     return "" if p_slip is None else f"(p_slip {p_slip:.3f})"
 
 
+@dataclass(slots=True)
+class Sliding:
+    """What the gate said of streams in which an object slides, or is held."""
+
+    sweeps: int = 0
+    still: int = 0
+    streams: int = 0
+    settled: int = 0
+    """Streams that settled at all."""
+    times: int = 0
+    """How often they did."""
+
+
+def sliding(slides: Sequence[bool], number: int, sampling: Sampling) -> Sliding:
+    """So many streams of fingers that all touch; `slides` says which of them slide."""
+    found = Sliding()
+    everywhere = np.ones((len(slides), ELECTRODES), dtype=np.bool_)
+    for seed in range(number):
+        gate = Gate(everywhere[:, 0], GateLimits())
+        fresh, settled = FreshMedian(everywhere.shape), 0
+        for t_s, counts in held(slides, sampling=sampling, seed=seed):
+            t_ns = round(t_s * 1e9)
+            fresh.push(counts, everywhere)
+            gate.step(t_ns, fresh.counts, everywhere, everywhere[:, 0])
+            if Reason.SEQUENCE_GAP not in gate.reasons:
+                found.sweeps += 1
+                found.still += Reason.MOVING not in gate.reasons
+            if gate.wants_judgement:
+                settled += 1
+                gate.judged(t_ns, fresh.counts)
+        found.streams += 1
+        found.settled += settled > 0
+        found.times += settled
+    return found
+
+
+def sliding_lines(number: int, fingers: int = 3) -> Iterator[str]:
+    """The same for people: held, one finger sliding alone, and all of a hand at once."""
+    kinds = {
+        f"{fingers} fingers held": [False] * fingers,
+        "one finger, sliding": [True],
+        f"{fingers} fingers, one sliding": [True, *[False] * (fingers - 1)],
+        f"{fingers} fingers, all sliding": [True] * fingers,
+    }
+    for name, slides in kinds.items():
+        for sampling, rate in ((Sampling.HELD, "71.43 Hz held"), (Sampling.FRESH, "100 Hz fresh")):
+            found = sliding(slides, number, sampling)
+            yield (
+                f"{rate}, {name}: {found.still / found.sweeps:.0%} of the sweeps called still, "
+                f"{found.settled} of {found.streams} settle, "
+                f"{found.times / found.streams:.1f} times in {SECONDS:g} s"
+            )
+
+
 def main() -> None:
     """Print the study."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.gate", description=__doc__)
     parser.add_argument("data", type=Path, metavar="DIR")
     parser.add_argument("--grasps", type=int, default=500)
+    parser.add_argument("--slides", type=int, default=100)
     parser.add_argument("--model", default="cnn1")
     parser.add_argument("--sweeps", type=int, choices=(1, 3), default=3)
     options = parser.parse_args()
@@ -199,6 +257,7 @@ def main() -> None:
     model = TactileModel(zoo.find(options.model))
     for name, stream in streams(options.data, points, rest).items():
         print("\n".join(lines(name, study(stream, points, model, options.sweeps))))  # noqa: T201
+    print("\n".join(sliding_lines(options.slides)))  # noqa: T201
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import count
 from pathlib import Path
-from typing import TextIO
+from typing import Protocol, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,28 +168,39 @@ class WholeGrasps:
             yield script
             start_s = script.timetable.end_s
 
-    def _sampler(self, rng: np.random.Generator) -> _Fresh | _Held:
-        kind = _Held if self._sampling is Sampling.HELD else _Fresh
+    def _sampler(self, rng: np.random.Generator) -> FreshSampler:
+        kind = HeldSampler if self._sampling is Sampling.HELD else FreshSampler
         return kind(self._rest, self._noise(len(self._rest), rng))
 
 
-class _Fresh:
+class Course(Protocol):
+    """What happens to the electrodes of a hand."""
+
+    def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Counts against the rest, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
+
+
+class FreshSampler:
+    """Every electrode is sampled at the time of the row."""
+
     def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
+        """`rest`: counts that everything is added to, shape (fingers, 24)."""
         self._rest = rest
         self._noise = noise
 
-    def sample(self, script: GraspScript, t_s: float) -> NDArray[np.uint16]:
-        return self._sweep(script, np.asarray(t_s))
+    def sample(self, course: Course, t_s: float) -> NDArray[np.uint16]:
+        """Counts of the row at `t_s`, shape (fingers, 24); rows come in order of time."""
+        return self._sweep(course, np.asarray(t_s))
 
-    def _sweep(self, script: GraspScript, t_s: NDArray[np.float64]) -> NDArray[np.uint16]:
+    def _sweep(self, course: Course, t_s: NDArray[np.float64]) -> NDArray[np.uint16]:
         """Counts, shape (fingers, 24), of electrodes sampled at `t_s`, shape () or (24,)."""
-        counts = self._rest + script.deviation(t_s) + self._noise.sweep(t_s)
+        counts = self._rest + course.deviation(t_s) + self._noise.sweep(t_s)
         # Off the rails: a count of 0 or 4095 is that of a broken electrode.
         readable = np.minimum(np.maximum(np.rint(counts), 1), COUNT_MAX - 1)
         return readable.astype(np.uint16)
 
 
-class _Held(_Fresh):
+class HeldSampler(FreshSampler):
     """Keeps two rounds: an electrode that the present one has not come to yet has its old value."""
 
     def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
@@ -197,17 +208,18 @@ class _Held(_Fresh):
         self._round: int | None = None
         self._present = self._former = np.zeros(rest.shape, dtype=np.uint16)
 
-    def sample(self, script: GraspScript, t_s: float) -> NDArray[np.uint16]:
+    def sample(self, course: Course, t_s: float) -> NDArray[np.uint16]:
+        """See `FreshSampler`; rows are 10 ms apart."""
         number, into_ms = divmod(round(t_s * 1000.0), ROUND_MS)
         if self._round is None:
-            self._present = self._begin(script, number - 1)
+            self._present = self._begin(course, number - 1)
         if number != self._round:
-            self._former, self._present = self._present, self._begin(script, number)
+            self._former, self._present = self._present, self._begin(course, number)
         return np.where(into_ms >= PLACES_MS, self._present, self._former)
 
-    def _begin(self, script: GraspScript, number: int) -> NDArray[np.uint16]:
+    def _begin(self, course: Course, number: int) -> NDArray[np.uint16]:
         self._round = number
-        return self._sweep(script, (number * ROUND_MS + PLACES_MS) / 1000.0)
+        return self._sweep(course, (number * ROUND_MS + PLACES_MS) / 1000.0)
 
 
 def rest_above(

@@ -1,0 +1,173 @@
+"""Fingers that hold an object, or along which it slides: generated, by figures of real ones.
+
+The figures are of 306 streams of one sensor at 100 Hz, three seconds each: 44 touches that hold and
+262 slides in six directions (Zapata-Impata, Gil, Torres: Sensors 2019, 19(3), 523; data set
+BioTacSP-DoS, of which nothing is kept here).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import ELECTRODES
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.whole_grasps import RATE_HZ, FreshSampler, HeldSampler, Sampling
+
+NOISE_COUNTS = (3.3, 5.0)
+"""Standard deviation of an electrode, another one for each finger, counts: successive sweeps were
+2.9 to 4.2 times the square root of two apart, which the correlation makes so much."""
+ECHO = 0.36
+"""Share of a sweep's noise that comes again in the next one: correlations of 0.32 at one sweep and
+of 0 at two (measured: 0.32 and 0.03)."""
+SPIKE_PROBABILITY = 0.0017
+"""Chance per electrode and sweep of a downward spike of more than 25 counts."""
+SPIKE_COUNTS = (25.0, 60.0)
+"""Depth of one, counts."""
+RELAXATION_COUNTS_PER_S = 20.0
+"""How fast an electrode moves (root mean square) when a hold begins, counts/s ..."""
+RELAXATION_SPREAD = 0.6
+"""... and by which factor that differs: standard deviation of its logarithm."""
+RELAXATION_TAU_S = 0.7
+"""Time constant of this motion, s. Not measured; it fits the quantiles of held touches."""
+RELAXATION_DIRECTIONS = (0.68, 0.32)
+"""Shares of the variance along one direction of the 24 electrodes, and along others."""
+SLIDE_DIRECTIONS = (0.81, 0.14, 0.05)
+"""The same of a slide: along one, along a second, and along others."""
+STANDSTILL_S = (0.0, 0.2)
+"""For so long nothing slides at the beginning, and again at the end, s."""
+SPEED_COUNTS_PER_S = 88.0
+"""Root mean square of an electrode's speed in the median slide, counts/s ..."""
+SLIDE_SPREAD, MOMENT_SPREAD = 0.58, 0.45
+"""... and by which factor slides, and moments of a slide, differ: standard deviations of the
+logarithm. These and the times fit the quantiles of slides."""
+MOMENT_TAU_S = 0.2
+"""An object sticks and slips: its speed is another one after this time, s ..."""
+TURN_TAU_S = 0.1
+"""... and its direction after this time, s."""
+STEP_S = 0.005
+"""Between two points of the way, s; it is straight between them."""
+SECONDS = 3.0
+"""Length of a stream, s."""
+LEVEL_COUNTS = 2000.0
+"""What every electrode reads where a hold begins."""
+
+
+class Hold:
+    """How far the electrodes of some fingers have moved since a hold began."""
+
+    def __init__(
+        self,
+        sliding: Sequence[bool],
+        rng: np.random.Generator,
+        seconds: float = SECONDS,
+        rest_s: float = 0.0,
+    ) -> None:
+        """`sliding` says of each finger whether the object slides along it, or is held.
+
+        For the first `rest_s` nothing has begun: all stand still.
+        """
+        self._times = np.arange(0.0, seconds + STEP_S, STEP_S)
+        ways = [
+            (
+                *_relaxation(self._times - rest_s, rng),
+                *(_slide(self._times, rest_s, rng) if slides else ()),
+            )
+            for slides in sliding
+        ]
+        self._ways = [[(along, way) for along, way in finger] for finger in ways]
+
+    def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Counts, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
+        moved = [
+            sum(np.interp(t_s, self._times, along) * way for along, way in finger)
+            for finger in self._ways
+        ]
+        return np.array(moved)
+
+
+class HeldNoise:
+    """Noise of held electrodes: correlated from sweep to sweep, with spikes downward alone."""
+
+    def __init__(self, fingers: int, rng: np.random.Generator) -> None:
+        self._rng = rng
+        deviation = rng.uniform(*NOISE_COUNTS, (fingers, 1)) / np.hypot(1.0, ECHO)
+        self._deviation = np.broadcast_to(deviation, (fingers, ELECTRODES))
+        self._last = rng.normal(0.0, self._deviation)
+
+    def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `TactileNoise`; the time does not matter."""
+        new = self._rng.normal(0.0, self._deviation)
+        noise: NDArray[np.float64] = new + ECHO * self._last
+        self._last = new
+        spiking = self._rng.random(noise.shape) < SPIKE_PROBABILITY
+        noise -= spiking * self._rng.uniform(*SPIKE_COUNTS, noise.shape)
+        return noise
+
+
+def held(
+    sliding: Sequence[bool],
+    *,
+    seconds: float = SECONDS,
+    rate_hz: float = RATE_HZ,
+    rest_s: float = 0.0,
+    sampling: Sampling = Sampling.FRESH,
+    seed: int = 0,
+) -> Iterator[tuple[float, Counts]]:
+    """Times, s, and counts, shape (fingers, 24), of fingers that hold, or along which it slides.
+
+    Nothing moves for the first `rest_s`. The same seed gives the same stream. Raises `ValueError`
+    for a rate that is not positive or, held, not 100 Hz.
+    """
+    if not 0.0 < rate_hz < float("inf"):
+        raise ValueError(f"rate_hz is {rate_hz}, must be positive")
+    if sampling is Sampling.HELD and rate_hz != RATE_HZ:
+        raise ValueError(f"held values come at {RATE_HZ:g} Hz, not {rate_hz}")
+    rng = np.random.default_rng([seed, 3])
+    hold, noise = Hold(sliding, rng, seconds, rest_s), HeldNoise(len(sliding), rng)
+    sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler
+    sample = sampler(np.full((len(sliding), ELECTRODES), LEVEL_COUNTS), noise).sample
+    for row in range(math.ceil(seconds * rate_hz)):
+        yield row / rate_hz, sample(hold, row / rate_hz)
+
+
+Way = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""How far along a direction at each time, and the direction, shape (24,)."""
+
+
+def _relaxation(times: NDArray[np.float64], rng: np.random.Generator) -> Iterator[Way]:
+    factor = np.exp(rng.normal(0.0, RELAXATION_SPREAD))
+    along = RELAXATION_COUNTS_PER_S * factor * RELAXATION_TAU_S
+    along = along * (1.0 - np.exp(-np.maximum(times, 0.0) / RELAXATION_TAU_S))
+    for share in RELAXATION_DIRECTIONS:
+        yield np.sqrt(share) * along, _direction(rng)
+
+
+def _slide(times: NDArray[np.float64], rest_s: float, rng: np.random.Generator) -> Iterator[Way]:
+    begins_s, ends_s = rng.uniform(*STANDSTILL_S, 2)
+    slides = (times >= rest_s + begins_s) & (times < times[-1] - ends_s)
+    speed = SPEED_COUNTS_PER_S * np.exp(
+        rng.normal(0.0, SLIDE_SPREAD) + MOMENT_SPREAD * _wander(len(times), MOMENT_TAU_S, rng)
+    )
+    for share in SLIDE_DIRECTIONS:
+        velocity = np.sqrt(share) * slides * speed * _wander(len(times), TURN_TAU_S, rng)
+        yield np.cumsum(velocity) * STEP_S, _direction(rng)
+
+
+def _direction(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Of the motion of 24 electrodes; root mean square 1."""
+    direction = rng.normal(size=ELECTRODES)
+    return np.asarray(direction / np.sqrt((direction**2).mean()), dtype=np.float64)
+
+
+def _wander(number: int, tau_s: float, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Standard Gaussian numbers `STEP_S` apart, correlated over `tau_s`, shape (number,)."""
+    keeps = np.exp(-STEP_S / tau_s)
+    values = rng.normal(size=number)
+    values[1:] *= np.sqrt(1.0 - keeps**2)
+    for index in range(1, number):
+        values[index] += keeps * values[index - 1]
+    return values
