@@ -32,6 +32,8 @@ class Parts:
     pipeline: Pipeline
     drivers: list[Driver]
     """The tactile one first."""
+    boot_id: str | None = None
+    """Of the start that judged what is played; None for grasps of this start."""
 
     @classmethod
     def of(cls, scene: Scene, model: TactileModel) -> Parts:
@@ -54,7 +56,7 @@ class Assembly:
         self._parts = parts
         self._stack = stack
         self._boot_id = uuid.uuid4().hex
-        parts.pipeline.boot_id = parts.pipeline.boot_id or self._boot_id
+        parts.pipeline.boot_id = parts.boot_id or self._boot_id
         self._tap: Tap | None = None
 
     def add_sockets(self, sockets: Sockets) -> None:
@@ -103,7 +105,7 @@ class Assembly:
             trust=pipeline.trust,
         )
         self._stack.callback(keeper.save)
-        self.companions.append(keeper)
+        self.companions.insert(0, keeper)  # what it answers quietens the socket that is read next
 
     def record(self) -> None:
         """Record, if the scene wants that; the session is by now what it is at the start.

@@ -55,7 +55,7 @@ class RecordedRun:
         recorded = self.header.scene
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
         if sections.get("model", {}).pop("min_accuracy", None) is not None:
-            log.warning("%s: was judged with min_accuracy, which is no more", self._paths[0])
+            log.warning("%s: was judged with min_accuracy, which is not known here", self._paths[0])
         sections["tactile"] = {
             "driver": "replay",
             "recordings": [path.absolute() for path in self._paths],

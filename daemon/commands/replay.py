@@ -153,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
     if args.wait is not None and args.publish is None:
         complain("--wait is for subscribers: it needs --publish")
         return 2
-    if args.only_lifted and not args.outcomes:
+    if args.only_lifted and args.recordings and not args.outcomes:
         complain("--only-lifted says which outcomes are told: it needs --outcomes")
         return 2
     try:
@@ -201,7 +201,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
     )
     with ExitStack() as stack:
-        around = Assembly(Parts(wanted, model, pipeline, drivers), stack)
+        around = Assembly(Parts(wanted, model, pipeline, drivers, pipeline.boot_id or None), stack)
         sockets = None if args.publish is None else stack.enter_context(Sockets(wanted))
         if sockets is not None:
             around.add_sockets(sockets)

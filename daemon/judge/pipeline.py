@@ -36,7 +36,7 @@ NOTHING_ELSE: Final = frozenset(filter(None, WITHHELD.values()))
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
     from daemon.judge.grip import Grip
-    from daemon.trust.trust import Trust
+    from daemon.trust.trust import Assessment, Trust
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +333,7 @@ class Pipeline:
             gate=felt.reasons,
             # Taken last, so that a slow inference counts too.
             age_ns=self._age_ns(t_ns),
-            against_stable=None if assessment is None else WITHHELD[assessment.permission],
+            against_stable=self._against_stable(felt.grasp, assessment),
         )
         decision, reasons = decide(case, self._limits)
         known, trust = decision is not Decision.UNKNOWN, self.trust
@@ -350,7 +350,7 @@ class Pipeline:
             contact=felt.touching,
             changes=felt.changes,
             p_slip_model=opinion.p_slip if known else None,
-            outcomes=0 if trust is None else trust.learner.outcomes,
+            outcomes=_outcomes(assessment, trust),
             supervised=(
                 assessment is not None
                 and assessment.supervised
@@ -360,5 +360,17 @@ class Pipeline:
             judged_counts=counts,
         )
 
+    def _against_stable(self, grasp: int, assessment: Assessment | None) -> Reason | None:
+        if self.trust is None or assessment is None:
+            return None
+        return WITHHELD[self.trust.permission(GraspId(self.boot_id, grasp), assessment)]
+
     def _age_ns(self, t_ns: int) -> int:
         return self._clock() - t_ns
+
+
+def _outcomes(assessment: Assessment | None, trust: Trust | None) -> int:
+    """How many what is said rests on."""
+    if assessment is not None:
+        return assessment.outcomes
+    return 0 if trust is None else trust.outcomes

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Annotated, Final, Self
 
 import msgspec
 
@@ -38,7 +38,7 @@ class KeptSession(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Order of the fingers in the statistics."""
     serials: dict[str, str]
     """Serial number of each finger's sensor, as far as it was known."""
-    saved_at: float
+    saved_at: Annotated[float, msgspec.Meta(ge=0.0, le=1e11)]
     """Wall-clock seconds since 1970, for people."""
     statistics: SessionState | None
     """None if no model has needed any."""
@@ -204,7 +204,7 @@ def read(path: Path) -> KeptSession | None:
         if hashlib.sha256(found.kept).hexdigest() != found.sha256:
             raise SessionFileError(f"{path}: not a session: its checksum is wrong")
         return msgspec.json.decode(found.kept, type=KeptSession)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise SessionFileError(f"{path}: not a session: {error}") from error
 
 
@@ -215,11 +215,16 @@ def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
 
 def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
     """What is kept of these fingers. Raises `SessionFileError` if it is of others, or nothing."""
+    of_fingers(kept, fingers)
+    if kept.statistics is None:
+        raise SessionFileError("the kept session is of a model that needs no statistics")
+    return kept.statistics
+
+
+def of_fingers(kept: KeptSession, fingers: Sequence[str]) -> None:
+    """Raise `SessionFileError` if what is kept is of others."""
     if kept.fingers != tuple(fingers):
         raise SessionFileError(
             f"the kept session is of the fingers {', '.join(kept.fingers)}, "
             f"the hand has {', '.join(fingers)}"
         )
-    if kept.statistics is None:
-        raise SessionFileError("the kept session is of a model that needs no statistics")
-    return kept.statistics

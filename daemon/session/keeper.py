@@ -16,7 +16,14 @@ from typing import Final, NamedTuple
 
 from daemon.judge.calibration import SessionCalibration
 from daemon.publish.companion import Answer, Companion, Requests
-from daemon.session.file import KeptSession, SessionFile, SessionFileError, exchanged, statistics_of
+from daemon.session.file import (
+    KeptSession,
+    SessionFile,
+    SessionFileError,
+    exchanged,
+    of_fingers,
+    statistics_of,
+)
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Driver
 from models.session_statistics import SessionState
@@ -30,6 +37,7 @@ SAVE_PERIOD_NS = 10_000_000_000
 WAITING_MAX: Final = 64
 """Answers that wait for the disk; the oldest is given up for a newer one."""
 BUSY: Final = "busy: too many wait for the disk, tell it again"
+UNEXPECTED: Final = "it could not be written"
 HANGS: Final = "not kept: the disk does not answer"
 
 
@@ -155,13 +163,16 @@ class SessionKeeper(Companion):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         while (job := self._jobs.get()) is not None:
             known, written = job
-            self._failure = None
+            self._failure = UNEXPECTED
             try:
                 self._file.save(known.statistics, self._fingers, known.serials, known.trust)
-                self._saved = known
+                self._saved, self._failure = known, None
             except SessionFileError as error:
                 self._failure = str(error)
-            os.eventfd_write(written, 1)
+            finally:  # whoever waits is answered, also where a mistake of ours ends this thread
+                if self._failure is UNEXPECTED:
+                    self._thread = None
+                os.eventfd_write(written, 1)
 
     def _answer(self, number: int, why: str | None) -> None:
         """Answer those who have waited longest."""
@@ -183,6 +194,7 @@ class SessionKeeper(Companion):
             if kept is None:
                 return
             if self._session is None:
+                of_fingers(kept, self._fingers)
                 self._unused = self._unused._replace(statistics=kept.statistics)
             else:
                 self._session.restore(statistics_of(kept, self._fingers))

@@ -73,6 +73,16 @@ class Ledger:
         """Whether a grasp is remembered."""
         return grasp in self._records
 
+    def is_told(self, grasp: GraspId) -> bool:
+        """Whether the outcome of a grasp is known."""
+        known = self._records.get(grasp)
+        return known is not None and known.slipped is not None
+
+    def is_stable(self, grasp: GraspId) -> bool:
+        """Whether a grasp was called `stable`."""
+        known = self._records.get(grasp)
+        return known is not None and known.stable
+
     def note(self, grasp: GraspId, features: bytes, *, stable: bool) -> bool:
         """Remember how a grasp was judged, and by which features, float64.
 

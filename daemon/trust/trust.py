@@ -28,8 +28,12 @@ class Assessment(msgspec.Struct, frozen=True, eq=False):
 
     p_slip: float
     """After learning, 0..1; the model's own as long as nothing was learned."""
+    outcomes: int
+    """How many `p_slip` rests on."""
+    log_odds: float
+    """Of slip, after learning."""
     permission: Permission
-    """Whether it may be called `stable`."""
+    """Whether it may be called `stable`, by the outcomes that were known when it was judged."""
     supervised: bool
     """Whether its lift, watched, would teach what is not known: ask for it."""
     features: bytes
@@ -64,6 +68,8 @@ class Trust:
         """Whether outcomes change what is thought of grasps."""
         self._report: RiskReport | None = None
         self.learner = Learner(inputs)
+        self._judging = self.learner if learns else Learner(inputs)
+        """What grasps are judged by: without learning, one that is never taught."""
         self.risk = Risk(self._limits)
         self.ledger = Ledger()
 
@@ -77,15 +83,38 @@ class Trust:
         """
         if not 0.0 <= p_slip <= 1.0:  # also true for NaN
             raise ValueError(f"{p_slip} is no probability")
-        features = self.learner.features(margin, inputs)
-        log_odds = self.learner.log_odds(features)
-        permission = self.risk.decide(log_odds)
+        features = self._judging.features(margin, inputs)
+        log_odds = self._judging.log_odds(features)
+        permission = self._decide(grasp, log_odds)
         return Assessment(
-            p_slip=sigmoid(log_odds) if self.learner.outcomes else p_slip,
+            p_slip=sigmoid(log_odds) if self._judging.outcomes else p_slip,
+            outcomes=self._judging.outcomes,
+            log_odds=log_odds,
             permission=permission,
             supervised=self.risk.supervised(permission, grasp.boot_id, grasp.grasp),
             features=features.astype("<f8").tobytes(),
         )
+
+    def _decide(self, grasp: GraspId, log_odds: float) -> Permission:
+        permission = self.risk.decide(log_odds)
+        has_rule = self._limits.max_slip_when_stable is not None
+        if has_rule and permission is Permission.ALLOWED and self.ledger.is_told(grasp):
+            return Permission.WITHHELD  # its outcome is known: a second lift would not be counted
+        return permission
+
+    @property
+    def outcomes(self) -> int:
+        """How many what is thought of the next grasp rests on."""
+        return self._judging.outcomes
+
+    def permission(self, grasp: GraspId, assessment: Assessment) -> Permission:
+        """Whether a grasp that was judged may be called `stable` now: never more than then.
+
+        What has been called so, may be again; else outcomes that were told since count too.
+        """
+        if assessment.permission is not Permission.ALLOWED or self.ledger.is_stable(grasp):
+            return assessment.permission
+        return self._decide(grasp, assessment.log_odds)
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
         """Remember what was said of a grasp, unless it is of another model.
@@ -149,6 +178,8 @@ class Trust:
         risk.restore(state.risk)
         ledger.restore(state.ledger, self._inputs + 2)
         self.learner, self.risk, self.ledger = learner, risk, ledger
+        if self.learns:
+            self._judging = learner
         self._report = None
 
 
@@ -166,5 +197,5 @@ def decode(data: bytes) -> TrustState:
     try:
         plain = zlib.decompressobj().decompress(content, MAX_BYTES)
         return msgspec.msgpack.decode(plain, type=TrustState)
-    except (zlib.error, msgspec.DecodeError) as error:
+    except (zlib.error, msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"is nothing that was learned: {error}") from error

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import re
 import tomllib
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from daemon.assembly import assembly
+from daemon.assembly.parts import Assembly, Parts
 from daemon.judge.reasons import Decision
 from daemon.scene import Scene, parse
 from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
@@ -172,3 +174,17 @@ def test_fingers_in_another_order_are_told_what_to_write_instead(
     as_written = hand(("ff", "th"), tactile | wanted.get("tactile", {}))
     assembly.build_pipeline(as_written, assembly.load_model(as_written))
     assert (tactile | wanted.get("tactile", {})).get("sensors") == sensors
+
+
+def test_grasps_are_named_by_the_start_that_tells_of_them_also_where_a_former_scene_goes_on() -> (
+    None
+):
+    parts = Parts.of(scene := parse({"tactile": REPLAY}, Path("s")), assembly.load_model(scene))
+    named = []
+    for _ in range(2):
+        with ExitStack() as stack:
+            outbox = Assembly(parts, stack).build_outbox()
+        judgement = parts.pipeline.silence(0)
+        named.append(outbox.verdict(judgement, 0, 1)[0].boot_id)
+        assert parts.pipeline.boot_id == named[-1]
+    assert named[0] != named[1]

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -13,12 +14,13 @@ from hypothesis import strategies as st
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
 from daemon.trust.ledger import GraspId
-from daemon.trust.risk import RiskLimits
+from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import ElectrodeFault
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 
 BOOT = "b" * 32
+NONE = np.empty(0, np.float32)
 
 
 def trusting(
@@ -169,3 +171,46 @@ def test_the_bound_holds_for_what_is_said(
         start = min(math.log(min(2 * alpha, 0.5) / (1 - min(2 * alpha, 0.5))), 0.0)
         assert slips <= alpha * told + max(start, -6.0) + 6.0 + 6
         assert slips <= report.bound + 1e-9
+
+
+def test_a_lift_after_the_outcome_was_told_is_counted_or_not_permitted() -> None:
+    """The same contact goes on: a second lift of it would be in no bound."""
+    grasp = GraspId(BOOT, 7)
+    trust = Trust("model", 0, RiskLimits(0.5), learns=False)
+    first = trust.judge(grasp, 0.1, -2.0, NONE)
+    trust.note(grasp, first, stable=True)
+    trust.outcome(grasp, slipped=False)
+    assert trust.permission(grasp, first) is Permission.ALLOWED, "it was counted"
+    assert trust.judge(grasp, 0.1, -2.0, NONE).permission is Permission.WITHHELD
+    free = Trust("model", 0)
+    free.note(grasp, free.judge(grasp, 0.1, -2.0, NONE), stable=True)
+    free.outcome(grasp, slipped=False)
+    assert free.judge(grasp, 0.1, -2.0, NONE).permission is Permission.ALLOWED, "no risk is set"
+
+
+def test_what_was_permitted_and_not_said_is_asked_again() -> None:
+    trust = Trust("model", 0, RiskLimits(0.05), learns=False)
+    grasps = [GraspId(BOOT, number) for number in range(30)]
+    early = [trust.judge(grasp, 1e-6, -13.8, NONE) for grasp in grasps]
+    assert {each.permission for each in early} == {Permission.ALLOWED}
+    slips = 0
+    for grasp, assessment in zip(grasps, early, strict=True):
+        if trust.permission(grasp, assessment) is Permission.ALLOWED:
+            trust.note(grasp, assessment, stable=True)
+            trust.outcome(grasp, slipped=True)
+            slips += 1
+    assert 0 < slips <= 0.05 * slips + math.log(0.1 / 0.9) + 6.0 + 0.95
+
+
+def test_without_learning_what_was_learned_before_is_not_used() -> None:
+    taught, x = Trust("model", 0), NONE
+    for number in range(40):
+        grasp = GraspId(BOOT, number)
+        taught.note(grasp, taught.judge(grasp, 0.4, -0.4, x), stable=False)
+        taught.outcome(grasp, slipped=False)
+    assert taught.judge(GraspId(BOOT, 99), 0.4, -0.4, x).p_slip < 0.3
+    plain = Trust("model", 0, learns=False)
+    plain.restore(taught.state())
+    assessment = plain.judge(GraspId(BOOT, 99), 0.4, -0.4, x)
+    assert (assessment.p_slip, assessment.outcomes, plain.outcomes) == (0.4, 0, 0)
+    assert plain.state() == taught.state()

@@ -229,6 +229,7 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
 ) -> None:
     part: Trust = trust()
     found: list[str | None] = []
+    threads = threading.active_count()
     keeper = keeper_of(part)
     disk.goes_on.clear()
     for grasp in range(3):
@@ -242,6 +243,44 @@ def test_a_disk_that_hangs_does_not_hold_up_the_end(
     disk.goes_on.set()
     go_round(keeper)
     assert found[3:] == []
+    while threading.active_count() > threads:  # it ends once the disk has answered
+        time.sleep(0.01)
+
+
+def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
+    tmp_path: Path,
+) -> None:
+    session = calibration()
+    observe(session, 30)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None)
+        part = trust()
+        keeper = SessionKeeper(None, FINGERS, sensors(), file, Clock(), trust=part)
+        judge(part, 0)
+        keeper.keep(lambda _: None)
+        keeper.save()
+    kept = load(tmp_path / "right.json")
+    assert kept is not None
+    assert (kept.fingers, kept.statistics, kept.serials) == (FINGERS, None, {})
+
+
+def test_whoever_waits_is_answered_whatever_ends_the_writing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threading, "excepthook", lambda _: None)
+    part, found = trust(), list[str | None]()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(None, FINGERS, sensors(), file, Clock(), trust=part)
+        save = file.save
+        monkeypatch.setattr(file, "save", lambda *_: 1 // 0)
+        judge(part, 0)
+        keeper.keep(found.append)
+        keeper.wait()
+        assert found == ["not kept: it could not be written"]
+        monkeypatch.setattr(file, "save", save)
+        keeper.keep(found.append)
+        keeper.save()
+    assert found[1:] == [None]
 
 
 def test_session_and_what_was_learned_are_restored_together(tmp_path: Path) -> None:

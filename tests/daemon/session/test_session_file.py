@@ -228,3 +228,14 @@ def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_pat
     assert kept.trust is not None
     assert decode(kept.trust) == part.state()
     assert (tmp_path / "right.json").stat().st_size < 1 << 20
+
+
+def test_what_is_nested_too_deeply_gives_way_to_the_former_file(tmp_path: Path) -> None:
+    path = tmp_path / "right.json"
+    with SessionFile(path) as file:
+        for number in (20, 21):
+            session = calibration()
+            observe(session, number)
+            file.save(session.state(), FINGERS, {}, None)
+    path.write_bytes(b'{"version":2,"sha256":"a","kept":' + b"[" * 100_000)
+    assert grasps_of(load(path)) == 20
