@@ -123,9 +123,10 @@ def test_the_figures_of_contract_and_card_are_the_same(name: str) -> None:
         by_palm = sum(palm["grasps"] for palm in figures["palms"].values())
         by_object = sum(figures["share"]["grasps"] for figures in figures["objects"].values())
         assert judged == by_palm == by_object
-        # Folds are of nearly the same size, so their mean is nearly that of all grasps.
-        accuracy = (true_stable + hit) / judged
-        assert figures["spreads"]["accuracy"]["mean"] == pytest.approx(accuracy, abs=0.01)
+        # Folds are of nearly the same size, so their mean is nearly that of all grasps; those of
+        # `days` judge one table or two.
+        accuracy, near = (true_stable + hit) / judged, 0.03 if protocol == "days" else 0.01
+        assert figures["spreads"]["accuracy"]["mean"] == pytest.approx(accuracy, abs=near)
 
 
 def test_cnn1_has_the_size_of_the_published_network() -> None:
