@@ -20,8 +20,7 @@ MARGIN_MAX: Final = 30.0
 """Larger margins, log-odds, say no more: the logarithm of the smallest probability that a network's
 float32 output is taken for."""
 INPUT_MAX: Final = 1e3
-"""Inputs whose root of the sum of squares is larger are refused: standardised features have a few
-units each."""
+"""Larger inputs are refused: standardised features have a few units."""
 MARGIN_SPREAD, BIAS_SPREAD, FEATURE_SPREAD = 0.3, 0.5, 0.3
 """Standard deviations of the prior: of the margin's weight, the bias, and each feature's weight."""
 DRIFT: Final = 2e-3
@@ -88,8 +87,8 @@ class Learner:
         """
         if inputs.shape != (self._width - 2,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
-        # As one product: a NaN or an overflow is no smaller than the limit.
-        if not (math.isfinite(margin) and float(inputs @ inputs) <= INPUT_MAX**2):
+        largest = float(np.maximum.reduce(np.abs(inputs), initial=0.0))  # NaN if one is
+        if not (math.isfinite(margin) and largest <= INPUT_MAX):
             raise ValueError("margin or inputs are not finite, or too large")
         values = np.empty(self._width)
         values[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE

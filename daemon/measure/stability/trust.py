@@ -40,7 +40,7 @@ CHECKS = 100
 """How often the covariance is looked at meanwhile."""
 COMPARED = 500
 """Outcomes that extended precision is asked for; it takes a millisecond for each."""
-ERROR_MAX = 1e-9
+ERROR_MAX = 1e-6
 """Largest error of log-odds, over their magnitude if that is above 1."""
 EIGENVALUE_MIN = 0.99 * DRIFT * FEATURE_SPREAD**2
 """What the learner's docstring derives, but for rounding."""

@@ -230,7 +230,7 @@ def test_a_weight_stops_at_fifty_times_its_priors_deviation_whatever_is_told() -
     for index in range(2000):
         sign = -1.0 if index % 2 else 1.0
         # In turns so far on one side that the learner is sure, and wrong.
-        features = learner.features(30.0 * sign, np.array([-999.0 * sign, 3.0]))
+        features = learner.features(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
         learner.learn(features, slipped=learner.log_odds(features) < 0.0)
     weights = np.frombuffer(learner.state().mean)
     limits = 50.0 * np.array([0.3, 0.5, 0.3, 0.3])
