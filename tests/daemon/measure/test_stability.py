@@ -170,7 +170,7 @@ def test_each_step_stands_in_the_report(whole: Run, step: str) -> None:
 
 def test_a_bound_that_nothing_keeps_makes_the_exit_code_1(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stability, "BOUNDS", Bounds(input_relative=1e-5, p_slip=1e-12))
-    code, text = run("mlp")
+    code, text = run("mlp", "--quick")
     assert code == 1
     assert "BROKEN: p_slip" in text
     assert max(map(len, text.splitlines())) < 400
