@@ -15,8 +15,7 @@ from tests.system.lab import CAN_RATE_HZ, LOOK_S, PATIENCE_S, PAYLOAD, Lab, Outc
 from tests.system.messages import Message
 
 REPLAYED_ROWS: Final = 30
-"""Of the recording 33 rows in a row at most are judged without a session."""
-"""Verdicts in a row that are compared with a replay."""
+"""Verdicts in a row that are compared with a replay; without a session at most 33 are judged."""
 P_SLIP_ERROR_MAX: Final = 1e-5
 """Same counts, same network, same processor: only the text of a number may round."""
 GRASPS: Final = 3
