@@ -56,24 +56,24 @@ class NoveltyCheck:
     def is_seen(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
         """The opposite of `never_seen` for one reading, (fingers, 24), in a third of the time."""
         inside = (values >= self._low) & (values <= self._high)
-        return np.count_nonzero(inside) == self._electrodes and self.is_near(values, repaired)
+        return np.count_nonzero(inside) == self._electrodes and self.is_near(
+            self.square(values, repaired)
+        )
 
-    def is_near(
-        self, values: NDArray[np.float64], repaired: int = 0, contradicted: int = 0
-    ) -> bool:
-        """Whether counts (fingers, 24) fit the training covariance; ranges do not matter.
+    def is_near(self, square: float, contradicted: int = 0) -> bool:
+        """Whether a reading of this `square` fits the training covariance; ranges do not matter.
 
-        So many of the `repaired` electrodes `contradicted` the others.
+        So many of the electrodes that were repaired in it `contradicted` the others.
         """
         share = CONTRADICTED_DISTANCES if contradicted else 1.0
-        square = self._square(values, repaired)
         return self._square_min <= square <= share**2 * self._square_max
 
-    def is_learned(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
-        """Whether a session may take in counts (fingers, 24) that were mapped by it."""
-        return self._square(values, repaired) <= LEARNED_DISTANCES**2 * self._square_max
+    def is_learned(self, square: float) -> bool:
+        """Whether a session may take in a reading of this `square`, which was mapped by it."""
+        return square <= LEARNED_DISTANCES**2 * self._square_max
 
-    def _square(self, values: NDArray[np.float64], repaired: int) -> float:
+    def square(self, values: NDArray[np.float64], repaired: int = 0) -> float:
+        """Mean square whitened deviation of counts (fingers, 24) with so many `repaired`."""
         deviations = (values.ravel() - self._centre) @ self._whitening
         return float(deviations @ deviations) / (self._electrodes - repaired)
 

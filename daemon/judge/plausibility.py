@@ -61,9 +61,9 @@ class Plausibility:
             elif self._electrodes.moved_finger(values):
                 seen = learned = False
             else:
-                learned = self._novelty.is_learned(values, number)
-                near = self._novelty.is_near(values, number, number - known)
-                seen = near and not session.odd
+                square = self._novelty.square(values, number)
+                learned = self._novelty.is_learned(square)
+                seen = self._novelty.is_near(square, number - known) and not session.odd
         if not seen:
             # A young session learns from all, for that is how drift begins; later on a sensor that
             # fails would slowly become its own standard.

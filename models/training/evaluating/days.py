@@ -82,8 +82,8 @@ class Day:
             return counts, self._novelty.is_seen(values, number), True
         if self.electrodes.moved_finger(values):
             return counts, False, False
-        is_near = self._novelty.is_near(values, number, number)
-        return counts, is_near, self._novelty.is_learned(values, number)
+        square = self._novelty.square(values, number)
+        return counts, self._novelty.is_near(square, number), self._novelty.is_learned(square)
 
 
 class SessionDay:
