@@ -74,11 +74,17 @@ def _whole(lab: Lab, began_s: float) -> tuple[float, float]:
     return from_s, to_s
 
 
-def _place(judged: list[float], expected: list[float]) -> int | None:
-    """From which row of the recording, played in a loop, the judgements are; None if of none."""
+def _place(judged: list[float], expected: list[float | None]) -> int | None:
+    """From which row of the recording, played in a loop, the judgements are; None if of none.
+
+    A row that a replay refuses has None for a probability, and is nobody's.
+    """
     for at in range(len(expected)):
         rows = (expected[(at + row) % len(expected)] for row in range(len(judged)))
-        if all(abs(a - b) <= P_SLIP_ERROR_MAX for a, b in zip(judged, rows, strict=True)):
+        if all(
+            row is not None and abs(judgement - row) <= P_SLIP_ERROR_MAX
+            for judgement, row in zip(judged, rows, strict=True)
+        ):
             return at
     return None
 
