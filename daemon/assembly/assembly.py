@@ -69,8 +69,8 @@ def build_pipeline(
 ) -> Pipeline:
     """The judge of this scene, whose session `learns` from the grasps or stays what it is.
 
-    Raises `ModelError` if the model does not fit the hand,
-    `SceneError` or `RecordingError` if recordings do not say whether they are grasps or streams.
+    Raises `ModelError` if the model does not fit the hand, `SceneError` or `RecordingError` if
+    recordings do not say whether they are grasps or streams.
     """
     _refuse_other_fingers(scene, model)
     limits = Limits(

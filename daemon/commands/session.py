@@ -143,7 +143,6 @@ def _learned(kept: KeptSession | None) -> dict[str, Any] | None:
     except ValueError as error:
         complain(f"what was learned {error}")
         return None
-    records = state.ledger.records
     return {
         "model": state.model,
         "outcomes": state.learner.outcomes,
@@ -151,7 +150,7 @@ def _learned(kept: KeptSession | None) -> dict[str, Any] | None:
         "max_slip_when_stable": state.risk.max_slip_when_stable,
         "lifts": state.risk.lifts,
         "slips": state.risk.slips,
-        "outstanding": sum(each.stable and each.slipped is None for each in records),
+        "outstanding": state.ledger.outstanding,
         "unreported": state.ledger.unreported,
         "proven": state.risk.proven,
     }

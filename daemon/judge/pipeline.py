@@ -15,13 +15,18 @@ from daemon.judge.health import Health
 from daemon.judge.limits import GripLimits
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
-from daemon.judge.reasons import Decision, GateChange, GateState, Reason
+from daemon.judge.reasons import WATCHED_LIFT, Decision, GateChange, GateState, Reason
 from daemon.trust.ledger import GraspId
 from daemon.trust.risk import Permission, RiskReport
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
 from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.judge.calibration import SessionCalibration
+    from daemon.judge.grip import Grip
+    from daemon.trust.trust import Assessment, Trust
 
 WITHHELD: Final = {
     Permission.ALLOWED: None,
@@ -30,13 +35,6 @@ WITHHELD: Final = {
     Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
 }
 """What is against calling a grasp `stable`, by what the risk permits."""
-NOTHING_ELSE: Final = frozenset(filter(None, WITHHELD.values()))
-"""With other reasons than these there is nothing to lift, under supervision or not."""
-
-if TYPE_CHECKING:
-    from daemon.judge.calibration import SessionCalibration
-    from daemon.judge.grip import Grip
-    from daemon.trust.trust import Assessment, Trust
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,7 +352,7 @@ class Pipeline:
             supervised=(
                 assessment is not None
                 and assessment.supervised
-                and NOTHING_ELSE.issuperset(reasons)
+                and WATCHED_LIFT.issuperset(reasons)
             ),
             risk=None if trust is None else trust.report(),
             judged_counts=counts,

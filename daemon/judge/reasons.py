@@ -89,6 +89,10 @@ ADVICE: dict[Reason, str] = {
 }
 
 
+WATCHED_LIFT = frozenset({Reason.LOW_CONFIDENCE, Reason.UNPROVEN})
+"""Reasons with which a grasp may still be lifted under supervision; with any other it may not."""
+
+
 class GateState(StrEnum):
     """Where in a grasp the hand is."""
 

@@ -55,6 +55,11 @@ class LedgerState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     told: dict[Told, Annotated[int, msgspec.Meta(ge=0)]]
     unreported: Annotated[int, msgspec.Meta(ge=0)]
 
+    @property
+    def outstanding(self) -> int:
+        """Grasps called `stable` whose outcome can still come."""
+        return sum(each.stable and each.slipped is None for each in self.records)
+
 
 class Ledger:
     """Remembers the last `GRASPS_MAX` judged grasps."""
@@ -136,4 +141,4 @@ class Ledger:
                 raise ValueError("would learn from a grasp twice")
         self._records, self.told = records, Counter(state.told)
         self.unreported = state.unreported
-        self.outstanding = sum(each.stable and each.slipped is None for each in records.values())
+        self.outstanding = state.outstanding

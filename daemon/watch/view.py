@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
+from daemon.judge.reasons import ADVICE, WATCHED_LIFT, Decision, GateState, Reason
 from daemon.publish.messages import (
     GateMessage,
     OutcomeMessage,
@@ -38,8 +38,6 @@ TACTILE_OLD_NS = 1_000_000_000
 """Images older than this are not shown: they would look alive."""
 GRASPS_MAX = 8
 """Grasps that are shown after they were judged."""
-WITHHELD = {Reason.UNPROVEN, Reason.LOW_CONFIDENCE}
-"""Reasons of a grasp that nothing but the risk is against."""
 AS_IT_SHOULD_BE = {
     Reason.NO_CONTACT,
     Reason.MOVING,
@@ -202,7 +200,7 @@ class View:
             return Tone.SILENT, [silence, Line("link", self.link)]
         if verdict.verdict is Decision.UNKNOWN:
             why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]
-            if verdict.supervised and WITHHELD.issuperset(verdict.reasons):
+            if verdict.supervised and WATCHED_LIFT.issuperset(verdict.reasons):
                 return Tone.LEARNING, [WATCHED, *why]
             quiet = AS_IT_SHOULD_BE.issuperset(verdict.reasons)
             return Tone.WAITING if quiet else Tone.TROUBLE, why

@@ -1,7 +1,7 @@
 """Grasps of another day, as they come: what networks say that saw neither their objects nor pose.
 
-The days are those of the protocol `days`. The session's statistics run as in the daemon, from
-nothing, and every grasp is judged, none refused.
+The days are those of the protocol `days`. The session's statistics run from nothing as in the
+daemon, but that slips weigh as much as others; every grasp is judged, none refused.
 """
 
 from __future__ import annotations
