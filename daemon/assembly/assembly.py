@@ -153,8 +153,8 @@ def grip_limits(scene: Scene) -> GripLimits | None:
         required=gate.fingers,
         contact=ContactLimits(counts=gate.contact_counts, sigmas=gate.contact_sigmas),
         gate=GateLimits(
-            hold_ns=round(gate.hold_ms * 1e6),
-            rate_counts_per_s=gate.rate_counts_per_s,
+            false_alarms=gate.false_alarms,
+            early=gate.early,
             change_counts=gate.change_counts,
             request_ns=round(gate.request_ms * 1e6),
             gap_ns=round(gate.gap_ms * 1e6),

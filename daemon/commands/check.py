@@ -212,8 +212,7 @@ def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
     joints = "" if limits.joints is None else f", joints below {gate.joint_rad_per_s:g} rad/s"
     fingers = ", ".join(gate.fingers or wanted.hand.fingers)
     return (
-        f"{when}once per grasp: {fingers} touch, still below {gate.rate_counts_per_s:g} counts/s"
-        f"{joints} for {gate.hold_ms:g} ms; {what}, {age}"
+        f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}, {age}"
     )
 
 

@@ -55,6 +55,14 @@ class Felt(NamedTuple):
     """Fingers that touch."""
     changes: tuple[GateChange, ...] = ()
     """What the gate did since it was asked last, oldest first."""
+    still_ns: int | None = None
+    """For how long the hand has touched and kept still."""
+    early: bool = False
+    """Whether it was judged while something might still slide slowly."""
+    motion: dict[Finger, float | None] | None = None
+    """How each finger moves, in units of its noise; None where that is not known."""
+    motion_limits: dict[Finger, float] | None = None
+    """What it may be at most for a finger that is still."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,8 @@
     closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
 
 A grasp begins with the first touch and ends when nothing touches any more. It is judged once, when
-all fingers touch and everything has kept still for the hold time, and again when it has changed.
+all fingers touch and everything has kept still for so long that nothing can slide unseen, and again
+when it has changed or moved on; where `early` is wanted, also once as soon as nothing moves fast.
 Times are those of the readings, so a stall or a burst of old readings settles nothing.
 """
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.limits import GateLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
-from daemon.judge.stillness import Stillness, mean_distance
+from daemon.judge.stillness import LONG_NS, SHORT_NS, Motion, mean_distance
 from drivers.base import ELECTRODES
 
 CHANGES_MAX = 64
@@ -34,8 +35,15 @@ class GateMemory:
     """Shape (fingers, 24): counts where it was judged; means nothing before."""
     last_ns: int | None = None
     """Time of the last reading."""
-    held_since_ns: int | None = None
-    """Since when touch and stillness have lasted."""
+    touched_ns: int = 0
+    """Since when all required fingers touch, if they do."""
+    still_since_ns: int | None = None
+    """Since when touch and stillness have lasted, as far as that can be told; None if something
+    moves."""
+    moved_since_ns: int | None = None
+    """Since when a judged grasp has moved; None if it does not."""
+    early: bool = False
+    """Whether a grasp that was judged had then only not moved fast."""
     released_ns: int = 0
     """When nothing touched any more."""
     asked: bool = False
@@ -64,7 +72,7 @@ class Gate:
         self._required: list[int] = np.flatnonzero(required).tolist()
         self._limits = limits
         self._on_request = on_request
-        self.stillness = Stillness(limits.rate_window_ns, len(required))
+        self.motion = Motion(len(required), limits.false_alarms, early=limits.early)
         self.memory = GateMemory(np.zeros((len(required), ELECTRODES), dtype=np.float32))
         self._changes: list[GateChange] = []
 
@@ -82,6 +90,22 @@ class Gate:
     def in_contact(self) -> bool:
         """Whether all required fingers touch."""
         return self.memory.in_contact
+
+    @property
+    def still_ns(self) -> int:
+        """For how long the hand has touched and kept still, ns; 0 if something moves.
+
+        Less than the long window as long as something may slide slowly.
+        """
+        memory = self.memory
+        if memory.still_since_ns is None or memory.last_ns is None:
+            return 0
+        return memory.last_ns - memory.still_since_ns
+
+    @property
+    def early(self) -> bool:
+        """Whether the grasp was judged while something might still slide slowly."""
+        return self.memory.state is GateState.JUDGED and self.memory.early
 
     @property
     def settled(self) -> bool:
@@ -116,7 +140,9 @@ class Gate:
     def judged(self, t_ns: int, median: NDArray[np.uint16]) -> None:
         """The settled grasp was judged, by the reading of `t_ns` with these counts."""
         self.memory.reference = median.astype(np.float32)
-        self.memory.asked = False
+        self.memory.early = self.still_ns < LONG_NS
+        self.memory.asked = self.memory.asked and self.memory.early  # the sure one comes unasked
+        self.memory.moved_since_ns = None
         self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
 
     def take_changes(self) -> list[GateChange]:
@@ -133,12 +159,13 @@ class Gate:
     def step(
         self,
         t_ns: int,
+        counts: NDArray[np.uint16],
         median: NDArray[np.uint16],
         usable: NDArray[np.bool_],
         touching: NDArray[np.bool_],
         against: tuple[Reason, ...] = (),
     ) -> None:
-        """Take in one usable reading of `t_ns`: its `FreshMedian` and which fingers touch.
+        """Take in one usable reading of `t_ns`, its `FreshMedian` and which fingers touch.
 
         `against` speaks against settling for reasons of others: no tare, joints that move.
         """
@@ -146,18 +173,21 @@ class Gate:
         self.skip(t_ns)
         memory.last_ns = t_ns
         self._follow_question(t_ns)
-        counts = median.astype(np.float32)
-        self.stillness.add(t_ns, counts)
+        self.motion.add(t_ns, counts, usable)
         touches = touching.tolist()
-        memory.in_contact = all(touches[finger] for finger in self._required)
-        reasons = self._disturbances(t_ns, counts, usable, against)
+        in_contact = all(touches[finger] for finger in self._required)
+        if in_contact and not memory.in_contact:
+            memory.touched_ns = t_ns
+        memory.in_contact = in_contact
+        reasons = self._disturbances(against)
+        self._follow_stillness(t_ns, bool(reasons))
         self._follow_contact(t_ns, any(touches))
         if memory.state is GateState.JUDGED:
-            self._follow_judged(t_ns, counts, usable)
-        elif memory.state is GateState.SETTLED and reasons:
+            reasons += self._follow_judged(t_ns, median.astype(np.float32), usable)
+        elif memory.state is GateState.SETTLED and (reasons or not self._is_still):
             cause = GateCause.MOVED if memory.in_contact else GateCause.CONTACT_LOST
             self._enter(GateState.CLOSING, t_ns, cause)
-        memory.against = (*reasons, *self._hold(t_ns, bool(reasons)))
+        memory.against = (*reasons, *self._settle(t_ns, bool(reasons)))
 
     def _follow_question(self, t_ns: int) -> None:
         memory = self.memory
@@ -170,24 +200,35 @@ class Gate:
         elif t_ns > memory.asked_until_ns:
             memory.asked = False
 
-    def _disturbances(
-        self,
-        t_ns: int,
-        counts: NDArray[np.float32],
-        usable: NDArray[np.bool_],
-        against: tuple[Reason, ...],
-    ) -> tuple[Reason, ...]:
+    def _disturbances(self, against: tuple[Reason, ...]) -> tuple[Reason, ...]:
         if not self.memory.in_contact:
             return (
                 *(reason for reason in against if reason is Reason.NOT_TARED),
                 Reason.NO_CONTACT,
             )
-        rate = self.stillness.rate(t_ns, counts, usable)
-        if rate is None:
+        if not self.motion.known:
             return (*against, Reason.SEQUENCE_GAP)
-        if not max(rate.tolist()) <= self._limits.rate_counts_per_s:
-            return (*against, Reason.MOVING)
-        return against
+        return against if self.motion.early else (*against, Reason.MOVING)
+
+    @property
+    def _is_still(self) -> bool:
+        """Whether it is for long enough to judge."""
+        return self.still_ns >= (SHORT_NS if self._limits.early else LONG_NS)
+
+    def _follow_stillness(self, t_ns: int, disturbed: bool) -> None:
+        """The windows say for how long nothing has moved; the touch must have lasted as long."""
+        memory = self.memory
+        if disturbed:
+            memory.still_since_ns = None
+            return
+        since_ns = memory.still_since_ns
+        if since_ns is None:
+            since_ns = max(t_ns - SHORT_NS, memory.touched_ns)
+        if self.motion.sure:
+            since_ns = min(since_ns, max(t_ns - LONG_NS, memory.touched_ns))
+        else:
+            since_ns = max(since_ns, t_ns - LONG_NS + 1)
+        memory.still_since_ns = since_ns
 
     def _follow_contact(self, t_ns: int, touches: bool) -> None:
         memory, release_ns = self.memory, self._limits.release_ns
@@ -202,25 +243,32 @@ class Gate:
 
     def _follow_judged(
         self, t_ns: int, counts: NDArray[np.float32], usable: NDArray[np.bool_]
-    ) -> None:
-        if not self.memory.in_contact:
+    ) -> tuple[Reason, ...]:
+        """Whether the judged grasp is still the same; what else is against it."""
+        memory = self.memory
+        if not memory.in_contact:
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
-            return
-        distance = mean_distance(counts, self.memory.reference, usable)
+            return ()
+        distance = mean_distance(counts, memory.reference, usable)
         if max(distance.tolist()) > self._limits.change_counts:
             self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
+            return ()
+        if self.motion.early if memory.early else self.motion.sure:
+            memory.moved_since_ns = None
+            if memory.early and self.still_ns >= LONG_NS and self._is_asked:
+                self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
+            return ()
+        if memory.moved_since_ns is None:
+            memory.moved_since_ns = t_ns
+        elif t_ns - memory.moved_since_ns >= LONG_NS:
+            self._enter(GateState.CLOSING, t_ns, GateCause.MOVED)
+        return (Reason.MOVING,) if self.motion.early else ()
 
-    def _hold(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:
-        """Wait for the hold time; what speaks against settling besides what disturbs."""
-        memory = self.memory
-        if disturbed:
-            memory.held_since_ns = None
+    def _settle(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:
+        """Settle once everything is still; what speaks against it besides what disturbs."""
+        if disturbed or self.memory.state is not GateState.CLOSING:
             return ()
-        if memory.state is not GateState.CLOSING:
-            return ()
-        if memory.held_since_ns is None:
-            memory.held_since_ns = t_ns
-        if t_ns - memory.held_since_ns < self._limits.hold_ns:
+        if not self._is_still:
             return (Reason.SETTLING,)
         self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
         return ()
@@ -232,8 +280,9 @@ class Gate:
             memory.released_ns = t_ns
             memory.asked_until_ns = None
         memory.last_ns = t_ns
-        memory.held_since_ns = None
-        self.stillness.reset()
+        memory.still_since_ns = None
+        memory.touched_ns = min(memory.touched_ns, t_ns)
+        self.motion.reset()
         memory.against = (Reason.SEQUENCE_GAP,)
         if memory.state in (GateState.SETTLED, GateState.JUDGED):
             self._enter(GateState.CLOSING, t_ns, GateCause.GAP)
@@ -244,4 +293,4 @@ class Gate:
             self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
         memory.state = state
         if state is GateState.CLOSING:
-            memory.held_since_ns = None
+            memory.moved_since_ns = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any
@@ -109,6 +110,7 @@ class Grip:
     def forget(self) -> None:
         """Forget tare and grasp: the sensors are others, or may be."""
         self._contact.forget()
+        self._gate.motion.forget()
         self._fresh.reset()
         self.restart()
 
@@ -128,7 +130,7 @@ class Grip:
             "fresh": self._fresh.memory,
             "contact": self._contact.memory,
             "gate": self._gate.memory,
-            "stillness": self._gate.stillness.memory,
+            "motion": self._gate.motion.memory,
         }
         joints = {} if self._joints is None else {"joints": {"joints": self._joints.memory}}
         return {"hand": hand, **joints}
@@ -152,6 +154,7 @@ class Grip:
             self._fresh.reset()
             if t_ns - last_ns > OUTAGE_NS:
                 self._contact.forget()
+                self._gate.motion.forget()
         self.memory.last_ns = t_ns
         if self.memory.unsettled:
             self.memory.unsettled -= 1
@@ -161,7 +164,7 @@ class Grip:
         median = self._fresh.counts
         self._contact.observe(t_ns, reading.counts, median, usable)
         against = self._against(t_ns)
-        self._gate.step(t_ns, median, usable, self._contact.touching, against)
+        self._gate.step(t_ns, reading.counts, median, usable, self._contact.touching, against)
 
     def counts_to_judge(
         self, reading: TactileReading, watched: Watched
@@ -189,7 +192,24 @@ class Grip:
             gate.state,
             self.touching,
             tuple(gate.take_changes()),
+            gate.still_ns,
+            gate.early,
+            *self._motion(),
         )
+
+    def _motion(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
+        """How each finger moves in the window that shows more of it, and what it may there."""
+        found, limits = dict[Finger, float | None](), dict[Finger, float]()
+        windows = self._gate.motion
+        fast, slow = windows.motion.tolist()
+        fast_limits, slow_limits = windows.limits.tolist()
+        for place, finger in enumerate(self._fingers):
+            moves, limit = fast[place], fast_limits[place]
+            if slow[place] < math.inf and slow[place] * limit > moves * slow_limits[place]:
+                moves, limit = slow[place], slow_limits[place]
+            found[finger] = round(moves, 2) if moves < math.inf else None
+            limits[finger] = round(limit, 2)
+        return found, limits
 
     def _against(self, t_ns: int) -> tuple[Reason, ...]:
         against: list[Reason] = []

@@ -29,13 +29,12 @@ class ContactLimits:
 class GateLimits:
     """When a grasp has settled, and when it is another one. Times in ns, counts raw."""
 
-    hold_ns: int = 60_000_000
-    """Touch and stillness must last so long."""
-    rate_window_ns: int = 80_000_000
-    """Motion is the difference to the sweep so long ago."""
-    rate_counts_per_s: float = 120.0
-    """A finger whose electrodes change faster than this in the mean is moving. Three untouched
-    sensors, whose noise counts as motion too, showed 75 at most in 9.8 s."""
+    false_alarms: float = 0.05
+    """Share of the sweeps of a hand that holds in which it may be said to move. A slower slide is
+    told from a held touch by a larger share; deploy/JUDGING.md has the curve."""
+    early: bool = False
+    """Whether a grasp is judged as soon as fast motion is excluded, and again when slow slides
+    are."""
     change_counts: float = 40.0
     """A finger whose electrodes are so far from where they were judged, in the mean, is another
     grasp."""

@@ -60,6 +60,15 @@ class Judgement:
     """Fingers that touch; None where nobody looks."""
     changes: tuple[GateChange, ...] = ()
     """What the gate did at this reading, oldest first."""
+    still_ms: float | None = None
+    """For how long the hand has touched and kept still; None where each reading is a grasp."""
+    early: bool = False
+    """Whether it was judged while something might still slide slowly; only where it is known."""
+    motion: dict[Finger, float | None] | None = None
+    """How each finger moves, in units of its noise, None where that is not known; all None where
+    nobody looks."""
+    motion_limits: dict[Finger, float] | None = None
+    """What it may be at most for a finger that is still."""
     p_slip_model: float | None = None
     """What the network alone says; None exactly when the decision is unknown."""
     outcomes: int = 0
@@ -237,7 +246,7 @@ class Pipeline:
         if self.grip is None:
             felt = Felt(self.memory.readings, None, judged=False)
         else:
-            felt = self.grip.felt(None)
+            felt = self.grip.felt(None)._replace(still_ns=None, motion=None, motion_limits=None)
         return self._decide(last_t_ns, (Reason.STALE,), felt, NO_OPINION)
 
     def health(self) -> dict[str, Reason]:
@@ -347,6 +356,10 @@ class Pipeline:
             gate=felt.gate,
             contact=felt.touching,
             changes=felt.changes,
+            still_ms=None if felt.still_ns is None else felt.still_ns / 1e6,
+            early=known and felt.early,
+            motion=felt.motion,
+            motion_limits=felt.motion_limits,
             p_slip_model=opinion.p_slip if known else None,
             outcomes=_outcomes(assessment, trust),
             supervised=(

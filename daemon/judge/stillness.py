@@ -1,6 +1,8 @@
-"""How fast the electrodes change: now against the last moments, so that noise is no motion.
+"""Whether the fingers keep still: how each moves, in units of its own noise.
 
-The window is remembered in few sweeps however fast they come, so memory is constant.
+Fast motion is the slope of a line through the last moments of every electrode; slow slides, which
+stop and turn, show in how far the electrodes spread over a longer time. What is remembered is so
+many steps of time however fast sweeps come, so memory is constant.
 """
 
 from __future__ import annotations
@@ -14,11 +16,51 @@ from numpy.typing import NDArray
 from daemon.judge.findings import Number
 from drivers.base import ELECTRODES
 
-SWEEPS = 16
-"""Sweeps remembered of a window; of faster readings, some are left out."""
-KEPT = SWEEPS + 2
-"""And one at each end of the window."""
+STEP_NS = 5_000_000
+"""Of sweeps that come faster than this, the mean is remembered."""
+SHORT_NS, LONG_NS = 100_000_000, 240_000_000
+"""The short window shows fast motion soon, the long one slow slides, which no short one can."""
+STEPS = LONG_NS // STEP_NS + 2
+"""Steps remembered: the long window, and one at each end of it."""
+STEPS_MIN = 3
+"""Steps of a window at least: where sweeps come slowly, windows are longer."""
+SPIKE_COUNTS = 20.0
+"""A value that falls further than this is believed when the next one is as low. Spikes last for one
+sweep and go down by 25 counts or more; noise does so in one value of three thousand."""
+BLOCK_STEPS, BLOCKS = 24, 16
+"""Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
+what it is while a hand closes or opens, ..."""
+BLOCKS_MIN = 4
+"""... and is not known before there are so many of them."""
+SIGMA_COUNTS = (0.5, 10.0)
+"""An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
+APART = 3
+"""Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
+sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
+SOUND_MIN = 12
+"""A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
+MEAN_ABS = math.sqrt(2.0 / math.pi)
+"""Mean absolute value of a Gaussian of standard deviation 1."""
+SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
+"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
+CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
+"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
+its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
+240 ms."""
+FAST_SHARE = 0.1
+"""Share of the false alarms that the short window may have where the long one decides."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
+SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))
+"""Of so many values on a line around 0: sum of the products of those so many steps apart, over the
+sum of squares. Noise that is correlated makes a slope the larger."""
+SPREAD_ECHO = np.zeros((STEPS + 1, APART - 1))
+"""Of so many values: pairs that are so many steps apart, over all pairs. Noise that is correlated
+spreads the less."""
+for _number in range(STEPS_MIN, STEPS + 1):
+    for _lag in range(1, APART):
+        _line = np.arange(_number) - (_number - 1) / 2.0
+        SLOPE_ECHO[_number, _lag - 1] = _line[_lag:] @ _line[:-_lag] / (_line @ _line)
+        SPREAD_ECHO[_number, _lag - 1] = 2.0 * (_number - _lag) / (_number * (_number - 1))
 
 
 def mean_distance(
@@ -38,115 +80,6 @@ def mean_distance(
 
 
 @dataclass(slots=True, eq=False)
-class StillnessMemory:
-    """The medians of the last window."""
-
-    times_ns: list[int]
-    """Of the sweeps of the window, oldest first."""
-    sweeps: NDArray[np.float32]
-    """Shape (2 * KEPT, fingers, 24), twice as long as it must be: the window is a slice of it that
-    moves to the right, and goes back to the left when it has come to the end."""
-    first: Number
-    """Where in `sweeps` the window begins."""
-
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for what no window can be."""
-        if self.first + len(self.times_ns) > len(self.sweeps):
-            raise ValueError("the window is longer than what is remembered")
-
-
-class Stillness:
-    """Remembers the medians of the last window."""
-
-    def __init__(self, window_ns: int, fingers: int) -> None:
-        """`window_ns` is how far back a sweep is compared with, at least, ns."""
-        self._window_ns = window_ns
-        sweeps = np.zeros((2 * KEPT, fingers, ELECTRODES), dtype=np.float32)
-        self.memory = StillnessMemory([], sweeps, 0)
-
-    def reset(self) -> None:
-        """Forget: what comes next does not continue what came before."""
-        self.memory.times_ns.clear()
-        self.memory.first = 0
-
-    def add(self, t_ns: int, median: NDArray[np.float32]) -> None:
-        """Take in the median of `t_ns`, shape (fingers, 24)."""
-        memory = self.memory
-        times_ns, sweeps = memory.times_ns, memory.sweeps
-        if times_ns and t_ns - times_ns[-1] < self._window_ns // SWEEPS:
-            return
-        if len(times_ns) == KEPT:
-            self._drop_oldest()
-        place = memory.first + len(times_ns)
-        if place == len(sweeps):
-            sweeps[: len(times_ns)] = sweeps[memory.first :]
-            memory.first, place = 0, len(times_ns)
-        sweeps[place] = median
-        times_ns.append(t_ns)
-
-    def rate(
-        self, t_ns: int, median: NDArray[np.float32], usable: NDArray[np.bool_]
-    ) -> NDArray[np.float64] | None:
-        """How far each finger's `usable` electrodes were away, counts/s, shape (fingers,).
-
-        The largest mean distance to any sweep of the window, over the window, and to the latest one
-        before it, over its age: two moments alone would miss what swings. None while no sweep is
-        that old.
-        """
-        memory, window_ns = self.memory, self._window_ns
-        times_ns = memory.times_ns
-        while len(times_ns) > 1 and t_ns - times_ns[1] >= window_ns:
-            self._drop_oldest()
-        if not times_ns or t_ns - times_ns[0] < window_ns:
-            return None
-        past = memory.sweeps[memory.first : memory.first + len(times_ns)]
-        rates = mean_distance(past, median, usable)
-        rates[0] /= (t_ns - times_ns[0]) / 1e9
-        rates[1:] /= window_ns / 1e9
-        rate: NDArray[np.float64] = np.maximum.reduce(rates, axis=0)
-        return rate
-
-    def _drop_oldest(self) -> None:
-        del self.memory.times_ns[0]
-        self.memory.first += 1
-
-
-STEP_NS = 5_000_000
-"""Of sweeps that come faster than this, the mean is remembered."""
-SHORT_NS, LONG_NS = WINDOWS_NS = (80_000_000, 240_000_000)
-"""Windows that a straight line is fitted to: the short one shows fast motion soon, the long one a
-slow slide; no window as short as that can."""
-STEPS = LONG_NS // STEP_NS + 2
-"""Steps remembered: the long window, and one at each end of it."""
-SPIKE_COUNTS = 20.0
-"""A value that falls further than this is believed when the next one is as low. Spikes last for one
-sweep and go down by 25 counts or more; noise does so in one value of three thousand."""
-BLOCK_STEPS, BLOCKS = 24, 16
-"""Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
-what it is while a hand closes or opens, ..."""
-BLOCKS_MIN = 4
-"""... and is not known before there are so many of them."""
-SIGMA_COUNTS = (0.5, 10.0)
-"""An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
-APART = 3
-"""Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
-sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
-SOUND_MIN = 12
-"""A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
-MEAN_ABS = math.sqrt(2.0 / math.pi)
-"""Mean absolute value of a Gaussian of standard deviation 1."""
-NOISE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
-"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
-CREEP_COUNTS_PER_S, CREEP_SPREAD = 6.0, 0.67
-"""A held touch relaxes: median speed of its electrodes, and standard deviation of its logarithm.
-With the noise it is what 44 held touches of one sensor showed, in windows of 50 to 240 ms."""
-FALSE_ALARMS = 0.05
-"""Share of the sweeps of a hand that holds in which it may be said to move."""
-FAST_SHARE = 0.1
-"""Share of that which the short window may have where the long one decides."""
-
-
-@dataclass(slots=True, eq=False)
 class MotionMemory:
     """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""
 
@@ -162,6 +95,8 @@ class MotionMemory:
     """Where it was lower, and not believed."""
     usable_since_ns: NDArray[np.int64]
     """Since when an electrode has been usable."""
+    all_usable_since_ns: int
+    """Since when all have."""
     total: NDArray[np.float32]
     """Sum of the sweeps of the step at hand."""
     block: NDArray[np.float64]
@@ -183,27 +118,50 @@ class MotionMemory:
     block_number: Number = 0
     """Blocks so far."""
 
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for what no such memory can be."""
+        if self.number > STEPS or self.first + self.number > len(self.steps):
+            raise ValueError("more steps than are remembered")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """What noise alone makes of windows of so many steps: each of shape (steps, fingers)."""
+
+    block_number: int
+    """Blocks that it is known from."""
+    slope: NDArray[np.float64]
+    """Mean absolute slope, counts/s, if the squares of the times around their mean sum to 1 s**2.
+    """
+    variance: NDArray[np.float64]
+    """Mean square deviation from the mean, counts**2 ..."""
+    spread: NDArray[np.float64]
+    """... and its standard deviation over that."""
+
 
 class Motion:
     """How each finger moves, in units of its own noise; constant memory, no clock.
 
-    The mean over the electrodes of the absolute fitted slope, over what noise alone would make of
-    it. Noise is known from the differences of sweeps, which slow motion hardly changes.
+    Over the short window it is the mean of the electrodes' absolute fitted slopes, over the long
+    one the root mean square of their deviations from their means, each over what noise alone makes
+    of it. Noise is known from the differences of sweeps, which slow motion hardly changes.
     """
 
-    def __init__(self, fingers: int, false_alarms: float = FALSE_ALARMS) -> None:
+    def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
         """`false_alarms`: share of a holding hand's sweeps that may be called moving, 0..0.5.
 
-        Raises `ValueError` for another one.
+        With `early` the short window may have as large a share itself, as it decides alone until
+        the long one is full. Raises `ValueError` for another share.
         """
         if not 0.0 < false_alarms < 0.5:
             raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         shape = (fingers, ELECTRODES)
         finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
-        # Rows: the short window, the long one, and the short one where the long one decides.
-        tails = np.array([upper_tail(share) for share in (finger, finger, FAST_SHARE * finger)])
-        self._noise_factor = np.exp(NOISE_SPREAD * tails)[:, np.newaxis]
-        self._creep = CREEP_COUNTS_PER_S * np.exp(CREEP_SPREAD * tails)[:, np.newaxis]
+        self._slow, self._fast = upper_tail(finger), upper_tail(FAST_SHARE * finger)
+        self._alone = self._slow if early else self._fast
+        """Limits of the long window, of the short one beside it, and of the short one where it
+        decides alone, in standard deviations."""
+        self._noise: Noise | None = None
         self.memory = MotionMemory(
             times_ns=np.zeros(2 * STEPS, dtype=np.int64),
             steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
@@ -211,20 +169,27 @@ class Motion:
             counts=np.zeros(shape, dtype=np.float32),
             fallen=np.zeros(shape, dtype=np.bool_),
             usable_since_ns=np.zeros(shape, dtype=np.int64),
+            all_usable_since_ns=0,
             total=np.zeros(shape, dtype=np.float32),
             block=np.zeros((APART, fingers)),
             blocks=np.zeros((BLOCKS, APART, fingers)),
         )
         self._unknown = np.full((2, fingers), np.inf)
+        self._no_limits = np.ones((2, fingers))
         self.motion = self._unknown
         """Over the short and the long window, shape (2, fingers), in units of the finger's noise;
         infinite where it is not known."""
-        self.limits = np.ones((2, fingers))
+        self.limits = self._no_limits
         """What it may be at most for a finger that is still, in the same units."""
         self.early = False
         """Whether fast motion is excluded."""
         self.sure = False
         """Whether slow slides are excluded as well, as far as they can be told from noise."""
+
+    @property
+    def known(self) -> bool:
+        """Whether it is known of all fingers how they moved in the short window."""
+        return max(self.motion[0].tolist()) < math.inf
 
     def reset(self) -> None:
         """Forget the motion: what comes next does not continue what came before."""
@@ -240,21 +205,23 @@ class Motion:
         """Forget the noise too: the sensors may be others."""
         self.reset()
         self.memory.block_number = 0
+        self._noise = None
 
     def add(self, t_ns: int, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
         """Take in the sweep of `t_ns`, shape (fingers, 24), and which electrodes are usable.
 
         Times must not go back; call `reset` where they do, and after a gap.
         """
-        memory = self.memory
+        memory, sweep = self.memory, counts.astype(np.float32)
         if memory.last_ns is None:
-            memory.last_ns = t_ns
-            memory.clean[:] = memory.counts[:] = counts
+            memory.last_ns = memory.all_usable_since_ns = t_ns
+            memory.clean = memory.counts = sweep
             memory.fallen.fill(False)
             memory.usable_since_ns.fill(t_ns)
-        self._clean(counts.astype(np.float32))
+        self._clean(sweep)
         if np.count_nonzero(usable) != usable.size:
             # Not in this step, and what comes next has nothing to fall from.
+            memory.all_usable_since_ns = t_ns + STEP_NS
             memory.usable_since_ns[~usable] = t_ns + STEP_NS
             memory.fallen[~usable] = True
         memory.total += memory.clean
@@ -290,7 +257,7 @@ class Motion:
             memory.steps[: memory.number] = memory.steps[memory.first :]
             memory.times_ns[: memory.number] = memory.times_ns[memory.first :]
             memory.first, place = 0, memory.number
-        memory.steps[place] = memory.total / memory.sweeps
+        np.divide(memory.total, memory.sweeps, out=memory.steps[place])
         memory.times_ns[place] = t_ns
         memory.number += 1
 
@@ -300,62 +267,118 @@ class Motion:
             return
         last = memory.first + memory.number - 1
         differences = memory.steps[last] - memory.steps[last - APART : last][::-1]
-        known = memory.usable_since_ns <= memory.times_ns[last - APART]
-        differences *= known
-        squares = np.einsum("sfe,sfe->sf", differences, differences)
-        memory.block += squares / np.maximum(np.count_nonzero(known, axis=1), 1)
+        memory.block += self._mean(np.square(differences, out=differences), last - APART)[0]
         memory.block_steps += 1
-        if memory.block_steps == BLOCK_STEPS:
+        if memory.block_steps >= BLOCK_STEPS:
             memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
             memory.block_number += 1
             memory.block_steps = 0
             memory.block.fill(0.0)
 
-    def _noise(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Variance of a step, counts**2, (fingers,), and correlations, (APART - 1, fingers)."""
-        number = min(self.memory.block_number, BLOCKS)
-        squares = np.sort(self.memory.blocks[:number], axis=0)[number // 4]
-        low, high = SIGMA_COUNTS
-        correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
-        variance = np.minimum(np.maximum(squares[-1] / 2.0, low**2), high**2)
-        return variance, np.minimum(np.maximum(correlations, 0.0), 1.0)
+    def _mean(
+        self, values: NDArray[np.float32], begin: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
+        """Over electrodes usable from a step on, (..., fingers); where there are too few of them.
+
+        None where all are usable.
+        """
+        memory, since_ns = self.memory, self.memory.times_ns[begin]
+        if memory.all_usable_since_ns <= since_ns:
+            return (values @ ONES).astype(np.float64) / ELECTRODES, None
+        known = memory.usable_since_ns <= since_ns
+        numbers = np.count_nonzero(known, axis=1)
+        mean = ((values * known) @ ONES).astype(np.float64) / np.maximum(numbers, 1)
+        return mean, numbers < SOUND_MIN
+
+    def _known_noise(self) -> Noise:
+        memory = self.memory
+        if self._noise is None or self._noise.block_number != memory.block_number:
+            number = min(memory.block_number, BLOCKS)
+            squares = np.sort(memory.blocks[:number], axis=0)[number // 4]
+            low, high = SIGMA_COUNTS
+            correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
+            correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
+            variance = np.minimum(np.maximum(squares[-1] / 2.0, low**2), high**2)
+            spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
+            free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
+            self._noise = Noise(
+                memory.block_number,
+                slope=MEAN_ABS * np.sqrt(variance * (1.0 + 2.0 * SLOPE_ECHO @ correlations)),
+                variance=variance * spreads,
+                spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
+            )
+        return self._noise
 
     def _decide(self) -> None:
         memory = self.memory
-        if memory.block_number < BLOCKS_MIN:
-            self._say_unknown()
+        number, end = memory.number, memory.first + memory.number
+        self._say_unknown()
+        if memory.block_number < BLOCKS_MIN or number <= STEPS_MIN:
             return
-        part = slice(memory.first, memory.first + memory.number)
-        ages_ns = memory.times_ns[part][-1] - memory.times_ns[part]
-        variance, correlations = self._noise()
-        motion, limits = self._unknown.copy(), np.ones((3, len(variance)))
-        for row, window_ns in enumerate(WINDOWS_NS):
-            begins = int(np.count_nonzero(ages_ns >= window_ns))
-            times_s = ages_ns[begins:] / -1e9
-            if not begins or len(times_s) < 3:
-                continue
-            times_s -= times_s.mean()
-            extent = float(times_s @ times_s)
-            echoes = [times_s[lag:] @ times_s[:-lag] / extent for lag in range(1, APART)]
-            noise = MEAN_ABS * np.sqrt(
-                variance * (1.0 + 2.0 * np.array(echoes) @ correlations) / extent
-            )
-            weights = (times_s / extent).astype(np.float32)
-            steps = memory.steps[memory.first + begins : part.stop]
-            slopes = (weights @ steps.reshape(len(steps), -1)).reshape(memory.clean.shape)
-            known = memory.usable_since_ns <= memory.times_ns[memory.first + begins]
-            numbers = np.count_nonzero(known, axis=1)
-            mean = (np.abs(slopes) * known).sum(axis=1) / np.maximum(numbers, 1)
-            motion[row] = np.where(numbers >= SOUND_MIN, mean / noise, np.inf)
-            for limit in (0, 2) if window_ns == SHORT_NS else (1,):
-                limits[limit] = np.hypot(self._noise_factor[limit], self._creep[limit] / noise)
-        self.motion, self.limits = motion, limits[:2]
-        self.early = bool((motion[0] <= limits[0]).all())
-        self.sure = bool((motion[1] <= limits[1]).all() and (motion[0] <= limits[2]).all())
+        times_ns = memory.times_ns[memory.first : end]
+        now_ns = int(times_ns[-1])
+        age_ns = now_ns - int(times_ns[0])
+        if age_ns < SHORT_NS:
+            return
+        self.motion, self.limits = self._unknown.copy(), self._no_limits.copy()
+        begins = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
+        short, long = np.minimum(begins, number - STEPS_MIN).tolist()
+        beside = self._follow_fast(memory.first + short, end)
+        self.early = bool((self.motion[0] <= self.limits[0]).all())
+        if age_ns >= LONG_NS:
+            self._follow_slow(memory.first + long, end)
+            slow = bool((self.motion[1] <= self.limits[1]).all())
+            self.sure = slow and bool((self.motion[0] <= beside).all())
+
+    def _follow_fast(self, begin: int, end: int) -> NDArray[np.float64]:
+        """How steps have moved, and its limit where it decides alone; the limit where not."""
+        memory, number, noise = self.memory, end - begin, self._known_noise()
+        times_s = _centred(memory.times_ns[begin:end])
+        extent = float(times_s @ times_s)
+        weights = (times_s / extent).astype(np.float32)
+        slopes = (weights @ memory.steps[begin:end].reshape(number, -1)).reshape(memory.clean.shape)
+        mean, too_few = self._mean(np.abs(slopes, out=slopes), begin)
+        by_noise = noise.slope[number] / math.sqrt(extent)
+        self.motion[0] = mean / by_noise
+        if too_few is not None:
+            self.motion[0, too_few] = np.inf
+        self.limits[0], beside = (
+            np.hypot(math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail) / by_noise)
+            for tail in (self._alone, self._fast)
+        )
+        return beside
+
+    def _follow_slow(self, begin: int, end: int) -> None:
+        """How far steps have spread, and the limit of it."""
+        memory, number, noise = self.memory, end - begin, self._known_noise()
+        deviations = memory.steps[begin:end] - memory.steps[begin:end].mean(axis=0)
+        squares = np.einsum("sfe,sfe->fe", deviations, deviations)
+        mean, too_few = self._mean(squares, begin)
+        by_noise = noise.variance[number] * (number - 1)
+        self.motion[1] = np.sqrt(mean / by_noise)
+        if too_few is not None:
+            self.motion[1, too_few] = np.inf
+        times_s = _centred(memory.times_ns[begin:end])
+        extent = float(times_s @ times_s) / by_noise
+        usual, most = creep(0.0) ** 2 * extent, creep(self._slow) ** 2 * extent
+        # Noise and creep know nothing of each other: their deviations add up as squares do.
+        above = np.hypot(self._slow * noise.spread[number] * (1.0 + usual), most - usual)
+        self.limits[1] = np.sqrt(1.0 + usual + above)
 
     def _say_unknown(self) -> None:
-        self.motion, self.limits = self._unknown, np.ones_like(self._unknown)
+        self.motion, self.limits = self._unknown, self._no_limits
         self.early = self.sure = False
+
+
+def creep(tail: float) -> float:
+    """Speed that a held touch keeps to but for so many standard deviations, counts/s."""
+    return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
+
+
+def _centred(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """In seconds, with a mean of 0."""
+    times_s = (times_ns - times_ns[0]) / 1e9
+    return np.asarray(times_s - times_s.sum() / len(times_s))
 
 
 def upper_tail(share: float) -> float:

@@ -27,6 +27,7 @@ message and one bare cell of a CSV file."""
 ObjectName = Annotated[str, msgspec.Meta(pattern=f"^{OBJECT_PATTERN}$")]
 _HAND = msgspec.Meta(max_length=5)
 """A hand has five fingers."""
+Motion = Annotated[dict[Finger, Duration | None], _HAND]
 
 
 DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
@@ -100,6 +101,18 @@ class Verdict(_Message, frozen=True, kw_only=True):
     not known yet."""
     risk: RiskReport | None = None
     """What lifts of `stable` verdicts came to; null where nothing learns and no risk is set."""
+    early: bool = False
+    """Whether it was judged when nothing moved fast, but something might still slide slowly
+    (`[gate] early`); a surer verdict of the same grasp follows."""
+    still_ms: Duration | None = None
+    """For how long the hand has touched and kept still, as far as that can be told, ms: from 80 on
+    nothing moves fast, from 240 on nothing slides slowly either; 0 while something moves. Null with
+    a null `gate`."""
+    motion: Motion | None = None
+    """How each finger moves, in units of its own noise (1 where only noise moves it); null where it
+    is not known, and with a null `gate`."""
+    motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
+    """What it is at most for a finger that is still."""
 
 
 class GateMessage(_Message, frozen=True, kw_only=True):
@@ -111,6 +124,12 @@ class GateMessage(_Message, frozen=True, kw_only=True):
     former: GateState
     state: GateState
     cause: GateCause
+    still_ms: Duration | None = None
+    """By the reading that made the change, as in its verdict; null where none did."""
+    motion: Motion | None = None
+    """Likewise."""
+    motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
+    """Likewise."""
 
 
 class Tactile(_Message, frozen=True, kw_only=True):

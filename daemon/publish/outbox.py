@@ -108,7 +108,7 @@ class Outbox:
         no message may come before the consumer must take the grasp for unknown.
         """
         for change in judgement.changes:
-            self._gate_change(judgement.t_ns, change)
+            self._gate_change(judgement, change)
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
         message = Verdict(
@@ -136,6 +136,10 @@ class Outbox:
             outcomes=judgement.outcomes,
             supervised=judgement.supervised,
             risk=judgement.risk,
+            early=judgement.early,
+            still_ms=judgement.still_ms,
+            motion=judgement.motion,
+            motion_limits=judgement.motion_limits,
         )
         payload = encode(message)
         self._send(self._verdict_topic, payload)
@@ -213,16 +217,19 @@ class Outbox:
         for output in self._outputs:
             output.send(topic, payload)
 
-    def _gate_change(self, t_ns: int, change: GateChange) -> None:
+    def _gate_change(self, judgement: Judgement, change: GateChange) -> None:
         message = GateMessage(
             boot_id=self._boot_id,
             seq=self._gate_seq,
             t=self._wall_clock(),
-            t_mono_ns=t_ns,
+            t_mono_ns=judgement.t_ns,
             grasp=change.grasp,
             former=change.former,
             state=change.state,
             cause=change.cause,
+            still_ms=judgement.still_ms,
+            motion=judgement.motion,
+            motion_limits=judgement.motion_limits,
         )
         self._gate_seq += 1
         self._send(self._gate_topic, encode(message))

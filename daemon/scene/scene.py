@@ -142,14 +142,16 @@ class Gate(Section):
     """A finger touches when three electrodes fall by so much below where they rest, counts ..."""
     contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0)] = ContactLimits.sigmas
     """... and by so many standard deviations of its noise."""
-    rate_counts_per_s: Annotated[float, Field(ge=10.0, le=10_000.0)] = GateLimits.rate_counts_per_s
-    """Electrodes of a finger that change faster, in the mean, are moving, counts/s."""
+    false_alarms: Annotated[float, Field(ge=0.001, le=0.3)] = GateLimits.false_alarms
+    """Share of the time in which a hand that holds may be said to move. Less of it lets more slow
+    slides pass for stillness (deploy/JUDGING.md)."""
+    early: bool = GateLimits.early
+    """Judge a grasp as soon as nothing moves fast, marked `early`, and once more when it is known
+    that nothing slides slowly either."""
     joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0)] = JointLimits.rad_per_s
     """A joint that turns faster is moving, rad/s; only with `[joints]`."""
     joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = JointLimits.lost_ns / 1e6
     """Late joint angles block a verdict no longer than this, ms; only with `[joints]`."""
-    hold_ms: Annotated[float, Field(ge=10.0, le=10_000.0)] = GateLimits.hold_ns / 1e6
-    """All this must last so long, ms."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
     """A question that cannot be answered with a judgement by then is answered with `unknown`."""
     gap_ms: Milliseconds = GateLimits.gap_ns / 1e6

@@ -213,7 +213,7 @@ def sliding(slides: Sequence[bool], number: int, sampling: Sampling) -> Sliding:
         for t_s, counts in held(slides, sampling=sampling, seed=seed):
             t_ns = round(t_s * 1e9)
             fresh.push(counts, everywhere)
-            gate.step(t_ns, fresh.counts, everywhere, everywhere[:, 0])
+            gate.step(t_ns, counts, fresh.counts, everywhere, everywhere[:, 0])
             if Reason.SEQUENCE_GAP not in gate.reasons:
                 found.sweeps += 1
                 found.still += Reason.MOVING not in gate.reasons

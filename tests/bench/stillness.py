@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.stillness import FALSE_ALARMS, LONG_NS, Motion
+from daemon.judge.limits import GateLimits
+from daemon.judge.stillness import LONG_NS, Motion
 from drivers.base import ELECTRODES
 from drivers.twins.grasps.slides import SECONDS, STANDSTILL_S, held
 from drivers.twins.grasps.whole_grasps import RATE_HZ, Sampling
@@ -60,7 +61,7 @@ def followed(
     end_s = REST_S + SECONDS - standstill_s
     early, sure = [], []
     for seed in range(streams):
-        motion, said = Motion(len(sliding), false_alarms), []
+        motion, said = Motion(len(sliding), false_alarms, early=True), []
         stream = held(
             sliding,
             seconds=end_s,
@@ -124,7 +125,7 @@ def main() -> None:
     """Print both."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.stillness", description=__doc__)
     parser.add_argument("--streams", type=int, default=100)
-    parser.add_argument("--false-alarms", type=float, default=FALSE_ALARMS)
+    parser.add_argument("--false-alarms", type=float, default=GateLimits.false_alarms)
     options = parser.parse_args()
     for lines in (points, curve):
         for line in lines(options.streams, options.false_alarms):

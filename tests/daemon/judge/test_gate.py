@@ -27,9 +27,6 @@ PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: 0.467 in the mean, and the third deepest
 falls by 0.8 of the depth further than the median one."""
 GATE = GateLimits(
-    hold_ns=80 * MS,
-    rate_window_ns=80 * MS,
-    rate_counts_per_s=120.0,
     change_counts=40.0,
     gap_ns=100 * MS,
     release_ns=100 * MS,

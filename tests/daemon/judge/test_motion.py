@@ -43,7 +43,7 @@ def test_tails_are_those_of_a_gaussian(share: float) -> None:
 def test_motion_is_the_slope_of_a_fitted_line_over_what_noise_makes(
     rate_hz: float, speed: float
 ) -> None:
-    sigma, motion = 4.0, Motion(1)
+    sigma, motion = 4.0, Motion(1, 0.05, early=True)
     begin_ns = fed(motion, wavering(4.5, rate_hz, sigma, 1), rate_hz)
     times = np.arange(round(0.5 * rate_hz)) / rate_hz
     counts = np.rint(wavering(0.5, rate_hz, sigma, 2) + speed * times[:, None, None])
@@ -53,7 +53,7 @@ def test_motion_is_the_slope_of_a_fitted_line_over_what_noise_makes(
         counts = counts[1:496].reshape(99, 5, 1, 24).mean(axis=1)
         times = times[1:496].reshape(99, 5).mean(axis=1)
         sigma /= np.sqrt(5)
-    for found, window_s in zip(motion.motion[:, 0], (0.08, 0.24), strict=True):
+    for found, window_s in zip(motion.motion[:, 0], (0.1, 0.24), strict=True):
         window = times > times[-1] - window_s + 1e-6
         slopes = np.polyfit(times[window], counts[window, 0], 1)[0]
         extent = ((times[window] - times[window].mean()) ** 2).sum()
@@ -71,7 +71,7 @@ def test_limits_are_the_quantiles_of_real_held_touches(
     random = np.random.default_rng(3)
     white = random.normal(0.0, 3.5 / np.sqrt(0.68) / np.hypot(1.0, 0.36), (4001, 1, 24))
     counts = 2000.0 + white[1:] + 0.36 * white[:-1]
-    motion = Motion(1, share)
+    motion = Motion(1, share, early=True)
     fed(motion, counts, 100.0)
     for limit, expected, sweeps in zip(motion.limits[:, 0], (short, long), (8, 24), strict=True):
         windows = np.lib.stride_tricks.sliding_window_view(counts[:, 0], sweeps, axis=0)
@@ -85,7 +85,7 @@ def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
     standstill_s = STANDSTILL_S[1] if any(sliding) else 0.0
     early, sure = [], []
     for seed in range(STREAMS):
-        motion = Motion(3)
+        motion = Motion(3, 0.05, early=True)
         stream = held(
             sliding,
             seconds=REST_S + 3.0 - standstill_s,
@@ -118,7 +118,7 @@ def test_held_hands_are_still_and_slides_are_not(sampling: Sampling) -> None:
 
 
 def test_sweeps_that_come_fast_show_at_least_as_much() -> None:
-    motion, still = Motion(3), []
+    motion, still = Motion(3, 0.05, early=True), []
     for t_s, counts in held([True] * 3, seconds=5.0, rate_hz=1000.0, rest_s=REST_S, seed=1):
         motion.add(round(t_s * 1e9), counts, HAND)
         if t_s > REST_S + 0.24:
@@ -127,7 +127,7 @@ def test_sweeps_that_come_fast_show_at_least_as_much() -> None:
 
 
 def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_a_gap() -> None:
-    motion, counts = Motion(1), wavering(3.0, 100.0, 3.5, 4)
+    motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
     known = []
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
         motion.add(index * 10_000_000, sweep, FINGER)
@@ -149,7 +149,7 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
 
 
 def test_fast_motion_is_no_noise_and_is_excluded_soon_after_it_ends() -> None:
-    motion, rate_hz = Motion(1), 100.0
+    motion, rate_hz = Motion(1, 0.05, early=True), 100.0
     begin_ns = fed(motion, wavering(2.0, rate_hz, 3.5, 5), rate_hz)
     before = motion.limits.copy()
     closing = wavering(0.5, rate_hz, 3.5, 6) - 900.0 * np.linspace(0, 1, 50)[:, None, None]
@@ -166,7 +166,7 @@ def test_fast_motion_is_no_noise_and_is_excluded_soon_after_it_ends() -> None:
 
 
 def test_motion_after_long_stillness_is_seen_by_the_short_window_first() -> None:
-    motion = Motion(1)
+    motion = Motion(1, 0.05, early=True)
     begin_ns = fed(motion, wavering(2.0, 100.0, 3.5, 9), 100.0)
     assert motion.sure
     moving = wavering(0.05, 100.0, 3.5, 10) + np.linspace(0, 40, 5)[:, None, None]
@@ -177,10 +177,10 @@ def test_motion_after_long_stillness_is_seen_by_the_short_window_first() -> None
 
 @pytest.mark.parametrize("repeats", [1, 2])
 def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
-    motion, counts = Motion(1), wavering(2.5, 100.0, 3.5, 11)
+    motion, counts = Motion(1, 0.05, early=True), wavering(2.5, 100.0, 3.5, 11)
     fed(motion, counts, 100.0)
     expected = motion.motion.copy()
-    motion = Motion(1)
+    motion = Motion(1, 0.05, early=True)
     spiked = counts.copy()
     spiked[-1 - repeats : -1, 0, :3] = counts[-1 - repeats, 0, :3] - 120.0
     fed(motion, spiked, 100.0)
@@ -188,13 +188,13 @@ def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     np.testing.assert_allclose(motion.motion, expected, rtol=0.12)
     # What stays down has fallen.
     spiked[-6:, 0] -= 120.0
-    motion = Motion(1)
+    motion = Motion(1, 0.05, early=True)
     fed(motion, spiked, 100.0)
     assert (motion.motion > 5.0).all()
 
 
 def test_electrodes_that_are_not_usable_tell_nothing_until_a_window_has_passed() -> None:
-    motion, counts = Motion(1), np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
+    motion, counts = Motion(1, 0.05, early=True), np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
     usable = FINGER.copy()
     for index in range(250):
         usable[0, :5] = index != 220
@@ -214,7 +214,7 @@ def test_electrodes_that_are_not_usable_tell_nothing_until_a_window_has_passed()
 def test_each_finger_is_measured_by_its_own_noise() -> None:
     random = np.random.default_rng(13)
     sigmas = np.array([2.0, 4.0, 8.0])[:, None]
-    motion, found = Motion(3), []
+    motion, found = Motion(3, 0.05, early=True), []
     for index in range(1500):
         sweep = np.rint(2000.0 + random.normal(0.0, sigmas, (3, 24))).astype(np.uint16)
         motion.add(index * 10_000_000, sweep, HAND)
@@ -225,7 +225,7 @@ def test_each_finger_is_measured_by_its_own_noise() -> None:
 
 
 def test_memory_is_bounded_however_fast_readings_come() -> None:
-    motion, counts = Motion(1), wavering(0.5, 20_000.0, 3.5, 14)
+    motion, counts = Motion(1, 0.05, early=True), wavering(0.5, 20_000.0, 3.5, 14)
     fed(motion, counts, 20_000.0)
     assert motion.memory.number <= STEPS
     assert motion.memory.first + motion.memory.number <= len(motion.memory.steps)
