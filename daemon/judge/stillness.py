@@ -33,6 +33,8 @@ SPIKES_MAX = 4
 BLOCK_STEPS, BLOCKS = 24, 16
 """Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
 what it is while a hand closes or opens, ..."""
+QUARTILE = 0.95
+"""Which is so much of the mean, of noise that is correlated as measured or is not."""
 BLOCKS_MIN = 4
 """... and is not known before there are so many of them."""
 SIGMA_COUNTS = (0.5, 10.0)
@@ -319,7 +321,7 @@ class Motion:
             low, high = SIGMA_COUNTS
             correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
             correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
-            variance = np.minimum(np.maximum(squares[-1] / 2.0, low**2), high**2)
+            variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
             slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
             spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
             free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
