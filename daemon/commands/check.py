@@ -211,9 +211,7 @@ def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
     when = "when asked, " if limits.on_request else ""
     joints = "" if limits.joints is None else f", joints below {gate.joint_rad_per_s:g} rad/s"
     fingers = ", ".join(gate.fingers or wanted.hand.fingers)
-    return (
-        f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}, {age}"
-    )
+    return f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}, {age}"
 
 
 def _rejects(wanted: scene.Scene) -> str:

