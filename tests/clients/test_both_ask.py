@@ -169,7 +169,7 @@ def cpp_lifts(lift_gate: Path, *words: str) -> bool:
     return result.returncode == 0
 
 
-STILL: dict[str, tuple[dict[str, object], bool, bool]] = {
+STILL: dict[str, tuple[dict[str, Any], bool, bool]] = {
     "for long": ({"still_ms": 1000}, True, True),
     "for just long enough": ({"still_ms": 240.0}, True, True),
     "for a moment less": ({"still_ms": 239.999999}, False, True),
@@ -192,7 +192,7 @@ STILL: dict[str, tuple[dict[str, object], bool, bool]] = {
 
 @pytest.mark.parametrize(("says", "may", "may_at_once"), STILL.values(), ids=STILL)
 def test_who_wants_the_hand_to_have_been_still_lifts_only_when_the_daemon_says_so(
-    lift_gate: Path, tmp_path: Path, says: dict[str, object], may: bool, may_at_once: bool
+    lift_gate: Path, tmp_path: Path, says: dict[str, Any], may: bool, may_at_once: bool
 ) -> None:
     out = f"ipc://{tmp_path}/out"
     with false_daemon(tmp_path, told(), **says), Graspd(out) as graspd:
@@ -230,7 +230,7 @@ def test_a_supervised_lift_must_have_been_still_as_any(lift_gate: Path, tmp_path
         with Graspd(out) as graspd:
             assert graspd.may_i_lift(30.0, supervised=True, still_ms=100)
             assert not graspd.may_i_lift(DEADLINE_S, supervised=True, still_ms=240)
-        asked = [lift_gate, "--supervised", "--still"]
+        asked = [str(lift_gate), "--supervised", "--still"]
         for still_ms, code in (("100", 0), ("240", 1)):
             result = subprocess.run(
                 [*asked, still_ms, out, "1.0"], capture_output=True, timeout=40, check=False
@@ -248,7 +248,7 @@ def test_a_stillness_that_is_no_time_is_refused(
     with Graspd(out) as graspd, pytest.raises((ValueError, TypeError)):
         graspd.may_i_lift(DEADLINE_S, still_ms=still_ms)
     if isinstance(still_ms, float):
-        asked = [lift_gate, "--still", str(still_ms), out, str(DEADLINE_S)]
+        asked = [str(lift_gate), "--still", str(still_ms), out, str(DEADLINE_S)]
         assert subprocess.run(asked, capture_output=True, check=False).returncode == 2
 
 
