@@ -260,7 +260,7 @@ class Gate:
             return ()
         if memory.moved_since_ns is None:
             memory.moved_since_ns = t_ns
-        elif t_ns - memory.moved_since_ns >= LONG_NS:
+        elif t_ns - memory.moved_since_ns >= 2 * LONG_NS:
             self._enter(GateState.CLOSING, t_ns, GateCause.MOVED)
         return (Reason.MOVING,) if self.motion.early else ()
 
@@ -269,7 +269,7 @@ class Gate:
         if disturbed or self.memory.state is not GateState.CLOSING:
             return ()
         if not self._is_still:
-            return (Reason.SETTLING,)
+            return (Reason.MOVING if self.motion.slides else Reason.SETTLING,)
         self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
         return ()
 
@@ -291,6 +291,8 @@ class Gate:
         memory = self.memory
         if len(self._changes) < CHANGES_MAX:
             self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
+        if memory.state is GateState.JUDGED and memory.early and state is not GateState.SETTLED:
+            memory.asked = False  # the question was about this grasp
         memory.state = state
         if state is GateState.CLOSING:
             memory.moved_since_ns = None

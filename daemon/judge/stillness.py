@@ -25,8 +25,11 @@ STEPS = LONG_NS // STEP_NS + 2
 STEPS_MIN = 3
 """Steps of a window at least: where sweeps come slowly, windows are longer."""
 SPIKE_COUNTS = 20.0
-"""A value that falls further than this is believed when the next one is as low. Spikes last for one
-sweep and go down by 25 counts or more; noise does so in one value of three thousand."""
+"""A value that jumps further than this is believed when the next one does too. Spikes last for one
+sweep: of a sensor by 25 counts or more, of a flipped bit by any; noise does so in one value of
+three thousand."""
+SPIKES_MAX = 4
+"""Where more electrodes of a finger jump at once, the finger moves: by chance not in a year."""
 BLOCK_STEPS, BLOCKS = 24, 16
 """Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
 what it is while a hand closes or opens, ..."""
@@ -37,6 +40,8 @@ SIGMA_COUNTS = (0.5, 10.0)
 APART = 3
 """Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
 sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
+LOST_MAX = 3
+"""An electrode that is not usable for so many sweeps in a row is taken to read what it read."""
 SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 MEAN_ABS = math.sqrt(2.0 / math.pi)
@@ -91,10 +96,12 @@ class MotionMemory:
     """The last sweep without spikes."""
     counts: NDArray[np.float32]
     """The last sweep as it came."""
-    fallen: NDArray[np.bool_]
-    """Where it was lower, and not believed."""
+    jumped: NDArray[np.bool_]
+    """Where it had jumped, and was not believed."""
+    lost: NDArray[np.uint8]
+    """For how many sweeps it has not been usable, up to `LOST_MAX` and one."""
     usable_since_ns: NDArray[np.int64]
-    """Since when an electrode has been usable."""
+    """Since when an electrode has been usable, but for so many sweeps now and then."""
     all_usable_since_ns: int
     """Since when all have."""
     total: NDArray[np.float32]
@@ -167,7 +174,8 @@ class Motion:
             steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
             clean=np.zeros(shape, dtype=np.float32),
             counts=np.zeros(shape, dtype=np.float32),
-            fallen=np.zeros(shape, dtype=np.bool_),
+            jumped=np.zeros(shape, dtype=np.bool_),
+            lost=np.zeros(shape, dtype=np.uint8),
             usable_since_ns=np.zeros(shape, dtype=np.int64),
             all_usable_since_ns=0,
             total=np.zeros(shape, dtype=np.float32),
@@ -190,6 +198,12 @@ class Motion:
     def known(self) -> bool:
         """Whether it is known of all fingers how they moved in the short window."""
         return max(self.motion[0].tolist()) < math.inf
+
+    @property
+    def slides(self) -> bool:
+        """Whether it is known that a finger moves slowly, or has moved within the long window."""
+        motion = np.where(np.isfinite(self.motion), self.motion, 0.0)[1]
+        return bool((motion > self.limits[1]).any())
 
     def reset(self) -> None:
         """Forget the motion: what comes next does not continue what came before."""
@@ -216,14 +230,20 @@ class Motion:
         if memory.last_ns is None:
             memory.last_ns = memory.all_usable_since_ns = t_ns
             memory.clean = memory.counts = sweep
-            memory.fallen.fill(False)
+            memory.jumped.fill(False)
+            memory.lost.fill(LOST_MAX)
             memory.usable_since_ns.fill(t_ns)
-        self._clean(sweep)
         if np.count_nonzero(usable) != usable.size:
-            # Not in this step, and what comes next has nothing to fall from.
-            memory.all_usable_since_ns = t_ns + STEP_NS
-            memory.usable_since_ns[~usable] = t_ns + STEP_NS
-            memory.fallen[~usable] = True
+            sweep = np.where(usable, sweep, memory.clean)
+            gone = ~usable & (memory.lost >= LOST_MAX)
+            if gone.any():
+                # Not in this step, and what comes next has nothing to jump from.
+                memory.all_usable_since_ns = t_ns + STEP_NS
+                memory.usable_since_ns[gone] = t_ns + STEP_NS
+                memory.jumped[gone] = True
+            memory.lost += ~usable & ~gone
+        self._clean(sweep)
+        memory.lost[usable] = 0
         memory.total += memory.clean
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
@@ -237,15 +257,16 @@ class Motion:
         self._decide()
 
     def _clean(self, counts: NDArray[np.float32]) -> None:
-        """Leave out what has fallen for one sweep alone; held values repeat what was not."""
+        """Leave out what has jumped for one sweep alone; held values repeat what was not."""
         memory = self.memory
-        fallen = memory.clean - counts > SPIKE_COUNTS
-        if fallen.any():
-            fallen &= ~memory.fallen | (counts == memory.counts)
-            memory.clean = np.where(fallen, memory.clean, counts)
+        jumped = np.abs(counts - memory.clean) > SPIKE_COUNTS
+        if jumped.any():
+            jumped[np.count_nonzero(jumped, axis=1) > SPIKES_MAX] = False
+            jumped &= ~memory.jumped | (counts == memory.counts)
+            memory.clean = np.where(jumped, memory.clean, counts)
         else:
             memory.clean = counts
-        memory.fallen, memory.counts = fallen, counts
+        memory.jumped, memory.counts = jumped, counts
 
     def _remember(self, t_ns: int) -> None:
         memory = self.memory
@@ -299,11 +320,12 @@ class Motion:
             correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
             correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
             variance = np.minimum(np.maximum(squares[-1] / 2.0, low**2), high**2)
+            slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
             spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
             free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
             self._noise = Noise(
                 memory.block_number,
-                slope=MEAN_ABS * np.sqrt(variance * (1.0 + 2.0 * SLOPE_ECHO @ correlations)),
+                slope=MEAN_ABS * np.sqrt(variance * slopes),
                 variance=variance * spreads,
                 spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
             )

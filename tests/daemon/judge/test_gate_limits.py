@@ -52,20 +52,20 @@ class Steps:
         self.t_ns += round(after_ms * MS)
         median = np.full(SHAPE, 3000, dtype=np.uint16)
         median[0] = round(counts)
-        self.gate.step(self.t_ns, median, ALL, np.array(touching), against)
+        self.gate.step(self.t_ns, median, median, ALL, np.array(touching), against)
         if self.gate.wants_judgement:
             assert self.gate.state is GateState.SETTLED
             self.gate.judged(self.t_ns, median)
         return self.gate.state
 
-    def rest(self, seconds: float = 0.2) -> None:
+    def rest(self, seconds: float = 1.2) -> None:
         for _ in range(round(seconds * 100)):
             self.step(touching=NOTHING)
 
     def grasp(self) -> None:
         """Rest, touch, and hold until it is judged."""
         self.rest()
-        for _ in range(9):
+        for _ in range(25):
             self.step()
         assert self.gate.settled
 
@@ -74,40 +74,93 @@ class Steps:
 
 
 @pytest.mark.parametrize("period_ms", [1.0, 8.0, 10.0, 16.0, 20.0, 40.0, 80.0])
-@pytest.mark.parametrize("hold_ms", [0, 80, 400])
-def test_hold_time_is_kept_to_the_nanosecond(period_ms: float, hold_ms: int) -> None:
-    steps = Steps(limits=replace(GATE, hold_ns=hold_ms * MS))
+@pytest.mark.parametrize(("early", "window_ms"), [(True, 100), (False, 240)])
+def test_a_touch_must_last_as_long_as_the_window(
+    period_ms: float, early: bool, window_ms: int
+) -> None:
+    steps = Steps(limits=replace(GATE, early=early))
     steps.rest()
     steps.step(period_ms)
     touched_ns = steps.t_ns
     while steps.gate.state is GateState.CLOSING:
         assert steps.gate.reasons == (Reason.SETTLING,)
-        assert steps.t_ns - touched_ns < hold_ms * MS
+        assert steps.gate.still_ns == steps.t_ns - touched_ns < window_ms * MS
         steps.step(period_ms)
     assert steps.gate.settled
-    assert steps.t_ns - touched_ns == hold_ms * MS
+    assert steps.gate.early is early
+    late_ns = steps.t_ns - touched_ns - window_ms * MS
+    assert 0 <= late_ns < period_ms * MS
     assert [c.t_ns for c in steps.gate.take_changes()] == [touched_ns, steps.t_ns, steps.t_ns]
 
 
-def test_the_hold_time_begins_anew_after_every_motion() -> None:
+def test_what_was_judged_early_is_judged_once_more_when_no_slow_slide_is_left() -> None:
+    steps = Steps(limits=replace(GATE, early=True))
+    steps.rest()
+    for _ in range(60):
+        steps.step()
+    assert steps.gate.settled
+    assert not steps.gate.early
+    changes = steps.gate.take_changes()
+    assert [str(change.cause) for change in changes] == ["contact", *["still", "judged"] * 2]
+    touched, *_, judged = changes
+    assert judged.t_ns - touched.t_ns == 240 * MS
+
+
+def test_a_question_is_answered_early_and_once_more() -> None:
+    steps = Steps(limits=replace(GATE, early=True), on_request=True)
+    steps.rest()
+    steps.step()
+    steps.gate.ask()
+    for _ in range(60):
+        steps.step()
+    assert steps.gate.settled
+    assert steps.story().split().count("judged:judged") == 2
+    for _ in range(200):
+        steps.step()
+        assert steps.gate.settled
+    assert not steps.story()
+
+
+def test_stillness_begins_anew_after_every_motion() -> None:
     steps = Steps()
     steps.rest()
-    for _ in range(20):
-        for _ in range(8):  # 70 ms
+    for _ in range(10):
+        for _ in range(20):  # 190 ms
             assert steps.step() is GateState.CLOSING
-        assert steps.step(against=(Reason.MOVING,)) is GateState.CLOSING
-    for _ in range(8):
+        assert steps.step(counts=3040) is GateState.CLOSING
+        assert steps.gate.still_ns == 0
+        assert steps.gate.reasons == (Reason.MOVING,)
+    for _ in range(23):
         assert steps.step() is GateState.CLOSING
-    assert steps.step() is GateState.JUDGED
+        assert steps.gate.still_ns < 240 * MS
+    for _ in range(2):
+        steps.step()
+    assert steps.gate.settled
 
 
-@pytest.mark.parametrize(("counts_per_s", "moves"), [(110, False), (-110, False), (130, True)])
-def test_a_finger_moves_above_the_limit_of_the_rate(counts_per_s: float, moves: bool) -> None:
+def test_a_judged_grasp_that_moves_on_for_two_windows_is_judged_again() -> None:
+    steps = Steps()
+    steps.grasp()
+    steps.story()
+    told_s = []
+    for place in range(100):  # 80 counts/s, to and fro, so that it is never another grasp
+        steps.step(counts=3000 + 0.8 * min(place % 60, 60 - place % 60))
+        if not steps.gate.settled:
+            told_s.append(place / 100)
+    assert told_s[0] < 0.3
+    assert steps.story() == "closing:moved"
+    for _ in range(60):
+        steps.step()
+    assert steps.story() == "settled:still judged:judged"
+
+
+@pytest.mark.parametrize(("counts_per_s", "moves"), [(25, False), (-25, False), (45, True)])
+def test_a_finger_moves_faster_than_held_touches_creep(counts_per_s: float, moves: bool) -> None:
+    # 7.5 counts/s in the median, 31 in 1.7 % of the time: that of one finger in three, for 5 %.
     steps = Steps()
     steps.rest()
-    for place in range(30):
+    for place in range(60):
         steps.step(counts=3000.0 + counts_per_s * place / 100)
-        assert not moves or place < 8 or steps.gate.reasons == (Reason.MOVING,)
     assert (GateState.JUDGED in [c.state for c in steps.gate.take_changes()]) is not moves
 
 
@@ -147,7 +200,8 @@ def test_a_request_expires_after_its_time(after_ms: float, judged: bool) -> None
     steps.gate.ask()
     for _ in range(18):
         steps.step(50, against=(Reason.MOVING,))
-    steps.step(after_ms - 930)  # its time runs from the first reading after it
+    # Its time runs from the first reading after it.
+    steps.step(after_ms - 930, against=(Reason.MOVING,))
     assert steps.step(80) is (GateState.JUDGED if judged else GateState.SETTLED)
     assert steps.gate.reasons == (() if judged else (Reason.NOT_ASKED,))
 
@@ -178,7 +232,8 @@ def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> Non
     for place in range(50):
         median[0, :12] = 4095 * (place % 2)
         steps.t_ns += 10 * MS
-        steps.gate.step(steps.t_ns, median.copy(), usable, np.ones(3, dtype=np.bool_))
+        sweep = median.copy()
+        steps.gate.step(steps.t_ns, sweep, sweep, usable, np.ones(3, dtype=np.bool_))
         assert steps.gate.settled
 
 
@@ -198,10 +253,11 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
     changes: list[GateChange] = []
     touching, median, t_ns = np.zeros(3, dtype=np.bool_), np.full(SHAPE, 3000), START_NS
     for _ in range(4000):
-        t_ns += round(MS * random.choice([0, 1, 10, 10, 10, 10, 10, 90, 101, 5000, -20]))
-        if random.random() < 0.05:
+        usual = random.random() < 0.97
+        t_ns += 10 * MS if usual else round(MS * random.choice([0, 1, 90, 101, 5000, -20]))
+        if random.random() < 0.02:
             touching = random.random(3) < random.choice([0.1, 0.9])
-        if random.random() < 0.05:
+        if random.random() < 0.01:
             median = random.integers(2900, 3000, SHAPE)
         if random.random() < 0.05:
             gate.ask()
@@ -209,7 +265,8 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
         if random.random() < 0.05:
             gate.skip(t_ns)
         else:
-            gate.step(t_ns, median.astype(np.uint16), random.random(SHAPE) < 0.9, touching, against)
+            sweep, usable = median.astype(np.uint16), random.random(SHAPE) < (0.9 + 0.1 * usual)
+            gate.step(t_ns, sweep, sweep, usable, touching, against)
         if gate.wants_judgement:
             assert gate.state is GateState.SETTLED
             assert gate.in_contact
@@ -245,7 +302,7 @@ def test_a_spike_in_the_very_sweep_shows_in_a_single_reading_and_not_in_a_median
 
 
 def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> None:
-    hasty = replace(GATE, hold_ns=0, rate_window_ns=10 * MS, rate_counts_per_s=1e4)
+    hasty = replace(GATE, early=True)
     firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, gate=hasty))
     grip, none = Grip(FINGERS, firm.limits), Watched((), ~ALL)
     sweeps = [(t_s, reading) for t_s, reading in readings(firm) if not 0.5 < t_s < 0.75]
@@ -276,7 +333,7 @@ def test_a_single_reading_is_judged_as_it_came() -> None:
 def test_a_finger_lost_while_settled_is_contact_lost() -> None:
     steps = Steps(on_request=True)
     steps.rest()
-    for _ in range(9):
+    for _ in range(25):
         steps.step()
     assert steps.gate.state is GateState.SETTLED
     steps.step(touching=(True, True, False))
@@ -298,7 +355,7 @@ def test_a_request_expires_though_time_went_back() -> None:
     steps.gate.ask()
     steps.step(-60_000.0, touching=NOTHING)
     steps.rest(2.0)
-    for _ in range(20):
+    for _ in range(30):
         steps.step()
     assert steps.gate.state is GateState.SETTLED
 

@@ -194,7 +194,8 @@ def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
 
 
 def test_electrodes_that_are_not_usable_tell_nothing_until_a_window_has_passed() -> None:
-    motion, counts = Motion(1, 0.05, early=True), np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
+    motion = Motion(1, 0.05, early=True)
+    counts = np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
     usable = FINGER.copy()
     for index in range(250):
         usable[0, :5] = index != 220
