@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from daemon.judge.reasons import Decision
-from daemon.judge.stillness import LONG_NS
+from daemon.judge.windows import LONG_NS
 from daemon.publish.messages import Status, Verdict
 from daemon.watch.snapshot import Line
 
