@@ -29,7 +29,7 @@ class ContactLimits:
 class GateLimits:
     """When a grasp has settled, and when it is another one. Times in ns, counts raw."""
 
-    false_alarms: float = 0.05
+    false_alarms: float = 0.03
     """Share of the sweeps of a hand that holds in which it may be said to move. A slower slide is
     told from a held touch by a larger share; deploy/JUDGING.md has the curve."""
     early: bool = False

@@ -38,6 +38,8 @@ SPIKES_MAX = 4
 BLOCK_STEPS, BLOCKS = 24, 16
 """Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
 what it is while a hand closes or opens, ..."""
+QUARTILE = 0.95
+"""Which is so much of the mean, of noise that is correlated as measured or is not."""
 BLOCKS_MIN = 4
 """... and is not known before there are so many of them."""
 SIGMA_COUNTS = (0.5, 10.0)
@@ -281,7 +283,7 @@ class Motion:
             low, high = SIGMA_COUNTS
             correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
             correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
-            variance = np.minimum(np.maximum(squares[-1] / 2.0, low**2), high**2)
+            variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
             self._noise, self._noise_blocks = Noise.of(variance, correlations), memory.block_number
         return self._noise
 

@@ -125,7 +125,7 @@ def test_check_says_what_is_in_and_what_is_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("gate", "judged", "share"),
-    [("", "judged after 240 ms", "5 %"), ("early = true\nfalse_alarms = 0.01", EARLY, "1 %")],
+    [("", "judged after 240 ms", "3 %"), ("early = true\nfalse_alarms = 0.01", EARLY, "1 %")],
 )
 def test_check_says_what_is_known_of_motion_and_when(
     tmp_path: Path, gate: str, judged: str, share: str

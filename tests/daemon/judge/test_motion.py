@@ -41,7 +41,7 @@ def test_tails_are_those_of_a_gaussian(share: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [1000 / 14, 100.0, 1000.0])
 @pytest.mark.parametrize("speed", [0.0, 60.0, 300.0])
-def test_motion_is_the_slope_of_a_fitted_line_over_what_noise_makes(
+def test_motion_is_slope_and_spread_over_what_noise_makes_of_them(
     rate_hz: float, speed: float
 ) -> None:
     sigma, motion = 4.0, Motion(1, 0.05, early=True)
@@ -54,31 +54,30 @@ def test_motion_is_the_slope_of_a_fitted_line_over_what_noise_makes(
         counts = counts[1:496].reshape(99, 5, 1, 24).mean(axis=1)
         times = times[1:496].reshape(99, 5).mean(axis=1)
         sigma /= np.sqrt(5)
-    for found, window_s in zip(motion.motion[:, 0], (0.1, 0.24), strict=True):
-        window = times > times[-1] - window_s + 1e-6
-        slopes = np.polyfit(times[window], counts[window, 0], 1)[0]
-        extent = ((times[window] - times[window].mean()) ** 2).sum()
-        by_noise = np.sqrt(2 / np.pi) * np.hypot(sigma, np.sqrt(1 / 12)) / np.sqrt(extent)
-        assert found == pytest.approx(np.abs(slopes).mean() / by_noise, rel=0.07)
+    sigma = np.hypot(sigma, np.sqrt(1 / 12))  # of whole numbers
+    short, long = (times > times[-1] - window_s + 1e-6 for window_s in (0.1, 0.24))
+    slopes = np.polyfit(times[short], counts[short, 0], 1)[0]
+    extent = ((times[short] - times[short].mean()) ** 2).sum()
+    by_noise = np.sqrt(2 / np.pi) * sigma / np.sqrt(extent)
+    assert motion.motion[0, 0] == pytest.approx(np.abs(slopes).mean() / by_noise, rel=0.07)
+    spread = np.sqrt(counts[long, 0].var(axis=0, ddof=1).mean())
+    assert motion.motion[1, 0] == pytest.approx(spread / sigma, rel=0.07)
 
 
-@pytest.mark.parametrize(
-    ("share", "short", "long"), [(0.1, 78, 22), (0.05, 83, 25), (0.01, 97, 34)]
-)
-def test_limits_are_the_quantiles_of_real_held_touches(
-    share: float, short: float, long: float
+@pytest.mark.parametrize(("share", "expected"), [(0.1, 61), (0.05, 66), (0.01, 77)])
+def test_the_limit_is_the_quantile_of_the_slopes_of_real_held_touches(
+    share: float, expected: float
 ) -> None:
-    # Standard deviation and correlation as measured: 3.5 counts from sweep to sweep, 0.32.
+    # At 100 ms, between those measured at 80 and at 120 ms: 78 and 49, 83 and 53, 97 and 63
+    # counts/s. Standard deviation and correlation as measured: 3.5 counts from sweep to sweep, 0.32.
     random = np.random.default_rng(3)
     white = random.normal(0.0, 3.5 / np.sqrt(0.68) / np.hypot(1.0, 0.36), (4001, 1, 24))
     counts = 2000.0 + white[1:] + 0.36 * white[:-1]
     motion = Motion(1, share, early=True)
     fed(motion, counts, 100.0)
-    for limit, expected, sweeps in zip(motion.limits[:, 0], (short, long), (8, 24), strict=True):
-        windows = np.lib.stride_tricks.sliding_window_view(counts[:, 0], sweeps, axis=0)
-        columns = windows.reshape(-1, sweeps).T
-        noise = np.abs(np.polyfit(0.01 * np.arange(sweeps), columns, 1)[0]).mean()
-        assert limit * noise == pytest.approx(expected, rel=0.12)
+    windows = np.lib.stride_tricks.sliding_window_view(counts[:, 0], 10, axis=0)
+    noise = np.abs(np.polyfit(0.01 * np.arange(10), windows.reshape(-1, 10).T, 1)[0]).mean()
+    assert motion.limits[0, 0] * noise == pytest.approx(expected, rel=0.12)
 
 
 def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
@@ -105,9 +104,9 @@ def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
 @pytest.mark.parametrize("sampling", Sampling)
 def test_held_hands_are_still_and_slides_are_not(sampling: Sampling) -> None:
     early, sure = shares([False] * 3, sampling)
-    # 5 % are wanted; generated touches relax a little less than real ones.
-    assert 0.94 < early < 0.995
-    assert 0.94 < sure < 0.995
+    # 5 % are wanted; of a dozen streams' windows, which overlap, it is more or less.
+    assert 0.93 < early < 0.995
+    assert 0.90 < sure < 0.99
     # Measured on real slides at 5 % of false alarms: 59 % at 80 ms and 35 % at 240 ms; a fifth more
     # for a dozen generated ones. Of three fingers that slide, the third power is left, and some.
     early, sure = shares([True, False, False], sampling)
@@ -142,8 +141,8 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     for index in range(30):
         motion.add(10**10 + index * 10_000_000, np.rint(counts[index]).astype(np.uint16), FINGER)
         fast.append(tuple(np.isfinite(motion.motion[:, 0]).tolist()))
-    # The first sweep that is 80 ms older than another is the ninth; that is 240 ms older, the 25th.
-    assert fast == [(False, False)] * 8 + [(True, False)] * 16 + [(True, True)] * 6
+    # The first sweep that is 100 ms older than another is the 11th; that is 240 ms older, the 25th.
+    assert fast == [(False, False)] * 10 + [(True, False)] * 14 + [(True, True)] * 6
     motion.forget()
     fed(motion, counts[:90], 100.0, 2 * 10**10)
     assert not np.isfinite(motion.motion).any()
@@ -194,23 +193,22 @@ def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     assert (motion.motion > 5.0).all()
 
 
-def test_electrodes_that_are_not_usable_tell_nothing_until_a_window_has_passed() -> None:
+def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_passed() -> None:
     motion = Motion(1, 0.05, early=True)
     counts = np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
-    usable = FINGER.copy()
-    for index in range(250):
-        usable[0, :5] = index != 220
-        sweep = counts[index].copy()
-        sweep[0, :5] = 4095 if index == 220 else sweep[0, :5]
+    known = []
+    for index in range(300):
+        usable, sweep = FINGER.copy(), counts[index].copy()
+        if index in (120, 123, *range(150, 153), *range(200, 204)):
+            usable[0, :13] = False
+            sweep[0, :13] = 4095
         motion.add(index * 10_000_000, sweep, usable)
-        if index >= 110:
-            assert motion.motion[1, 0] < 2.5
-    usable[0, :13] = False
-    motion.add(2_500_000_000, counts[250], usable)
-    # Eleven electrodes are too few to know that a finger is still.
-    assert np.isinf(motion.motion).all()
-    assert not motion.early
-    assert not motion.sure
+        known.append(tuple(np.isfinite(motion.motion[:, 0]).tolist()))
+        assert not known[-1][1] or motion.motion[1, 0] < 1.5
+    # Three sweeps in a row are bridged, a fourth is not: eleven electrodes are too few to know that
+    # a finger is still, for as long as a window goes back to it.
+    assert set(known[110:203]) == {(True, True)}
+    assert known[203:] == [(False, False)] * 10 + [(True, False)] * 14 + [(True, True)] * 73
 
 
 def test_each_finger_is_measured_by_its_own_noise() -> None:
