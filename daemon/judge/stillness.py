@@ -161,7 +161,7 @@ class Motion:
     @property
     def known(self) -> bool:
         """Whether it is known of all fingers how they moved in the short window."""
-        return max(self.motion[0].tolist()) < math.inf
+        return bool(max(self.motion[0].tolist()) < math.inf)
 
     @property
     def slides(self) -> bool:
