@@ -19,7 +19,7 @@ from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.limits import GripLimits
+    from daemon.judge.limits import GateLimits, GripLimits
     from daemon.measure.cost.tables import Footprint
 
 TACTILE_SECTIONS = (
@@ -30,6 +30,8 @@ TACTILE_SECTIONS = (
 )
 
 WRONG, FAILED = 2, 1
+USUAL_PERIOD_NS = 10_000_000
+"""Between readings, where only the device knows."""
 COIN = 0.5
 """Every verdict is as sure as this, to two digits: a threshold below refuses nothing."""
 
@@ -73,7 +75,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
         limits = assembly.grip_limits(wanted)
-        _try_drivers(wanted)
+        period_ns = _try_drivers(wanted)
         _try_keys(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
         complain(error)
@@ -88,7 +90,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
             complain(error)
             return _Checked(FAILED)
     parts = {
-        "in": _what_is_in(wanted, model, limits),
+        "in": _what_is_in(wanted, model, limits, period_ns),
         "left_out": _what_is_left_out(wanted, model, limits),
     }
     if args.json:
@@ -123,8 +125,11 @@ def _write(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None)
         sys.stdout.writelines(f"{line}\n" for line in lines(cost))
 
 
-def _try_drivers(wanted: scene.Scene) -> None:
-    """Construct them all, and open what reads nothing but files: those are part of the scene."""
+def _try_drivers(wanted: scene.Scene) -> int | None:
+    """Construct them all, and open what reads nothing but files: those are part of the scene.
+
+    The time between readings, ns; None where only the device knows.
+    """
     tactile, joints = wanted.tactile, wanted.joints
     driver, *_ = assembly.build_drivers(wanted)
     is_file = isinstance(tactile, scene_drivers.PalmTactile) and "://" not in tactile.source
@@ -135,6 +140,7 @@ def _try_drivers(wanted: scene.Scene) -> None:
         from drivers.palm.calibration import load_calibration
 
         load_calibration(joints.calibration)
+    return driver.period_ns
 
 
 def _try_keys(wanted: scene.Scene) -> None:
@@ -150,7 +156,7 @@ def _try_keys(wanted: scene.Scene) -> None:
 
 
 def _what_is_in(
-    wanted: scene.Scene, model: TactileModel, limits: GripLimits | None
+    wanted: scene.Scene, model: TactileModel, limits: GripLimits | None, period_ns: int | None
 ) -> dict[str, str]:
     contract = model.contract
     figures = ", ".join(
@@ -167,6 +173,8 @@ def _what_is_in(
         "gate": _gate(wanted, limits),
         "publish": (f"verdict, gate and status.{wanted.hand.name} on {wanted.endpoint}"),
     }
+    if limits is not None:
+        parts["still"] = _still(wanted, limits.gate, period_ns)
     if wanted.ask_endpoint is not None:
         parts["ask"] = f"on {wanted.ask_endpoint}, answered within {wanted.gate.request_ms:g} ms"
     if wanted.joints is not None:
@@ -212,6 +220,28 @@ def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
     joints = "" if limits.joints is None else f", joints below {gate.joint_rad_per_s:g} rad/s"
     fingers = ", ".join(gate.fingers or wanted.hand.fingers)
     return f"{when}once per grasp: {fingers} touch and keep still{joints}; {what}, {age}"
+
+
+def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
+    """What is known of motion when, and what is judged then."""
+    from daemon.judge.windows import Tails, operating_points
+
+    tails = Tails.of(len(wanted.hand.fingers), gate.false_alarms, early=gate.early)
+    soon, sure = operating_points(tails, period_ns or USUAL_PERIOD_NS)
+    after, again = f"{soon.after_ns / 1e6:.0f} ms", f"{sure.after_ns / 1e6:.0f} ms"
+    judged = (
+        f"judged early after {after}, again after {again}"
+        if gate.early
+        else f"judged after {again}"
+    )
+    rate = 1e9 / (period_ns or USUAL_PERIOD_NS)
+    return (
+        f"after {after} fast motion is excluded, {soon.counts_per_s:.0f} counts/s and more, after "
+        f"{again} slow slides, {sure.counts_per_s:.0f} and more (mean of the electrodes that is "
+        f"seen in half of the readings; {rate:.0f}/s{', as usual' if period_ns is None else ''}, "
+        f"typical noise); a hand that holds may be said to move {100 * gate.false_alarms:g} % of "
+        f"the time; {judged}"
+    )
 
 
 def _rejects(wanted: scene.Scene) -> str:

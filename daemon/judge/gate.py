@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from daemon.judge.limits import GateLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
-from daemon.judge.stillness import LONG_NS, SHORT_NS, Motion, mean_distance
+from daemon.judge.stillness import Motion, mean_distance
+from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
 
 CHANGES_MAX = 64

@@ -75,7 +75,7 @@ ADVICE: dict[Reason, str] = {
     Reason.NOT_TARED: "where the fingers rest is not known yet: open the hand for two seconds",
     Reason.NO_CONTACT: "not all fingers touch: close the hand; or open it once, to tare",
     Reason.MOVING: "fingers or object move: wait until they are still",
-    Reason.SETTLING: "still for too short a time yet: wait for the hold time",
+    Reason.SETTLING: "still for too short a time yet: keep the hand as it is",
     Reason.SEQUENCE_GAP: "readings were lost, so motion is not known: check cable, bus and PC load",
     Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
     Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",

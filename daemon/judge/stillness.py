@@ -14,16 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.findings import Number
+from daemon.judge.windows import (
+    APART,
+    LONG_NS,
+    SHORT_NS,
+    STEP_NS,
+    STEPS,
+    STEPS_MIN,
+    Noise,
+    Tails,
+    centred,
+    fast_limit,
+    slow_limit,
+)
 from drivers.base import ELECTRODES
 
-STEP_NS = 5_000_000
-"""Of sweeps that come faster than this, the mean is remembered."""
-SHORT_NS, LONG_NS = 100_000_000, 240_000_000
-"""The short window shows fast motion soon, the long one slow slides, which no short one can."""
-STEPS = LONG_NS // STEP_NS + 2
-"""Steps remembered: the long window, and one at each end of it."""
-STEPS_MIN = 3
-"""Steps of a window at least: where sweeps come slowly, windows are longer."""
 SPIKE_COUNTS = 20.0
 """A value that jumps further than this is believed when the next one does too. Spikes last for one
 sweep: of a sensor by 25 counts or more, of a flipped bit by any; noise does so in one value of
@@ -39,35 +44,11 @@ BLOCKS_MIN = 4
 """... and is not known before there are so many of them."""
 SIGMA_COUNTS = (0.5, 10.0)
 """An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
-APART = 3
-"""Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
-sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
 LOST_MAX = 3
 """An electrode that is not usable for so many sweeps in a row is taken to read what it read."""
 SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
-MEAN_ABS = math.sqrt(2.0 / math.pi)
-"""Mean absolute value of a Gaussian of standard deviation 1."""
-SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
-"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
-CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
-"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
-its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
-240 ms."""
-FAST_SHARE = 0.1
-"""Share of the false alarms that the short window may have where the long one decides."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
-SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))
-"""Of so many values on a line around 0: sum of the products of those so many steps apart, over the
-sum of squares. Noise that is correlated makes a slope the larger."""
-SPREAD_ECHO = np.zeros((STEPS + 1, APART - 1))
-"""Of so many values: pairs that are so many steps apart, over all pairs. Noise that is correlated
-spreads the less."""
-for _number in range(STEPS_MIN, STEPS + 1):
-    for _lag in range(1, APART):
-        _line = np.arange(_number) - (_number - 1) / 2.0
-        SLOPE_ECHO[_number, _lag - 1] = _line[_lag:] @ _line[:-_lag] / (_line @ _line)
-        SPREAD_ECHO[_number, _lag - 1] = 2.0 * (_number - _lag) / (_number * (_number - 1))
 
 
 def mean_distance(
@@ -133,21 +114,6 @@ class MotionMemory:
             raise ValueError("more steps than are remembered")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Noise:
-    """What noise alone makes of windows of so many steps: each of shape (steps, fingers)."""
-
-    block_number: int
-    """Blocks that it is known from."""
-    slope: NDArray[np.float64]
-    """Mean absolute slope, counts/s, if the squares of the times around their mean sum to 1 s**2.
-    """
-    variance: NDArray[np.float64]
-    """Mean square deviation from the mean, counts**2 ..."""
-    spread: NDArray[np.float64]
-    """... and its standard deviation over that."""
-
-
 class Motion:
     """How each finger moves, in units of its own noise; constant memory, no clock.
 
@@ -162,15 +128,11 @@ class Motion:
         With `early` the short window may have as large a share itself, as it decides alone until
         the long one is full. Raises `ValueError` for another share.
         """
-        if not 0.0 < false_alarms < 0.5:
-            raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         shape = (fingers, ELECTRODES)
-        finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
-        self._slow, self._fast = upper_tail(finger), upper_tail(FAST_SHARE * finger)
-        self._alone = self._slow if early else self._fast
-        """Limits of the long window, of the short one beside it, and of the short one where it
-        decides alone, in standard deviations."""
+        self._tails = Tails.of(fingers, false_alarms, early=early)
         self._noise: Noise | None = None
+        self._noise_blocks = 0
+        """Blocks that it is known from."""
         self.memory = MotionMemory(
             times_ns=np.zeros(2 * STEPS, dtype=np.int64),
             steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
@@ -199,7 +161,7 @@ class Motion:
     @property
     def known(self) -> bool:
         """Whether it is known of all fingers how they moved in the short window."""
-        return max(self.motion[0].tolist()) < math.inf
+        return bool(max(self.motion[0].tolist()) < math.inf)
 
     @property
     def slides(self) -> bool:
@@ -315,22 +277,14 @@ class Motion:
 
     def _known_noise(self) -> Noise:
         memory = self.memory
-        if self._noise is None or self._noise.block_number != memory.block_number:
+        if self._noise is None or self._noise_blocks != memory.block_number:
             number = min(memory.block_number, BLOCKS)
             squares = np.sort(memory.blocks[:number], axis=0)[number // 4]
             low, high = SIGMA_COUNTS
             correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
             correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
             variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
-            slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
-            spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
-            free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
-            self._noise = Noise(
-                memory.block_number,
-                slope=MEAN_ABS * np.sqrt(variance * slopes),
-                variance=variance * spreads,
-                spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
-            )
+            self._noise, self._noise_blocks = Noise.of(variance, correlations), memory.block_number
         return self._noise
 
     def _decide(self) -> None:
@@ -357,7 +311,7 @@ class Motion:
     def _follow_fast(self, begin: int, end: int) -> NDArray[np.float64]:
         """How steps have moved, and its limit where it decides alone; the limit where not."""
         memory, number, noise = self.memory, end - begin, self._known_noise()
-        times_s = _centred(memory.times_ns[begin:end])
+        times_s = centred(memory.times_ns[begin:end])
         extent = float(times_s @ times_s)
         weights = (times_s / extent).astype(np.float32)
         slopes = (weights @ memory.steps[begin:end].reshape(number, -1)).reshape(memory.clean.shape)
@@ -366,11 +320,8 @@ class Motion:
         self.motion[0] = mean / by_noise
         if too_few is not None:
             self.motion[0, too_few] = np.inf
-        self.limits[0], beside = (
-            np.hypot(math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail) / by_noise)
-            for tail in (self._alone, self._fast)
-        )
-        return beside
+        self.limits[0] = fast_limit(self._tails.alone, by_noise)
+        return fast_limit(self._tails.fast, by_noise)
 
     def _follow_slow(self, begin: int, end: int) -> None:
         """How far steps have spread, and the limit of it."""
@@ -382,34 +333,10 @@ class Motion:
         self.motion[1] = np.sqrt(mean / by_noise)
         if too_few is not None:
             self.motion[1, too_few] = np.inf
-        times_s = _centred(memory.times_ns[begin:end])
+        times_s = centred(memory.times_ns[begin:end])
         extent = float(times_s @ times_s) / by_noise
-        usual, most = creep(0.0) ** 2 * extent, creep(self._slow) ** 2 * extent
-        # Noise and creep know nothing of each other: their deviations add up as squares do.
-        above = np.hypot(self._slow * noise.spread[number] * (1.0 + usual), most - usual)
-        self.limits[1] = np.sqrt(1.0 + usual + above)
+        self.limits[1] = slow_limit(self._tails.slow, extent, noise.spread[number])
 
     def _say_unknown(self) -> None:
         self.motion, self.limits = self._unknown, self._no_limits
         self.early = self.sure = False
-
-
-def creep(tail: float) -> float:
-    """Speed that a held touch keeps to but for so many standard deviations, counts/s."""
-    return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
-
-
-def _centred(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """In seconds, with a mean of 0."""
-    times_s = (times_ns - times_ns[0]) / 1e9
-    return np.asarray(times_s - times_s.sum() / len(times_s))
-
-
-def upper_tail(share: float) -> float:
-    """How many standard deviations this share, 0..0.5, of a Gaussian lies above.
-
-    Abramowitz and Stegun, 26.2.23; the error is at most 0.00045.
-    """
-    t = math.sqrt(-2.0 * math.log(share))
-    above = 2.515517 + t * (0.802853 + t * 0.010328)
-    return t - above / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)))

@@ -105,7 +105,7 @@ class Verdict(_Message, frozen=True, kw_only=True):
     """Whether it was judged when nothing moved fast, but something might still slide slowly
     (`[gate] early`); a surer verdict of the same grasp follows."""
     still_ms: Duration | None = None
-    """For how long the hand has touched and kept still, as far as that can be told, ms: from 80 on
+    """For how long the hand has touched and kept still, as far as that can be told, ms: from 100 on
     nothing moves fast, from 240 on nothing slides slowly either; 0 while something moves. Null with
     a null `gate`."""
     motion: Motion | None = None

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from daemon.judge.reasons import Decision
+from daemon.judge.windows import LONG_NS
 from daemon.publish.messages import Status, Verdict
 from daemon.watch.snapshot import Line
 
+SURE_MS = LONG_NS / 1e6
+"""Of a hand that has been still for so long nothing slides slowly either."""
 LIKELY = 0.25
 """A slip that is likelier is never shown as a promise, whatever `stable` has been worth so far."""
 NO_OUTCOME = "no outcome told yet"
@@ -15,6 +18,8 @@ WATCHED = Line("supervised", "lift only while a person watches, and tell the out
 def doubt(verdict: Verdict) -> str | None:
     """Why `stable` is not yet a promise; None where lifts have shown that it keeps the target."""
     risk, p_slip = verdict.risk, verdict.p_slip
+    if verdict.early:
+        return "judged early: it may still slide slowly, and is judged once more"
     if p_slip is None or p_slip > LIKELY:
         return "a slip is too likely for a promise: grasp again, or watch the lift"
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
@@ -38,6 +43,16 @@ def rests_on(verdict: Verdict) -> str:
     slipped = f"of {risk.lifts} `stable` ones {risk.slips} slipped"
     said += slipped if risk.lifts else "no `stable` one told yet"
     return said + ("" if risk.target is None else f", target {_percent(risk.target)}")
+
+
+def stillness(still_ms: float | None) -> str:
+    """For how long a hand has been still; `-` where that is not told."""
+    if still_ms is None:
+        return "-"
+    whole_ms = int(still_ms)
+    if still_ms < SURE_MS:
+        return f"{whole_ms} ms" + (", may slide" if whole_ms else "")
+    return f"{whole_ms} ms" if still_ms < 10_000.0 else f"{whole_ms // 1000} s"
 
 
 def lift(verdict: Verdict, ended: str | None) -> str:

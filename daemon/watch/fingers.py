@@ -36,6 +36,15 @@ _FILL = fill_matrix(D1, Fill.NEIGHBOUR_MEAN)[:, :ELECTRODES]
 _PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, strict=True)]
 
 
+class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
+    """How a finger moves, in units of its own noise."""
+
+    now: float | None
+    """None: not known, which is not 0."""
+    limit: float
+    """What it is at most while the finger is still."""
+
+
 class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     """What is drawn of one finger."""
 
@@ -50,6 +59,8 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     """Largest fall of an electrode, counts."""
     marked: list[int]
     """Pixels of the electrodes that are faulty or were repaired."""
+    motion: FingerMotion | None
+    """None where nobody says: each reading is a grasp of its own."""
 
 
 class Rest:
@@ -83,6 +94,7 @@ def image(
     *,
     touches: bool | None,
     repaired: Collection[str] = (),
+    motion: FingerMotion | None = None,
 ) -> FingerImage:
     """The image of one reading of a finger; `counts`, `sound` and `rest` have shape (24,).
 
@@ -100,6 +112,7 @@ def image(
         levels=_levels(fall, from_rest=rest is not None),
         deepest=round(float(fall.max())),
         marked=sorted(marked),
+        motion=motion,
     )
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from dataclasses import dataclass
 
 from rich.color import Color
 from rich.style import Style
 from rich.text import Text
 
-from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerImage
+from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerImage, FingerMotion
 from daemon.watch.snapshot import TONE_CODE, Tone
 
 COLOURS = {
@@ -98,6 +99,25 @@ class Canvas:
         number = 0 if share is None else round(share * width)
         text = Text(full * number, self.style(tone))
         return text.append(empty * (width - number), "dim")
+
+    @property
+    def limit(self) -> str:
+        """The mark of a limit on a bar."""
+        return "|" if self.ascii_only else "┃"
+
+    def motion(self, motion: FingerMotion, width: int) -> Text:
+        """How a finger moves: up to the mark it is still, and at the end it is twice as much."""
+        if motion.now is None:
+            return Text("?" * width, self.style(Tone.TROUBLE))
+        full, empty = ("#", "-") if self.ascii_only else ("█", "░")
+        share, below = min(motion.now / motion.limit, 2.0), width // 2
+        above = width - below - 1
+        still = min(round(share * below), below)
+        moving = min(math.ceil(max(share - 1.0, 0.0) * below), above)
+        style: Style | str = self.style(Tone.TROUBLE) if moving else ""
+        text = Text(full * still, style).append(empty * (below - still), "dim")
+        text.append(self.limit, "bold").append(full * moving, style)
+        return text.append(empty * (above - moving), "dim")
 
     def strip(self, history: str, moments: int, width: int) -> Text:
         """Tones of the last `moments` snapshots, the newest at the right."""

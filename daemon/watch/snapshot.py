@@ -110,6 +110,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     grasp: int | None
     gate: str | None
     contact: list[str] | None
+    still: str
+    """For how long the hand has been still, in words; `-` where nobody says."""
     judged: Judged | None
     """The newest of `grasps`."""
     grasps: list[Judged]

@@ -11,13 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from daemon.process.text import printable
+from daemon.watch.fingers import FingerImage
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Snapshot, Tone
 from daemon.watch.view import HISTORY
 
 LARGE = (100, 34)
 """Columns and lines from which on the images are large."""
-LINES, LINES_LARGE = 23, 29
+LINES, LINES_LARGE = 23, 30
 """Lines of all but what is not well, with small and with large images."""
 WHY_MAX = 3
 """Reasons that are shown; a reading seldom has more."""
@@ -98,6 +99,8 @@ def _facts(seen: Snapshot, canvas: Canvas, width: int) -> Text:
         (seen.gate or "-", BOLD),
         ("\ntouches ", DIM),
         ("not known" if seen.contact is None else " ".join(seen.contact) or "nothing", BOLD),
+        ("   still ", DIM),
+        (seen.still, BOLD),
         ("\nslip probability ", DIM),
         (f"{p_slip:6}", BOLD),
     )
@@ -128,19 +131,35 @@ def _why(seen: Snapshot, canvas: Canvas) -> Group:
 def _hand(seen: Snapshot, canvas: Canvas, *, large: bool, width: int) -> RenderableType:
     lines, columns = (12, 22) if large else (6, 11)
     if not seen.fingers:
-        return Text("no readings to see" + "\n" * (lines + 1), DIM)
+        return Text("no readings to see" + "\n" * (lines + (2 if large else 1)), DIM)
     grid = Table.grid(padding=(0, GAP, 0, 0))
     cells: list[RenderableType] = []
     for finger in seen.fingers:
         known = {True: "touches", False: "free", None: ""}[finger.touches]
         title = Text.assemble((f"{finger.name} ", BOLD), (known, canvas.style(seen.tone)))
-        depth = Text(f"{'fall' if finger.from_rest else 'span'} {finger.deepest}", DIM)
-        cells.append(Group(title, canvas.picture(finger, large=large), depth))
+        below = _depth_and_motion(finger, canvas, large=large)
+        cells.append(Group(title, canvas.picture(finger, large=large), *below))
         grid.add_column(width=columns, no_wrap=True)
     left = max(width - len(cells) * (columns + GAP), 1)
     grid.add_column(width=left, no_wrap=True)
-    grid.add_row(*cells, Group(_beside(seen, left, lines), _legend(seen, canvas)))
+    grid.add_row(*cells, Group(_beside(seen, left, lines), _legend(seen, canvas, large)))
     return grid
+
+
+def _depth(finger: FingerImage) -> str:
+    return "fall" if finger.from_rest else "span"
+
+
+def _depth_and_motion(finger: FingerImage, canvas: Canvas, *, large: bool) -> list[Text]:
+    """Two lines where there is room for them, one where not."""
+    motion = finger.motion
+    depth = Text(f"{_depth(finger)} {finger.deepest}", DIM)
+    if motion is None:
+        return [depth, Text()] if large else [depth]
+    if not large:
+        return [Text(f"{finger.deepest:4} ", DIM).append_text(canvas.motion(motion, 6))]
+    moves = _line(("moves ", DIM), (f"{'' if motion.now is None else f'{motion.now:.1f}':5}", ""))
+    return [depth, moves.append_text(canvas.motion(motion, 11))]
 
 
 def _beside(seen: Snapshot, width: int, lines: int) -> RenderableType:
@@ -180,9 +199,12 @@ def _joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
     return [Text("joints" if named else "no joints", DIM), *[_line((row, "")) for row in rows]]
 
 
-def _legend(seen: Snapshot, canvas: Canvas) -> Text:
-    what = "below rest" if seen.fingers[0].from_rest else "below the median"
-    text = Text.assemble(("risen ", DIM), canvas.scale(12), (f" pressed, {what}", DIM))
+def _legend(seen: Snapshot, canvas: Canvas, large: bool) -> Text:
+    first = seen.fingers[0]
+    what, width = ", below rest" if first.from_rest else ", below the median", 12
+    if first.motion is not None and not large:
+        what, width = f"; {_depth(first)}, motion to {canvas.limit}", 8
+    text = Text.assemble(("risen ", DIM), canvas.scale(width), (f" pressed{what}", DIM))
     text.no_wrap, text.overflow = True, "ellipsis"
     return text
 

@@ -23,9 +23,10 @@ from daemon.publish.messages import (
     decode_tactile,
     decode_verdict,
 )
-from daemon.watch.evidence import WATCHED, doubt, learning, lift, rests_on
-from daemon.watch.fingers import FingerImage, Rest, image
+from daemon.watch.evidence import WATCHED, doubt, learning, lift, rests_on, stillness
+from daemon.watch.fingers import FingerImage, FingerMotion, Rest, image
 from daemon.watch.snapshot import TONE_CODE, Judged, Line, Session, Snapshot, Timing, Tone
+from models.contract import Finger
 from models.layout import ELECTRODES
 
 SNAPSHOTS_HZ = 10
@@ -172,6 +173,7 @@ class View:
             grasp=None if verdict is None else verdict.grasp,
             gate=None if self._gate is None or silent else self._gate.value,
             contact=None if verdict is None or silent else _names(verdict.contact),
+            still=stillness(None if verdict is None or silent else verdict.still_ms),
             judged=grasps[0] if grasps else None,
             grasps=grasps,
             fingers=[] if silent else self._images(now_ns),
@@ -234,6 +236,7 @@ class View:
                     None if rest is None else rest.counts,
                     touches=None if contact is None else finger in contact,
                     repaired=() if verdict is None else verdict.repaired,
+                    motion=_motion(verdict, finger),
                 )
             )
         return images
@@ -284,6 +287,13 @@ def _arrays(tactile: Tactile, index: int) -> tuple[NDArray[np.float64] | None, N
     if not len(counts) == len(faults) == ELECTRODES:
         return None, np.zeros(ELECTRODES, dtype=np.bool_)
     return np.array(counts, dtype=np.float64), np.array(faults) == 0
+
+
+def _motion(verdict: Verdict | None, finger: Finger) -> FingerMotion | None:
+    if verdict is None or verdict.motion is None:
+        return None
+    limit = (verdict.motion_limits or {}).get(finger, 0.0)
+    return FingerMotion(now=verdict.motion.get(finger) if limit > 0.0 else None, limit=limit)
 
 
 def _names(fingers: Sequence[str] | None) -> list[str] | None:

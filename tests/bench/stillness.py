@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.limits import GateLimits
-from daemon.judge.stillness import LONG_NS, SHORT_NS, Motion
+from daemon.judge.stillness import Motion
+from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
 from drivers.twins.grasps.slides import SECONDS, SPEED_COUNTS_PER_S, STANDSTILL_S, held
 from drivers.twins.grasps.whole_grasps import RATE_HZ, Sampling

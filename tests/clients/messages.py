@@ -20,7 +20,9 @@ RISK = {
     "target": 0.05, "lifts": 41, "slips": 2, "outstanding": 1, "bound": 6.1, "warm_up_left": 0,
 }  # fmt: skip
 ADDED: dict[str, Any] = {
-    "p_slip_model": 0.3, "outcomes": 57, "supervised": False, "risk": RISK
+    "p_slip_model": 0.3, "outcomes": 57, "supervised": False, "risk": RISK,
+    "early": False, "still_ms": 250.0, "motion": {"ff": 0.9, "th": None},
+    "motion_limits": {"ff": 1.5, "th": 1.0},
 }  # fmt: skip
 """What older daemons leave out, as it is of a known grasp."""
 
@@ -104,6 +106,10 @@ def _added(draw: st.DrawFn, known: bool) -> dict[str, Any]:
         "outcomes": draw(st.integers(0, 99)),
         "supervised": draw(st.booleans()),
         "risk": draw(st.sampled_from([None, RISK, RISK, risk])),
+        "early": draw(st.booleans()),
+        "still_ms": draw(st.sampled_from([None, 0, 99.9, 100.0, 239.999999, 240, 500.5])),
+        "motion": draw(st.sampled_from([None, {}, {"ff": 0.5}, {"mf": None, "ff": 3, "": 0.0}])),
+        "motion_limits": draw(st.sampled_from([None, {}, {"ff": 1.5, "th": 2}])),
     }
     if not known:
         reasons = [["moving"], ["unproven"], ["low-confidence"], ["unproven", "moving"]]

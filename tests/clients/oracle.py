@@ -62,6 +62,10 @@ class Told(Former):
     outcomes: Whole = 0
     supervised: bool = False
     risk: RiskTold | None = None
+    early: bool = False
+    still_ms: Duration | None = None
+    motion: dict[str, Duration | None] | None = None
+    motion_limits: dict[str, Duration] | None = None
 
     @property
     def teaches(self) -> bool:
@@ -108,6 +112,13 @@ def is_stable(came: Sequence[Sequence[bytes]], now_ns: int) -> bool:
     message = newest(came)
     known = message is not None and message.verdict == "stable" and not message.teaches
     return known and message is not None and is_fresh(message, now_ns)
+
+
+def has_been_still(message: Told, still_ms: float | None) -> bool:
+    """Whether it says that the hand has been still for so long, if anybody wants to know."""
+    if still_ms is None:
+        return True
+    return message.still_ms is not None and message.still_ms >= still_ms
 
 
 def is_to_be_watched(came: Sequence[Sequence[bytes]], now_ns: int) -> bool:

@@ -31,6 +31,11 @@ void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
         std::cout << std::llrint(risk->target.value_or(-1) * 1e9) << ' ' << risk->lifts << ' '
                   << risk->slips << ' ' << risk->outstanding << ' '
                   << std::llrint(risk->bound.value_or(-1)) << ' ' << risk->warm_up_left << ' ';
+    std::cout << verdict.early << ' ' << std::llrint(verdict.still_ms.value_or(-1) * 1e6) << ' ';
+    for (const auto& [finger, moves] : verdict.motion)
+        std::cout << finger << '=' << std::llrint(moves.value_or(-1) * 1e3) << ' ';
+    for (const auto& [finger, limit] : verdict.motion_limits)
+        std::cout << finger << '<' << std::llrint(limit * 1e3) << ' ';
     std::cout << counts.messages << ' '
               << counts.lost << ' ' << counts.repeats << ' ' << counts.malformed << ' '
               << counts.restarts << ' ' << counts.former << std::endl;

@@ -38,6 +38,29 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_p
             assert client.counts.malformed == 0
 
 
+def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
+    with (
+        Daemon(tmp_path, "[gate]\nearly = true\n", whole_grasps=True) as daemon,
+        Graspd(daemon.endpoint) as graspd,
+    ):
+        lifted = dict.fromkeys((None, 240.0), graspd.verdict())
+        for still_ms, early in ((None, True), (240.0, False)):
+
+            def may_i_lift(still_ms: float | None = still_ms, early: bool = early) -> bool:
+                answer = graspd.may_i_lift(1.0, still_ms=still_ms)
+                lifted[still_ms] = answer.verdict
+                assert still_ms is None or not (answer and answer.verdict.early)
+                return bool(answer) and answer.verdict.early == early
+
+            until(may_i_lift)
+        soon, sure = lifted.values()
+        assert 100.0 <= (soon.still_ms or 0.0) < 240.0 <= (sure.still_ms or 0.0)
+        assert soon.motion is not None
+        assert soon.motion_limits is not None
+        assert set(soon.motion) == set(soon.motion_limits) == {"ff", "mf", "th"}
+        assert graspd.counts.malformed == 0
+
+
 def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: Path) -> None:
     with (
         Daemon(tmp_path) as daemon,

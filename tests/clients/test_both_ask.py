@@ -159,6 +159,99 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
         assert not graspd.may_i_lift(DEADLINE_S)
 
 
+def cpp_lifts(lift_gate: Path, *words: str) -> bool:
+    """Whether the example says so."""
+    result = subprocess.run(
+        [lift_gate, *words], capture_output=True, text=True, timeout=40, check=False
+    )
+    assert result.returncode in (0, 1), result.stderr
+    assert ("\nlift after" in result.stdout) is (result.returncode == 0)
+    return result.returncode == 0
+
+
+STILL: dict[str, tuple[dict[str, Any], bool, bool]] = {
+    "for long": ({"still_ms": 1000}, True, True),
+    "for just long enough": ({"still_ms": 240.0}, True, True),
+    "for a moment less": ({"still_ms": 239.999999}, False, True),
+    "early": ({"still_ms": 130.0, "early": True}, False, True),
+    "moving": ({"still_ms": 0.0}, False, True),
+    "not known": ({"still_ms": None}, False, True),
+    "not told": ({}, False, True),
+    "less than nothing": ({"still_ms": -1.0}, False, False),
+    "no number": ({"still_ms": float("nan")}, False, False),
+    "for ever": ({"still_ms": float("inf")}, False, False),
+    "a text": ({"still_ms": "240"}, False, False),
+    "true": ({"still_ms": True}, False, False),
+    "a list": ({"still_ms": [240.0]}, False, False),
+    "early is no word": ({"still_ms": 240.0, "early": "no"}, False, False),
+    "moves less than not": ({"still_ms": 240.0, "motion": {"ff": -1.0}}, False, False),
+    "without a limit": ({"still_ms": 240.0, "motion_limits": {"ff": None}}, False, False),
+}
+"""What the daemon says, whether one may lift who wants 240 ms, and who does not ask for any."""
+
+
+@pytest.mark.parametrize(("says", "may", "may_at_once"), STILL.values(), ids=STILL)
+def test_who_wants_the_hand_to_have_been_still_lifts_only_when_the_daemon_says_so(
+    lift_gate: Path, tmp_path: Path, says: dict[str, Any], may: bool, may_at_once: bool
+) -> None:
+    out = f"ipc://{tmp_path}/out"
+    with false_daemon(tmp_path, told(), **says), Graspd(out) as graspd:
+        for still_ms, allowed in ((240.0, may), (None, may_at_once)):
+            deadline_s = 30.0 if allowed else DEADLINE_S
+            answer = graspd.may_i_lift(deadline_s, still_ms=still_ms)
+            assert bool(answer) is allowed
+            if may_at_once and not allowed:
+                assert answer.verdict.reasons == ("not-still",)
+            still = [] if still_ms is None else ["--still", str(still_ms)]
+            assert cpp_lifts(lift_gate, *still, out, str(deadline_s)) is allowed
+
+
+@pytest.mark.parametrize("newest_ms", [130.0, 250.0, None])
+@pytest.mark.parametrize("answer_ms", [130.0, 250.0, None])
+def test_both_answer_and_newest_message_must_have_been_still(
+    lift_gate: Path, tmp_path: Path, newest_ms: float | None, answer_ms: float | None
+) -> None:
+    places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
+    may = newest_ms == answer_ms == 250.0
+    deadline_s = 30.0 if may else DEADLINE_S
+    with (
+        false_daemon(tmp_path, told(still_ms=answer_ms), still_ms=newest_ms),
+        Graspd(places[0], ask_endpoint=places[1]) as graspd,
+    ):
+        assert bool(graspd.may_i_lift(deadline_s, still_ms=240.0)) is may
+        words = ["--still", "240", places[0], str(deadline_s), places[1]]
+        assert cpp_lifts(lift_gate, *words) is may
+
+
+def test_a_supervised_lift_must_have_been_still_as_any(lift_gate: Path, tmp_path: Path) -> None:
+    out = f"ipc://{tmp_path}/out"
+    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
+    with false_daemon(tmp_path, told(), "unknown", **more | {"still_ms": 130.0}):
+        with Graspd(out) as graspd:
+            assert graspd.may_i_lift(30.0, supervised=True, still_ms=100)
+            assert not graspd.may_i_lift(DEADLINE_S, supervised=True, still_ms=240)
+        asked = [str(lift_gate), "--supervised", "--still"]
+        for still_ms, code in (("100", 0), ("240", 1)):
+            result = subprocess.run(
+                [*asked, still_ms, out, "1.0"], capture_output=True, timeout=40, check=False
+            )
+            assert result.returncode == code
+
+
+@pytest.mark.parametrize("still_ms", [-1.0, float("nan"), float("inf"), True, "240"])
+def test_a_stillness_that_is_no_time_is_refused(
+    lift_gate: Path,
+    tmp_path: Path,
+    still_ms: Any,  # noqa: ANN401
+) -> None:
+    out = f"ipc://{tmp_path}/out"
+    with Graspd(out) as graspd, pytest.raises((ValueError, TypeError)):
+        graspd.may_i_lift(DEADLINE_S, still_ms=still_ms)
+    if isinstance(still_ms, float):
+        asked = [str(lift_gate), "--still", str(still_ms), out, str(DEADLINE_S)]
+        assert subprocess.run(asked, capture_output=True, check=False).returncode == 2
+
+
 @pytest.mark.parametrize("outcome", ["unknown", "slip"])
 def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome: str) -> None:
     places = [f"ipc://{tmp_path}/out", str(DEADLINE_S), f"ipc://{tmp_path}/ask"]

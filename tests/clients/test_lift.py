@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from deploy.clients.python import graspd_client
 from deploy.clients.python.graspd_client import Graspd, Outcome, Verdict
 from tests.clients.messages import ADDED, MS, Event, events, frames, supervised, verdict
-from tests.clients.oracle import is_stable, is_to_be_watched, newest, told
+from tests.clients.oracle import has_been_still, is_stable, is_to_be_watched, newest, told
 
 START_NS = 1000 * MS
 ASK = "ipc:///nowhere.ask"
@@ -161,6 +161,28 @@ def test_stable_that_came_after_the_deadline_is_late() -> None:
     with client(world) as graspd:
         answer = graspd.may_i_lift(0.02)
     assert (bool(answer), answer.verdict.reasons) == (False, ("late",))
+
+
+def test_it_waits_until_the_hand_has_been_still_for_so_long() -> None:
+    times = [(START_NS + seq * 10 * MS, 110.0 + 10 * seq) for seq in range(20)]
+    coming = [
+        (at_ns, frames(verdict(seq, at_ns - MS, early=still_ms < 240.0, still_ms=still_ms)))
+        for seq, (at_ns, still_ms) in enumerate(times)
+    ]
+    with client(World(list(coming))) as graspd:
+        answer = graspd.may_i_lift(0.5)
+        assert (bool(answer), answer.verdict.still_ms, answer.verdict.early) == (True, 110.0, True)
+        answer = graspd.may_i_lift(0.5, still_ms=240.0)
+        assert (bool(answer), answer.verdict.still_ms, answer.verdict.early) == (True, 240.0, False)
+        assert answer.waited_s == pytest.approx(0.13, abs=0.002)
+
+
+def test_slip_is_a_no_at_once_however_short_a_time_the_hand_has_been_still() -> None:
+    world = World([(START_NS, frames(verdict(0, START_NS - MS, "slip", still_ms=110.0)))])
+    with client(world) as graspd:
+        answer = graspd.may_i_lift(0.5, still_ms=240.0)
+    assert (bool(answer), answer.verdict.verdict) == (False, "slip")
+    assert answer.waited_s < 1e-3
 
 
 @pytest.mark.parametrize("deadline_s", [-1.0, float("nan"), float("inf")])
@@ -463,6 +485,7 @@ def test_a_flood_does_not_hold_it_up() -> None:
     st.booleans(),
     st.sampled_from([0, 10, 150]),
     st.booleans(),
+    st.sampled_from([None, None, 0.0, 100.0, 240.0]),
 )
 def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     sequence: Sequence[Event],
@@ -470,6 +493,7 @@ def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     ask: bool,
     deadline_ms: int,
     watch: bool,
+    still_ms: float | None,
 ) -> None:
     coming, at_ns = [], START_NS
     for event in sequence:
@@ -478,7 +502,7 @@ def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     said = [(delay * MS, sent[-1].frames[-1:]) for delay, sent in answers]
     world = World(coming, [(delay, found[0] if found else b"") for delay, found in said])
     with client(world, ask) as graspd:
-        answer = graspd.may_i_lift(deadline_ms / 1e3, supervised=watch)
+        answer = graspd.may_i_lift(deadline_ms / 1e3, supervised=watch, still_ms=still_ms)
     assert answer.waited_s <= deadline_ms / 1e3 + 1e-3
     assert not answer.supervised or watch
     if not answer:
@@ -488,10 +512,12 @@ def test_a_lift_is_never_allowed_by_anything_but_fresh_and_stable(
     assert any(holds(world.came, world.now_ns - looks * LOOK_NS) for looks in range(21))
     last = newest(world.came)
     assert last is not None
+    assert has_been_still(last, still_ms)
     if ask:
         told_so = told(world.asking.answered[-1])
         assert told_so is not None
         assert told_so.teaches == answer.supervised
+        assert has_been_still(told_so, still_ms)
         assert told_so.verdict == "stable" or answer.supervised
         assert told_so.boot_id == last.boot_id
         assert told_so.grasp == last.grasp

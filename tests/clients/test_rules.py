@@ -123,6 +123,10 @@ def test_what_a_verdict_rests_on_is_told() -> None:
     assert found
     assert (found.p_slip, found.p_slip_model, found.outcomes) == (0.125, 0.3, 57)
     assert found.risk == Risk(0.05, 41, 2, 1, 6.1, 0)
+    assert (found.early, found.still_ms) == (False, 250.0)
+    assert found.motion == {"ff": 0.9, "th": None}
+    assert found.motion_limits == {"ff": 1.5, "th": 1.0}
+    assert hash(found) == hash(said(verdict(0, START_NS, **ADDED)))
 
 
 def test_a_daemon_that_knows_nothing_of_outcomes_is_understood() -> None:
@@ -132,6 +136,8 @@ def test_a_daemon_that_knows_nothing_of_outcomes_is_understood() -> None:
         *(None, 0, False),
         None,
     )
+    stillness = (found.early, found.still_ms, found.motion, found.motion_limits)
+    assert stillness == (False, None, None, None)
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("verdict_*.json")), ids=lambda path: path.stem)
@@ -177,6 +183,21 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
         {"risk": RISK | {"bound": -1.0}},
         {"risk": RISK | {"bound": True}},
         {"risk": RISK | {"warm_up_left": -1}},
+        {"early": None},
+        {"early": 0},
+        {"early": "false"},
+        {"still_ms": -1.0},
+        {"still_ms": "240"},
+        {"still_ms": True},
+        {"still_ms": 1.1e12},
+        {"motion": []},
+        {"motion": 1.0},
+        {"motion": {"ff": -0.1}},
+        {"motion": {"ff": "1"}},
+        {"motion": {"ff": False}},
+        {"motion_limits": [1.5]},
+        {"motion_limits": {"ff": None}},
+        {"motion_limits": {"ff": -1.5}},
     ],
     ids=str,
 )
@@ -188,9 +209,18 @@ def test_what_was_added_and_contradicts_itself_is_malformed(
     assert (found.reasons, found.supervised) == (("malformed",), False)
 
 
-@pytest.mark.parametrize("name", ["p_slip_model", "risk"])
-def test_nan_in_what_was_added_is_malformed(name: str) -> None:
-    value = math.nan if name == "p_slip_model" else RISK | {"bound": math.nan}
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("p_slip_model", math.nan),
+        ("risk", RISK | {"bound": math.nan}),
+        ("still_ms", math.nan),
+        ("still_ms", math.inf),
+        ("motion", {"ff": math.nan}),
+        ("motion_limits", {"ff": math.inf}),
+    ],
+)
+def test_nan_in_what_was_added_is_malformed(name: str, value: object) -> None:
     assert said(verdict(0, START_NS, **ADDED | {name: value})).reasons == ("malformed",)
 
 

@@ -23,6 +23,7 @@
 #include <functional>
 #include <iostream>
 #include <iterator>
+#include <map>
 #include <optional>
 #include <stdexcept>
 #include <string>
@@ -40,7 +41,7 @@ using Nanoseconds = std::int64_t;
 constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not understood
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
 constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
-// A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected.
+// A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 constexpr std::int64_t MESSAGE_MAX_BYTES = 1 << 16;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
 // Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
@@ -95,6 +96,15 @@ struct Verdict {
     std::int64_t outcomes = 0;           // of lifts, that `p_slip` rests on
     bool supervised = false;             // its lift would teach, but only while a person watches
     std::optional<Risk> risk;
+    // Judged when nothing moved fast, but something might still slide slowly.
+    bool early = false;
+    // For how long the hand has been still: from 100 on nothing moves fast, from 240 on nothing
+    // slides slowly either; none if the daemon does not say.
+    std::optional<double> still_ms;
+    // How each finger moves, in units of its own noise, none where that is not known; and what it
+    // is at most while it is still.
+    std::map<std::string, std::optional<double>> motion;
+    std::map<std::string, double> motion_limits;
 
     explicit operator bool() const { return outcome == Outcome::stable && !supervised; }
 
@@ -202,13 +212,13 @@ struct Message {
 
 struct Malformed {};
 
-inline const json& field(const json& told, const char* name) {
+inline const json& field(const json& told, const std::string& name) {
     const auto found = told.find(name);
     if (found == told.end()) throw Malformed{};
     return *found;
 }
 
-inline std::int64_t integer(const json& told, const char* name) {
+inline std::int64_t integer(const json& told, const std::string& name) {
     const json& value = field(told, name);
     if (!value.is_number_integer()) throw Malformed{};
     if (value.is_number_unsigned() && value.get<std::uint64_t>() > INTEGER_MAX) throw Malformed{};
@@ -217,7 +227,7 @@ inline std::int64_t integer(const json& told, const char* name) {
     return number;
 }
 
-inline double number(const json& told, const char* name, double most) {
+inline double number(const json& told, const std::string& name, double most) {
     const json& value = field(told, name);
     if (!value.is_number()) throw Malformed{};
     const auto number = value.get<double>();
@@ -225,11 +235,11 @@ inline double number(const json& told, const char* name, double most) {
     return number;
 }
 
-inline Nanoseconds milliseconds(const json& told, const char* name) {
+inline Nanoseconds milliseconds(const json& told, const std::string& name) {
     return std::llrint(number(told, name, REAL_MAX) * 1e6);
 }
 
-inline std::optional<double> maybe(const json& told, const char* name, double most) {
+inline std::optional<double> maybe(const json& told, const std::string& name, double most) {
     if (field(told, name).is_null()) return std::nullopt;
     return number(told, name, most);
 }
@@ -265,6 +275,28 @@ inline void trust(const json& told, Verdict& found) {
         });
 }
 
+// What daemons that know nothing of stillness leave out.
+inline void stillness(const json& told, Verdict& found) {
+    const auto early = told.find("early");
+    if (early != told.end()) {
+        if (!early->is_boolean()) throw Malformed{};
+        found.early = early->get<bool>();
+    }
+    if (told.contains("still_ms")) found.still_ms = maybe(told, "still_ms", REAL_MAX);
+    const json nothing = json::object();
+    const auto by_finger = [&](const char* which) -> const json& {
+        const auto moves = told.find(which);
+        if (moves == told.end() || moves->is_null()) return nothing;
+        if (!moves->is_object()) throw Malformed{};
+        return *moves;
+    };
+    const json &motion = by_finger("motion"), &limits = by_finger("motion_limits");
+    for (const auto& each : motion.items())
+        found.motion[each.key()] = maybe(motion, each.key(), REAL_MAX);
+    for (const auto& each : limits.items())
+        found.motion_limits[each.key()] = number(limits, each.key(), REAL_MAX);
+}
+
 inline Message message(const json& told) {
     Message all;
     Verdict& found = all.verdict;
@@ -284,6 +316,7 @@ inline Message message(const json& told) {
     found.seq = integer(told, "seq");
     found.grasp = integer(told, "grasp");
     trust(told, found);
+    stillness(told, found);
     all.read_ns = integer(told, "t_mono_ns");
     all.published_ns = all.read_ns + milliseconds(told, "age_ms");
     all.silence_ns = milliseconds(told, "silence_ms");
@@ -545,8 +578,10 @@ inline bool is_behind(const Verdict& newest, const Verdict& answer) {
 // One question at a time, until the newest message confirms the answer that permits a lift.
 class Question {
 public:
-    Question(Newest& newest, Link& link, bool asks, bool supervised)
-        : newest_(newest), link_(link), asks_(asks), supervised_(supervised) {}
+    Question(Newest& newest, Link& link, bool asks, bool supervised,
+             std::optional<double> still_ms)
+        : newest_(newest), link_(link), asks_(asks), supervised_(supervised),
+          still_ms_(still_ms) {}
     Question(const Question&) = delete;
     Question& operator=(const Question&) = delete;
     ~Question() { link_.asking.hang_up(); }
@@ -561,10 +596,12 @@ public:
 
     // The newest message, if it confirms the answer; nothing to lift on otherwise. Asks.
     Verdict decided(Verdict newest) {
+        newest = if_still(std::move(newest));
         if (!asks_) return newest;
         if (const auto payload = asked_ ? link_.asking.answer() : std::nullopt) {
             asked_ = false;
             answer_ = newest_.answered(*payload);
+            if (answer_) answer_ = if_still(*std::move(answer_));
             const bool permitted = answer_ && permits(*answer_);
             if (answer_ && answer_->outcome == Outcome::slip && !permitted) return *answer_;
             if (!permitted) answer_.reset();
@@ -585,9 +622,16 @@ public:
     }
 
 private:
+    // A verdict, unknown if it permits a lift before the hand has been still for so long.
+    Verdict if_still(Verdict said) const {
+        const bool still = said.still_ms && still_ms_ && *said.still_ms >= *still_ms_;
+        return !still_ms_ || still || !permits(said) ? said : said.unknown({"not-still"});
+    }
+
     Newest& newest_;
     Link& link_;
     bool asks_, supervised_, asked_ = false;
+    std::optional<double> still_ms_;
     std::optional<Verdict> answer_;  // that is to be confirmed
 };
 
@@ -626,11 +670,17 @@ public:
     // answer and the newest message of the same grasp must both say so; an unknown answer is asked
     // for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
     // person watches: then what graspd wants to learn from (in the warm-up, and now and then after
-    // it) may be lifted too, and the answer says that it is such a lift.
-    LiftAnswer may_i_lift(double deadline_s, bool supervised = false) {
+    // it) may be lifted too, and the answer says that it is such a lift. With `still_ms` the hand
+    // must have been still for so long as well, and a daemon that does not say so gets a no;
+    // without it, what the daemon calls `stable` is enough, also where it is `early`. Throws
+    // `std::invalid_argument` for a time that is none.
+    LiftAnswer may_i_lift(double deadline_s, bool supervised = false,
+                          std::optional<double> still_ms = {}) {
+        if (still_ms && !(*still_ms >= 0.0 && *still_ms <= REAL_MAX))
+            throw std::invalid_argument("still_ms must be 0 or more, and finite");
         const Nanoseconds began_ns = detail::now_ns();
         const Nanoseconds due_ns = began_ns + duration_ns(deadline_s);
-        detail::Question question(newest_, link_, asks_, supervised);
+        detail::Question question(newest_, link_, asks_, supervised, still_ms);
         Verdict decided = question.decided(verdict());
         while (!question.is_over(decided) && wait(due_ns)) {
             decided = question.decided(verdict());
@@ -642,6 +692,9 @@ public:
         if (answer) allow(key(decided));
         return answer;
     }
+
+    // A time in the place of `supervised` would be taken for true.
+    LiftAnswer may_i_lift(double deadline_s, double still_ms) = delete;
 
     // Tell how the lift ended that was made on a verdict, and what was lifted (empty: not told).
     //

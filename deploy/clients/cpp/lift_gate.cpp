@@ -1,8 +1,9 @@
 // Asks graspd whether a hand may lift, and says so: 0 it may, 1 it may not. Or tells it how the
 // lift ended: 0 it was taken, 1 it was not.
 //
-//     lift_gate [--supervised] ENDPOINT DEADLINE_S [ASK_ENDPOINT]
-//                                                     one question; a person watches the lift
+//     lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT]
+//                                                     one question; a person watches the lift; the
+//                                                     hand must have been still for so long
 //     lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]
 //                                                     `boot` and `grasp` are those of the answer
 //     lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]
@@ -30,9 +31,10 @@ int watch(const graspd::Options& options) {
     }
 }
 
-int ask(const graspd::Options& options, double deadline_s, bool supervised) {
+int ask(const graspd::Options& options, double deadline_s, bool supervised,
+        std::optional<double> still_ms) {
     graspd::Client client(options);
-    const graspd::LiftAnswer answer = client.may_i_lift(deadline_s, supervised);
+    const graspd::LiftAnswer answer = client.may_i_lift(deadline_s, supervised, still_ms);
     print(answer.verdict, client.counts());
     std::cout << (answer ? "lift" : "do not lift") << (answer.supervised ? " supervised" : "")
               << " after " << answer.waited_s << " s\n";
@@ -67,6 +69,11 @@ int main(int count, char** given) {
     if (supervised) words.erase(words.begin());
     graspd::Options options;
     try {
+        std::optional<double> still_ms;
+        if (words.size() > 1 && words[0] == "--still") {
+            still_ms = std::stod(words[1]);
+            words.erase(words.begin(), words.begin() + 2);
+        }
         if (!words.empty() && words[0] == "--watch" && (words.size() == 2 || words.size() == 4)) {
             options.endpoint = words[1];
             if (words.size() == 4)
@@ -80,13 +87,13 @@ int main(int count, char** given) {
         if (words.size() == 2 || words.size() == 3) {
             options.endpoint = words[0];
             if (words.size() == 3) options.ask_endpoint = words[2];
-            return ask(options, std::stod(words[1]), supervised);
+            return ask(options, std::stod(words[1]), supervised, still_ms);
         }
     } catch (const std::exception& error) {
         std::cerr << "lift_gate: " << error.what() << '\n';
         return 2;
     }
-    std::cerr << "lift_gate [--supervised] ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
+    std::cerr << "lift_gate [--supervised] [--still MS] ENDPOINT DEADLINE_S [ASK_ENDPOINT]\n"
                  "lift_gate --tell ENDPOINT ASK_ENDPOINT BOOT_ID GRASP held|slipped [OBJECT]\n"
                  "lift_gate --watch ENDPOINT [SERVER.key OWN.key_secret]\n";
     return 2;

@@ -20,8 +20,8 @@ import math
 import re
 import time
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +36,7 @@ CODES = {UNKNOWN: 0, STABLE: 1, SLIP: 2}
 WITHHELD = {"unproven", "low-confidence"}
 INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
 REAL_MAX = 1e12  # of a message: as a time, thirty years in ms
-# A verdict has 0.6 kB, at most 3; a peer that sends more is no daemon and is disconnected.
+# A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
 QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
 # Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
@@ -95,8 +95,12 @@ class Verdict:
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
     unknown, and rests on so many `outcomes`; the network alone says `p_slip_model`. `grasp` is the
     number of the contact episode, `age_ms` the time since the reading's last byte, ms, at least.
-    `supervised`: its lift would teach, but only while a person watches. What is not known before
-    the first message is None.
+    `supervised`: its lift would teach, but only while a person watches. `early`: it was judged when
+    nothing moved fast, but something might still slide slowly. `still_ms` is for how long the hand
+    has been still, ms: from 100 on nothing moves fast, from 240 on nothing slides slowly either.
+    `motion` is how each finger moves, in units of its own noise, and None where that is not known;
+    `motion_limits` what that is at most while it is still. What is not known before the first
+    message, or not told by the daemon, is None.
     """
 
     verdict: str
@@ -110,6 +114,10 @@ class Verdict:
     outcomes: int = 0
     supervised: bool = False
     risk: Risk | None = None
+    early: bool = False
+    still_ms: float | None = None
+    motion: dict[str, float | None] | None = field(default=None, hash=False)
+    motion_limits: dict[str, float] | None = field(default=None, hash=False)
 
     def __bool__(self) -> bool:
         return self.verdict == STABLE and not self.supervised
@@ -240,21 +248,28 @@ class Graspd:
             return Verdict(UNKNOWN, ("behind",))
         return self._newest.at(time.monotonic_ns())
 
-    def may_i_lift(self, deadline_s: float, *, supervised: bool = False) -> LiftAnswer:
+    def may_i_lift(
+        self, deadline_s: float, *, supervised: bool = False, still_ms: float | None = None
+    ) -> LiftAnswer:
         """Whether the current grasp is stable, known within `deadline_s` seconds from now.
 
         Waits for a fresh `stable`, or `slip`. With an ask endpoint the daemon is asked, and the
         answer and the newest message of the same grasp must both say so; an unknown answer is asked
         for again. Whatever else happens until the deadline is a no. Say `supervised` only while a
         person watches: then what graspd wants to learn from (in the warm-up, and now and then
-        after it) may be lifted too, and the answer says that it is such a lift.
+        after it) may be lifted too, and the answer says that it is such a lift. With `still_ms`
+        the hand must have been still for so long as well, ms, and a daemon that does not say so
+        gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
+        Raises `ValueError` for a time that is none.
         """
         if not 0.0 <= deadline_s < math.inf:
             raise ValueError(f"the deadline must be 0 s or more and finite, not {deadline_s}")
+        if still_ms is not None and (isinstance(still_ms, bool) or not 0.0 <= still_ms < math.inf):
+            raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms}")
         began_ns = time.monotonic_ns()
         due_ns = began_ns + round(deadline_s * 1e9)
         asking = self._link.asking if self._asks and not self._closed else None
-        question = _Question(self._newest, asking, supervised is True)
+        question = _Question(self._newest, asking, supervised is True, still_ms)
         try:
             decided = question.decided(self.verdict())
             while not question.is_over(decided) and not self._closed and self._wait(due_ns):
@@ -515,8 +530,11 @@ class Newest:
 class _Question:
     """One question at a time, until the newest message confirms the answer that permits a lift."""
 
-    def __init__(self, newest: Newest, asking: _Call | None, supervised: bool) -> None:
+    def __init__(
+        self, newest: Newest, asking: _Call | None, supervised: bool, still_ms: float | None
+    ) -> None:
         self._newest, self._asking, self._supervised = newest, asking, supervised
+        self._still_ms = still_ms
         self._asked = False
         self._answer: Verdict | None = None
         """That is to be confirmed."""
@@ -531,13 +549,14 @@ class _Question:
 
     def decided(self, newest: Verdict) -> Verdict:
         """The newest message, if it confirms the answer; nothing to lift on otherwise. Asks."""
+        newest = self._if_still(newest)
         if self._asking is None:
             return newest
         payload = self._asking.answer() if self._asked else None
         if payload is not None:
             self._asked = False
             answer = self._newest.read(payload)
-            said = Verdict(UNKNOWN) if isinstance(answer, str) else answer.verdict
+            said = Verdict(UNKNOWN) if isinstance(answer, str) else self._if_still(answer.verdict)
             if said.verdict == SLIP and not self.permits(said):
                 return said
             self._answer = said if self.permits(said) else None
@@ -555,6 +574,13 @@ class _Question:
         if newest.verdict == UNKNOWN and not self.permits(newest):
             return newest
         return newest.unknown(*(newest.reasons or ("no-answer",)))
+
+    def _if_still(self, said: Verdict) -> Verdict:
+        """A verdict, unknown if it permits a lift before the hand has been still for so long."""
+        if self._still_ms is None or not self.permits(said):
+            return said
+        still = said.still_ms is not None and said.still_ms >= self._still_ms
+        return said if still else said.unknown("not-still")
 
 
 def _reaches(newest: Verdict, answer: Verdict) -> bool:
@@ -681,7 +707,31 @@ def _message(told: dict[str, Any]) -> _Message:
     supervised = supervised and WITHHELD.issuperset(reasons)
     said = replace(said, p_slip_model=p_model, outcomes=outcomes, supervised=supervised)
     said = replace(said, risk=None if told["risk"] is None else _risk(told["risk"]))
+    said = _with_stillness(said, told)
     return _Message(said, read_ns, read_ns + round(age_ms * 1e6), round(silence_ms * 1e6))
+
+
+def _with_stillness(said: Verdict, told: dict[str, Any]) -> Verdict:
+    """With what is told of it; older daemons tell nothing."""
+    told = {"early": False, "still_ms": None, "motion": None, "motion_limits": None, **told}
+    if not isinstance(told["early"], bool):
+        raise ValueError
+    return replace(
+        said,
+        early=told["early"],
+        still_ms=_maybe(told, "still_ms"),
+        motion=_by_finger(told["motion"], _maybe),
+        motion_limits=_by_finger(told["motion_limits"], _real),
+    )
+
+
+def _by_finger(told: Any, read: Callable[[dict[str, Any], str], Any]) -> Any:  # noqa: ANN401
+    """An object, all of whose values can be read so; None for none."""
+    if told is None:
+        return None
+    if not isinstance(told, dict):
+        raise ValueError
+    return {finger: read(told, finger) for finger in told}
 
 
 def _risk(told: Any) -> Risk:  # noqa: ANN401

@@ -105,6 +105,9 @@ def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) ->
     assert "Traceback" not in result.stderr
 
 
+EARLY = "judged early after 100 ms, again after 240 ms"
+
+
 def test_check_says_what_is_in_and_what_is_left_out() -> None:
     scene = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
     people = graspd("check", scene)
@@ -118,6 +121,34 @@ def test_check_says_what_is_in_and_what_is_left_out() -> None:
     assert "rf, lf" in content["left_out"]["fingers"]
     assert content["in"]["joints"] == "those of the recordings"
     assert "joints" not in content["left_out"]
+
+
+@pytest.mark.parametrize(
+    ("gate", "judged", "share"),
+    [("", "judged after 240 ms", "3 %"), ("early = true\nfalse_alarms = 0.01", EARLY, "1 %")],
+)
+def test_check_says_what_is_known_of_motion_and_when(
+    tmp_path: Path, gate: str, judged: str, share: str
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f'[tactile]\ndriver = "can"\n[gate]\n{gate}\n')
+    said = json.loads(graspd("check", scene, "--json").stdout)["in"]["still"]
+    assert said.endswith(f"said to move {share} of the time; {judged}")
+    found = re.match(
+        r"after 100 ms fast motion is excluded, (\d+) counts/s and more, after 240 ms slow slides,"
+        r" (\d+) and more .*100/s, as usual",
+        said,
+    )
+    assert found is not None
+    fast, slow = map(int, found.groups())
+    # Half of the slides of real sensors have a mean slope of 39 counts/s in 240 ms, 62 in 120 ms.
+    assert 15 < slow < 39 < fast < 2 * 62
+
+
+def test_check_says_nothing_of_motion_where_each_reading_is_a_grasp(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[tactile]\ndriver = "can"\n[gate]\nmode = "every"\n')
+    assert "still" not in json.loads(graspd("check", scene, "--json").stdout)["in"]
 
 
 def test_check_finds_a_recording_that_is_not_there(tmp_path: Path) -> None:

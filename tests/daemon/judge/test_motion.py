@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from daemon.judge.stillness import STEPS, Motion, upper_tail
+from daemon.judge.stillness import Motion
+from daemon.judge.windows import STEPS, upper_tail
 from drivers.twins.grasps.slides import STANDSTILL_S, held
 from drivers.twins.grasps.whole_grasps import Sampling
 

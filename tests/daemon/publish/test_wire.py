@@ -133,6 +133,10 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         outcomes=57,
         supervised=True,
         risk=RiskReport(target=0.0625, lifts=41, slips=2, outstanding=1, bound=8.5, warm_up_left=0),
+        early=True,
+        still_ms=130.0,
+        motion={"ff": 1.25, "mf": 0.75, "th": 1.0},
+        motion_limits={"ff": 1.5, "mf": 1.5, "th": 1.625},
     ),
     "gate": GateMessage(
         boot_id=BOOT,
@@ -143,6 +147,22 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         former=GateState.SETTLED,
         state=GateState.JUDGED,
         cause=GateCause.JUDGED,
+        still_ms=130.0,
+        motion={"ff": 1.25, "mf": 0.75, "th": 1.0},
+        motion_limits={"ff": 1.5, "mf": 1.5, "th": 1.625},
+    ),
+    "gate_moved": GateMessage(
+        boot_id=BOOT,
+        seq=12,
+        t=1790000001.5,
+        t_mono_ns=123457391512345,
+        grasp=3,
+        former=GateState.JUDGED,
+        state=GateState.CLOSING,
+        cause=GateCause.MOVED,
+        still_ms=0.0,
+        motion={"ff": 1.25, "mf": 12.5, "th": None},
+        motion_limits={"ff": 1.5, "mf": 1.5, "th": 1.0},
     ),
     "tactile": Tactile(
         boot_id=BOOT,
@@ -208,9 +228,17 @@ DECODE: dict[type, Callable[[bytes], object]] = {
 def test_a_verdict_of_before_there_was_a_gate_or_a_learner_is_still_read() -> None:
     former = json.loads((GOLDEN / "verdict_stable.json").read_text())
     gate = ("judged", "gate", "contact", "repaired", "session_calibrated")
-    for added in (*gate, "p_slip_model", "outcomes", "supervised", "risk"):
+    stillness = ("early", "still_ms", "motion", "motion_limits")
+    for added in (*gate, "p_slip_model", "outcomes", "supervised", "risk", *stillness):
         del former[added]
     assert decode_verdict(json.dumps(former).encode()) == MESSAGES["verdict_stable"]
+
+
+def test_a_change_of_the_gate_of_before_motion_was_told_is_still_read() -> None:
+    former = json.loads((GOLDEN / "gate.json").read_text())
+    del former["still_ms"], former["motion"], former["motion_limits"]
+    read = decode_gate(json.dumps(former).encode())
+    assert (read.state, read.still_ms, read.motion) == (GateState.JUDGED, None, None)
 
 
 def test_an_outcome_of_before_objects_were_told_is_still_read() -> None:

@@ -21,7 +21,7 @@ from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
 from daemon.trust.ledger import Told
 from daemon.trust.risk import RiskReport
 from daemon.watch.evidence import WATCHED
-from daemon.watch.fingers import FULL, HEIGHT, WIDTH, Rest, image
+from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerMotion, Rest, image
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Line, Snapshot, Tone
 from daemon.watch.terminal import draw
@@ -188,6 +188,7 @@ NOTHING_TOLD = risk(lifts=0, slips=0)
         ({"risk": risk(lifts=9, slips=0)}, "too few `stable` lifts"),
         ({"risk": risk(target=None, bound=None)}, "no target is set"),
         ({"risk": risk(slips=5)}, "more `stable` lifts slipped"),
+        ({"early": True}, "judged early"),
     ],
 )
 def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why: str) -> None:
@@ -203,6 +204,88 @@ def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why:
 
 def tone_of(**other: Any) -> Tone:  # noqa: ANN401
     return after((b"verdict.right", verdict(0, Decision.STABLE, **other))).snapshot(0).tone
+
+
+@pytest.mark.parametrize(
+    ("still_ms", "words"),
+    [
+        (None, "-"),
+        (0.0, "0 ms"),
+        (100.0, "100 ms, may slide"),
+        (239.999999, "239 ms, may slide"),
+        (240.0, "240 ms"),
+        (9999.9, "9999 ms"),
+        (75_600.0, "75 s"),
+    ],
+)
+def test_for_how_long_the_hand_has_been_still_is_said(still_ms: float | None, words: str) -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE, still_ms=still_ms)))
+    assert view.snapshot(0).still == words
+    assert f"   still {words}" in text_of(view.snapshot(0), 80, 24, Canvas())[2]
+    assert view.snapshot(101 * MS).still == "-"  # silent
+
+
+MOVES: dict[str, Any] = {"still_ms": 130.0, "motion": {"ff": 1.2, "th": None}}
+LIMITS: dict[str, Any] = {"motion_limits": {"ff": 1.5, "th": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("told", "seen"),
+    [
+        (MOVES | LIMITS, {"ff": (1.2, 1.5), "th": (None, 1.0)}),
+        ({"motion": {"ff": 0.0}} | LIMITS, {"ff": (0.0, 1.5), "th": (None, 1.0)}),
+        (MOVES, {"ff": (None, 0.0), "th": (None, 0.0)}),
+        ({"motion": {"ff": 1.0}, "motion_limits": {"ff": 0.0}}, {"ff": (None, 0.0)}),
+        ({}, {"ff": None, "th": None}),
+    ],
+    ids=["all", "one", "no limits", "no limit", "nothing"],
+)
+def test_a_finger_has_its_motion_and_what_is_not_known_is_not_0(
+    told: dict[str, Any], seen: dict[str, tuple[float | None, float] | None]
+) -> None:
+    view = after(
+        (b"tactile.right", tactile(0, RESTING, RESTING)),
+        (b"verdict.right", verdict(0, **told)),
+    )
+    found = {
+        finger.name: None if finger.motion is None else (finger.motion.now, finger.motion.limit)
+        for finger in view.snapshot(0).fingers
+    }
+    assert seen.items() <= found.items()
+
+
+@pytest.mark.parametrize(
+    ("now", "bar"),
+    [
+        (0.0, "-----|-----"),
+        (0.3, "#----|-----"),
+        (1.5, "#####|-----"),
+        (1.51, "#####|#----"),
+        (2.0, "#####|##---"),
+        (3.0, "#####|#####"),
+        (1e308, "#####|#####"),
+        (None, "???????????"),
+    ],
+)
+def test_a_bar_of_motion_has_the_limit_in_its_middle(now: float | None, bar: str) -> None:
+    """It ends at twice the limit, so five characters are the limit, here 1.5."""
+    ascii_only = Canvas(colour=False, ascii_only=True)
+    assert ascii_only.motion(FingerMotion(now=now, limit=1.5), 11).plain == bar
+    drawn = str.maketrans("#-|", "█░┃")
+    assert Canvas().motion(FingerMotion(now=now, limit=1.5), 11).plain == bar.translate(drawn)
+
+
+def test_the_terminal_shows_each_finger_s_motion_below_its_image() -> None:
+    seen = a_grasp(**MOVES | LIMITS)
+    small, large = (
+        text_of(seen, *size, Canvas(colour=False, ascii_only=True))
+        for size in ((80, 24), (120, 40))
+    )
+    assert "1379 ##-|--     0 ??????" in small[17]  # by hand: 1.2 / 1.5 of 3 are 2.4
+    assert "fall, motion to |" in small[17]
+    assert "fall 1379" in large[23]
+    assert large[24].rstrip() == "moves 1.2  ####-|-----  moves      ???????????"
+    assert "-" not in text_of(a_grasp(), 80, 24, Canvas(colour=False, ascii_only=True))[17]
 
 
 def test_messages_of_before_there_were_outcomes_are_never_a_promise() -> None:
@@ -461,19 +544,21 @@ def test_images_go_when_readings_no_longer_come() -> None:
     assert view.snapshot(1001 * MS).fingers == []
 
 
-def a_grasp() -> Snapshot:
+def a_grasp(**more: Any) -> Snapshot:  # noqa: ANN401
     view = a_view()
     rested(view)
     pressed = [3000 - 60 * electrode for electrode in range(24)]
     view.take(b"tactile.right", tactile(99, pressed, RESTING, faulty=(6,)), 0)
-    view.take(b"verdict.right", verdict(99, Decision.SLIP), 0)
+    view.take(b"verdict.right", verdict(99, Decision.SLIP, **more), 0)
     return view.snapshot(0)
 
 
 @pytest.mark.parametrize("canvas", [Canvas(), Canvas(colour=False), Canvas(False, True)], ids=str)
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (100, 34), (120, 40), (200, 60)])
-def test_the_view_fits_the_terminal(width: int, height: int, canvas: Canvas) -> None:
-    lines = text_of(a_grasp(), width, height, canvas)
+@pytest.mark.parametrize("moves", [False, True])
+def test_the_view_fits_the_terminal(width: int, height: int, canvas: Canvas, moves: bool) -> None:
+    seen = a_grasp(**MOVES | LIMITS) if moves else a_grasp()
+    lines = text_of(seen, width, height, canvas)
     assert len(lines) <= height
     assert max(map(len, lines)) <= width
     text = "\n".join(lines)
@@ -484,8 +569,9 @@ def test_the_view_fits_the_terminal(width: int, height: int, canvas: Canvas) -> 
 
 
 def test_a_terminal_of_ascii_gets_ascii() -> None:
-    for line in text_of(a_grasp(), 80, 24, Canvas(colour=False, ascii_only=True)):
-        assert line.replace("°", "").isascii()
+    for seen in (a_grasp(), a_grasp(**MOVES | LIMITS)):
+        for line in text_of(seen, 80, 24, Canvas(colour=False, ascii_only=True)):
+            assert line.replace("°", "").isascii()
 
 
 def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -156,6 +156,42 @@ def test_a_stable_that_lifts_have_not_earned_is_hollow(
     assert browser.complaints == []
 
 
+def test_each_finger_s_motion_is_a_bar_and_what_is_not_known_is_none(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    def bars() -> object:
+        return browser.value(
+            "[...document.querySelectorAll('.moves')].map(bar => [bar.dataset.motion,"
+            " bar.style.getPropertyValue('--share'), bar.hidden, bar.nextSibling.innerText])"
+        )
+
+    browser.look(1280, 800)
+    browser.go(f"http://127.0.0.1:{page.port}/")
+    talker.decision = Decision.STABLE
+    see(browser, "stable")
+    assert text(browser, "still") == "-"
+    assert browser.value("[...document.querySelectorAll('.moves')].every(bar => bar.hidden)")
+    talker.more = {
+        "still_ms": 130.5,
+        "motion": {"ff": 1.0, "th": None},
+        "motion_limits": {"ff": 1.25, "th": 1.0},
+    }
+    browser.wait_for("document.getElementById('still').innerText == '130 ms, may slide'")
+    known = ["still", "40%", False, "moves 1.0, still to 1.3"]  # by hand: half of 1 / 1.25
+    assert bars() == [known, ["unknown", "0%", False, "motion unknown"]]
+    talker.more |= {"still_ms": 0.0, "motion": {"ff": 2.0, "th": 9.0}}
+    browser.wait_for("document.getElementById('still').innerText == '0 ms'")
+    assert bars() == [
+        ["moving", "80%", False, "moves 2.0, still to 1.3"],
+        ["moving", "100%", False, "moves 9.0, still to 1.0"],
+    ]
+    talker.decision = None
+    see(browser, "silent")
+    assert text(browser, "still") == "-"
+    assert bars() == []
+    assert browser.complaints == []
+
+
 def test_past_grasps_stay_and_so_does_the_verdict_until_the_next_one(
     page: Page, talker: Talker, browser: Browser
 ) -> None:

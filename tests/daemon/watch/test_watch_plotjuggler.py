@@ -53,7 +53,16 @@ def test_a_verdict_is_numbers_and_the_outcome_is_a_code() -> None:
         "verdict.right/silence_ms": 100.0,
         "verdict.right/outcomes": 0.0,
         "verdict.right/supervised": 0.0,
+        "verdict.right/early": 0.0,
     }
+
+
+def test_stillness_has_a_series_for_each_finger_and_what_is_not_known_makes_a_gap() -> None:
+    found = series("gate_moved", "gate.right")
+    assert found["gate.right/still_ms"] == 0.0
+    assert found["gate.right/motion/mf"] == 12.5
+    assert found["gate.right/motion_limits/mf"] == 1.5
+    assert "gate.right/motion/th" not in found
 
 
 def test_an_unknown_verdict_makes_a_gap_in_the_probability_and_not_a_zero() -> None:

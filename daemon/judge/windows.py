@@ -1,0 +1,179 @@
+"""The windows over which motion is looked for: what noise makes of them, and the limits.
+
+The short one shows fast motion soon; the long one slow slides, which no short one can.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.base import ELECTRODES
+
+STEP_NS = 5_000_000
+"""Of sweeps that come faster than this, the mean is remembered."""
+SHORT_NS, LONG_NS = 100_000_000, 240_000_000
+STEPS = LONG_NS // STEP_NS + 2
+"""Steps remembered: the long window, and one at each end of it."""
+STEPS_MIN = 3
+"""Steps of a window at least: where sweeps come slowly, windows are longer."""
+APART = 3
+"""Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
+sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
+TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
+"""Standard deviation of a held touch's electrode, and its correlation at one and two sweeps; by the
+differences of sweeps, which the correlation makes less, it is 3.5 counts (2.9 to 4.2)."""
+MEAN_ABS = math.sqrt(2.0 / math.pi)
+"""Mean absolute value of a Gaussian of standard deviation 1."""
+SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
+"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
+CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
+"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
+its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
+240 ms."""
+FAST_SHARE = 0.1
+"""Share of the false alarms that the short window may have where the long one decides."""
+SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))
+"""Of so many values on a line around 0: sum of the products of those so many steps apart, over the
+sum of squares. Noise that is correlated makes a slope the larger."""
+SPREAD_ECHO = np.zeros((STEPS + 1, APART - 1))
+"""Of so many values: pairs that are so many steps apart, over all pairs. Noise that is correlated
+spreads the less."""
+for _number in range(STEPS_MIN, STEPS + 1):
+    for _lag in range(1, APART):
+        _line = np.arange(_number) - (_number - 1) / 2.0
+        SLOPE_ECHO[_number, _lag - 1] = _line[_lag:] @ _line[:-_lag] / (_line @ _line)
+        SPREAD_ECHO[_number, _lag - 1] = 2.0 * (_number - _lag) / (_number * (_number - 1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """What noise alone makes of windows of so many steps: each of shape (steps, fingers)."""
+
+    slope: NDArray[np.float64]
+    """Mean absolute slope, counts/s, if the squares of the times around their mean sum to 1 s**2.
+    """
+    variance: NDArray[np.float64]
+    """Mean square deviation from the mean, counts**2 ..."""
+    spread: NDArray[np.float64]
+    """... and its standard deviation over that."""
+
+    @classmethod
+    def of(cls, variance: NDArray[np.float64], correlations: NDArray[np.float64]) -> Noise:
+        """By the variance, counts**2, of each finger's electrodes, shape (fingers,), and the
+        correlations of those 1 to `APART` - 1 steps apart, shape (APART - 1, fingers).
+        """
+        slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
+        spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
+        free = ELECTRODES * np.maximum(np.arange(STEPS + 1) - 1.0, 1.0)[:, np.newaxis]
+        return cls(
+            slope=MEAN_ABS * np.sqrt(variance * slopes),
+            variance=variance * spreads,
+            spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
+        )
+
+
+class Tails(NamedTuple):
+    """How far a finger that holds may be above what is usual, in standard deviations."""
+
+    slow: float
+    """In the long window."""
+    fast: float
+    """In the short window where the long one decides."""
+    alone: float
+    """In the short window where it decides alone."""
+
+    @classmethod
+    def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
+        """By the share of a holding hand's sweeps that may be called moving, 0..0.5.
+
+        Raises `ValueError` for another share.
+        """
+        if not 0.0 < false_alarms < 0.5:
+            raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
+        finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
+        slow, fast = upper_tail(finger), upper_tail(FAST_SHARE * finger)
+        return cls(slow, fast, slow if early else fast)
+
+
+def fast_limit(tail: float, by_noise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Of the mean absolute slope over what noise makes of it, counts/s, shape (fingers,)."""
+    limit = np.hypot(math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail) / by_noise)
+    return np.asarray(limit)
+
+
+def slow_limit(
+    tail: float, extent: NDArray[np.float64], spread: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Of the root mean square deviation over that of noise, shape (fingers,).
+
+    `extent` is the sum of the squares of the times around their mean over the sum of the squares of
+    the noise, (s/counts)**2, and `spread` is that of `Noise`.
+    """
+    usual, most = creep(0.0) ** 2 * extent, creep(tail) ** 2 * extent
+    # Noise and creep know nothing of each other: their deviations add up as squares do.
+    above = np.hypot(tail * spread * (1.0 + usual), most - usual)
+    return np.asarray(np.sqrt(1.0 + usual + above))
+
+
+class OperatingPoint(NamedTuple):
+    """What one window can tell."""
+
+    after_ns: int
+    """Its length: so long after a motion has ended it says so."""
+    counts_per_s: float
+    """A steady motion of so many counts/s, mean of a finger's electrodes, is seen in every other
+    sweep; a faster one in more."""
+
+
+def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, OperatingPoint]:
+    """Of the short and of the long window, for a finger of typical noise and so many ns between
+    sweeps.
+    """
+    sweeps = max(math.ceil(STEP_NS / period_ns), 1)
+    step_ns = sweeps * period_ns
+    short, long = (
+        max(math.ceil(window_ns / step_ns), STEPS_MIN) for window_ns in (SHORT_NS, LONG_NS)
+    )
+    variance, correlations = np.full(1, TYPICAL_COUNTS**2 / sweeps), np.array(TYPICAL_CORRELATIONS)
+    noise = Noise.of(variance, correlations[:, np.newaxis])
+    # The squares of noise and motion add up: how much motion brings the sum to the limit?
+    by_noise = noise.slope[short] / math.sqrt(_extent(short, step_ns))
+    fast = by_noise * np.sqrt(np.square(fast_limit(tails.alone, by_noise)) - 1.0)
+    extent = _extent(long, step_ns) / (noise.variance[long] * (long - 1))
+    limit = slow_limit(tails.slow, extent, noise.spread[long])
+    slow = MEAN_ABS * np.sqrt((np.square(limit) - 1.0) / extent)
+    return (
+        OperatingPoint(max(SHORT_NS, short * step_ns), float(fast[0])),
+        OperatingPoint(max(LONG_NS, long * step_ns), float(slow[0])),
+    )
+
+
+def _extent(number: int, step_ns: int) -> float:
+    times_s = centred(np.arange(number) * step_ns)
+    return float(times_s @ times_s)
+
+
+def creep(tail: float) -> float:
+    """Speed that a held touch keeps to but for so many standard deviations, counts/s."""
+    return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
+
+
+def centred(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """In seconds, with a mean of 0."""
+    times_s = (times_ns - times_ns[0]) / 1e9
+    return np.asarray(times_s - times_s.sum() / len(times_s))
+
+
+def upper_tail(share: float) -> float:
+    """How many standard deviations this share, 0..0.5, of a Gaussian lies above.
+
+    Abramowitz and Stegun, 26.2.23; the error is at most 0.00045.
+    """
+    t = math.sqrt(-2.0 * math.log(share))
+    above = 2.515517 + t * (0.802853 + t * 0.010328)
+    return t - above / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)))
