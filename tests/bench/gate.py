@@ -173,7 +173,9 @@ def lines(name: str, found: Study, *, early: bool) -> Iterator[str]:
         f"{'early and surely' if early else 'once'}"
     )
     for place, kind in enumerate(("early", "sure") if early else ("sure",)):
-        told = [(seen, seen.before_lift[place][0]) for seen in judged if len(seen.judged) > place]
+        told = [
+            (seen, seen.before_lift[place][0]) for seen in judged if len(seen.before_lift) > place
+        ]
         for since in ("still", "the end of closing"):
             closes = since != "still"
             begins = [seen.truth.closed_s if closes else seen.still_s for seen, _ in told]
