@@ -228,7 +228,7 @@ class Gate:
         if self.motion.sure:
             since_ns = min(since_ns, max(t_ns - LONG_NS, memory.touched_ns))
         else:
-            since_ns = max(since_ns, t_ns - LONG_NS + 1)
+            since_ns = max(since_ns, t_ns - LONG_NS + 1_000_000)  # a ms short of it
         memory.still_since_ns = since_ns
 
     def _follow_contact(self, t_ns: int, touches: bool) -> None:
