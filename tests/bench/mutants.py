@@ -29,6 +29,7 @@ import signal
 import sys
 import tempfile
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -308,6 +309,7 @@ class Workshop:
     def __init__(self, root: Path, folder: Path, package: str, tests: Sequence[str]) -> None:
         """`folder` is empty; `tests` are paths from the root."""
         self._folder, self._package, self._tests = folder, package, tests
+        self._log = folder / "last-run.log"
         ignored = shutil.ignore_patterns(".*", "__pycache__")
         shutil.copytree(root, folder, ignore=ignored, dirs_exist_ok=True)
         for module in WARM:
@@ -317,9 +319,9 @@ class Workshop:
     def baseline(self) -> Baseline:
         """Run all tests once. Raises `RuntimeError` if that cannot be done."""
         report = self._folder / "baseline.json"
-        _forked(lambda: self._measure(report), None)
+        _forked(lambda: self._measure(report), None, self._log)
         if not report.exists():
-            raise RuntimeError("the tests do not run without a mutant")
+            raise RuntimeError(f"the tests do not run without a mutant:\n{self._log.read_text()}")
         found = Baseline(**json.loads(report.read_text()))
         report.unlink()
         return found
@@ -335,7 +337,7 @@ class Workshop:
         limit_s = SLACK * sum(seconds.values()) + 2.0 * SLACK_S
         try:
             plugins = [Chosen(seconds, known), SameExamples()]
-            return _forked(lambda: self._pytest([*files, "-x"], plugins), limit_s) != 0
+            return _forked(lambda: self._pytest([*files, "-x"], plugins), limit_s, self._log) != 0
         finally:
             compiled.unlink()
 
@@ -362,21 +364,29 @@ class Workshop:
         packages = {path.name for path in self._folder.iterdir()}
         for name in [name for name in sys.modules if name.partition(".")[0] in packages]:
             del sys.modules[name]
-        options = ("-q", "-n0", "--tb=no", "-p", "no:cacheprovider")
+        # hypothesis, its plugin, is imported already.
+        ignored = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+        options = ("-q", "-n0", "--tb=no", "-p", "no:cacheprovider", *ignored)
         return int(pytest.main([*arguments, *options], list(plugins)))
 
 
-def _forked(task: Callable[[], int], limit_s: float | None) -> int | None:
-    """Exit status of a task in a process of its own, silent; None if it took too long."""
+def _forked(task: Callable[[], int], limit_s: float | None, log: Path) -> int | None:
+    """Exit status of a task in a process of its own; None if it took too long.
+
+    `log` is overwritten with what it says.
+    """
     pid = os.fork()
     if pid == 0:
         status = os.EX_SOFTWARE
         try:
             os.setsid()
-            silence = os.open(os.devnull, os.O_RDWR)
-            for descriptor in (0, 1, 2):
-                os.dup2(silence, descriptor)
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(output, 1)
+            os.dup2(output, 2)
             status = task()
+        except Exception:  # noqa: BLE001 (nothing may go on as if it were the parent)
+            traceback.print_exc()
         finally:
             os._exit(status)
     descriptor = os.pidfd_open(pid)
