@@ -183,3 +183,66 @@ def test_a_slow_clock_of_a_kilohertz_is_no_fault() -> None:
         mapped_ns = clock.host_ns(k * 10, now_ns + MS, now_ns)
         assert now_ns - 3 * MS <= mapped_ns <= now_ns
     assert clock.faults == 0
+
+
+DECAY = 1.0 / 30.0
+"""As in Klipper's clock synchronisation (klippy/clocksync.py)."""
+
+
+def by_the_definition(
+    pings: list[tuple[int, int]], ns_per_tick: float, tick: int
+) -> tuple[float, int]:
+    """Slope of host over device time, less one, and the time of `tick`, host ns, after PINGs.
+
+    `pings` are (tick, sent_ns). Weights of the regression written out: a PING counts a thirtieth
+    of all, the first whatever is left; with 1 ms of noise before any is known.
+    """
+    x = np.array([ping[0] * ns_per_tick for ping in pings])
+    y = np.array([ping[1] for ping in pings]) - x
+    x, y = x - x[0], y - y[0]
+    noise, slope, slack = 1e6**2, 0.0, 200e-6
+    for number in range(1, len(pings) + 1):
+        if number > 1:  # the first PING is the line
+            weights = DECAY * (1.0 - DECAY) ** np.arange(number - 2, -1, -1.0)
+            weights = np.append((1.0 - DECAY) ** (number - 1), weights)
+            before = np.append((1.0 - DECAY) ** (number - 2), weights[1:-1] / (1.0 - DECAY))
+            middle = before @ np.column_stack((x, y))[: number - 1]
+            residual = y[number - 1] - middle[1] - slope * (x[number - 1] - middle[0])
+            noise = (1.0 - DECAY) * (noise + DECAY * residual**2)
+        else:
+            weights = np.ones(1)
+            noise = (1.0 - DECAY) * noise
+        dx, dy = (v[:number] - weights @ v[:number] for v in (x, y))
+        variance = weights @ dx**2
+        slope, slack = 0.0, 200e-6
+        if variance > 0.0:
+            found = weights @ (dx * dy) / variance
+            error = 6.0 * np.sqrt(noise * DECAY / (2.0 * variance))
+            if error < 200e-6 and abs(found) <= 500e-6:
+                slope, slack = float(found), max(float(error), 10e-6)
+
+    def earliest_ns(ping: tuple[int, int], at: int) -> int:
+        passed = (at - ping[0]) * ns_per_tick * (1.0 + slope)
+        return ping[1] + round(passed * (1.0 - slack) - ns_per_tick)
+
+    best = max(pings[-16:], key=lambda ping: earliest_ns(ping, pings[-1][0]))
+    return slope, earliest_ns(best, tick)
+
+
+@pytest.mark.parametrize("pings", [1, 2, 3, 5, 8, 16, 17, 40, 400])
+@pytest.mark.parametrize("drift_ppm", [-90.0, 0.0, 60.0])
+def test_a_time_is_that_of_the_weighted_regression(pings: int, drift_ppm: float) -> None:
+    rng = np.random.default_rng(pings)
+    clock, way, sent = DeviceClock(TICK_HZ), Way(drift_ppm=drift_ppm), []
+    for number in range(pings):
+        made_ns = START_NS + number * S
+        sent.append((tick_of(made_ns, way), made_ns - int(rng.integers(0, MS // 3))))
+        clock.round_trip(*sent[-1], made_ns + MS)
+    later_ns = START_NS + pings * S
+    slope, mapped_ns = by_the_definition(sent, 1e9 / TICK_HZ, tick_of(later_ns, way))
+    assert clock.host_ns(tick_of(later_ns, way), later_ns, later_ns) == pytest.approx(
+        mapped_ns, abs=2
+    )
+    if clock.drift_ppm is not None:
+        assert clock.drift_ppm == pytest.approx((1.0 / (1.0 + slope) - 1.0) * 1e6, abs=1e-3)
+    assert (clock.drift_ppm is not None) == (slope != 0.0)
