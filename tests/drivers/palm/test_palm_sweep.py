@@ -143,8 +143,9 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
     stream = packets(2)
     for index in range(5, ROUND):
         stream[index] = change(stream[index], "ff", {}, tactile_valid=0b10010)
-    reading = play_packets(stream).readings[0]
-    assert flags(reading, MISSING) == [[0, electrode] for electrode in range(7, 24)]
+    played = play_packets(stream)
+    assert flags(played.readings[0], MISSING) == [[0, electrode] for electrode in range(7, 24)]
+    assert played.counters.invalid_fingers == ROUND - 5
     sweeps = RoundAssembler(FINGERS, PalmCounters(), heed_finger_bits=False)
     heedless = [reading for packet in stream for reading in sweeps.push(packet, 0)]
     assert not heedless[0].faults.any()
@@ -161,6 +162,17 @@ def test_the_garbage_of_an_absent_sensor_is_no_reading() -> None:
         assert flags(reading, MISSING) == [[1, electrode] for electrode in range(24)]
         assert np.array_equal(reading.counts[::2], row[::2])
     assert played.counters.absent_fingers == 20
+
+
+def test_a_finger_of_nothing_but_zeros_is_absent() -> None:
+    stream = packets(2)
+    for index in range(ROUND):
+        stream[index] = change(stream[index], "mf", {"other_0": 0, "other_1": 0})
+    stream[3] = change(stream[3], "th", {"other_0": 0, "other_1": 0})
+    played = play_packets(stream)
+    assert flags(played.readings[0], MISSING) == [[1, electrode] for electrode in range(24)]
+    assert played.counters.absent_fingers == 1
+    assert not played.readings[1].faults.any()
 
 
 def test_a_damaged_type_never_puts_a_value_in_another_place_unseen() -> None:
