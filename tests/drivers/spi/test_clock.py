@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.spi.clock import AGE_MAX_NS, UNKNOWN_DELAY_NS, DeviceClock
+from drivers.spi.clock import DeviceClock
 from tests.drivers.spi.clock_error import (
     MS,
     START_NS,
@@ -15,6 +15,10 @@ from tests.drivers.spi.clock_error import (
     errors_ms,
     tick_of,
 )
+
+UNKNOWN_DELAY_NS = 20 * MS
+"""16 ms of a USB adapter's latency timer, and 4 ms for the rest."""
+AGE_MAX_NS = 10 * S
 
 
 def synchronised(way: Way | None = None, pings: int = 5) -> tuple[DeviceClock, int]:
@@ -246,3 +250,92 @@ def test_a_time_is_that_of_the_weighted_regression(pings: int, drift_ppm: float)
     if clock.drift_ppm is not None:
         assert clock.drift_ppm == pytest.approx((1.0 / (1.0 + slope) - 1.0) * 1e6, abs=1e-3)
     assert (clock.drift_ppm is not None) == (slope != 0.0)
+
+
+def exact(pings: int) -> tuple[DeviceClock, int]:
+    """A clock after so many PINGs that took no time, one a second; host time of the last, ns."""
+    clock = DeviceClock(TICK_HZ)
+    for number in range(pings):
+        now_ns = START_NS + number * S
+        clock.round_trip(tick_of(now_ns, Way()), now_ns, now_ns)
+    return clock, now_ns
+
+
+@pytest.mark.parametrize(
+    ("pings", "late_us", "taken"),
+    [
+        # The noise of 1 ms that is assumed fades by a thirtieth each PING; five sigmas of it ...
+        (100, 900, True),  # 5 * 1000 * (29 / 30)**50 = 918
+        (100, 936, False),
+        # ... or half a millisecond, where five sigmas are less: 169.
+        (200, 490, True),
+        (200, 510, False),
+    ],
+)
+def test_a_late_ping_is_left_out(pings: int, late_us: int, taken: bool) -> None:
+    clock, now_ns = exact(pings)
+    assert clock.drift_ppm == pytest.approx(0.0, abs=1e-6)
+    made_ns = now_ns + S
+    clock.round_trip(tick_of(made_ns, Way()), made_ns - late_us * 1000, made_ns)
+    assert clock.drift_ppm is not None
+    assert (abs(clock.drift_ppm) > 0.01) == taken
+
+
+def test_after_five_late_pings_in_a_row_the_next_begins_a_new_line() -> None:
+    clock, now_ns = exact(200)
+    known = []
+    for _ in range(6):
+        now_ns += S
+        clock.round_trip(tick_of(now_ns, Way()), now_ns - 5 * MS, now_ns)
+        known.append(clock.drift_ppm is not None)
+    assert known == [True] * 5 + [False]
+
+
+def test_a_ping_that_comes_too_early_begins_a_new_line_at_once() -> None:
+    clock, now_ns = exact(200)
+    made_ns = now_ns + S
+    for early_us, known in ((490, True), (510, False)):
+        tick = tick_of(made_ns, Way()) - early_us
+        clock, _ = exact(200)
+        clock.round_trip(tick, made_ns, made_ns + MS)
+        assert (clock.drift_ppm is not None) == known
+
+
+@pytest.mark.parametrize(("ahead_us", "trusted"), [(990, True), (1010, False)])
+def test_a_time_a_millisecond_after_its_arrival_is_no_fault(ahead_us: int, trusted: bool) -> None:
+    clock, now_ns = exact(200)  # wrong by 10 parts in a million at most, and by a tick
+    arrival_ns = now_ns + 10 * MS
+    tick = tick_of(arrival_ns, Way()) + ahead_us + 1
+    mapped_ns = clock.host_ns(tick, arrival_ns, now_ns)
+    assert clock.trusted == trusted
+    assert mapped_ns == (arrival_ns if trusted else now_ns - UNKNOWN_DELAY_NS)
+
+
+def test_no_reading_is_older_than_ten_seconds() -> None:
+    clock, now_ns = exact(200)
+    tick = tick_of(now_ns, Way())
+    assert clock.host_ns(tick, now_ns + 9 * S, now_ns) < now_ns
+    clock, now_ns = exact(200)
+    assert clock.host_ns(tick, now_ns + 11 * S, now_ns) == now_ns + S
+
+
+def test_a_clock_that_was_wrong_must_prove_itself_longer_each_time() -> None:
+    clock, now_ns = exact(3)
+    for proof_ns in (S // 2, 2 * S, 8 * S, 8 * S):
+        for _ in range(2):  # a tick that does not rise is a fault
+            clock.host_ns(5, now_ns, now_ns)
+        begin_ns = now_ns + S
+        for after_ns, trusted in ((0, False), (proof_ns - MS, False), (proof_ns, True)):
+            now_ns = begin_ns + after_ns
+            clock.round_trip(tick_of(now_ns, Way()), now_ns, now_ns)
+            assert clock.trusted == trusted
+    assert clock.faults == 4
+
+
+@pytest.mark.parametrize(("wrong_ppm", "faults"), [(480, 0), (520, 1), (-480, 0), (-520, 1)])
+def test_a_rate_wrong_by_500_parts_in_a_million_is_a_fault(wrong_ppm: int, faults: int) -> None:
+    clock = DeviceClock(TICK_HZ)
+    for second in (0, 10):
+        now_ns = START_NS + second * S
+        clock.round_trip(1000 + second * (TICK_HZ + wrong_ppm), now_ns, now_ns)
+    assert clock.faults == faults
