@@ -66,8 +66,9 @@ def test_frames_are_those_of_an_independent_encoder(length: int, digest: int) ->
 
 
 def test_encoding_refuses_what_no_receiver_would_take() -> None:
-    with pytest.raises(ValueError, match="256 is not a byte"):
-        encode_frame(256, b"")
+    for kind in (-1, 256):
+        with pytest.raises(ValueError, match=f"{kind} is not a byte"):
+            encode_frame(kind, b"")
     longest = next(n for n in range(1024, 0, -1) if fits(n))
     assert len(encode_frame(1, bytes(longest))) == ENCODED_MAX_BYTES + 1
     with pytest.raises(ValueError, match="1025 bytes, more than 1024"):
