@@ -210,11 +210,9 @@ MOST = Hello(
     digest=U32,
 )
 ONE_WORD, ALL_WORDS = np.full((1, 1), 0x0101, np.uint16), np.full((64, 5), 0xFEF8, np.uint16)
-EDGES: list[Message] = [
-    *(LEAST, MOST, Ping(0), Ping(U32)),
-    *(Sweep(0, 0, 0, 0, ONE_WORD), Sweep(U32, U64, U64, 0b11111, ALL_WORDS)),
-    *(Status(0, 0, 0, 0, 0, (0,)), Status(U64, U32, U32, U32, U32, (U32,) * 5)),
-]
+SWEEPS = Sweep(0, 0, 0, 0, ONE_WORD), Sweep(U32, U64, U64, 0b11111, ALL_WORDS)
+STATES = Status(0, 0, 0, 0, 0, (0,)), Status(U64, U32, U32, U32, U32, (U32,) * 5)
+EDGES: list[Message] = [LEAST, MOST, *SWEEPS, *STATES, Ping(0), Ping(U32)]
 BEYOND: list[Message] = [
     *(
         dataclasses.replace(message, **{field: value})
@@ -224,19 +222,18 @@ BEYOND: list[Message] = [
     ),
     *(dataclasses.replace(LEAST, serials=()), dataclasses.replace(MOST, serials=("S",) * 6)),
     *(dataclasses.replace(LEAST, commands=()), dataclasses.replace(MOST, commands=(0xD0,) * 65)),
-    *(dataclasses.replace(EDGES[4], seq=-1), dataclasses.replace(EDGES[5], seq=U32 + 1)),
-    *(dataclasses.replace(EDGES[4], present=-1), dataclasses.replace(EDGES[4], present=2)),
-    *(dataclasses.replace(EDGES[4], tick_start=-1), dataclasses.replace(EDGES[4], tick_end=-1)),
-    dataclasses.replace(EDGES[5], tick_end=U64 + 1),
+    *(dataclasses.replace(SWEEPS[0], seq=-1), dataclasses.replace(SWEEPS[1], seq=U32 + 1)),
+    *(dataclasses.replace(SWEEPS[0], present=-1), dataclasses.replace(SWEEPS[0], present=2)),
+    *(dataclasses.replace(SWEEPS[0], tick_start=-1), dataclasses.replace(SWEEPS[0], tick_end=-1)),
+    dataclasses.replace(SWEEPS[1], tick_end=U64 + 1),
     *(
-        dataclasses.replace(EDGES[4], words=np.zeros(shape, np.uint16))
+        dataclasses.replace(SWEEPS[0], words=np.zeros(shape, np.uint16))
         for shape in ((0, 1), (1, 0), (65, 1), (1, 6), (1,), (1, 1, 1))
     ),
     *(
         dataclasses.replace(message, **{field: getattr(message, field) + step})
-        for message, step in ((EDGES[6], -1), (EDGES[7], 1))
+        for message, step in ((STATES[0], -1), (STATES[1], 1))
         for field in ("tick", "sweeps", "overruns", "tx_dropped", "rx_errors")
-        if isinstance(message, Status)
     ),
     *(Status(0, 0, 0, 0, 0, (0, -1)), Status(0, 0, 0, 0, 0, (0,) * 6), Ping(-1), Ping(U32 + 1)),
 ]

@@ -36,6 +36,10 @@ def hear(conversation: Conversation, message: Message, now_ns: int) -> int:
     return len(conversation.receive(encode(message), now_ns, now_ns))
 
 
+def state(conversation: Conversation) -> LinkState:
+    return conversation.link.state
+
+
 def greeted(period_ms: int = 10) -> Conversation:
     conversation = opened()
     said(conversation, T0)
@@ -53,9 +57,9 @@ def test_a_bridge_is_asked_four_times_half_a_second_apart_and_given_up() -> None
         now_ns += 500 * MS
     assert conversation.due_ns == now_ns
     assert said(conversation, now_ns - 1) == []
-    assert conversation.link.state is LinkState.GREETING
+    assert state(conversation) is LinkState.GREETING
     assert said(conversation, now_ns) == []
-    assert conversation.link.state is LinkState.WAITING
+    assert state(conversation) is LinkState.WAITING
     assert conversation.counters.unanswered_pings == 4
     assert conversation.counters.link_failures == 1
 
@@ -86,11 +90,11 @@ def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
     assert said(conversation, T0) == [Start()]
     heard_ns = T0 + 7 * MS
     assert hear(conversation, sweep(0, 10**9), heard_ns) == 1
-    assert conversation.link.state is LinkState.UP
+    assert state(conversation) is LinkState.UP
     said(conversation, heard_ns + silence_ms * MS - 1)
-    assert conversation.link.state is LinkState.UP
+    assert state(conversation) is LinkState.UP
     said(conversation, heard_ns + silence_ms * MS)
-    assert conversation.link.state is LinkState.WAITING
+    assert state(conversation) is LinkState.WAITING
     assert conversation.link.reason == f"no sweep for {silence_ms} ms"
 
 
