@@ -86,11 +86,8 @@ class SampleAssembler:
         self._at_ns = 0
         self._widest_ns = 0
         self._broken = False
-        self._have = 0
-        self._last = -1
-        self._t_ns = 0
         self._origin_ns = 0.0
-        self._finished = False
+        self._begin()
 
     @property
     def period_ns(self) -> int | None:
@@ -172,7 +169,7 @@ class SampleAssembler:
 
     def _begin(self) -> None:
         self._have = 0
-        self._last = -1
+        self._last: int = -1
         self._t_ns = 0
         self._finished = False
 

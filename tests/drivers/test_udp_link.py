@@ -1,0 +1,194 @@
+"""A link of datagrams on a scripted socket: who is heard, when it is silent, what was dropped."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.base import LinkError
+from drivers.link import LinkState
+from drivers.udp.link import DatagramCounters, DatagramLink
+from drivers.udp.receiver import Datagram, Endpoint
+from tests.drivers.spi.bridge_bench import MS, Clock
+
+HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
+SILENCE_NS = 100 * MS
+
+
+class Receiver:
+    """A socket that hands over what a test puts in, and breaks when there is an exception."""
+
+    port = 5700
+
+    def __init__(self, dropped: int = 0) -> None:
+        self.waiting: list[Datagram | LinkError] = []
+        self.dropped = dropped
+        self.closed = False
+
+    def receive(self, most: int) -> Iterator[Datagram]:
+        while self.waiting and most:
+            most -= 1
+            datagram = self.waiting.pop(0)
+            if isinstance(datagram, LinkError):
+                raise datagram
+            yield datagram
+
+    def fileno(self) -> int:
+        return 99
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Bench:
+    """A link, its clock, and the sockets that it opens one after the other."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, only_from: str | None = None) -> None:
+        self.sockets = [Receiver(3), Receiver(4)]
+        waiting = list(self.sockets)
+        monkeypatch.setattr("drivers.udp.link.DatagramReceiver", lambda *_: waiting.pop(0))
+        self.clock = Clock()
+        self.link = DatagramLink(
+            *("test", "udp://127.0.0.1:5700", self.clock),
+            bytes_max=100,
+            silence_ns=SILENCE_NS,
+            only_from=only_from,
+        )
+        self.counters = DatagramCounters()
+
+    def hear(self, *sent: Datagram, good: bool = True) -> list[tuple[bytes, int]]:
+        """What comes through of what is sent."""
+        self.sockets[0].waiting += sent
+        heard = []
+        for data, t_ns in self.link.receive():
+            heard.append((data, self.clock.now_ns - t_ns))
+            if good:
+                self.link.confirm("somebody")
+        return heard
+
+    def listening(self) -> tuple[int | None, int | None]:
+        return self.link.fileno(), self.link.port
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    made = Bench(monkeypatch)
+    made.link.open(made.counters)
+    return made
+
+
+def test_the_first_good_sender_is_the_only_one_until_it_is_silent(bench: Bench) -> None:
+    assert bench.hear(Datagram(b"x", 0, THERE), good=False) == [(b"x", 0)]
+    assert bench.link.state is LinkState.GREETING
+    assert bench.hear(Datagram(b"a", 0, HERE), Datagram(b"b", 0, THERE)) == [(b"a", 0)]
+    assert bench.counters.foreign_datagrams == 1
+    assert bench.link.describe() == {
+        "source": "udp://127.0.0.1:5700",
+        "link": "up",
+        "heard": "somebody from 127.0.0.1 port 7",
+    }
+    bench.clock.now_ns += SILENCE_NS
+    assert bench.link.fell_silent()
+    assert bench.hear(Datagram(b"b", 0, THERE)) == [(b"b", 0)]
+
+
+@pytest.mark.parametrize(
+    ("only_from", "heard"), [("127.0.0.1", True), ("127.0.0.2", False), (None, True)]
+)
+def test_only_one_address_is_heard_if_that_is_wanted(
+    monkeypatch: pytest.MonkeyPatch, only_from: str | None, heard: bool
+) -> None:
+    bench = Bench(monkeypatch, only_from)
+    bench.link.open(bench.counters)
+    assert bool(bench.hear(Datagram(b"a", 0, HERE))) == heard
+    assert bench.counters.foreign_datagrams == (not heard)
+
+
+def test_a_datagram_is_as_old_as_the_kernel_says_and_never_older_than_the_one_before(
+    bench: Bench,
+) -> None:
+    sent = [Datagram(b"a", 5, HERE), Datagram(b"b", 7, HERE), Datagram(b"c", 2, HERE)]
+    assert bench.hear(*sent) == [(b"a", 5), (b"b", 5), (b"c", 2)]
+
+
+def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
+    assert bench.link.due_ns() is None
+    assert not bench.link.fell_silent()
+    bench.hear(Datagram(b"a", 10 * MS, HERE))
+    assert bench.link.due_ns() == bench.clock.now_ns + SILENCE_NS - 10 * MS
+    bench.clock.now_ns += SILENCE_NS - 10 * MS - 1
+    assert not bench.link.fell_silent()
+    bench.clock.now_ns += 1
+    assert bench.link.fell_silent()
+    assert not bench.link.fell_silent()
+    assert (bench.link.state, bench.counters.link_losses) == (LinkState.GREETING, 1)
+    assert bench.link.describe()["why"] == "nothing good for 100 ms"
+    assert bench.link.due_ns() is None
+
+
+def test_a_link_that_never_was_up_does_not_fall_silent(bench: Bench) -> None:
+    bench.hear(Datagram(b"x", 0, HERE), good=False)
+    bench.clock.now_ns += 10 * SILENCE_NS
+    assert not bench.link.fell_silent()
+    assert bench.counters.link_losses == 0
+
+
+def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> None:
+    first, second = bench.sockets
+    bench.hear(Datagram(b"a", 0, HERE))
+    assert bench.counters.kernel_drops == 3
+    first.waiting.append(LinkError("Network is down"))
+    assert bench.hear() == []
+    assert (bench.link.state, first.closed) == (LinkState.WAITING, True)
+    assert bench.listening() == (None, None)
+    due_ns = bench.link.due_ns()
+    assert due_ns is not None
+    bench.clock.now_ns = due_ns - 1
+    assert bench.hear() == []
+    assert bench.listening() == (None, None)
+    bench.clock.now_ns = due_ns
+    assert bench.hear() == []
+    assert bench.listening() == (99, 5700)
+    assert bench.counters.kernel_drops == 3 + 4
+    second.waiting.append(LinkError("Network is down"))
+    assert bench.hear() == []
+    assert bench.counters.kernel_drops == 3 + 4
+
+
+def test_at_most_256_datagrams_are_taken_at_once(bench: Bench) -> None:
+    assert len(bench.hear(*[Datagram(b"a", 0, HERE)] * 300)) == 256
+    assert len(bench.hear()) == 300 - 256
+
+
+def test_a_closed_link_says_what_it_was_and_cannot_be_read(bench: Bench) -> None:
+    bench.hear(Datagram(b"a", 0, HERE))
+    bench.link.close()
+    assert bench.link.describe()["link"] == "up"
+    with pytest.raises(RuntimeError, match="test link is not open"):
+        next(bench.link.receive())
+
+
+@pytest.mark.parametrize(
+    ("source", "endpoint"),
+    [
+        ("udp://127.0.0.1:0", Endpoint("127.0.0.1", 0)),
+        ("udp://127.0.0.1:65535", Endpoint("127.0.0.1", 65535)),
+        ("udp://[::1]:5700", Endpoint("::1", 5700)),
+        ("udp://127.0.0.1:65536", None),
+        ("udp://127.0.0.1:-1", None),
+        ("udp://127.0.0.1:", None),
+        ("udp://127.0.0.1", None),
+        ("udp://127.0.0.1:\u0661", None),
+        ("127.0.0.1:5700", None),
+        ("tcp://127.0.0.1:5700", None),
+        ("udp://localhost:5700", None),
+    ],
+)
+def test_a_source_is_an_address_and_a_port(source: str, endpoint: Endpoint | None) -> None:
+    if endpoint is None:
+        with pytest.raises(ValueError, match=r"is not (like udp://|an IP address)"):
+            Endpoint.parse(source)
+    else:
+        assert Endpoint.parse(source) == endpoint
+        assert str(endpoint) == source
