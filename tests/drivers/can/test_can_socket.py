@@ -12,7 +12,6 @@ import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.can.driver import (
-    REST_MAX_NS,
     CanBridgeDriver,
 )
 from drivers.can.formats import CanFormat
@@ -30,6 +29,8 @@ from tests.drivers.can.can_standin import (
     tactile,
 )
 from tests.drivers.can.can_words import SLOT_NS, Clock, pack_frame, truth
+
+REST_MAX_NS = 15_000_000
 
 MS = 1_000_000
 

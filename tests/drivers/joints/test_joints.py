@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from drivers.base import Driver, JointReading, LinkError
 from drivers.joints.driver import JointStreamDriver
 from drivers.joints.message import (
-    DATAGRAM_BYTES_MAX,
     JointCounters,
     JointMessage,
     JointParser,
@@ -25,6 +24,8 @@ from drivers.link import LinkState
 from drivers.twins.faults import LinkFaults
 from drivers.twins.joints import JointTwin
 from tests.drivers.palm.palm_stream import MS, Clock, Sender, joints, listen
+
+DATAGRAM_BYTES_MAX = 4096
 
 LOOPBACK = "udp://127.0.0.1:0"
 

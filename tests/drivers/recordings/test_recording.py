@@ -12,7 +12,6 @@ import pytest
 
 from drivers.base import ElectrodeFault, RecordingError
 from drivers.recordings.csv_rows import (
-    LINE_BYTES_MAX,
     Recording,
     open_recording,
     read_lines,
@@ -30,6 +29,8 @@ from tests.drivers.recordings.tables import (
     stream,
     table,
 )
+
+LINE_BYTES_MAX = 65_536
 
 
 def test_a_table_gives_its_counts_and_annotations() -> None:
