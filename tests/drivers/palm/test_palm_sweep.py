@@ -272,3 +272,68 @@ def test_the_real_hand_has_the_same_signature() -> None:
     for pair in PAIRS[2:-1]:
         stale = (counts[1:, :, pair] == counts[:-1, :, pair]).all(axis=(1, 2))
         assert stale.mean() == pytest.approx(2 / 7, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("after_ns", "lost"),
+    [(MS, 0), (11 * MS - 1, 0), (11 * MS, 1), (25 * MS - 1, 1), (25 * MS, 2)],
+)
+def test_a_packet_ten_cycles_after_it_was_due_tells_of_a_lost_round(
+    after_ns: int, lost: int
+) -> None:
+    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    stream = packets(2)
+    readings = [reading for at in range(ROUND) for reading in sweeps.push(stream[at], at * MS)]
+    end_ns = 13 * MS + after_ns
+    for at in range(ROUND):
+        readings += sweeps.push(stream[ROUND + at], end_ns + at * MS)
+    assert [reading.seq for reading in readings] == [0, 1 + lost]
+    assert (counters.missed_readings, counters.lost_packets) == (lost, lost * ROUND)
+
+
+@pytest.mark.parametrize(
+    ("after_ns", "missed"),
+    [(13 * MS, 0), (14 * MS, 1), (2_000 * MS, 142), (2_000 * MS + 1, 1)],
+)
+def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
+    after_ns: int, missed: int
+) -> None:
+    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    stream = packets(2)
+    for at in range(ROUND):
+        sweeps.push(stream[at], at * MS)
+    sweeps.interrupt()
+    assert counters.interrupted_rounds == 0
+    assert sweeps.push(stream[ROUND + 3], 15 * MS) == ()
+    sweeps.push(stream[ROUND], 13 * MS + after_ns)
+    assert (counters.missed_readings, counters.unsynchronised_packets) == (missed, 1)
+
+
+@pytest.mark.parametrize(
+    ("step", "after_ns", "late"),
+    [
+        (8, 4 * MS - 1, True),  # six before, or eight ahead: nearer in time
+        (8, 4 * MS, False),
+        (13, 6_500_000 - 1, True),
+        (13, 6_500_000, False),
+        (7, 0, False),  # half a round ahead
+    ],
+)
+def test_a_packet_is_late_that_comes_in_half_the_time_of_its_step_ahead(
+    step: int, after_ns: int, late: bool
+) -> None:
+    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    stream = packets(1)
+    for at in range(ROUND):
+        sweeps.push(stream[at], at * MS)
+    sweeps.push(stream[(ROUND - 1 + step) % ROUND], 13 * MS + after_ns)
+    assert counters.conflicting_packets == late, "its place is taken already"
+
+
+def test_how_long_no_round_can_end() -> None:
+    sweeps = RoundAssembler(FINGERS, PalmCounters())
+    left = [sweeps.cycles_to_go]
+    for at, packet in enumerate(packets(2)):
+        sweeps.push(packet, at * MS)
+        left.append(sweeps.cycles_to_go)
+    assert left == [0, *range(13, -1, -1), *range(13, -1, -1)]
