@@ -7,7 +7,14 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from drivers.base import ELECTRODES, FINGERS, DriverCounters, TactileReading, sensor_rows
+from drivers.base import (
+    ELECTRODES,
+    FINGERS,
+    DriverCounters,
+    ElectrodeFault,
+    TactileReading,
+    sensor_rows,
+)
 from drivers.can.readings import CanCounters
 from drivers.joints.message import JointCounters
 from drivers.palm.packet import PalmCounters
@@ -71,6 +78,13 @@ def test_a_reading_has_24_electrodes_a_finger(
     assert ELECTRODES == 24
     with pytest.raises(ValueError, match="counts"):
         TactileReading(0, 0, np.zeros(counts, np.uint16), np.zeros(faults, np.uint8))
+
+
+def test_faults_keep_the_bits_that_recordings_hold() -> None:
+    assert {fault.name: int(fault) for fault in ElectrodeFault} == {
+        **{"MISSING": 1, "NOT_A_COUNT": 2, "PARITY": 4},
+        **{"ERROR_WORD": 8, "HELD": 16, "CUT_OFF": 32},
+    }
 
 
 def test_a_recorded_reading_was_made_when_it_was_recorded_a_live_one_when_it_came() -> None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.health import Health, too_many
 from daemon.judge.reasons import Reason
-from drivers.base import TactileReading
+from drivers.base import ElectrodeFault, TactileReading
 
 FINGERS = 3
 # What wears an electrode out, by the words of `daemon.judge.health`.
@@ -223,3 +223,25 @@ def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) ->
             flags[finger, 3] = 1
         reasons.append(health.watch(TactileReading(place, place, counts, flags)).reasons)
     assert reasons == [(), (Reason.FROZEN,)]
+
+
+def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
+    health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
+    flags[0, 5] = ElectrodeFault.PARITY | ElectrodeFault.NOT_A_COUNT
+    flags[1, 6] = ElectrodeFault.ERROR_WORD
+    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    found = health.watch(TactileReading(0, 0, counts, flags))
+    assert (found.reasons, int(found.broken.sum())) == ((), 2)
+    assert health.electrodes() == {(0, 5): Reason.NOT_A_COUNT, (1, 6): Reason.ERROR_WORD}
+
+
+@pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF, 64])
+def test_a_fault_that_is_not_of_one_electrode_speaks_against_the_reading(flag: int) -> None:
+    flags = np.zeros((FINGERS, 24), dtype=np.uint8)
+    flags[2, 23] = flag
+    flags[0, 1] = ElectrodeFault.PARITY
+    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    named = {16: Reason.HELD, 32: Reason.CUT_OFF}.get(int(flag))
+    found = Health(FINGERS).watch(TactileReading(0, 0, counts, flags))
+    assert found.reasons == ((Reason.PARITY, named) if named else (Reason.PARITY,))
+    assert np.argwhere(found.broken).tolist() == [[0, 1], [2, 23]]
