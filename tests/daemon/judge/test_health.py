@@ -138,9 +138,9 @@ def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -
     ("jumps", "jumpy"),
     [
         ({0: 151, 1: -151, 2: 151}, True),
-        ({0: 150, 1: -150, 2: 150}, False),  # the highest spike
+        ({at: 150 * (-1) ** at for at in range(5)}, False),  # the highest spike
         ({0: -151, 1: 151, 2: -151}, True),
-        ({0: -150, 1: 150, 2: -150}, False),
+        ({at: -150 * (-1) ** at for at in range(5)}, False),
         ({0: 151, 1: -151}, False),  # twice may be a spike
         ({0: 151, 1: -151, 7: 151}, True),  # 0.9**6 * (0.9 + 1) + 1 = 2.01
         ({0: 151, 1: -151, 8: 151}, False),  # 1.91
