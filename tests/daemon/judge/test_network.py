@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,7 +13,9 @@ from daemon.judge.findings import Examined
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
 from daemon.judge.reasons import Reason
+from models import zoo
 from models.electrodes import Electrodes
+from models.runtime import TactileModel
 from tests.daemon.fakes import FINGERS, FakeModel, seen_box
 
 COUNTS = np.random.default_rng(1).integers(1000, 3000, (3, 24)).astype(np.uint16)
@@ -124,3 +127,30 @@ def test_a_finger_that_reads_about_the_same_everywhere_is_flat(
     seen = seen_box(3)
     found = Plausibility(FINGERS, seen, Electrodes(seen)).examine(counts, mask)
     assert (Reason.FLAT in found.reasons) == flat
+
+
+@pytest.mark.parametrize(("swing", "flat"), [(0, True), (2, False)])
+def test_a_finger_without_an_image_is_not_judged(swing: int, flat: bool) -> None:
+    """Its electrodes differ by less than a count (standard deviation)."""
+    counts, model = COUNTS.copy(), FakeModel(0.2)
+    counts[1] = 2000 + swing * (-1) ** np.arange(24)
+    opinion = Network(model, 0.5).judge(Examined((), counts))  # type: ignore[arg-type]
+    assert (opinion.p_slip, opinion.reasons) == ((None, (Reason.FLAT,)) if flat else (0.2, ()))
+    assert model.runs == (0 if flat else 1)
+
+
+def test_a_session_model_is_asked_about_what_its_session_standardises() -> None:
+    network = Network(TactileModel(zoo.find("small-session")), 0.5)
+    known = dataclasses.replace(
+        session(1.0), features_mean=np.arange(78.0), features_spread=np.linspace(1.0, 900.0, 78)
+    )
+    assert network.judge(Examined((), COUNTS), known).p_slip is not None
+    z = (COUNTS - COUNTS.mean(axis=1, keepdims=True)) / COUNTS.std(axis=1, keepdims=True)
+    features = np.concatenate((z.ravel(), COUNTS.mean(axis=1), COUNTS.std(axis=1)))
+    expected = (features - np.arange(78.0)) / np.linspace(1.0, 900.0, 78)
+    asked = network.features
+    assert asked.shape == (78,)
+    clip = np.abs(asked).max()  # as the model's card says
+    np.testing.assert_allclose(asked, np.clip(expected, -clip, clip), rtol=1e-5, atol=1e-6)
+    assert (np.abs(expected) < clip).sum() > 60
+    assert Network(FakeModel(), 0.5).features.shape == (0,)  # type: ignore[arg-type]
