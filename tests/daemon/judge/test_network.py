@@ -99,6 +99,7 @@ def test_a_young_session_is_less_sure_and_on_the_same_side(
     assert opinion.p_slip is not None
     expected = logit(threshold) + (logit(p_slip) - logit(threshold)) / temperature
     assert logit(opinion.p_slip) == pytest.approx(expected)
+    assert temperature > 1.0 or opinion.p_slip == p_slip, "to the bit where nothing is softened"
     assert opinion.margin == pytest.approx(logit(p_slip)), "the margin is that of the network"
 
 
