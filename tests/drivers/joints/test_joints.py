@@ -183,6 +183,14 @@ def test_a_datagram_has_at_most_four_kilobytes(length: int, taken: bool) -> None
             long.to_bytes()
 
 
+@pytest.mark.parametrize(
+    ("seq", "taken"), [(0, True), ((1 << 63) - 1, True), (1 << 63, False), (-1, False)]
+)
+def test_a_number_fits_into_a_signed_integer_of_64_bits(seq: int, taken: bool) -> None:
+    found, counters = parse(message(seq))
+    assert (found is not None, counters.bad_messages) == (taken, int(not taken))
+
+
 @pytest.mark.parametrize(("step", "missed", "restarts"), [(1001, 1000, 0), (1002, 0, 1)])
 def test_a_jump_by_more_than_a_thousand_is_a_new_start(
     step: int, missed: int, restarts: int

@@ -202,6 +202,25 @@ def test_half_a_degree_per_count_is_the_steepest(steep: float, refused: bool) ->
             parse_calibration(data, FILE)
 
 
+@pytest.mark.parametrize(("number", "refused"), [(1, True), (2, False), (64, False), (65, True)])
+def test_a_table_has_2_to_64_points(number: int, refused: bool) -> None:
+    rows = [[1000 + 10 * row, row / 2] for row in range(number)]
+    data: dict[str, object] = {"version": 1, "joints": {"FFJ1": rows}}
+    if refused:
+        assert problems(data) == (f"FFJ1: has {number} points, must have 2 to 64",)
+    else:
+        parse_calibration(data, FILE)
+
+
+@pytest.mark.parametrize(("number", "refused"), [(2, True), (3, False), (49, False), (50, True)])
+def test_the_coupled_table_has_3_to_49_points(number: int, refused: bool) -> None:
+    rows = [[1000 + 100 * (row % 2), 1000 + 60 * (row // 2), row % 2, 0] for row in range(number)]
+    if refused:
+        assert problems(coupled(rows)) == (f"THJ1_THJ2: has {number} points, must have 3 to 49",)
+    else:
+        parse_calibration(coupled(rows), FILE)
+
+
 # THJ1 and THJ2: five by five raw pairs, as a hand is calibrated.
 RAW_PAIRS = [(900 + 420 * i + 60 * j, 800 + 380 * j - 45 * i) for i in range(5) for j in range(5)]
 ANGLES = [(-15 + 26 * i, -40 + 20 * j) for i in range(5) for j in range(5)]
