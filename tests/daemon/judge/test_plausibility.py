@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.calibration import Calibration
 from daemon.judge.plausibility import Plausibility
 from daemon.judge.reasons import Reason
 from drivers.twins.grasps import synthetic
@@ -59,3 +60,50 @@ def test_two_electrodes_may_contradict_besides_those_known_to_be_broken(
         errors = np.abs(found.counts[repaired].astype(float) - grasp[repaired])
         assert (errors < 400).all(), "what the others let expect is near what was there"
         assert found.grasp is not None
+
+
+@pytest.fixture(scope="module")
+def of_sessions() -> Plausibility:
+    contract = TactileModel(zoo.find("small-session")).contract
+    return Plausibility(contract.fingers, contract.seen, Electrodes(contract.seen))
+
+
+def same_sensors(centre: NDArray[np.float64], **known: bool) -> Calibration:
+    """A session whose sensors are those of the training."""
+    nothing, ones = np.zeros(0), np.ones((3, 24))
+    return Calibration(
+        *(nothing, nothing, centre, ones, centre, ones),
+        calibrated=known.get("calibrated", True),
+        odd=known.get("odd", False),
+        temperature=1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("stretched", "known", "judged", "learned"),
+    [
+        (1.0, {}, True, True),
+        (1.0, {"odd": True}, False, True),  # near the training, in a session that is none
+        (1.6, {}, False, True),  # up to twice as far a session learns from what it cannot judge
+        (4.0, {}, False, False),
+        (4.0, {"calibrated": False}, False, True),  # a young one learns from all
+    ],
+)
+def test_a_session_judges_what_is_near_and_learns_from_what_is_twice_as_far(
+    of_sessions: Plausibility,
+    stretched: float,
+    known: dict[str, bool],
+    judged: bool,
+    learned: bool,
+) -> None:
+    seen = TactileModel(zoo.find("small-session")).contract.seen
+    centre = np.array(seen.centre)
+    # One deviation of the training, of 0.9 of the distance up to which it is judged.
+    spread = np.linalg.inv(seen.whitening_matrix()).T
+    direction = np.random.default_rng(2).normal(size=72)
+    direction *= 0.9 * seen.distance_max * np.sqrt(72) / np.linalg.norm(direction)
+    counts = np.clip(centre + stretched * (direction @ spread.T).reshape(3, 24), 1, 4094)
+    session = same_sensors(centre, **known)
+    found = of_sessions.examine(np.rint(counts).astype(np.uint16), NOTHING, session)
+    assert found.reasons == (() if judged else (Reason.NEVER_SEEN,))
+    assert (found.grasp is not None) == learned
