@@ -22,7 +22,10 @@ def new_session() -> SessionCalibration:
         clip=5.0,
         prior_grasps=1.0,
         calibrated_from=3.0,
-        sharpness=(Sharpness(0.0, 2.5), Sharpness(2.0, 1.5), Sharpness(4.0, 1.0)),
+        sharpness=(
+            *(Sharpness(0.0, 2.5), Sharpness(1.0, 2.0)),
+            *(Sharpness(2.0, 1.5), Sharpness(4.0, 1.0)),
+        ),
     )
     return SessionCalibration(wanted, np.full(SHAPE, MEAN), np.full(SHAPE, SPREAD))
 
@@ -34,7 +37,7 @@ def grasps(number: int, mean: float = MEAN, spread: float = SPREAD) -> NDArray[n
 
 @pytest.mark.parametrize(
     ("number", "calibrated", "temperature"),
-    [(0, False, 2.5), (1, False, 2.5), (2, False, 1.5), (3, True, 1.5), (4, True, 1.0)],
+    [(0, False, 2.5), (1, False, 2.0), (2, False, 1.5), (3, True, 1.5), (4, True, 1.0)],
 )
 def test_a_session_is_calibrated_and_sharp_after_the_grasps_of_its_card(
     number: int, calibrated: bool, temperature: float

@@ -118,6 +118,27 @@ def test_a_late_frame_is_one_of_the_two_periods_before() -> None:
         assert (counters.late_frames, counters.restarts) == (late, 1 - late)
 
 
+def test_a_late_frame_is_told_from_a_new_start_across_the_wrap() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, (1 << 16) + 3)
+    assert push(sweeps, 0, (1 << 16) - 2) == []
+    assert (counters.late_frames, counters.restarts) == (1, 0)
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 5000)
+    (reading,) = whole(sweeps, 5000 + (1 << 15) - 8, tick_us=17)  # half of all numbers away
+    assert_true(reading, 5000 + (1 << 15) - 8)
+    assert (counters.late_frames, counters.restarts) == (0, 1)
+
+
+def test_a_sweep_that_was_joined_in_the_middle_after_an_interruption_is_missed() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 0)
+    sweeps.interrupt()
+    assert push(sweeps, 1, 5) == []
+    (reading,) = whole(sweeps, 6)
+    assert (reading.seq, counters.missed_readings, counters.unsynchronised_frames) == (6, 5, 1)
+
+
 def test_frames_of_a_sweep_that_come_in_another_order_are_counted() -> None:
     sweeps, counters = frame_sweeps()
     for row in (1, 0, 2):

@@ -330,6 +330,14 @@ def test_a_packet_is_late_that_comes_in_half_the_time_of_its_step_ahead(
     assert counters.conflicting_packets == late, "its place is taken already"
 
 
+def test_a_packet_of_the_round_before_is_late() -> None:
+    stream = packets(2)
+    lost = stream.pop(ROUND - 1)
+    played = play_packets([*stream[:ROUND], lost, *stream[ROUND:]])
+    assert [bool(reading.faults.any()) for reading in played.readings] == [True, False]
+    assert (played.counters.late_packets, played.counters.lost_packets) == (1, 1)
+
+
 def test_how_long_no_round_can_end() -> None:
     sweeps = RoundAssembler(FINGERS, PalmCounters())
     left = [sweeps.cycles_to_go]
