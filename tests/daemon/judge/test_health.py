@@ -225,6 +225,15 @@ def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) ->
     assert reasons == [(), (Reason.FROZEN,)]
 
 
+def test_electrodes_of_all_fingers_that_repeat_themselves_are_no_held_finger() -> None:
+    """Ten of each finger, as a palm at 71.43 Hz read at 100 Hz: 2 of 7, and quiet ones."""
+    health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
+    for place in range(5):
+        counts = np.full((FINGERS, 24), 2000 + place, dtype=np.uint16)
+        counts[:, :10] = 2000
+        assert health.watch(TactileReading(place, place, counts, flags)).reasons == ()
+
+
 def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
     health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
     flags[0, 5] = ElectrodeFault.PARITY | ElectrodeFault.NOT_A_COUNT

@@ -121,7 +121,9 @@ def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
     stream = packets(3)
     for index in (2, ROUND + 2):  # E2 and E3 of rounds 0 and 1, without the bit of other_sensor_1
         stream[index] = change(stream[index], "mf", {"valid": 0b0111})
-    first, second, third = play_packets(stream[ROUND:] + stream[:ROUND]).readings
+    played = play_packets(stream[ROUND:] + stream[:ROUND])
+    assert played.counters.held_values == 2
+    first, second, third = played.readings
     assert flags(first, MISSING) == [[1, 2]]  # nothing older is known
     assert not second.faults.any()
     assert flags(third, HELD) == [[1, 2]]
@@ -162,6 +164,26 @@ def test_the_garbage_of_an_absent_sensor_is_no_reading() -> None:
         assert flags(reading, MISSING) == [[1, electrode] for electrode in range(24)]
         assert np.array_equal(reading.counts[::2], row[::2])
     assert played.counters.absent_fingers == 20
+
+
+@pytest.mark.parametrize("position", [0, 1])
+def test_garbage_for_a_pressure_or_temperature_is_an_absent_sensor_whatever_the_electrodes_say(
+    position: int,
+) -> None:
+    """As recorded from a hand without this sensor: -22072 is 43464 unsigned."""
+    stream = packets(2)
+    stream[position] = change(stream[position], "mf", {"other_0": 43464})
+    stream[5] = change(stream[5], "th", {"other_0": 43464})  # an electrode tells only of itself
+    first, second = play_packets(stream).readings
+    assert flags(first, MISSING) == [[1, electrode] for electrode in range(24)]
+    assert flags(first, NOT_A_COUNT) == [[2, 7]]
+    assert not second.faults.any()
+    stale = change(packets(1)[position], "mf", {"other_0": 43464, "valid": 0b1011})
+    (reading,) = play_packets(
+        [stale if at == position else p for at, p in enumerate(packets(1))]
+    ).readings
+    assert not flags(reading, NOT_A_COUNT)
+    assert [1, 5] not in flags(reading, MISSING), "what is not fresh tells nothing"
 
 
 def test_a_finger_of_nothing_but_zeros_is_absent() -> None:

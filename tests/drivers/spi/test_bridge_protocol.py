@@ -180,6 +180,24 @@ def test_a_sweep_that_makes_no_sense_is_nothing(offset: int, value: int) -> None
     assert Sweep.from_bytes(bytes(payload)) is None
 
 
+@pytest.mark.parametrize(
+    ("sensors", "slots", "sense"),
+    [(1, 1, True), (5, 64, True), (0, 1, False), (1, 0, False), (6, 1, False), (1, 65, False)],
+)
+def test_a_sweep_has_1_to_5_sensors_and_1_to_64_slots(
+    sensors: int, slots: int, sense: bool
+) -> None:
+    """However well its length fits."""
+    payload = struct.pack("<IQQBBB", 7, 1, 2, 0, sensors, slots) + bytes(2 * sensors * slots)
+    assert (Sweep.from_bytes(payload) is not None) == sense
+
+
+@pytest.mark.parametrize(("sensors", "sense"), [(0, False), (1, True), (5, True), (6, False)])
+def test_a_status_has_1_to_5_sensors(sensors: int, sense: bool) -> None:
+    payload = struct.pack("<QIIIIB", 1, 2, 3, 4, 5, sensors) + bytes(4 * sensors)
+    assert (Status.from_bytes(payload) is not None) == sense
+
+
 def test_the_head_of_a_later_version_can_be_read() -> None:
     later = struct.pack("<BII", 2, 0xCAFEF00D, 99) + b"anything"
     assert HelloHead.from_bytes(later) == HelloHead(2, 0xCAFEF00D, 99)
