@@ -231,6 +231,8 @@ class Baseline:
     failed: list[str] = dataclasses.field(default_factory=list)
     tests: dict[str, dict[str, list[str]]] = dataclasses.field(default_factory=dict)
     """By file and line (as text) the tests that execute it."""
+    naming: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    """By file the tests in files that name its module."""
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """A part of a test is done."""
@@ -242,13 +244,14 @@ class Baseline:
         """The tests that run a mutant, the fastest in `seconds` altogether, and their times.
 
         Those that execute its statement; where none does, for it is executed by importing, all that
-        execute anything of its file.
+        execute anything of its file, and those whose file names its module.
         """
         lines = self.tests.get(mutant.file, {})
         found = {
             test for at in range(mutant.begin, mutant.line + 1) for test in lines.get(str(at), ())
         }
-        found = found or {test for tests in lines.values() for test in tests}
+        if not found:
+            found.update(self.naming.get(mutant.file, ()), *lines.values())
         chosen: dict[str, float] = {}
         for test in sorted(found.difference(self.failed), key=lambda test: self.seconds[test]):
             chosen[test] = self.seconds[test]
@@ -349,11 +352,18 @@ class Workshop:
         with measure.collect():
             status = self._pytest(self._tests, [found, Contexts(measure), SameExamples()])
         data = measure.get_data()
+        files = {test.partition("::")[0] for test in found.seconds}
+        texts = {file: (self._folder / file).read_text() for file in files}
         for file in data.measured_files():
             lines = data.contexts_by_lineno(file)
-            found.tests[str(Path(file).relative_to(self._folder))] = {
+            name = str(Path(file).relative_to(self._folder))
+            found.tests[name] = {
                 str(line): sorted(filter(None, tests)) for line, tests in lines.items()
             }
+            module = name.removesuffix(".py").replace("/", ".")
+            found.naming[name] = [
+                test for test in found.seconds if module in texts[test.partition("::")[0]]
+            ]
         report.write_text(json.dumps(dataclasses.asdict(found)))
         return status
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import socket
 from collections.abc import Iterator
 
 import pytest
@@ -9,7 +11,7 @@ import pytest
 from drivers.base import LinkError
 from drivers.link import LinkState
 from drivers.udp.link import DatagramCounters, DatagramLink
-from drivers.udp.receiver import Datagram, Endpoint
+from drivers.udp.receiver import Datagram, DatagramReceiver, Endpoint
 from tests.drivers.spi.bridge_bench import MS, Clock
 
 HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
@@ -159,6 +161,17 @@ def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> Non
 def test_at_most_256_datagrams_are_taken_at_once(bench: Bench) -> None:
     assert len(bench.hear(*[Datagram(b"a", 0, HERE)] * 300)) == 256
     assert len(bench.hear()) == 300 - 256
+
+
+def test_a_socket_keeps_128_kilobytes() -> None:
+    """0.2 s of palm packets; the kernel gives what it gives to whoever asks for as much."""
+    receiver = DatagramReceiver(Endpoint("127.0.0.1", 0), 100)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 131_072)
+        with socket.socket(fileno=os.dup(receiver.fileno())) as same:
+            sizes = {each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for each in (same, other)}
+    receiver.close()
+    assert len(sizes) == 1
 
 
 def test_a_closed_link_says_what_it_was_and_cannot_be_read(bench: Bench) -> None:

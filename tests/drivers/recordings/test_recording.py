@@ -97,7 +97,7 @@ def test_a_quoted_object_name_may_hold_commas_and_quotes() -> None:
 
 
 def test_of_one_missing_column_no_number_is_told() -> None:
-    with pytest.raises(RecordingError, match="column mf_biotac_7: this column is missing$"):
+    with pytest.raises(RecordingError, match=r"column mf_biotac_7: this column is missing$"):
         rows_of(table(2, columns=[name for name in TABLE_HEADER if name != "mf_biotac_7"]))
 
 
