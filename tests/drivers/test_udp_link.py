@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import struct
 from collections.abc import Iterator
 
 import pytest
@@ -205,3 +206,94 @@ def test_a_source_is_an_address_and_a_port(source: str, endpoint: Endpoint | Non
     else:
         assert Endpoint.parse(source) == endpoint
         assert str(endpoint) == source
+
+
+class Kernel:
+    """A socket that hands over what the kernel would: datagrams with notes, or errors."""
+
+    def __init__(self, *_: object) -> None:
+        self.script: list[tuple[bytes, list[tuple[int, int, bytes]]] | OSError] = []
+        self.options: dict[int, int] = {}
+
+    def setsockopt(self, level: int, option: int, value: int) -> None:
+        assert level == socket.SOL_SOCKET
+        self.options[option] = value
+
+    def setblocking(self, _on: bool) -> None: ...
+
+    def bind(self, _address: object) -> None: ...
+
+    def close(self) -> None: ...
+
+    def recvmsg(self, most: int, _room: int) -> tuple[bytes, list[object], int, tuple[object, ...]]:
+        if not self.script:
+            raise BlockingIOError
+        step = self.script.pop(0)
+        if isinstance(step, OSError):
+            raise step
+        return step[0][:most], list(step[1]), 0, ("::1", 7, 0, 0)
+
+
+def noted(
+    monkeypatch: pytest.MonkeyPatch, *script: tuple[bytes, list[tuple[int, int, bytes]]] | OSError
+) -> tuple[DatagramReceiver, Kernel]:
+    kernel = Kernel()
+    kernel.script += script
+    monkeypatch.setattr("drivers.udp.receiver.socket.socket", lambda *_: kernel)
+    monkeypatch.setattr("drivers.udp.receiver.time.time_ns", lambda: 5_000_000_010)
+    return DatagramReceiver(Endpoint("::1", 5700), 100), kernel
+
+
+SOL, STAMP, LOST = socket.SOL_SOCKET, 35, 40
+"""Of asm-generic/socket.h: SO_TIMESTAMPNS and SO_RXQ_OVFL."""
+
+
+@pytest.mark.parametrize(
+    ("notes", "age_ns", "dropped"),
+    [
+        ([(SOL, STAMP, struct.pack("@ll", 5, 7))], 3, 0),
+        ([(SOL, STAMP, struct.pack("@ll", 4, 7))], 1_000_000_003, 0),
+        ([(SOL, STAMP, struct.pack("@ll", 5, 11))], 0, 0),  # the wall clock was set back
+        ([(SOL, STAMP, b"short")], 0, 0),
+        ([(0, STAMP, struct.pack("@ll", 5, 7)), (0, LOST, struct.pack("@I", 9))], 0, 0),
+        ([(SOL, LOST, struct.pack("@I", 9))], 0, 9),
+        ([(SOL, LOST, struct.pack("@Q", 9))], 0, 0),
+        ([(SOL, STAMP, struct.pack("@ll", 5, 7)), (SOL, LOST, struct.pack("@I", 2))], 3, 2),
+        ([(0, 1, b""), (SOL, LOST, struct.pack("@I", 2))], 0, 2),
+        ([(SOL, 99, struct.pack("@I", 9))], 0, 0),
+        ([], 0, 0),
+    ],
+)
+def test_age_and_losses_are_what_the_kernel_notes(
+    monkeypatch: pytest.MonkeyPatch,
+    notes: list[tuple[int, int, bytes]],
+    age_ns: int,
+    dropped: int,
+) -> None:
+    receiver, kernel = noted(monkeypatch, (b"a", notes))
+    assert list(receiver.receive(5)) == [Datagram(b"a", age_ns, ("::1", 7))]
+    assert receiver.dropped == dropped
+    assert kernel.options[STAMP]
+    assert kernel.options[LOST]
+
+
+def test_a_datagram_that_is_too_long_shows_by_one_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+    receiver, _ = noted(monkeypatch, (bytes(100), []), (bytes(500), []))
+    assert [len(datagram.data) for datagram in receiver.receive(5)] == [100, 101]
+
+
+def test_an_interrupted_call_is_made_again_and_an_error_is_a_broken_link(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    broken = OSError(100, "Network is down")
+    receiver, _ = noted(monkeypatch, InterruptedError(), (b"a", []), broken)
+    taken = receiver.receive(5)
+    assert next(taken).data == b"a"
+    with pytest.raises(LinkError, match="cannot receive: Network is down"):
+        next(taken)
+
+
+def test_no_more_are_taken_than_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    receiver, _ = noted(monkeypatch, *[(b"a", [])] * 4)
+    assert len(list(receiver.receive(3))) == 3
+    assert len(list(receiver.receive(3))) == 1
