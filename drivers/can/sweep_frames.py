@@ -109,7 +109,7 @@ class FrameAssembler:
         if self._current is None or t_ns - self._t_ns > self._patience_ns():
             return False
         back = (self._current - sequence) % (1 << 16)
-        return 0 < back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _TICKS // 2
+        return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _TICKS // 2
 
     def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
         """Begin a sweep; count those left out, or a device that started anew."""

@@ -248,3 +248,37 @@ def test_a_bus_with_a_descriptor_is_looked_at_when_silence_is_due(
             driver.read_ready()
             assert str(driver.link_state) == "greeting"
             assert driver.due_ns() is None
+
+
+@pytest.mark.parametrize(
+    ("stamp_s", "age_ns"), [(100.0, 500_000_000), (100.5, 0), (101.0, 0)], ids=str
+)
+def test_a_frame_is_as_old_as_its_stamp_by_the_wall_clock(
+    monkeypatch: pytest.MonkeyPatch, stamp_s: float, age_ns: int
+) -> None:
+    """A stamp after now is of a wall clock that was set back meanwhile."""
+    received = message(b"\0", 0x7FF)
+    received.timestamp = stamp_s
+    stand_in(monkeypatch, lambda: ScriptedBus([received]))
+    bus = CanBus("virtual", "x", {}, Clock(7_000_000_000), Clock(100_500_000_000))
+    bus.open()
+    ((_, t_ns, until_ns),) = bus.drain()
+    assert t_ns == until_ns == 7_000_000_000 - age_ns
+    bus.close()
+    assert bus.drain() == []
+
+
+def test_a_frame_without_a_stamp_came_since_the_bus_was_last_empty(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scripted, clock = ScriptedBus(), Clock(1_000)
+    stand_in(monkeypatch, lambda: scripted)
+    bus = CanBus("pcan", "x", {}, clock, Clock(0))
+    bus.open()
+    doubts = []
+    for now_ns, frames in ((2_000, 1), (3_000, 0), (5_000, 2)):
+        clock.now_ns = now_ns
+        scripted.script += [message(b"\0", 0x7FF)] * frames
+        doubts += [(t_ns, until_ns) for _, t_ns, until_ns in bus.drain()]
+    assert doubts == [(1_000, 2_000), (3_000, 5_000), (3_000, 5_000)]
+    bus.close()

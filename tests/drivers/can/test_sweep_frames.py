@@ -286,6 +286,14 @@ def test_an_interrupted_frame_sweep_is_missed() -> None:
     assert (counters.interrupted_sweeps, counters.missed_readings) == (1, 1)
 
 
+@pytest.mark.parametrize(("gap_ns", "learned"), [(OUTAGE_NS, True), (OUTAGE_NS + 1, False)])
+def test_no_period_is_learned_from_an_outage(gap_ns: int, learned: bool) -> None:
+    sweeps, _ = frame_sweeps()
+    for sweep in range(PERIODS_NEEDED + 1):
+        whole(sweeps, sweep, 1 + sweep * gap_ns)
+    assert sweeps.period_ns == (gap_ns if learned else None)
+
+
 def test_the_frame_period_is_learned() -> None:
     sweeps, _ = frame_sweeps()
     for sweep in range(PERIODS_NEEDED + 1):

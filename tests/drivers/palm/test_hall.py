@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers import hand
 from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
 from drivers.palm.hall import (
     HALL_SENSORS,
@@ -142,6 +143,10 @@ RANGES_DEG = {
     **{"LFJ5": (0, 45), "THJ1": (-15, 90), "THJ2": (-40, 40), "THJ3": (-12, 12)},
     **{"THJ4": (0, 70), "THJ5": (-60, 60), "WRJ1": (-40, 28), "WRJ2": (-28, 10)},
 }
+
+
+def test_a_hand_has_the_joints_of_shadows_documentation() -> None:
+    assert set(RANGES_DEG) == hand.JOINTS
 
 
 @pytest.mark.parametrize("joint", RANGES_DEG)
@@ -352,6 +357,27 @@ def test_a_file_that_cannot_be_read_is_refused_by_its_path(
         path.write_bytes(content)
     with pytest.raises(CalibrationError, match=re.escape(f"{path}: {reason}")):
         load_calibration(path)
+
+
+@pytest.mark.parametrize(("length", "taken"), [(262_144, True), (262_145, False)])
+def test_a_file_has_at_most_256_kilobytes(tmp_path: Path, length: int, taken: bool) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(EXAMPLE.read_text().ljust(length, "#"))
+    assert path.stat().st_size == length
+    if taken:
+        assert load_calibration(path).tables
+    else:
+        with pytest.raises(CalibrationError, match="is longer than 262144 bytes"):
+            load_calibration(path)
+
+
+@pytest.mark.parametrize(("raw", "taken"), [(1, True), (4095, True), (4096, False)])
+def test_a_raw_value_has_12_bits(raw: float, taken: bool) -> None:
+    data: dict[str, object] = {"version": 1, "joints": {"FFJ1": [[raw, 0.0], [2000, 45.0]]}}
+    if taken:
+        parse_calibration(data, FILE)
+    else:
+        assert problems(data) == (f"FFJ1: raw {raw} is not in 1..4095",)
 
 
 def test_the_example_says_what_is_missing() -> None:
