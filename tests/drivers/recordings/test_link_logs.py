@@ -199,6 +199,12 @@ def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content:
     LinkLogDriver([path], CanLog(fingers), speed=0.5)
 
 
+@pytest.mark.parametrize(("length", "taken"), [(256, True), (257, False)])
+def test_a_line_has_at_most_256_characters(length: int, taken: bool) -> None:
+    line = line_of(CanFrame(0x123, b"abc"), 10**18, "can0").rstrip().ljust(length)
+    assert (frame_of(line) is not None) == taken
+
+
 def test_the_frames_of_a_can_log_are_counted_and_other_lines_passed_over(tmp_path: Path) -> None:
     path, log = tmp_path / "can.log", CanLog(("ff", "mf", "th"), sequence="electrodes")
     lines = ["# of yesterday\n", "\n"]
