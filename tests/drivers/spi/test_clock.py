@@ -339,3 +339,20 @@ def test_a_rate_wrong_by_500_parts_in_a_million_is_a_fault(wrong_ppm: int, fault
         now_ns = START_NS + second * S
         clock.round_trip(1000 + second * (TICK_HZ + wrong_ppm), now_ns, now_ns)
     assert clock.faults == faults
+
+
+@pytest.mark.parametrize(("late_pings", "remembered"), [(15, True), (16, False)])
+def test_the_best_of_the_last_sixteen_pings_is_believed(late_pings: int, remembered: bool) -> None:
+    """The last good one is up to 16 s old, so 160 us too old at ten parts in a million."""
+    clock, now_ns = exact(200)
+    for _ in range(late_pings):
+        now_ns += S
+        clock.round_trip(tick_of(now_ns, Way()), now_ns - MS * 4 // 10, now_ns)
+    error_ns = clock.host_ns(tick_of(now_ns, Way()), now_ns + MS, now_ns) - now_ns
+    assert (error_ns > -350_000) == remembered
+
+
+def test_a_first_tick_of_zero_is_no_fault() -> None:
+    clock = DeviceClock(TICK_HZ)
+    clock.host_ns(0, START_NS, START_NS)
+    assert (clock.faults, clock.fallbacks) == (0, 1)
