@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import hand
+from drivers.hand import JOINTS as HAND_JOINTS
 from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
 from drivers.palm.hall import (
     HALL_SENSORS,
@@ -146,7 +146,7 @@ RANGES_DEG = {
 
 
 def test_a_hand_has_the_joints_of_shadows_documentation() -> None:
-    assert set(RANGES_DEG) == hand.JOINTS
+    assert set(RANGES_DEG) == HAND_JOINTS
 
 
 @pytest.mark.parametrize("joint", RANGES_DEG)

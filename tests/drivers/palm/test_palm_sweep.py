@@ -173,6 +173,7 @@ def test_garbage_for_a_pressure_or_temperature_is_an_absent_sensor_whatever_the_
     """As recorded from a hand without this sensor: -22072 is 43464 unsigned."""
     stream = packets(2)
     stream[position] = change(stream[position], "mf", {"other_0": 43464})
+    stream[position] = change(stream[position], "ff", {"other_0": 4095})  # may be that high
     stream[5] = change(stream[5], "th", {"other_0": 43464})  # an electrode tells only of itself
     first, second = play_packets(stream).readings
     assert flags(first, MISSING) == [[1, electrode] for electrode in range(24)]
