@@ -46,7 +46,7 @@ class Link:
         """Times that the link was up and was lost."""
         self.reason: str | None = None
         """Why it is not up, None while it is or has not been tried."""
-        self._tries = 0
+        self._wait_s = BACKOFF_FIRST_S
         self._warned: set[str] = set()
         self._down_since_ns = 0
 
@@ -58,7 +58,7 @@ class Link:
         """Begin: the first try is due at once."""
         self.state = LinkState.WAITING
         self.reason = None
-        self._tries = 0
+        self._wait_s = BACKOFF_FIRST_S
         self._warned.clear()
         self._down_since_ns = self.retry_ns = now_ns
 
@@ -74,7 +74,7 @@ class Link:
         self.state = LinkState.UP
         self.retry_ns = None
         self.reason = None
-        self._tries = 0
+        self._wait_s = BACKOFF_FIRST_S
         self._warned.clear()
 
     def failed(self, why: str, now_ns: int) -> None:
@@ -88,9 +88,8 @@ class Link:
             self._warned.add(why)
             level = logging.WARNING
         _log.log(level, "%s: %s; trying again", self.name, why)
-        wait_s = min(BACKOFF_FIRST_S * BACKOFF_FACTOR**self._tries, BACKOFF_MAX_S)
-        self._tries = min(self._tries + 1, 64)
-        self.retry_ns = now_ns + round(wait_s * 1e9)
+        self.retry_ns = now_ns + round(self._wait_s * 1e9)
+        self._wait_s = min(BACKOFF_FACTOR * self._wait_s, BACKOFF_MAX_S)
         self.state = LinkState.WAITING
 
     def close(self) -> None:

@@ -86,11 +86,8 @@ class SampleAssembler:
         self._at_ns = 0
         self._widest_ns = 0
         self._broken = False
-        self._have = 0
-        self._last = -1
-        self._t_ns = 0
         self._origin_ns = 0.0
-        self._finished = False
+        self._begin()
 
     @property
     def period_ns(self) -> int | None:
@@ -164,17 +161,17 @@ class SampleAssembler:
         self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
         self._at_ns = t_ns
 
-    def _starts(self, place: int) -> bool:
-        """Whether a sweep begins with this sample, the first ones after opening."""
-        self._synchronised = place == 0 or place < self._last
-        self._last = -1 if self._synchronised else place
-        return self._synchronised
-
     def _begin(self) -> None:
         self._have = 0
         self._last = -1
         self._t_ns = 0
         self._finished = False
+
+    def _starts(self, place: int) -> bool:
+        """Whether a sweep begins with this sample, the first ones after opening."""
+        self._synchronised = place == 0 or place < self._last
+        self._last = -1 if self._synchronised else place
+        return self._synchronised
 
     def _untimed(self, place: int, t_ns: int) -> Sequence[TactileReading]:
         """A sample without a time ends the sweep at hand; the period is learned all the same."""

@@ -33,7 +33,6 @@ class FrameAssembler:
     ) -> None:
         """`order`: for each row when its frame comes in a sweep; each in its turn unless given."""
         self._order = range(fingers) if order is None else order
-        self._furthest = -1
         self._fingers = fingers
         self._all = (1 << fingers) - 1
         self._readings = ReadingMaker(counters)
@@ -41,11 +40,15 @@ class FrameAssembler:
         self._words = np.zeros((fingers, ELECTRODES), dtype=np.uint16)
         self._faults = np.zeros(fingers, dtype=np.uint8)
         self._current: int | None = None
-        self._tick_us = 0
         self._synchronised = False
         self._finished_ns: int | None = None
+        self._begin(0, 0)
+
+    def _begin(self, tick_us: int, t_ns: int) -> None:
+        self._tick_us = tick_us
         self._have = 0
-        self._begun_ns = 0
+        self._furthest = -1
+        self._begun_ns = t_ns
         self._t_ns = 0
         self._finished = False
 
@@ -101,20 +104,12 @@ class FrameAssembler:
         period_ns = self._readings.period_ns
         return PATIENCE_NS if period_ns is None else min(PATIENCE_PERIODS * period_ns, OUTAGE_NS)
 
-    def _begin(self, tick_us: int, t_ns: int) -> None:
-        self._tick_us = tick_us
-        self._have = 0
-        self._furthest = -1
-        self._begun_ns = t_ns
-        self._t_ns = 0
-        self._finished = False
-
     def _is_late(self, sequence: int, tick_us: int, t_ns: int) -> bool:
         """Whether a frame is of one of the sweeps just before: by number, time and tick."""
         if self._current is None or t_ns - self._t_ns > self._patience_ns():
             return False
         back = (self._current - sequence) % (1 << 16)
-        return 0 < back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _TICKS // 2
+        return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _TICKS // 2
 
     def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
         """Begin a sweep; count those left out, or a device that started anew."""

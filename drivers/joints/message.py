@@ -137,7 +137,7 @@ class MessageOrder:
             return False
         if last is not None and now > last and counted:
             self._count_gap(int(now - last) - 1)
-        self._last, self._counted, self._last_old, self._old_in_a_row = now, counted, None, 0
+        self._last, self._counted, self._last_old = now, counted, None
         return True
 
     def _began_anew(self, now: float) -> bool:

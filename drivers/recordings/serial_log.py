@@ -60,11 +60,9 @@ class SerialLogParser:
     def feed(self, chunk: bytes) -> Iterator[SerialRecord]:
         """Records that these bytes complete, oldest first."""
         for kind, payload in self._frames.feed(chunk):
-            if kind not in _EVENTS or len(payload) < _TIME.size:
-                self._frames.counters.bad_crc += 1
-                continue
-            (t_ns,) = _TIME.unpack_from(payload)
-            yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
+            if kind in _EVENTS and len(payload) >= _TIME.size:
+                (t_ns,) = _TIME.unpack_from(payload)
+                yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
 
 
 class SerialLog:

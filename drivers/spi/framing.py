@@ -117,7 +117,7 @@ class FrameParser:
             self.counters.bad_cobs += 1
             return None
         body = decoded[: -_CRC.size]
-        seed = 0 if decoded[:1] and decoded[0] in self._unseeded else self._digest
+        seed = 0 if decoded and decoded[0] in self._unseeded else self._digest
         if len(decoded) < _SHORTEST or _CRC.pack(zlib.crc32(body, seed)) != decoded[-_CRC.size :]:
             self.counters.bad_crc += 1
             return None

@@ -162,7 +162,7 @@ def _reason(error: Exception) -> str:
         return "another program has it open"
     if number is not None:
         return os.strerror(number).lower()
-    return str(error).split("\n", 1)[0]
+    return str(error).partition("\n")[0]
 
 
 def _loss(error: Exception) -> str:

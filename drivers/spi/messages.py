@@ -340,5 +340,5 @@ def _text_to_bytes(text: str) -> bytes:
 
 def _text(padded: bytes) -> str:
     """A sensor that answers nonsense must not take the link down: odd bytes become `?`."""
-    text = padded.split(b"\0", 1)[0].decode("ascii", errors="replace")
+    text = padded.partition(b"\0")[0].decode("ascii", errors="replace")
     return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text)

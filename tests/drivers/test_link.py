@@ -6,28 +6,46 @@ import logging
 
 import pytest
 
-from drivers.link import BACKOFF_FIRST_S, BACKOFF_MAX_S, Link, LinkState
+from drivers.link import Link, LinkState
 from tests.drivers.spi.bridge_bench import Clock
 
 
-def test_patience_grows_up_to_a_limit_and_begins_anew_when_the_link_is_up() -> None:
+def test_patience_grows_up_to_a_second_and_begins_anew_when_the_link_is_up() -> None:
     clock = Clock()
     link = Link("spi")
     link.start(clock.now_ns)
     assert link.retry_ns == clock.now_ns
     waits_s = []
-    for _ in range(12):
+    for _ in range(2000):  # half an hour
         link.failed("not there", clock.now_ns)
         assert link.retry_ns is not None
         waits_s.append((link.retry_ns - clock.now_ns) / 1e9)
+        assert not link.is_due(link.retry_ns - 1)
         clock.now_ns = link.retry_ns
-    assert waits_s == sorted(waits_s)
-    assert (waits_s[0], waits_s[-1]) == (BACKOFF_FIRST_S, BACKOFF_MAX_S)
+        assert link.is_due(clock.now_ns)
+        assert link.is_due(clock.now_ns + 1)
+    # From 50 ms on, each 1.8 times the one before.
+    first_s = [0.05, 0.09, 0.162, 0.2916, 0.52488, 0.944784, 1.0]
+    assert waits_s == pytest.approx(first_s + [1.0] * (2000 - 7))
     link.greeting()
+    assert link.is_due(0), "nothing to wait for"
     link.up("a device", clock.now_ns)
     link.failed("gone", clock.now_ns)
-    assert link.retry_ns is not None
-    assert (link.retry_ns - clock.now_ns) / 1e9 == BACKOFF_FIRST_S
+    assert link.retry_ns == clock.now_ns + 50_000_000
+
+
+def test_the_journal_says_how_long_a_link_was_down(caplog: pytest.LogCaptureFixture) -> None:
+    link = Link("spi")
+    with caplog.at_level(logging.INFO):
+        link.start(2_000_000_000)
+        link.up("a device", 5_250_000_000)
+        link.failed("gone", 8_000_000_000)
+        link.failed("not there", 8_100_000_000)
+        link.up("a device", 9_000_000_000)
+    assert [r.getMessage() for r in caplog.records if r.levelname == "INFO"] == [
+        "spi: up after 3.25 s: a device",
+        "spi: up after 1.00 s: a device",
+    ]
 
 
 def test_only_a_link_that_was_up_is_lost() -> None:

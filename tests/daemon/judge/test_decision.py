@@ -16,7 +16,7 @@ import pytest
 from daemon.judge import decision
 from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.reasons import Decision, Reason
-from tests.daemon.judge.mutants import load, mutants
+from tests.bench.mutants import mutants
 
 LIMIT_NS = 100
 THRESHOLD = 0.4
@@ -113,12 +113,22 @@ def test_the_defaults_ask_for_no_confidence() -> None:
         assert decide(case, limits) == (decided, ())
 
 
+@pytest.mark.parametrize(("age_ns", "stale"), [(100_000_000, False), (100_000_001, True)])
+def test_by_default_a_reading_is_stale_after_a_tenth_of_a_second(age_ns: int, stale: bool) -> None:
+    """Ten periods at 100 Hz: no message for so long means unknown, too."""
+    case = Case(0.1, (), in_contact=True, settled=True, gate=(), age_ns=age_ns)
+    assert decide(case, Limits())[1] == ((Reason.STALE,) if stale else ())
+
+
 def test_every_small_mistake_in_the_rule_would_be_noticed() -> None:
-    changed = list(mutants(inspect.getsource(decision), "decide"))
+    changed = list(mutants(inspect.getsource(decision), within="decide"))
     assert len(changed) > 30
-    survivors = [
-        what for what, source in changed if not broken_cases(load(source, decision)["decide"])
-    ]
+    survivors = []
+    for mutant in changed:
+        names: dict[str, Any] = {"__name__": decision.__name__}
+        exec(mutant.code(), names)
+        if not broken_cases(names["decide"]):
+            survivors.append(f"line {mutant.line}: {mutant.what}")
     assert survivors == []
 
 

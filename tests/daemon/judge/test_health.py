@@ -6,19 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.health import (
-    JUMP_COUNTS,
-    JUMPS_FADE,
-    JUMPS_MAX,
-    STILL,
-    STILL_COUNTS,
-    UNCHANGED_MAX,
-    Health,
-)
+from daemon.judge.health import Health, too_many
 from daemon.judge.reasons import Reason
-from drivers.base import TactileReading
+from drivers.base import ElectrodeFault, TactileReading
 
 FINGERS = 3
+# What wears an electrode out, by the words of `daemon.judge.health`.
+UNCHANGED_MAX = 16
+JUMP_COUNTS, JUMPS_MAX, JUMPS_FADE = 150, 2.0, 0.9
+STILL, STILL_COUNTS = 20, 30
 Counts = NDArray[np.uint16]
 Flags = NDArray[np.uint8]
 
@@ -112,3 +108,149 @@ def test_what_is_shared_by_all_sound_readings_cannot_be_written() -> None:
     assert not watched.broken.any()
     with pytest.raises(ValueError, match="read-only"):
         watched.broken[0, 0] = True
+
+
+def watched(steps: NDArray[np.int64]) -> tuple[Health, list[dict[tuple[int, int], Reason]]]:
+    """What was found in electrodes that go from 2000 by `steps`, shape (sweeps, 24), finger 1.
+
+    The electrodes of the other fingers go up and down by one.
+    """
+    health, found = Health(FINGERS), []
+    flags = np.zeros((FINGERS, 24), dtype=np.uint8)
+    for place in range(len(steps) + 1):
+        counts = np.full((FINGERS, 24), 2000 + place % 2)
+        counts[1] = 2000 + steps[:place].sum(axis=0)
+        health.watch(TactileReading(place, place, counts.astype(np.uint16), flags))
+        found.append(health.electrodes())
+    return health, found
+
+
+def steps_of(sweeps: int, jumps: dict[int, int], movers: int = 1, by: int = 0) -> NDArray[np.int64]:
+    """All electrodes go up and down by one, the first by `jumps` (by sweep), others by `by`."""
+    steps = np.tile((-1) ** np.arange(sweeps)[:, None], (1, 24))
+    for sweep, jump in jumps.items():
+        steps[sweep, 1:movers] = by
+        steps[sweep, 0] = jump
+    return steps
+
+
+@pytest.mark.parametrize(
+    ("jumps", "jumpy"),
+    [
+        ({0: 151, 1: -151, 2: 151}, True),
+        ({at: 150 * (-1) ** at for at in range(5)}, False),  # the highest spike
+        ({0: -151, 1: 151, 2: -151}, True),
+        ({at: -150 * (-1) ** at for at in range(5)}, False),
+        ({0: 151, 1: -151}, False),  # twice may be a spike
+        ({0: 151, 1: -151, 7: 151}, True),  # 0.9**6 * (0.9 + 1) + 1 = 2.01
+        ({0: 151, 1: -151, 8: 151}, False),  # 1.91
+    ],
+)
+def test_an_electrode_jumps_by_more_than_a_spike_and_more_than_twice(
+    jumps: dict[int, int], jumpy: bool
+) -> None:
+    _, found = watched(steps_of(max(jumps) + 1, jumps))
+    assert [named == {(1, 0): Reason.ELECTRODE_JUMPS} for named in found] == [
+        *([False] * (len(found) - 1)),
+        jumpy,
+    ]
+
+
+@pytest.mark.parametrize(("movers", "by", "jumpy"), [(4, 31, True), (5, 31, False), (5, 30, True)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_it_jumps_while_the_others_keep_still(movers: int, by: int, jumpy: bool, sign: int) -> None:
+    """A touch moves more than four electrodes by more than 30 counts."""
+    jumps = {0: 400, 1: -400, 2: 400}
+    steps = steps_of(3, {at: sign * jump for at, jump in jumps.items()}, movers, sign * by)
+    _, found = watched(steps)
+    assert ((1, 0) in found[-1]) == jumpy
+
+
+def test_an_electrode_is_dead_that_keeps_its_count_in_16_readings() -> None:
+    steps = steps_of(40, {})
+    steps[:16, 0] = 0
+    steps[17:, 5] = 0  # from 17 on
+    _, found = watched(steps)
+    named = [set(each) for each in found]
+    assert named[15] == set()
+    assert named[16] == {(1, 0)}
+    assert named[17] == set(), "it has changed"
+    assert named[32] == set()
+    assert named[33] == {(1, 5)}
+
+
+@pytest.mark.parametrize(
+    ("broken", "found"),
+    [
+        ((8, 4, 0), False),
+        ((8, 5, 0), True),  # more than 12
+        ((9, 0, 0), True),  # more than 8 of one finger
+        ((4, 4, 4), False),
+        ((5, 4, 4), True),
+        ((0, 0, 0), False),
+    ],
+)
+def test_twelve_broken_electrodes_of_a_hand_and_eight_of_a_finger_can_be_repaired(
+    broken: tuple[int, ...], found: bool
+) -> None:
+    mask = np.array([np.arange(24) < number for number in broken])
+    assert too_many(mask) == found
+
+
+@pytest.mark.parametrize(
+    ("count", "railed"), [(0, True), (1, False), (4094, False), (4095, True), (65535, True)]
+)
+def test_rails_are_broken_and_their_neighbours_are_not(count: int, railed: bool) -> None:
+    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    counts[2, 7] = count
+    health = Health(FINGERS)
+    broken = health.watch(TactileReading(0, 0, counts, np.zeros((3, 24), dtype=np.uint8))).broken
+    assert broken.sum() == broken[2, 7] == railed
+    assert health.electrodes() == ({(2, 7): Reason.SATURATED} if railed else {})
+
+
+@pytest.mark.parametrize("flagged", [False, True])
+@pytest.mark.parametrize("finger", range(FINGERS))
+def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) -> None:
+    """All others change in every electrode; what is flagged was not read and hides nothing."""
+    health, reasons = Health(FINGERS), []
+    for place in range(2):
+        counts = np.full((FINGERS, 24), 2000 + place, dtype=np.uint16)
+        flags = np.zeros((FINGERS, 24), dtype=np.uint8)
+        counts[finger] = 1500
+        if flagged:
+            counts[finger, 3] += place
+            flags[finger, 3] = 1
+        reasons.append(health.watch(TactileReading(place, place, counts, flags)).reasons)
+    assert reasons == [(), (Reason.FROZEN,)]
+
+
+def test_electrodes_of_all_fingers_that_repeat_themselves_are_no_held_finger() -> None:
+    """Ten of each finger, as a palm at 71.43 Hz read at 100 Hz: 2 of 7, and quiet ones."""
+    health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
+    for place in range(5):
+        counts = np.full((FINGERS, 24), 2000 + place, dtype=np.uint16)
+        counts[:, :10] = 2000
+        assert health.watch(TactileReading(place, place, counts, flags)).reasons == ()
+
+
+def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
+    health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
+    flags[0, 5] = ElectrodeFault.PARITY | ElectrodeFault.NOT_A_COUNT
+    flags[1, 6] = ElectrodeFault.ERROR_WORD
+    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    found = health.watch(TactileReading(0, 0, counts, flags))
+    assert (found.reasons, int(found.broken.sum())) == ((), 2)
+    assert health.electrodes() == {(0, 5): Reason.NOT_A_COUNT, (1, 6): Reason.ERROR_WORD}
+
+
+@pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF, 64])
+def test_a_fault_that_is_not_of_one_electrode_speaks_against_the_reading(flag: int) -> None:
+    flags = np.zeros((FINGERS, 24), dtype=np.uint8)
+    flags[2, 23] = flag
+    flags[0, 1] = ElectrodeFault.PARITY
+    counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
+    named = {16: Reason.HELD, 32: Reason.CUT_OFF}.get(int(flag))
+    found = Health(FINGERS).watch(TactileReading(0, 0, counts, flags))
+    assert found.reasons == ((Reason.PARITY, named) if named else (Reason.PARITY,))
+    assert np.argwhere(found.broken).tolist() == [[0, 1], [2, 23]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,24 +10,15 @@ from numpy.typing import NDArray
 
 from drivers.base import TactileReading
 from drivers.biotac import E1, SEQUENCES
-from drivers.can.frames import (
-    CAN_FRAME,
-    CANFD_FRAME,
-    CLASSIC_DATA_MAX,
-    EFF_FLAG,
-    ERR_FLAG,
-    ERROR,
-    EXTENDED,
-    EXTENDED_ID_MAX,
-    FD,
-    FD_DATA_MAX,
-    REMOTE,
-    RTR_FLAG,
-    STANDARD_ID_MAX,
-    CanFrame,
-)
+from drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
 from drivers.can.readings import CanCounters
 from drivers.can.samples import SampleAssembler
+
+# linux/can.h
+EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
+STANDARD_ID_MAX, EXTENDED_ID_MAX = 0x7FF, 0x1FFFFFFF
+CLASSIC_DATA_MAX, FD_DATA_MAX = 8, 64
+CAN_FRAME, CANFD_FRAME = struct.Struct("=IB3x8s"), struct.Struct("=IBB2x64s")
 
 FINGERS = 3
 SLOT_NS = 227_000

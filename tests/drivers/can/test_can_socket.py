@@ -12,7 +12,6 @@ import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.can.driver import (
-    REST_MAX_NS,
     CanBridgeDriver,
 )
 from drivers.can.formats import CanFormat
@@ -30,6 +29,8 @@ from tests.drivers.can.can_standin import (
     tactile,
 )
 from tests.drivers.can.can_words import SLOT_NS, Clock, pack_frame, truth
+
+REST_MAX_NS = 15_000_000
 
 MS = 1_000_000
 
@@ -241,6 +242,25 @@ def test_the_loop_rests_while_no_reading_is_near(socket_bus: SocketBus) -> None:
         assert rests > 0
         driver.close()
         assert driver.due_ns() is driver.fileno() is None
+
+
+def test_the_loop_rests_until_a_millisecond_before_a_reading_and_fifteen_at_most(
+    socket_bus: SocketBus,
+) -> None:
+    clock = Clock()
+    rests: dict[int, int | None] = {}
+    with over_socket(clock=clock, wall_clock=clock) as driver:
+        for sweep in range(8):  # a sample a millisecond: a sweep takes 24
+            for at, frame in enumerate(sweep_of_frames(sweep)):
+                clock.now_ns += MS
+                socket_bus.send(frame)
+                driver.read_ready()
+                due_ns = driver.due_ns()
+                assert due_ns is not None
+                is_resting = driver.fileno() is None
+                rests[at] = (due_ns - clock.now_ns) // MS if is_resting else None
+    left = {at: 23 - at for at in range(23)} | {23: 24}
+    assert rests == {at: min(ms - 1, 15) if ms > 1 else None for at, ms in left.items()}
 
 
 def test_real_socketcan_plays_count_for_count() -> None:

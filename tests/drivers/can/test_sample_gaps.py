@@ -11,7 +11,7 @@ import pytest
 
 from drivers.base import TactileReading
 from drivers.biotac import SEQUENCES
-from drivers.can.samples import NEXT_SWEEP_PERIODS, SampleAssembler
+from drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
     FINGERS,
     SLOT_NS,
@@ -22,6 +22,8 @@ from tests.drivers.can.can_words import (
     samples,
     truth,
 )
+
+NEXT_SWEEP_PERIODS = 0.75
 
 MS = 1_000_000
 

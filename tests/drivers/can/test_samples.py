@@ -9,7 +9,7 @@ import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.biotac import PAC, PDC, SEQUENCE_ELECTRODES, SEQUENCES
-from drivers.can.readings import OUTAGE_NS, PERIODS_NEEDED, CanCounters
+from drivers.can.readings import CanCounters
 from drivers.can.samples import SampleAssembler
 from tests.drivers.can.can_words import (
     FINGERS,
@@ -22,6 +22,9 @@ from tests.drivers.can.can_words import (
     truth,
     word,
 )
+
+OUTAGE_NS = 2_000_000_000
+PERIODS_NEEDED = 5
 
 MISSING = ElectrodeFault.MISSING
 SWEEP_NS = 24 * SLOT_NS

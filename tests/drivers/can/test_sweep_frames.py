@@ -5,9 +5,15 @@ from __future__ import annotations
 import pytest
 
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.can.readings import OUTAGE_NS, PERIODS_NEEDED, CanCounters
-from drivers.can.sweep_frames import LATE_FRAMES_MAX, SEQUENCE_JUMP_MAX, FrameAssembler
+from drivers.can.readings import CanCounters
+from drivers.can.sweep_frames import FrameAssembler
 from tests.drivers.can.can_words import FINGERS, assert_true, truth, word
+
+OUTAGE_NS = 2_000_000_000
+PERIODS_NEEDED = 5
+LATE_FRAMES_MAX = 8
+SEQUENCE_JUMP_MAX = 1000
+"""Ten seconds of sweeps; more is a new start."""
 
 MISSING = ElectrodeFault.MISSING
 
@@ -70,6 +76,80 @@ def test_gaps_in_the_sequence_are_missed_readings_across_its_wrap() -> None:
     assert second.seq == first.seq + 5
     assert counters.missed_readings == 4
     assert counters.restarts == 0
+
+
+@pytest.mark.parametrize(("jump", "missed"), [(1, 0), (2, 1), (1000, 999)])
+def test_up_to_a_thousand_sweeps_may_be_missing(jump: int, missed: int) -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 5)
+    whole(sweeps, 5 + jump)
+    assert (counters.missed_readings, counters.restarts) == (missed, 0)
+
+
+@pytest.mark.parametrize(
+    ("late_ns", "of_the_sweep"), [(2 * 10_000_000, True), (2 * 10_000_000 + 1, False)]
+)
+def test_a_frame_may_come_two_periods_after_the_first_of_its_sweep(
+    late_ns: int, of_the_sweep: bool
+) -> None:
+    sweeps, counters = frame_sweeps()
+    due_ns = running(sweeps, 9)
+    push(sweeps, 0, 9, due_ns)
+    push(sweeps, 1, 9, due_ns)
+    (reading,) = push(sweeps, 2, 9, due_ns + late_ns)
+    assert (not reading.faults.any()) == of_the_sweep
+    assert counters.restarts == (not of_the_sweep)
+
+
+@pytest.mark.parametrize(("late_ns", "restarts"), [(100_000_000, 0), (100_000_001, 1)])
+def test_a_tenth_of_a_second_while_the_period_is_not_known(late_ns: int, restarts: int) -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 1)
+    push(sweeps, 0, 2, 10)
+    push(sweeps, 1, 2, 10 + late_ns)
+    assert counters.restarts == restarts
+
+
+def test_a_late_frame_is_one_of_the_two_periods_before() -> None:
+    for late_ns, late in ((2 * PERIOD_NS, 1), (2 * PERIOD_NS + 1, 0)):
+        sweeps, counters = frame_sweeps()
+        due_ns = running(sweeps, 9)
+        push(sweeps, 0, 7, due_ns - PERIOD_NS + late_ns)
+        assert (counters.late_frames, counters.restarts) == (late, 1 - late)
+
+
+def test_a_late_frame_is_told_from_a_new_start_across_the_wrap() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, (1 << 16) + 3)
+    assert push(sweeps, 0, (1 << 16) - 2) == []
+    assert (counters.late_frames, counters.restarts) == (1, 0)
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 5000)
+    (reading,) = whole(sweeps, 5000 + (1 << 15) - 8, tick_us=17)  # half of all numbers away
+    assert_true(reading, 5000 + (1 << 15) - 8)
+    assert (counters.late_frames, counters.restarts) == (0, 1)
+
+
+def test_a_sweep_that_was_joined_in_the_middle_after_an_interruption_is_missed() -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 0)
+    sweeps.interrupt()
+    assert push(sweeps, 1, 5) == []
+    (reading,) = whole(sweeps, 6)
+    assert (reading.seq, counters.missed_readings, counters.unsynchronised_frames) == (6, 5, 1)
+
+
+def test_frames_of_a_sweep_that_come_in_another_order_are_counted() -> None:
+    sweeps, counters = frame_sweeps()
+    for row in (1, 0, 2):
+        push(sweeps, row, 0)
+    whole(sweeps, 1)
+    assert counters.reordered_frames == 1
+    counters = CanCounters()
+    sweeps = FrameAssembler(FINGERS, counters, order=(2, 0, 1))  # row 1 comes first
+    for row in (1, 2, 0):
+        push(sweeps, row, 0)
+    assert counters.reordered_frames == 0
 
 
 def test_duplicated_and_late_frames_change_nothing() -> None:
@@ -204,6 +284,14 @@ def test_an_interrupted_frame_sweep_is_missed() -> None:
     (after,) = whole(sweeps, 2)
     assert after.seq == before.seq + 2
     assert (counters.interrupted_sweeps, counters.missed_readings) == (1, 1)
+
+
+@pytest.mark.parametrize(("gap_ns", "learned"), [(OUTAGE_NS, True), (OUTAGE_NS + 1, False)])
+def test_no_period_is_learned_from_an_outage(gap_ns: int, learned: bool) -> None:
+    sweeps, _ = frame_sweeps()
+    for sweep in range(PERIODS_NEEDED + 1):
+        whole(sweeps, sweep, 1 + sweep * gap_ns)
+    assert sweeps.period_ns == (gap_ns if learned else None)
 
 
 def test_the_frame_period_is_learned() -> None:

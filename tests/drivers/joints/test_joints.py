@@ -15,15 +15,17 @@ from hypothesis import strategies as st
 from drivers.base import Driver, JointReading, LinkError
 from drivers.joints.driver import JointStreamDriver
 from drivers.joints.message import (
-    DATAGRAM_BYTES_MAX,
     JointCounters,
     JointMessage,
     JointParser,
+    MessageOrder,
 )
 from drivers.link import LinkState
 from drivers.twins.faults import LinkFaults
 from drivers.twins.joints import JointTwin
 from tests.drivers.palm.palm_stream import MS, Clock, Sender, joints, listen
+
+DATAGRAM_BYTES_MAX = 4096
 
 LOOPBACK = "udp://127.0.0.1:0"
 
@@ -165,6 +167,49 @@ def test_a_message_is_written_as_it_is_read() -> None:
     assert np.array_equal(found.position_rad, sent.position_rad)
     with pytest.raises(ValueError, match="not JSON compliant"):
         JointMessage(7, 1.5, ("FFJ3",), np.array([math.nan])).to_bytes()
+
+
+@pytest.mark.parametrize(("length", "taken"), [(4096, True), (4097, False)])
+def test_a_datagram_has_at_most_four_kilobytes(length: int, taken: bool) -> None:
+    found, counters = parse(message(1).ljust(length))
+    assert (found is not None) == taken
+    assert counters.bad_messages == (not taken)
+    names = ("FFJ3", "x" * (length - len(b'{"seq":1,"joints":{"FFJ3":0.5,"":0.5}}')))
+    long = JointMessage(1, None, names, np.array([0.5, 0.5]))
+    if taken:
+        assert len(long.to_bytes()) == length
+    else:
+        with pytest.raises(ValueError, match="4097 bytes are more than 4096"):
+            long.to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("seq", "taken"), [(0, True), ((1 << 63) - 1, True), (1 << 63, False), (-1, False)]
+)
+def test_a_number_fits_into_a_signed_integer_of_64_bits(seq: int, taken: bool) -> None:
+    found, counters = parse(message(seq))
+    assert (found is not None, counters.bad_messages) == (taken, int(not taken))
+
+
+@pytest.mark.parametrize(("step", "missed", "restarts"), [(1001, 1000, 0), (1002, 0, 1)])
+def test_a_jump_by_more_than_a_thousand_is_a_new_start(
+    step: int, missed: int, restarts: int
+) -> None:
+    counters = JointCounters()
+    order = MessageOrder(counters)
+    for seq in (5, 5 + step):
+        assert order.admits(JointMessage(seq, None, (), np.empty(0)))
+    assert (counters.missed_readings, counters.restarts) == (missed, restarts)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "angle"), [(200.0, True), (-200.0, True), (200.01, False), (-200.01, False)]
+)
+def test_no_joint_turns_further_than_200_degrees(degrees: float, angle: bool) -> None:
+    found, counters = parse(message(FFJ0=math.radians(degrees)))
+    assert found is not None
+    assert math.isnan(found.position_rad[0]) == (not angle)
+    assert counters.bad_angles == (not angle)
 
 
 def test_the_joint_stream_is_a_driver() -> None:

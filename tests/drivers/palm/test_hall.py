@@ -13,8 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.hand import JOINTS as HAND_JOINTS
 from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
-from drivers.palm.hall import JOINTS, Calibration, CoupledTable, Table, impossible_angles
+from drivers.palm.hall import (
+    HALL_SENSORS,
+    JOINTS,
+    Calibration,
+    CoupledTable,
+    Table,
+    impossible_angles,
+)
 
 EXAMPLE = Path(__file__).parents[3] / "deploy" / "calibration" / "example_hand.toml"
 FFJ1 = [[3109, 0.0], [2673, 22.5], [1942, 45.0], [1247, 67.5], [649, 90.0]]
@@ -123,6 +131,99 @@ def test_impossible_angles_are_counted_and_not_changed() -> None:
     assert by_name["FFJ3"] == pytest.approx(-90 * (3205 - 2487) / (2487 - 946))  # -41.9
     assert by_name["THJ4"] == pytest.approx(67.5 * (2496 - 1403) / (2260 - 1403))  # 86.1
     assert impossible_angles(angles) == 2
+
+
+# Shadow's documentation, md_ranges.rst; J0 is the sum of J1 and J2.
+RANGES_DEG = {
+    **{f"{finger}J0": (0, 180) for finger in ("FF", "MF", "RF", "LF")},
+    **{f"{finger}J1": (0, 90) for finger in ("FF", "MF", "RF", "LF")},
+    **{f"{finger}J2": (0, 90) for finger in ("FF", "MF", "RF", "LF")},
+    **{f"{finger}J3": (-15, 90) for finger in ("FF", "MF", "RF", "LF")},
+    **{f"{finger}J4": (-20, 20) for finger in ("FF", "MF", "RF", "LF")},
+    **{"LFJ5": (0, 45), "THJ1": (-15, 90), "THJ2": (-40, 40), "THJ3": (-12, 12)},
+    **{"THJ4": (0, 70), "THJ5": (-60, 60), "WRJ1": (-40, 28), "WRJ2": (-28, 10)},
+}
+
+
+def test_a_hand_has_the_joints_of_shadows_documentation() -> None:
+    assert set(RANGES_DEG) == HAND_JOINTS
+
+
+@pytest.mark.parametrize("joint", RANGES_DEG)
+def test_an_angle_is_impossible_ten_degrees_beyond_the_range_of_its_joint(joint: str) -> None:
+    assert set(JOINTS) == set(RANGES_DEG)
+    low, high = RANGES_DEG[joint]
+    for angle, impossible in (
+        *((low - 10.01, 1), (low - 9.99, 0), (low, 0)),
+        *((high, 0), (high + 9.99, 0), (high + 10.01, 1)),
+    ):
+        angles = np.full(28, np.nan)
+        angles[JOINTS.index(joint)] = math.radians(angle)
+        assert impossible_angles(angles) == impossible
+
+
+@pytest.mark.parametrize(
+    ("joint", "degrees", "refused"),
+    [(joint, edge + side * by, by > 10) for joint, edges in RANGES_DEG.items()
+     if joint not in ("THJ1", "THJ2") and not joint.endswith("J0")
+     for edge, side in zip(edges, (-1, 1), strict=True) for by in (10, 10.5)],
+)  # fmt: skip
+def test_a_table_reaches_ten_degrees_beyond_the_range_of_its_joint(
+    joint: str, degrees: float, refused: bool
+) -> None:
+    low, high = RANGES_DEG[joint]
+    rows = sorted([[degrees], [(low + high) / 2]])
+    data: dict[str, object] = {
+        "version": 1,
+        "joints": {joint: [[1000, *rows[0]], [3000, *rows[1]]]},
+    }
+    if refused:
+        (problem,) = problems(data)
+        assert f"the joint goes from {low} to {high}" in problem
+    else:
+        parse_calibration(data, FILE)
+
+
+def test_sensors_stand_where_shadows_headers_have_them() -> None:
+    """`sensors[]` of the palm headers: THJ5 and WRJ1 have two, A and B."""
+    order = [f"{finger}J{joint}" for finger in ("FF", "MF", "RF") for joint in (1, 2, 3, 4)]
+    order += ["LFJ1", "LFJ2", "LFJ3", "LFJ4", "LFJ5", "THJ1", "THJ2", "THJ3", "THJ4"]
+    order += ["THJ5", "THJ5", "WRJ1", "WRJ1", "WRJ2"]
+    assert {
+        joint: tuple(word for word, name in enumerate(order) if name == joint) for joint in order
+    } == HALL_SENSORS
+
+
+@pytest.mark.parametrize(("steep", "refused"), [(0.5, False), (0.51, True)])
+def test_half_a_degree_per_count_is_the_steepest(steep: float, refused: bool) -> None:
+    tables: list[dict[str, object]] = [
+        {"version": 1, "joints": {"FFJ1": [[1000, 0.0], [1100, 100 * steep]]}},
+        coupled([[1000, 1000, 0, -15], [1060, 1080, 0, 100 * steep - 15], [1060, 1000, 0, 10]]),
+    ]
+    for data in tables:
+        if refused:
+            assert any("steeper than 0.5" in problem for problem in problems(data))
+        else:
+            parse_calibration(data, FILE)
+
+
+@pytest.mark.parametrize(("number", "refused"), [(1, True), (2, False), (64, False), (65, True)])
+def test_a_table_has_2_to_64_points(number: int, refused: bool) -> None:
+    rows = [[1000 + 10 * row, row / 2] for row in range(number)]
+    data: dict[str, object] = {"version": 1, "joints": {"FFJ1": rows}}
+    if refused:
+        assert problems(data) == (f"FFJ1: has {number} points, must have 2 to 64",)
+    else:
+        parse_calibration(data, FILE)
+
+
+@pytest.mark.parametrize(("number", "refused"), [(2, True), (3, False), (49, False), (50, True)])
+def test_the_coupled_table_has_3_to_49_points(number: int, refused: bool) -> None:
+    rows = [[1000 + 100 * (row % 2), 1000 + 60 * (row // 2), row % 2, 0] for row in range(number)]
+    if refused:
+        assert problems(coupled(rows)) == (f"THJ1_THJ2: has {number} points, must have 3 to 49",)
+    else:
+        parse_calibration(coupled(rows), FILE)
 
 
 # THJ1 and THJ2: five by five raw pairs, as a hand is calibrated.
@@ -256,6 +357,27 @@ def test_a_file_that_cannot_be_read_is_refused_by_its_path(
         path.write_bytes(content)
     with pytest.raises(CalibrationError, match=re.escape(f"{path}: {reason}")):
         load_calibration(path)
+
+
+@pytest.mark.parametrize(("length", "taken"), [(262_144, True), (262_145, False)])
+def test_a_file_has_at_most_256_kilobytes(tmp_path: Path, length: int, taken: bool) -> None:
+    path = tmp_path / "hand.toml"
+    path.write_text(EXAMPLE.read_text().ljust(length, "#"))
+    assert path.stat().st_size == length
+    if taken:
+        assert load_calibration(path).tables
+    else:
+        with pytest.raises(CalibrationError, match="is longer than 262144 bytes"):
+            load_calibration(path)
+
+
+@pytest.mark.parametrize(("raw", "taken"), [(1, True), (4095, True), (4096, False)])
+def test_a_raw_value_has_12_bits(raw: float, taken: bool) -> None:
+    data: dict[str, object] = {"version": 1, "joints": {"FFJ1": [[raw, 0.0], [2000, 45.0]]}}
+    if taken:
+        parse_calibration(data, FILE)
+    else:
+        assert problems(data) == (f"FFJ1: raw {raw} is not in 1..4095",)
 
 
 def test_the_example_says_what_is_missing() -> None:

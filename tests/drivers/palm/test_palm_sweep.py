@@ -121,7 +121,9 @@ def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
     stream = packets(3)
     for index in (2, ROUND + 2):  # E2 and E3 of rounds 0 and 1, without the bit of other_sensor_1
         stream[index] = change(stream[index], "mf", {"valid": 0b0111})
-    first, second, third = play_packets(stream[ROUND:] + stream[:ROUND]).readings
+    played = play_packets(stream[ROUND:] + stream[:ROUND])
+    assert played.counters.held_values == 2
+    first, second, third = played.readings
     assert flags(first, MISSING) == [[1, 2]]  # nothing older is known
     assert not second.faults.any()
     assert flags(third, HELD) == [[1, 2]]
@@ -143,8 +145,9 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
     stream = packets(2)
     for index in range(5, ROUND):
         stream[index] = change(stream[index], "ff", {}, tactile_valid=0b10010)
-    reading = play_packets(stream).readings[0]
-    assert flags(reading, MISSING) == [[0, electrode] for electrode in range(7, 24)]
+    played = play_packets(stream)
+    assert flags(played.readings[0], MISSING) == [[0, electrode] for electrode in range(7, 24)]
+    assert played.counters.invalid_fingers == ROUND - 5
     sweeps = RoundAssembler(FINGERS, PalmCounters(), heed_finger_bits=False)
     heedless = [reading for packet in stream for reading in sweeps.push(packet, 0)]
     assert not heedless[0].faults.any()
@@ -161,6 +164,38 @@ def test_the_garbage_of_an_absent_sensor_is_no_reading() -> None:
         assert flags(reading, MISSING) == [[1, electrode] for electrode in range(24)]
         assert np.array_equal(reading.counts[::2], row[::2])
     assert played.counters.absent_fingers == 20
+
+
+@pytest.mark.parametrize("position", [0, 1])
+def test_garbage_for_a_pressure_or_temperature_is_an_absent_sensor_whatever_the_electrodes_say(
+    position: int,
+) -> None:
+    """As recorded from a hand without this sensor: -22072 is 43464 unsigned."""
+    stream = packets(2)
+    stream[position] = change(stream[position], "mf", {"other_0": 43464})
+    stream[position] = change(stream[position], "ff", {"other_0": 4095})  # may be that high
+    stream[5] = change(stream[5], "th", {"other_0": 43464})  # an electrode tells only of itself
+    first, second = play_packets(stream).readings
+    assert flags(first, MISSING) == [[1, electrode] for electrode in range(24)]
+    assert flags(first, NOT_A_COUNT) == [[2, 7]]
+    assert not second.faults.any()
+    stale = change(packets(1)[position], "mf", {"other_0": 43464, "valid": 0b1011})
+    (reading,) = play_packets(
+        [stale if at == position else p for at, p in enumerate(packets(1))]
+    ).readings
+    assert not flags(reading, NOT_A_COUNT)
+    assert [1, 5] not in flags(reading, MISSING), "what is not fresh tells nothing"
+
+
+def test_a_finger_of_nothing_but_zeros_is_absent() -> None:
+    stream = packets(2)
+    for index in range(ROUND):
+        stream[index] = change(stream[index], "mf", {"other_0": 0, "other_1": 0})
+    stream[3] = change(stream[3], "th", {"other_0": 0, "other_1": 0})
+    played = play_packets(stream)
+    assert flags(played.readings[0], MISSING) == [[1, electrode] for electrode in range(24)]
+    assert played.counters.absent_fingers == 1
+    assert not played.readings[1].faults.any()
 
 
 def test_a_damaged_type_never_puts_a_value_in_another_place_unseen() -> None:
@@ -260,3 +295,76 @@ def test_the_real_hand_has_the_same_signature() -> None:
     for pair in PAIRS[2:-1]:
         stale = (counts[1:, :, pair] == counts[:-1, :, pair]).all(axis=(1, 2))
         assert stale.mean() == pytest.approx(2 / 7, abs=0.003)
+
+
+@pytest.mark.parametrize(
+    ("after_ns", "lost"),
+    [(MS, 0), (11 * MS - 1, 0), (11 * MS, 1), (25 * MS - 1, 1), (25 * MS, 2)],
+)
+def test_a_packet_ten_cycles_after_it_was_due_tells_of_a_lost_round(
+    after_ns: int, lost: int
+) -> None:
+    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    stream = packets(2)
+    readings = [reading for at in range(ROUND) for reading in sweeps.push(stream[at], at * MS)]
+    end_ns = 13 * MS + after_ns
+    for at in range(ROUND):
+        readings += sweeps.push(stream[ROUND + at], end_ns + at * MS)
+    assert [reading.seq for reading in readings] == [0, 1 + lost]
+    assert (counters.missed_readings, counters.lost_packets) == (lost, lost * ROUND)
+
+
+@pytest.mark.parametrize(
+    ("after_ns", "missed"),
+    [(13 * MS, 0), (14 * MS, 1), (2_000 * MS, 142), (2_000 * MS + 1, 1)],
+)
+def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
+    after_ns: int, missed: int
+) -> None:
+    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    stream = packets(2)
+    for at in range(ROUND):
+        sweeps.push(stream[at], at * MS)
+    sweeps.interrupt()
+    assert counters.interrupted_rounds == 0
+    assert sweeps.push(stream[ROUND + 3], 15 * MS) == ()
+    sweeps.push(stream[ROUND], 13 * MS + after_ns)
+    assert (counters.missed_readings, counters.unsynchronised_packets) == (missed, 1)
+
+
+@pytest.mark.parametrize(
+    ("step", "after_ns", "late"),
+    [
+        (8, 4 * MS - 1, True),  # six before, or eight ahead: nearer in time
+        (8, 4 * MS, False),
+        (13, 6_500_000 - 1, True),
+        (13, 6_500_000, False),
+        (7, 0, False),  # half a round ahead
+    ],
+)
+def test_a_packet_is_late_that_comes_in_half_the_time_of_its_step_ahead(
+    step: int, after_ns: int, late: bool
+) -> None:
+    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    stream = packets(1)
+    for at in range(ROUND):
+        sweeps.push(stream[at], at * MS)
+    sweeps.push(stream[(ROUND - 1 + step) % ROUND], 13 * MS + after_ns)
+    assert counters.conflicting_packets == late, "its place is taken already"
+
+
+def test_a_packet_of_the_round_before_is_late() -> None:
+    stream = packets(2)
+    lost = stream.pop(ROUND - 1)
+    played = play_packets([*stream[:ROUND], lost, *stream[ROUND:]])
+    assert [bool(reading.faults.any()) for reading in played.readings] == [True, False]
+    assert (played.counters.late_packets, played.counters.lost_packets) == (1, 1)
+
+
+def test_how_long_no_round_can_end() -> None:
+    sweeps = RoundAssembler(FINGERS, PalmCounters())
+    left = [sweeps.cycles_to_go]
+    for at, packet in enumerate(packets(2)):
+        sweeps.push(packet, at * MS)
+        left.append(sweeps.cycles_to_go)
+    assert left == [0, *range(13, -1, -1), *range(13, -1, -1)]

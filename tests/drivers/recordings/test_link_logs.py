@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import RecordingError
+from drivers.base import RecordingError, TactileReading
+from drivers.biotac import sample_command
 from drivers.can.frames import ERROR, EXTENDED, FD, REMOTE, CanFrame
 from drivers.recordings.can_log import CanLog, frame_of, line_of
 from drivers.recordings.link_log_player import LinkLogDriver
@@ -192,5 +193,34 @@ def test_a_file_without_anything_from_a_link_is_refused(tmp_path: Path, content:
     for driver in drivers:
         with pytest.raises(RecordingError, match="nothing that came over a link"), driver:
             pass
-    with pytest.raises(ValueError, match="positive speed"):
-        LinkLogDriver([path], CanLog(fingers), speed=0.0)
+    for speed in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="positive speed"):
+            LinkLogDriver([path], CanLog(fingers), speed=speed)
+    LinkLogDriver([path], CanLog(fingers), speed=0.5)
+
+
+@pytest.mark.parametrize(("length", "taken"), [(256, True), (257, False)])
+def test_a_line_has_at_most_256_characters(length: int, taken: bool) -> None:
+    line = line_of(CanFrame(0x123, b"abc"), 10**18, "can0").rstrip().ljust(length)
+    assert (frame_of(line) is not None) == taken
+
+
+def test_the_frames_of_a_can_log_are_counted_and_other_lines_passed_over(tmp_path: Path) -> None:
+    path, log = tmp_path / "can.log", CanLog(("ff", "mf", "th"), sequence="electrodes")
+    lines = ["# of yesterday\n", "\n"]
+    for sweep in range(2):
+        for at, channel in enumerate(range(17, 41)):
+            t_ns = 10**18 + (24 * sweep + at) * 400_000
+            data = bytes([sample_command(channel)]) + bytes.fromhex("A251 A8C8 94B9")
+            lines.append(line_of(CanFrame(0x1A5, data), t_ns, "can0"))
+    path.write_text("".join([*lines, "x" * 300 + "\n", lines[-1]]))
+    records = list(log.records(path))
+    assert len(records) == 49
+    readings = [reading for record in records for reading in log.feed(*record)]
+    assert [(reading.t_ns - 10**18) / 400_000 for reading in readings] == [23, 47]
+    assert isinstance(readings[1], TactileReading)
+    assert (readings[1].counts == [[2602], [2713], [2391]]).all()
+    counters = log.stream.counters
+    assert (counters.frames, counters.accepted_frames, counters.duplicate_frames) == (49, 49, 1)
+    log.begin()
+    assert log.stream.counters.frames == 0

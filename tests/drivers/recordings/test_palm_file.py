@@ -29,6 +29,7 @@ def test_a_file_of_packets_plays_count_for_count(
         while not driver.exhausted:
             clock.now_ns = driver.due_ns() or clock.now_ns
             readings += tactile(driver.read_ready())
+        assert driver.describe() == {"source": str(path)}
         assert driver.counters.bad_lengths == 1  # the file ends in the middle of a packet
         assert driver.due_ns() is None
     assert np.array_equal([reading.counts for reading in readings], rows(40))

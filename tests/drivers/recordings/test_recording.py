@@ -12,7 +12,6 @@ import pytest
 
 from drivers.base import ElectrodeFault, RecordingError
 from drivers.recordings.csv_rows import (
-    LINE_BYTES_MAX,
     Recording,
     open_recording,
     read_lines,
@@ -30,6 +29,8 @@ from tests.drivers.recordings.tables import (
     stream,
     table,
 )
+
+LINE_BYTES_MAX = 65_536
 
 
 def test_a_table_gives_its_counts_and_annotations() -> None:
@@ -93,6 +94,11 @@ def test_the_dialects_of_spreadsheets_read_the_same(content: bytes) -> None:
 def test_a_quoted_object_name_may_hold_commas_and_quotes() -> None:
     (row,) = rows_of(table(1, {0: {"object": '"a ""red"" pen, long"'}}))
     assert row.annotation.object_name == 'a "red" pen, long'
+
+
+def test_of_one_missing_column_no_number_is_told() -> None:
+    with pytest.raises(RecordingError, match=r"column mf_biotac_7: this column is missing$"):
+        rows_of(table(2, columns=[name for name in TABLE_HEADER if name != "mf_biotac_7"]))
 
 
 def test_an_empty_object_name_is_none() -> None:

@@ -58,6 +58,13 @@ def test_an_integer_may_be_written_in_several_ways(cell: str, expected: int) -> 
     assert not row.faults.any()
 
 
+@pytest.mark.parametrize(("length", "read"), [(32, 5), (33, None)])
+def test_a_number_has_at_most_32_characters(length: int, read: int | None) -> None:
+    """A double in full takes 24."""
+    cell = "5." + "0" * (length - 2)
+    assert (count_of(cell), number_of(cell)) == (read, read)
+
+
 @given(st.text(max_size=12) | st.from_regex(r"[0-9.eE+_ -]{1,8}", fullmatch=True))
 @example("1_0")
 def test_a_count_is_never_read_from_what_python_would_not_call_that_number(cell: str) -> None:

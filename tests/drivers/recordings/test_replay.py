@@ -308,6 +308,10 @@ def test_opening_again_starts_over(tmp_path: Path) -> None:
         (lambda path: ReplayDriver([path], rate_hz=float("nan")), "rate_hz is nan"),
         (lambda path: ReplayDriver([path], speed=-1), "speed is -1"),
         (lambda path: ReplayDriver([path], speed=float("inf")), "speed is inf"),
+        (lambda path: ReplayDriver([path], speed=0.00099), "speed is 0.00099"),
+        (lambda path: ReplayDriver([path], speed=1000.1), "speed is 1000.1"),
+        (lambda path: ReplayDriver([path], rate_hz=0.00099), "rate_hz is 0.00099"),
+        (lambda path: ReplayDriver([path], rate_hz=100_000.1), "rate_hz is 100000.1"),
     ],
 )
 def test_an_argument_out_of_range_is_refused(
@@ -315,6 +319,11 @@ def test_an_argument_out_of_range_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         build(Path("grasps.csv"))
+
+
+@pytest.mark.parametrize(("speed", "rate_hz"), [(1e-3, 1e-3), (1e3, 1e5)])
+def test_a_schedule_may_be_a_thousand_times_slower_or_faster(speed: float, rate_hz: float) -> None:
+    assert not ReplayDriver([Path("grasps.csv")], speed=speed, rate_hz=rate_hz).exhausted
 
 
 def test_fingers_come_in_the_order_asked_for(tmp_path: Path) -> None:

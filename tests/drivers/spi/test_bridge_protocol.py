@@ -180,6 +180,24 @@ def test_a_sweep_that_makes_no_sense_is_nothing(offset: int, value: int) -> None
     assert Sweep.from_bytes(bytes(payload)) is None
 
 
+@pytest.mark.parametrize(
+    ("sensors", "slots", "sense"),
+    [(1, 1, True), (5, 64, True), (0, 1, False), (1, 0, False), (6, 1, False), (1, 65, False)],
+)
+def test_a_sweep_has_1_to_5_sensors_and_1_to_64_slots(
+    sensors: int, slots: int, sense: bool
+) -> None:
+    """However well its length fits."""
+    payload = struct.pack("<IQQBBB", 7, 1, 2, 0, sensors, slots) + bytes(2 * sensors * slots)
+    assert (Sweep.from_bytes(payload) is not None) == sense
+
+
+@pytest.mark.parametrize(("sensors", "sense"), [(0, False), (1, True), (5, True), (6, False)])
+def test_a_status_has_1_to_5_sensors(sensors: int, sense: bool) -> None:
+    payload = struct.pack("<QIIIIB", 1, 2, 3, 4, 5, sensors) + bytes(4 * sensors)
+    assert (Status.from_bytes(payload) is not None) == sense
+
+
 def test_the_head_of_a_later_version_can_be_read() -> None:
     later = struct.pack("<BII", 2, 0xCAFEF00D, 99) + b"anything"
     assert HelloHead.from_bytes(later) == HelloHead(2, 0xCAFEF00D, 99)
@@ -194,6 +212,73 @@ def test_a_serial_number_of_odd_bytes_does_not_break_the_hello() -> None:
     back = Hello.from_bytes(bytes(payload))
     assert back is not None
     assert back.serials[0] == "B???P0001"
+
+
+U8, U16, U32, U64 = 0xFF, 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF
+# The smallest HELLO, by hand from the document; a board needs no name and no firmware's version.
+LEAST = Hello(0, 0, 1000, 1, ("",), (0xA2,), version=0, digest=0)
+LEAST_BYTES = (
+    "00 00000000 00000000 0000000000000000 E8030000 0000"
+    + "00" * 16
+    + ("01000000 01 01" + "00" * 16 + "A2")
+)
+MOST = Hello(
+    *(U32, U64, U32, U32, ("S" * 16,) * 5, (0xD0,) * 64, U16, "B" * 16),
+    version=U8,
+    digest=U32,
+)
+ONE_WORD, ALL_WORDS = np.full((1, 1), 0x0101, np.uint16), np.full((64, 5), 0xFEF8, np.uint16)
+SWEEPS = Sweep(0, 0, 0, 0, ONE_WORD), Sweep(U32, U64, U64, 0b11111, ALL_WORDS)
+STATES = Status(0, 0, 0, 0, 0, (0,)), Status(U64, U32, U32, U32, U32, (U32,) * 5)
+EDGES: list[Message] = [LEAST, MOST, *SWEEPS, *STATES, Ping(0), Ping(U32)]
+BEYOND: list[Message] = [
+    *(
+        dataclasses.replace(message, **{field: value})
+        for message, step in ((LEAST, -1), (MOST, 1))
+        for field in ("version", "digest", "nonce", "tick", "tick_hz", "firmware", "period_ticks")
+        for value in [getattr(message, field) + step]
+    ),
+    *(dataclasses.replace(LEAST, serials=()), dataclasses.replace(MOST, serials=("S",) * 6)),
+    *(dataclasses.replace(LEAST, commands=()), dataclasses.replace(MOST, commands=(0xD0,) * 65)),
+    *(dataclasses.replace(SWEEPS[0], seq=-1), dataclasses.replace(SWEEPS[1], seq=U32 + 1)),
+    *(dataclasses.replace(SWEEPS[0], present=-1), dataclasses.replace(SWEEPS[0], present=2)),
+    *(dataclasses.replace(SWEEPS[0], tick_start=-1), dataclasses.replace(SWEEPS[0], tick_end=-1)),
+    dataclasses.replace(SWEEPS[1], tick_end=U64 + 1),
+    *(
+        dataclasses.replace(SWEEPS[0], words=np.zeros(shape, np.uint16))
+        for shape in ((0, 1), (1, 0), (65, 1), (1, 6), (1,), (1, 1, 1))
+    ),
+    *(
+        dataclasses.replace(message, **{field: getattr(message, field) + step})
+        for message, step in ((STATES[0], -1), (STATES[1], 1))
+        for field in ("tick", "sweeps", "overruns", "tx_dropped", "rx_errors")
+    ),
+    *(Status(0, 0, 0, 0, 0, (0, -1)), Status(0, 0, 0, 0, 0, (0,) * 6), Ping(-1), Ping(U32 + 1)),
+]
+
+
+@pytest.mark.parametrize("message", EDGES, ids=lambda message: type(message).__name__)
+def test_the_largest_and_smallest_messages_are_written(message: Message) -> None:
+    payload = message.to_bytes()
+    back = type(message).from_bytes(payload)
+    if isinstance(message, Hello):
+        assert back is None, "of another version"
+        message = dataclasses.replace(message, version=1)
+        assert Hello.from_bytes(message.to_bytes()) == message
+    else:
+        assert back is not None
+        assert back.to_bytes() == payload
+
+
+def test_the_smallest_hello_has_its_golden_bytes() -> None:
+    assert LEAST.to_bytes() == bytes.fromhex(LEAST_BYTES)
+    assert MOST.to_bytes()[:45] == b"\xff" * 23 + b"B" * 16 + b"\xff" * 4 + bytes([5, 64])
+
+
+@pytest.mark.parametrize("message", BEYOND, ids=lambda message: type(message).__name__)
+def test_what_is_beyond_a_fields_range_is_not_written(message: Message) -> None:
+    with pytest.raises(ValueError, match=r"must be in|words are"):
+        message.to_bytes()
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers.spi.clock import AGE_MAX_NS, UNKNOWN_DELAY_NS, DeviceClock
+from drivers.spi.clock import DeviceClock
 from tests.drivers.spi.clock_error import (
     MS,
     START_NS,
@@ -15,6 +15,10 @@ from tests.drivers.spi.clock_error import (
     errors_ms,
     tick_of,
 )
+
+UNKNOWN_DELAY_NS = 20 * MS
+"""16 ms of a USB adapter's latency timer, and 4 ms for the rest."""
+AGE_MAX_NS = 10 * S
 
 
 def synchronised(way: Way | None = None, pings: int = 5) -> tuple[DeviceClock, int]:
@@ -183,3 +187,172 @@ def test_a_slow_clock_of_a_kilohertz_is_no_fault() -> None:
         mapped_ns = clock.host_ns(k * 10, now_ns + MS, now_ns)
         assert now_ns - 3 * MS <= mapped_ns <= now_ns
     assert clock.faults == 0
+
+
+DECAY = 1.0 / 30.0
+"""As in Klipper's clock synchronisation (klippy/clocksync.py)."""
+
+
+def by_the_definition(
+    pings: list[tuple[int, int]], ns_per_tick: float, tick: int
+) -> tuple[float, int]:
+    """Slope of host over device time, less one, and the time of `tick`, host ns, after PINGs.
+
+    `pings` are (tick, sent_ns). Weights of the regression written out: a PING counts a thirtieth
+    of all, the first whatever is left; with 1 ms of noise before any is known.
+    """
+    x = np.array([ping[0] * ns_per_tick for ping in pings])
+    y = np.array([ping[1] for ping in pings]) - x
+    x, y = x - x[0], y - y[0]
+    noise, slope, slack = 1e6**2, 0.0, 200e-6
+    for number in range(1, len(pings) + 1):
+        if number > 1:  # the first PING is the line
+            weights = DECAY * (1.0 - DECAY) ** np.arange(number - 2, -1, -1.0)
+            weights = np.append((1.0 - DECAY) ** (number - 1), weights)
+            before = np.append((1.0 - DECAY) ** (number - 2), weights[1:-1] / (1.0 - DECAY))
+            middle = before @ np.column_stack((x, y))[: number - 1]
+            residual = y[number - 1] - middle[1] - slope * (x[number - 1] - middle[0])
+            noise = (1.0 - DECAY) * (noise + DECAY * residual**2)
+        else:
+            weights = np.ones(1)
+            noise = (1.0 - DECAY) * noise
+        dx, dy = (v[:number] - weights @ v[:number] for v in (x, y))
+        variance = weights @ dx**2
+        slope, slack = 0.0, 200e-6
+        if variance > 0.0:
+            found = weights @ (dx * dy) / variance
+            error = 6.0 * np.sqrt(noise * DECAY / (2.0 * variance))
+            if error < 200e-6 and abs(found) <= 500e-6:
+                slope, slack = float(found), max(float(error), 10e-6)
+
+    def earliest_ns(ping: tuple[int, int], at: int) -> int:
+        passed = (at - ping[0]) * ns_per_tick * (1.0 + slope)
+        return ping[1] + round(passed * (1.0 - slack) - ns_per_tick)
+
+    best = max(pings[-16:], key=lambda ping: earliest_ns(ping, pings[-1][0]))
+    return slope, earliest_ns(best, tick)
+
+
+@pytest.mark.parametrize("pings", [1, 2, 3, 5, 8, 16, 17, 40, 400])
+@pytest.mark.parametrize("drift_ppm", [-90.0, 0.0, 60.0])
+def test_a_time_is_that_of_the_weighted_regression(pings: int, drift_ppm: float) -> None:
+    rng = np.random.default_rng(pings)
+    clock, way, sent = DeviceClock(TICK_HZ), Way(drift_ppm=drift_ppm), []
+    for number in range(pings):
+        made_ns = START_NS + number * S
+        sent.append((tick_of(made_ns, way), made_ns - int(rng.integers(0, MS // 3))))
+        clock.round_trip(*sent[-1], made_ns + MS)
+    later_ns = START_NS + pings * S
+    slope, mapped_ns = by_the_definition(sent, 1e9 / TICK_HZ, tick_of(later_ns, way))
+    assert clock.host_ns(tick_of(later_ns, way), later_ns, later_ns) == pytest.approx(
+        mapped_ns, abs=2
+    )
+    if clock.drift_ppm is not None:
+        assert clock.drift_ppm == pytest.approx((1.0 / (1.0 + slope) - 1.0) * 1e6, abs=1e-3)
+    assert (clock.drift_ppm is not None) == (slope != 0.0)
+
+
+def exact(pings: int) -> tuple[DeviceClock, int]:
+    """A clock after so many PINGs that took no time, one a second; host time of the last, ns."""
+    clock = DeviceClock(TICK_HZ)
+    for number in range(pings):
+        now_ns = START_NS + number * S
+        clock.round_trip(tick_of(now_ns, Way()), now_ns, now_ns)
+    return clock, now_ns
+
+
+@pytest.mark.parametrize(
+    ("pings", "late_us", "taken"),
+    [
+        # The noise of 1 ms that is assumed fades by a thirtieth each PING; five sigmas of it ...
+        (100, 900, True),  # 5 * 1000 * (29 / 30)**50 = 918
+        (100, 936, False),
+        # ... or half a millisecond, where five sigmas are less: 169.
+        (200, 490, True),
+        (200, 510, False),
+    ],
+)
+def test_a_late_ping_is_left_out(pings: int, late_us: int, taken: bool) -> None:
+    clock, now_ns = exact(pings)
+    assert clock.drift_ppm == pytest.approx(0.0, abs=1e-6)
+    made_ns = now_ns + S
+    clock.round_trip(tick_of(made_ns, Way()), made_ns - late_us * 1000, made_ns)
+    assert clock.drift_ppm is not None
+    assert (abs(clock.drift_ppm) > 0.01) == taken
+
+
+def test_after_five_late_pings_in_a_row_the_next_begins_a_new_line() -> None:
+    clock, now_ns = exact(200)
+    known = []
+    for _ in range(6):
+        now_ns += S
+        clock.round_trip(tick_of(now_ns, Way()), now_ns - 5 * MS, now_ns)
+        known.append(clock.drift_ppm is not None)
+    assert known == [True] * 5 + [False]
+
+
+def test_a_ping_that_comes_too_early_begins_a_new_line_at_once() -> None:
+    clock, now_ns = exact(200)
+    made_ns = now_ns + S
+    for early_us, known in ((490, True), (510, False)):
+        tick = tick_of(made_ns, Way()) - early_us
+        clock, _ = exact(200)
+        clock.round_trip(tick, made_ns, made_ns + MS)
+        assert (clock.drift_ppm is not None) == known
+
+
+@pytest.mark.parametrize(("ahead_us", "trusted"), [(990, True), (1010, False)])
+def test_a_time_a_millisecond_after_its_arrival_is_no_fault(ahead_us: int, trusted: bool) -> None:
+    clock, now_ns = exact(200)  # wrong by 10 parts in a million at most, and by a tick
+    arrival_ns = now_ns + 10 * MS
+    tick = tick_of(arrival_ns, Way()) + ahead_us + 1
+    mapped_ns = clock.host_ns(tick, arrival_ns, now_ns)
+    assert clock.trusted == trusted
+    assert mapped_ns == (arrival_ns if trusted else now_ns - UNKNOWN_DELAY_NS)
+
+
+def test_no_reading_is_older_than_ten_seconds() -> None:
+    clock, now_ns = exact(200)
+    tick = tick_of(now_ns, Way())
+    assert clock.host_ns(tick, now_ns + 9 * S, now_ns) < now_ns
+    clock, now_ns = exact(200)
+    assert clock.host_ns(tick, now_ns + 11 * S, now_ns) == now_ns + S
+
+
+def test_a_clock_that_was_wrong_must_prove_itself_longer_each_time() -> None:
+    clock, now_ns = exact(3)
+    for proof_ns in (S // 2, 2 * S, 8 * S, 8 * S):
+        for _ in range(2):  # a tick that does not rise is a fault
+            clock.host_ns(5, now_ns, now_ns)
+        begin_ns = now_ns + S
+        for after_ns, trusted in ((0, False), (proof_ns - MS, False), (proof_ns, True)):
+            now_ns = begin_ns + after_ns
+            clock.round_trip(tick_of(now_ns, Way()), now_ns, now_ns)
+            assert clock.trusted == trusted
+    assert clock.faults == 4
+
+
+@pytest.mark.parametrize(("wrong_ppm", "faults"), [(480, 0), (520, 1), (-480, 0), (-520, 1)])
+def test_a_rate_wrong_by_500_parts_in_a_million_is_a_fault(wrong_ppm: int, faults: int) -> None:
+    clock = DeviceClock(TICK_HZ)
+    for second in (0, 10):
+        now_ns = START_NS + second * S
+        clock.round_trip(1000 + second * (TICK_HZ + wrong_ppm), now_ns, now_ns)
+    assert clock.faults == faults
+
+
+@pytest.mark.parametrize(("late_pings", "remembered"), [(15, True), (16, False)])
+def test_the_best_of_the_last_sixteen_pings_is_believed(late_pings: int, remembered: bool) -> None:
+    """The last good one is up to 16 s old, so 160 us too old at ten parts in a million."""
+    clock, now_ns = exact(200)
+    for _ in range(late_pings):
+        now_ns += S
+        clock.round_trip(tick_of(now_ns, Way()), now_ns - MS * 4 // 10, now_ns)
+    error_ns = clock.host_ns(tick_of(now_ns, Way()), now_ns + MS, now_ns) - now_ns
+    assert (error_ns > -350_000) == remembered
+
+
+def test_a_first_tick_of_zero_is_no_fault() -> None:
+    clock = DeviceClock(TICK_HZ)
+    clock.host_ns(0, START_NS, START_NS)
+    assert (clock.faults, clock.fallbacks) == (0, 1)

@@ -76,6 +76,13 @@ def test_the_greeting_is_that_of_the_protocol(rig: Rig) -> None:
     assert rig.driver.period_ns == 10 * MS
 
 
+def test_the_first_nonce_is_of_the_time_so_that_an_old_answer_is_told_from_a_new_one(
+    rig: Rig,
+) -> None:
+    rig.clock.now_ns = (7 << 32) + 12345
+    assert rig.greet()[-1] == Ping(12346)
+
+
 def test_closing_tells_the_bridge_to_stop(rig: Rig) -> None:
     rig.greet()
     rig.bridge.heard(Start)

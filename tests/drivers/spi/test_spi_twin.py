@@ -15,7 +15,6 @@ from cobs import cobs
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.biotac import SEQUENCE_INTERLEAVED
-from drivers.spi.clock import UNKNOWN_DELAY_NS
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.messages import DIGEST
 from drivers.twins.faults import LinkFaults
@@ -24,6 +23,9 @@ from drivers.twins.spi import SpiTwin
 from tests.conftest import data_dir
 from tests.drivers.spi.bridge_bench import FINGERS, MS, replug_times_s, run
 from tests.drivers.twins.signals import GeneratedContact
+
+UNKNOWN_DELAY_NS = 20_000_000
+"""One latency timer of a USB serial adapter, 16 ms, and 4 ms for the rest."""
 
 SWEEPS = 600
 REPLUGS = 50

@@ -1,0 +1,488 @@
+"""Mutants: copies of the code with one small mistake each, to see whether the tests notice.
+
+`python -m tests.bench.mutants drivers --number 200` picks 200 at random, runs for each the tests in
+`tests/drivers` that execute its line, and lists those that no test notices. `--only contact.py:88`
+takes the mutants of a file or a line.
+
+The mistakes: a comparison, an operator, a `not`, `and` or `or`, a number by one; a float or a large
+number by 20 %, for nobody chooses one nanosecond. Nothing is changed in place: a mutant is a
+compiled file in a copy of the tree, which Python and whatever a test starts take for the source's.
+
+mutmut leaves numbers outside functions alone; cosmic-ray changes files in place, one command for
+all; neither picks a sample by a seed. Hence our own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import dataclasses
+import importlib.util
+import json
+import marshal
+import os
+import random
+import select
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import CodeType
+from typing import Final
+
+import coverage
+import pytest
+from hypothesis import Phase, settings
+
+from tests.conftest import ROOT, data_dir
+
+NUMBER = 200
+KILLED_SHARE = 0.9
+"""Of the mutants that the tests must notice."""
+LEFT_OUT = ("drivers/twins/",)
+"""Test equipment."""
+KINDS = ("comparison", "operator", "logic", "number")
+"""Of the mutants that are picked from."""
+BY_ONE_MAX, BY_ONE_MAX_FLOAT = 1_000_000, 100.0
+"""Numbers up to these differ by one, others by `SHARE`."""
+SHARE = 0.2
+TESTS_S = 60.0
+"""Tests that a mutant gets, by the time that they take without it, s."""
+SLACK, SLACK_S = 5.0, 10.0
+"""A test that takes longer than this many times its usual time, and this, s, hangs."""
+WARM = ("can", "msgspec", "numpy", "onnxruntime", "pydantic", "serial", "zmq")
+"""Imported once for all mutants."""
+UNCHECKED: Final = (1).to_bytes(4, "little")
+"""Flags of a compiled file that is never compared with its source (PEP 552)."""
+
+COMPARISONS: Final[dict[type[ast.cmpop], tuple[type[ast.cmpop], ...]]] = {
+    ast.Lt: (ast.LtE, ast.Gt),
+    ast.LtE: (ast.Lt, ast.GtE),
+    ast.Gt: (ast.GtE, ast.Lt),
+    ast.GtE: (ast.Gt, ast.LtE),
+    ast.Eq: (ast.NotEq,),
+    ast.NotEq: (ast.Eq,),
+    ast.Is: (ast.IsNot,),
+    ast.IsNot: (ast.Is,),
+    ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+}
+OPERATORS: Final[dict[type[ast.operator], type[ast.operator]]] = {
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.FloorDiv,
+    ast.Pow: ast.Mult,
+    ast.LShift: ast.RShift,
+    ast.RShift: ast.LShift,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+    ast.BitXor: ast.BitAnd,
+}
+VERDICTS: Final = {"SLIP": "STABLE", "STABLE": "SLIP", "UNKNOWN": "STABLE"}
+
+Change = Callable[[ast.AST], None]
+"""Makes the mistake in a node."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One mistake in one module."""
+
+    source: str
+    place: int
+    """Of the changed node among those of the module."""
+    line: int
+    begin: int
+    """First line of the statement around it: what runs them runs the mistake."""
+    kind: str
+    what: str
+    change: Change
+    file: str = ""
+    """From the root, where it is one of a tree."""
+
+    def code(self) -> CodeType:
+        """The module with the mistake, compiled."""
+        tree = ast.parse(self.source)
+        for place, (node, _) in enumerate(_nodes(tree, None)):
+            if place == self.place:
+                self.change(node)
+                break
+        return compile(ast.fix_missing_locations(tree), self.file or "mutant", "exec")
+
+    def __str__(self) -> str:
+        text = self.source.splitlines()[self.line - 1].strip()
+        return f"{self.file}:{self.line}: {self.what} in `{text}`"
+
+
+def mutants(source: str, *, within: str | None = None, file: str = "") -> Iterator[Mutant]:
+    """All mutants of a module, or of its function `within`."""
+    tree = ast.parse(source)
+    lines: Collection[int] | None = None
+    if within is not None:
+        (body,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == within]
+        lines = range(body.lineno, (body.end_lineno or body.lineno) + 1)
+    for place, (node, statement) in enumerate(_nodes(tree, None)):
+        line = getattr(node, "lineno", 0)
+        if lines is None or line in lines:
+            for kind, what, change in _changes(node):
+                yield Mutant(source, place, line, statement.lineno, kind, what, change, file)
+
+
+def _nodes(
+    parent: ast.AST, statement: ast.stmt | None
+) -> Iterator[tuple[ast.expr | ast.stmt, ast.stmt]]:
+    """What may be changed, and the statement around it: no annotations, no messages."""
+    for name, value in ast.iter_fields(parent):
+        if name in ("annotation", "returns", "decorator_list"):
+            continue
+        for node in value if isinstance(value, list) else [value]:
+            if not isinstance(node, ast.AST) or _is_message(node):
+                continue
+            around = node if isinstance(node, ast.stmt) else statement
+            if isinstance(node, ast.expr | ast.stmt) and around is not None:
+                yield node, around
+            yield from _nodes(node, around)
+
+
+def _is_message(node: ast.AST) -> bool:
+    """Text for people: formatted strings and the log."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+        node = node.func.value
+        return isinstance(node, ast.Name) and node.id == "_log"
+    return isinstance(node, ast.JoinedStr)
+
+
+def _changes(node: ast.AST) -> Iterator[tuple[str, str, Change]]:
+    """Kind, description and function of everything that can go wrong in a node."""
+    match node:
+        case ast.Compare():
+            for place, operator in enumerate(node.ops):
+                for other in COMPARISONS[type(operator)]:
+                    what = f"{type(operator).__name__} becomes {other.__name__}"
+                    yield "comparison", what, _setter("ops", other(), place)
+        case ast.BoolOp():
+            both = isinstance(node.op, ast.And)
+            yield "logic", "and and or change places", _setter("op", (ast.And, ast.Or)[both]())
+            for place in range(len(node.values)):
+                dropped = _setter("values", ast.Constant(both), place)
+                yield "operand", f"operand {place} is dropped", dropped
+        case ast.UnaryOp(op=ast.Not() | ast.Invert() | ast.USub() as sign, operand=operand):
+            kind = "logic" if isinstance(sign, ast.Not) else "operator"
+            twice = ast.UnaryOp(sign, operand)
+            yield kind, f"{type(sign).__name__} is dropped", _setter("operand", twice)
+        case ast.BinOp(op=sign) | ast.AugAssign(op=sign) if type(sign) in OPERATORS:
+            wrong = OPERATORS[type(sign)]
+            what = f"{type(sign).__name__} becomes {wrong.__name__}"
+            yield "operator", what, _setter("op", wrong())
+        case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
+            for changed in _numbers(number):
+                yield "number", f"{number} becomes {changed}", _setter("value", changed)
+        case ast.Attribute(attr=verdict) if verdict in VERDICTS:
+            what = f"{verdict} becomes {VERDICTS[verdict]}"
+            yield "verdict", what, _setter("attr", VERDICTS[verdict])
+    match node:
+        case ast.If() | ast.IfExp():
+            for truth in (True, False):
+                what = f"the condition is {truth}"
+                yield "condition", what, _setter("test", ast.Constant(truth))
+        case ast.Expr(value=value) if not isinstance(value, ast.Constant):
+            yield "statement", "a statement is dropped", _setter("value", ast.Constant(None))
+        case ast.AugAssign():  # of a list
+            nothing = ast.Tuple([], ast.Load())
+            yield "statement", "a statement is dropped", _setter("value", nothing)
+
+
+def _setter(field: str, value: object, place: int | None = None) -> Change:
+    def change(node: ast.AST) -> None:
+        if place is None:
+            setattr(node, field, value)
+        else:
+            getattr(node, field)[place] = value
+
+    return change
+
+
+def _numbers(number: float) -> tuple[float, ...]:
+    """What a number may be by mistake: by one where that is little, else by a share."""
+    if isinstance(number, int):
+        if abs(number) <= BY_ONE_MAX:
+            return number + 1, number - 1
+        return round(number * (1.0 + SHARE)), round(number * (1.0 - SHARE))
+    larger = number + 1.0 if abs(number) <= BY_ONE_MAX_FLOAT else number * (1.0 + SHARE)
+    return (larger, number * (1.0 - SHARE)) if number else (larger,)
+
+
+@dataclass(eq=False)
+class Baseline:
+    """What the tests do without a mutant. As a plugin of pytest it finds that out."""
+
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    """By test."""
+    failed: list[str] = dataclasses.field(default_factory=list)
+    tests: dict[str, dict[str, list[str]]] = dataclasses.field(default_factory=dict)
+    """By file and line (as text) the tests that execute it."""
+    naming: dict[str, list[str]] = dataclasses.field(default_factory=dict)
+    """By file the tests in files that name its module."""
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """A part of a test is done."""
+        self.seconds[report.nodeid] = self.seconds.get(report.nodeid, 0.0) + report.duration
+        if report.failed:
+            self.failed.append(report.nodeid)
+
+    def concerned(self, mutant: Mutant, seconds: float) -> dict[str, float]:
+        """The tests that run a mutant, the fastest in `seconds` altogether, and their times.
+
+        Those that execute its statement; where none does, for it is executed by importing, all that
+        execute anything of its file, and those whose file names its module.
+        """
+        lines = self.tests.get(mutant.file, {})
+        found = {
+            test for at in range(mutant.begin, mutant.line + 1) for test in lines.get(str(at), ())
+        }
+        if not found:
+            found.update(self.naming.get(mutant.file, ()), *lines.values())
+        chosen: dict[str, float] = {}
+        for test in sorted(found.difference(self.failed), key=lambda test: self.seconds[test]):
+            chosen[test] = self.seconds[test]
+            seconds -= chosen[test]
+            if seconds < 0.0:
+                break
+        return chosen
+
+
+class Contexts:
+    """Plugin of pytest: tells coverage which test runs."""
+
+    def __init__(self, measure: coverage.Coverage) -> None:
+        self._measure = measure
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, bool, bool]:
+        """A test runs, with its fixtures."""
+        self._measure.switch_context(item.nodeid)
+        return (yield)
+
+
+class SameExamples:
+    """Plugin of pytest: hypothesis tries the same every time, and never simplifies."""
+
+    def pytest_sessionstart(self) -> None:
+        """After the conftest with its own profile, before any test is imported."""
+        phases = (Phase.explicit, Phase.generate)
+        settings.register_profile("mutants", settings(), derandomize=True, phases=phases)
+        settings.load_profile("mutants")
+
+
+class Chosen:
+    """Plugin of pytest: runs the chosen tests, the fastest files first."""
+
+    def __init__(self, seconds: Mapping[str, float], known: Collection[str]) -> None:
+        """`known` are all tests without a mutant: one that a mutant has renamed runs, too."""
+        self._seconds = seconds
+        self._known = known
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        """Drop the others, and limit the times."""
+        items[:] = [
+            item for item in items if item.nodeid in self._seconds or item.nodeid not in self._known
+        ]
+        total: defaultdict[Path, float] = defaultdict(float)
+        for item in items:
+            usual_s = self._seconds.get(item.nodeid, 0.0)
+            total[item.path] += usual_s
+            item.add_marker(pytest.mark.timeout(SLACK * usual_s + SLACK_S), append=False)
+        items.sort(key=lambda item: total[item.path])
+
+
+class Workshop:
+    """A copy of the tree in which mutants are run."""
+
+    def __init__(self, root: Path, folder: Path, package: str, tests: Sequence[str]) -> None:
+        """`folder` is empty; `tests` are paths from the root."""
+        self._folder, self._package, self._tests = folder, package, tests
+        self._log = folder / "last-run.log"
+        ignored = shutil.ignore_patterns(".*", "__pycache__")
+        shutil.copytree(root, folder, ignore=ignored, dirs_exist_ok=True)
+        for module in WARM:
+            if importlib.util.find_spec(module) is not None:
+                importlib.import_module(module)
+
+    def baseline(self) -> Baseline:
+        """Run all tests once. Raises `RuntimeError` if that cannot be done."""
+        report = self._folder / "baseline.json"
+        status = _forked(lambda: self._measure(report), None, self._log)
+        if status not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+            raise RuntimeError(f"the tests do not run without a mutant:\n{self._log.read_text()}")
+        found = Baseline(**json.loads(report.read_text()))
+        report.unlink()
+        return found
+
+    def notices(self, mutant: Mutant, seconds: Mapping[str, float], known: Collection[str]) -> bool:
+        """Whether one of the tests fails, or hangs."""
+        module = self._folder / mutant.file
+        compiled = Path(importlib.util.cache_from_source(str(module)))
+        compiled.parent.mkdir(exist_ok=True)
+        content = importlib.util.MAGIC_NUMBER + UNCHECKED + bytes(8) + marshal.dumps(mutant.code())
+        compiled.write_bytes(content)
+        files = sorted({test.partition("::")[0] for test in seconds})
+        limit_s = SLACK * sum(seconds.values()) + 2.0 * SLACK_S
+        try:
+            plugins = [Chosen(seconds, known), SameExamples()]
+            return _forked(lambda: self._pytest([*files, "-x"], plugins), limit_s, self._log) != 0
+        finally:
+            compiled.unlink()
+
+    def _measure(self, report: Path) -> int:
+        measure = coverage.Coverage(
+            data_file=None, config_file=False, source=[str(self._folder / self._package)]
+        )
+        found = Baseline()
+        with measure.collect():
+            status = self._pytest(self._tests, [found, Contexts(measure), SameExamples()])
+        data = measure.get_data()
+        files = {test.partition("::")[0] for test in found.seconds}
+        texts = {file: (self._folder / file).read_text() for file in files}
+        for file in data.measured_files():
+            lines = data.contexts_by_lineno(file)
+            name = str(Path(file).relative_to(self._folder))
+            found.tests[name] = {
+                str(line): sorted(filter(None, tests)) for line, tests in lines.items()
+            }
+            module = name.removesuffix(".py").replace("/", ".")
+            found.naming[name] = [
+                test for test in found.seconds if module in texts[test.partition("::")[0]]
+            ]
+        report.write_text(json.dumps(dataclasses.asdict(found)))
+        return status
+
+    def _pytest(self, arguments: Sequence[str], plugins: Sequence[object]) -> int:
+        """Run tests in the copy, as if this process had never seen the original."""
+        os.chdir(self._folder)
+        os.environ["PYTHONPATH"] = sys.path[0] = str(self._folder)
+        packages = {path.name for path in self._folder.iterdir()}
+        for name in [name for name in sys.modules if name.partition(".")[0] in packages]:
+            del sys.modules[name]
+        # hypothesis, its plugin, is imported already.
+        ignored = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+        options = ("-q", "-n0", "--tb=no", "-p", "no:cacheprovider", *ignored)
+        return int(pytest.main([*arguments, *options], list(plugins)))
+
+
+def _forked(task: Callable[[], int], limit_s: float | None, log: Path) -> int | None:
+    """Exit status of a task in a process of its own; None if it took too long.
+
+    `log` is overwritten with what it says.
+    """
+    pid = os.fork()
+    if pid == 0:
+        status = os.EX_SOFTWARE
+        try:
+            os.setsid()
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(output, 1)
+            os.dup2(output, 2)
+            status = task()
+        except Exception:  # noqa: BLE001 (nothing may go on as if it were the parent)
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    descriptor = os.pidfd_open(pid)
+    try:
+        ended, _, _ = select.select([descriptor], [], [], limit_s)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(pid, signal.SIGKILL)  # and whatever a test has started
+        _, status = os.waitpid(pid, 0)
+    finally:
+        os.close(descriptor)
+    return os.waitstatus_to_exitcode(status) if ended else None
+
+
+def modules(root: Path, package: str, only: Sequence[str]) -> Iterator[Mutant]:
+    """All mutants of a package that are picked from; `only` has ends of paths, `:LINE` or not."""
+    for path in sorted((root / package).rglob("*.py")):
+        file = path.relative_to(root).as_posix()
+        if file.startswith(LEFT_OUT):
+            continue
+        for mutant in mutants(path.read_text(), file=file):
+            places = (f"/{file}", f"/{file}:{mutant.line}")
+            wanted = not only or any(at.endswith(f"/{end}") for at in places for end in only)
+            if mutant.kind in KINDS and wanted:
+                yield mutant
+
+
+def run(root: Path, options: argparse.Namespace) -> tuple[list[Mutant], list[Mutant]]:
+    """The mutants that were picked, and those that no test noticed."""
+    found = list(modules(root, options.package, options.only))
+    picked = random.Random(options.seed).sample(found, min(options.number, len(found)))
+    picked.sort(key=lambda mutant: (mutant.file, mutant.line, mutant.place))
+    survivors = []
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        workshop = Workshop(root, Path(folder), options.package, options.tests)
+        began_s = time.monotonic()
+        baseline = workshop.baseline()
+        _say(
+            f"{len(found)} mutants, {len(picked)} of them picked; {len(baseline.seconds)} tests in "
+            f"{time.monotonic() - began_s:.0f} s, left out as they fail: {baseline.failed}"
+        )
+        for number, mutant in enumerate(picked, 1):
+            tests = baseline.concerned(mutant, options.timeout)
+            if not tests or not workshop.notices(mutant, tests, baseline.seconds):
+                survivors.append(mutant)
+                _say(f"{number}: {mutant} ({len(tests)} tests)")
+    return picked, survivors
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Pick, run, and print a table; 1 if too few are noticed."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.bench.mutants",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("package", help="folder of modules, such as daemon/judge or drivers")
+    parser.add_argument("--number", type=int, default=NUMBER, help=f"default {NUMBER}")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", nargs="+", default=[], metavar="FILE[:LINE]")
+    parser.add_argument("--tests", nargs="+", metavar="PATH", help="default: tests/PACKAGE")
+    parser.add_argument(
+        "--timeout", type=float, default=TESTS_S, help=f"s of tests per mutant, default {TESTS_S}"
+    )
+    options = parser.parse_args(arguments)
+    options.tests = options.tests or [f"tests/{options.package}"]
+    if (folder := data_dir()) is not None:
+        os.environ["GRASPD_DATA"] = str(folder)
+    began_s = time.monotonic()
+    picked, survivors = run(ROOT, options)
+    if not picked:
+        parser.error("no such file or line")
+    total, left = (Counter(mutant.file for mutant in some) for some in (picked, survivors))
+    for file, number in sorted(total.items()):
+        _say(f"{file}: {number - left[file]} of {number} noticed")
+    noticed = len(picked) - len(survivors)
+    _say(
+        f"{noticed} of {len(picked)} noticed, {noticed / len(picked):.1%}; seed {options.seed}, "
+        f"{(time.monotonic() - began_s) / 60.0:.1f} min"
+    )
+    return 0 if noticed >= KILLED_SHARE * len(picked) else 1
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

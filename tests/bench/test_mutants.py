@@ -1,0 +1,116 @@
+"""The maker of mutants: what it changes, what it lets be, and that a blind test is found out."""
+
+from __future__ import annotations
+
+import argparse
+import marshal
+from pathlib import Path
+
+import pytest
+
+from tests.bench import mutants as bench
+
+SOURCE = '''"""In 2 sentences."""
+LONG_NS = 2_000_000_000
+
+def far(x: Literal[3], limit: float = 2.5) -> bool:
+    _log.info("%d", x + 1)
+    if not x < limit and x is not None:
+        raise ValueError(f"{x / 1e6} is bad")
+    return -x & 7 == 250.0
+'''
+CHANGES = [
+    "2: 2000000000 becomes 2400000000",
+    "2: 2000000000 becomes 1600000000",
+    "4: 2.5 becomes 3.5",
+    "4: 2.5 becomes 2.0",
+    "6: and and or change places",
+    "6: Not is dropped",
+    "6: Lt becomes LtE",
+    "6: Lt becomes Gt",
+    "6: IsNot becomes Is",
+    "8: Eq becomes NotEq",
+    "8: BitAnd becomes BitOr",
+    "8: USub is dropped",
+    "8: 7 becomes 8",
+    "8: 7 becomes 6",
+    "8: 250.0 becomes 300.0",
+    "8: 250.0 becomes 200.0",
+]
+TESTS = """
+import pytest
+from speeds.limit import first_beyond, is_fast
+
+@pytest.mark.parametrize("speed", [{speeds}])
+def test_from_six_on_it_is_fast(speed):
+    assert is_fast(speed) == (speed in (6, 7))
+
+def test_the_first_is_found():
+    assert first_beyond(1) == 6
+"""
+
+
+def test_numbers_operators_and_conditions_are_changed_and_nothing_that_is_only_said() -> None:
+    found = [each for each in bench.mutants(SOURCE) if each.kind in bench.KINDS]
+    assert sorted(f"{each.line}: {each.what}" for each in found) == sorted(CHANGES)
+    assert len({marshal.dumps(each.code()) for each in found}) == len(CHANGES)
+
+
+def test_a_mutant_has_its_one_mistake_and_no_other() -> None:
+    source = "def far(x):\n    return not x > 2\ndef near(x):\n    return x < 2\n"
+    found = list(bench.mutants(source, within="far"))
+    assert [each.what for each in found] == [
+        *("Not is dropped", "Gt becomes GtE", "Gt becomes Lt"),
+        *("2 becomes 3", "2 becomes 1"),
+    ]
+    answers = []
+    for each in found:
+        names: dict[str, object] = {}
+        exec(each.code(), names)
+        far = names["far"]
+        assert callable(far)
+        answers.append([far(x) for x in (1, 2, 3, 4)])
+    assert answers == [
+        [False, False, True, True],
+        [True, False, False, False],
+        [False, True, True, True],
+        [True, True, True, False],
+        [True, False, False, False],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("speeds", "unnoticed"),
+    [
+        ("5, 6", []),
+        (
+            "4, 6",
+            [
+                "speeds/limit.py:1: 5 becomes 4 in `LIMIT = 5`",
+                "speeds/limit.py:5: Gt becomes GtE in `return speed > LIMIT`",
+            ],
+        ),
+    ],
+)
+def test_what_no_test_tells_apart_is_found(
+    speeds: str, unnoticed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "SLACK_S", 0.5)  # one of the mutants never ends
+    for file, content in {
+        "speeds/limit.py": "LIMIT = 5\n\n\n"
+        "def is_fast(speed):\n    return speed > LIMIT\n\n\n"
+        "def first_beyond(n):\n    while n <= 5:\n        n += 1\n    return n\n",
+        "speeds/__init__.py": "",
+        "tests/speeds/test_limit.py": TESTS.replace("{speeds}", speeds),
+        "pyproject.toml": "[tool.pytest.ini_options]\naddopts = '--import-mode=importlib'\n",
+    }.items():
+        path = tmp_path / "tree" / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content)
+    options = argparse.Namespace(
+        package="speeds", only=[], number=99, seed=1, tests=["tests/speeds"], timeout=9.0
+    )
+    picked, survivors = bench.run(tmp_path / "tree", options)
+    assert len(picked) == 11
+    assert [str(each) for each in survivors] == unnoticed
+    assert "LIMIT = 5" in (tmp_path / "tree/speeds/limit.py").read_text()

@@ -1,0 +1,112 @@
+"""What a session's own grasps make of its sensors, with a training of round numbers."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.calibration import Calibration, SessionCalibration
+from models.contract import SessionInput, Sharpness
+
+MEAN, SPREAD = 2000.0, 100.0
+"""Of every electrode in the training, counts."""
+SHAPE = (3, 24)
+
+
+def new_session() -> SessionCalibration:
+    wanted = SessionInput(
+        mean=(0.0,) * 78,
+        spread=(1.0,) * 78,
+        clip=5.0,
+        prior_grasps=1.0,
+        calibrated_from=3.0,
+        sharpness=(
+            *(Sharpness(0.0, 2.5), Sharpness(1.0, 2.0)),
+            *(Sharpness(2.0, 1.5), Sharpness(4.0, 1.0)),
+        ),
+    )
+    return SessionCalibration(wanted, np.full(SHAPE, MEAN), np.full(SHAPE, SPREAD))
+
+
+def grasps(number: int, mean: float = MEAN, spread: float = SPREAD) -> NDArray[np.float64]:
+    """Shape (number, 3, 24)."""
+    return np.random.default_rng(3).normal(mean, spread, (number, *SHAPE))
+
+
+@pytest.mark.parametrize(
+    ("number", "calibrated", "temperature"),
+    [(0, False, 2.5), (1, False, 2.0), (2, False, 1.5), (3, True, 1.5), (4, True, 1.0)],
+)
+def test_a_session_is_calibrated_and_sharp_after_the_grasps_of_its_card(
+    number: int, calibrated: bool, temperature: float
+) -> None:
+    session = new_session()
+    for counts in grasps(number):
+        session.observe(counts)
+    assert session.grasps == number
+    assert (session.calibrated, session.now.odd) == (calibrated, False)
+    assert session.now.temperature == temperature
+    session.reset()
+    assert (session.grasps, session.calibrated, session.now.temperature) == (0, False, 2.5)
+
+
+@pytest.mark.parametrize("spread", [SPREAD, 1.0], ids=["far away", "standing still"])
+def test_what_cannot_have_been_grasps_is_never_calibrated_nor_sharp(spread: float) -> None:
+    session = new_session()
+    for counts in grasps(50, 3200.0 if spread == SPREAD else MEAN, spread):
+        session.observe(counts)
+    assert session.grasps > 40, "a reading that stands still is no new grasp"
+    assert (session.now.odd, session.calibrated) == (True, False)
+    assert session.now.temperature == 2.5
+
+
+def test_a_count_is_mapped_by_its_distance_from_the_mean_in_spreads() -> None:
+    nothing = np.zeros(0)
+    calibration = Calibration(
+        *(nothing, nothing, np.full(SHAPE, 1500.0), np.full(SHAPE, 50.0)),
+        training_mean=np.full(SHAPE, MEAN),
+        scale=np.full(SHAPE, SPREAD / 50.0),
+        calibrated=True,
+        odd=False,
+        temperature=1.0,
+    )
+    counts = np.full(SHAPE, 1600, dtype=np.uint16)  # two spreads of 50 above 1500
+    assert (calibration.to_training(counts) == MEAN + 2 * SPREAD).all()
+    assert (calibration.from_training(calibration.to_training(counts)) == counts).all()
+
+
+def test_the_statistics_are_those_of_the_grasps_and_of_one_grasp_of_the_training() -> None:
+    session, seen = new_session(), grasps(200, mean=2300.0, spread=60.0)
+    for counts in seen:
+        session.observe(counts)
+    now = session.now
+    assert now.counts_mean.shape == now.counts_spread.shape == SHAPE
+    np.testing.assert_allclose(now.counts_mean, (seen.sum(axis=0) + MEAN) / 201)
+    np.testing.assert_allclose(now.counts_spread, 60.0, rtol=0.5)
+    np.testing.assert_allclose(now.scale, SPREAD / now.counts_spread)
+    assert now.features_mean.shape == now.features_spread.shape == (78,)
+    means = seen.mean(axis=2)  # the features after the 72 z-values
+    np.testing.assert_allclose(now.features_mean[72:75], means.sum(axis=0) / 201)
+
+
+@pytest.mark.parametrize(
+    ("mean", "possible"), [(0.0, True), (4095.0, True), (-0.1, False), (4095.1, False)]
+)
+@pytest.mark.parametrize("place", [78, 78 + 71])
+def test_kept_means_are_those_of_counts(mean: float, possible: bool, place: int) -> None:
+    session = new_session()
+    for counts in grasps(5):
+        session.observe(counts)
+    state = session.state()
+    means = list(state.mean)
+    means[place] = mean
+    kept, other = msgspec.structs.replace(state, mean=tuple(means)), new_session()
+    if not possible:
+        with pytest.raises(ValueError, match="means that no counts have"):
+            other.restore(kept)
+        assert other.grasps == 0
+    else:
+        other.restore(kept)
+        assert (other.grasps, other.now.temperature) == (5, 1.0)

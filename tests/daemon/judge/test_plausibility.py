@@ -1,0 +1,109 @@
+"""How many electrodes may contradict the others, on a grasp like those of a model's training."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.calibration import Calibration
+from daemon.judge.plausibility import Plausibility
+from daemon.judge.reasons import Reason
+from drivers.twins.grasps import synthetic
+from models import zoo
+from models.electrodes import Electrodes
+from models.runtime import TactileModel
+
+NOTHING = np.zeros((3, 24), dtype=np.bool_)
+# Of different fingers and apart, so that none explains another.
+WRONG = ((0, 3), (1, 9), (2, 20))
+BROKEN = ((0, 14), (1, 20))
+
+
+@pytest.fixture(scope="module")
+def plausibility() -> Plausibility:
+    contract = TactileModel(zoo.find("cnn1")).contract
+    return Plausibility(contract.fingers, contract.seen, Electrodes(contract.seen))
+
+
+@pytest.fixture(scope="module")
+def grasp(plausibility: Plausibility) -> NDArray[np.uint16]:
+    """One that is judged as it is: shape (3, 24)."""
+    drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(1), 50)
+    for counts in drawn.counts.reshape(50, 3, 24):
+        found = plausibility.examine(counts, NOTHING)
+        if not found.reasons and not found.repaired:
+            return np.asarray(counts, dtype=np.uint16)
+    raise AssertionError("no grasp is like those of the training")
+
+
+@pytest.mark.parametrize("known", [0, 1, 2])
+@pytest.mark.parametrize(("wrong", "judged"), [(0, True), (1, True), (2, True), (3, False)])
+def test_two_electrodes_may_contradict_besides_those_known_to_be_broken(
+    plausibility: Plausibility, grasp: NDArray[np.uint16], known: int, wrong: int, judged: bool
+) -> None:
+    counts, broken = grasp.copy(), NOTHING.copy()
+    for place in WRONG[:wrong]:
+        counts[place] = counts[place] + 1500 if counts[place] < 2000 else counts[place] - 1500
+    for place in BROKEN[:known]:
+        counts[place] = 0
+        broken[place] = True
+    found = plausibility.examine(counts, broken)
+    assert found.reasons == (() if judged else (Reason.NEVER_SEEN,))
+    if judged:
+        names = {f"{('ff', 'mf', 'th')[f]}_{e + 1}" for f, e in (*WRONG[:wrong], *BROKEN[:known])}
+        assert set(found.repaired) == names
+        repaired = np.zeros((3, 24), dtype=np.bool_)
+        for place in (*WRONG[:wrong], *BROKEN[:known]):
+            repaired[place] = True
+        assert (found.counts[~repaired] == grasp[~repaired]).all()
+        errors = np.abs(found.counts[repaired].astype(float) - grasp[repaired])
+        assert (errors < 400).all(), "what the others let expect is near what was there"
+        assert found.grasp is not None
+
+
+@pytest.fixture(scope="module")
+def of_sessions() -> Plausibility:
+    contract = TactileModel(zoo.find("small-session")).contract
+    return Plausibility(contract.fingers, contract.seen, Electrodes(contract.seen))
+
+
+def same_sensors(centre: NDArray[np.float64], **known: bool) -> Calibration:
+    """A session whose sensors are those of the training."""
+    nothing, ones = np.zeros(0), np.ones((3, 24))
+    return Calibration(
+        *(nothing, nothing, centre, ones, centre, ones),
+        calibrated=known.get("calibrated", True),
+        odd=known.get("odd", False),
+        temperature=1.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("stretched", "known", "judged", "learned"),
+    [
+        (1.0, {}, True, True),
+        (1.0, {"odd": True}, False, True),  # near the training, in a session that is none
+        (1.6, {}, False, True),  # up to twice as far a session learns from what it cannot judge
+        (4.0, {}, False, False),
+        (4.0, {"calibrated": False}, False, True),  # a young one learns from all
+    ],
+)
+def test_a_session_judges_what_is_near_and_learns_from_what_is_twice_as_far(
+    of_sessions: Plausibility,
+    stretched: float,
+    known: dict[str, bool],
+    judged: bool,
+    learned: bool,
+) -> None:
+    seen = TactileModel(zoo.find("small-session")).contract.seen
+    centre = np.array(seen.centre)
+    # One deviation of the training, of 0.9 of the distance up to which it is judged.
+    spread = np.linalg.inv(seen.whitening_matrix()).T
+    direction = np.random.default_rng(2).normal(size=72)
+    direction *= 0.9 * seen.distance_max * np.sqrt(72) / np.linalg.norm(direction)
+    counts = np.clip(centre + stretched * (direction @ spread.T).reshape(3, 24), 1, 4094)
+    session = same_sensors(centre, **known)
+    found = of_sessions.examine(np.rint(counts).astype(np.uint16), NOTHING, session)
+    assert found.reasons == (() if judged else (Reason.NEVER_SEEN,))
+    assert (found.grasp is not None) == learned

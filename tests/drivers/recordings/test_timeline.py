@@ -1,0 +1,68 @@
+"""When recorded items are due and played, by a clock that only tests move."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import pytest
+
+from drivers.base import RecordingError
+from drivers.recordings.player import Timeline
+from tests.drivers.palm.palm_stream import MS, Clock
+
+RECORDED_NS = (500 * MS, 510 * MS, 530 * MS)
+
+
+def items() -> Generator[tuple[int, str], None, None]:
+    yield from ((at_ns, f"at {at_ns // MS}") for at_ns in RECORDED_NS)
+
+
+@pytest.mark.parametrize(("speed", "steps_ms"), [(1.0, [0, 10, 30]), (2.0, [0, 5, 15])])
+@pytest.mark.parametrize("delay_ms", [0, 7])
+def test_items_are_due_as_recorded_over_the_speed(
+    speed: float, steps_ms: list[int], delay_ms: int
+) -> None:
+    clock = Clock()
+    timeline: Timeline[str] = Timeline(speed, clock, delay_ns=delay_ms * MS)
+    timeline.start(items())
+    assert timeline.due_ns() == clock.now_ns, "the first one begins the run"
+    began_ns = clock.now_ns
+    assert (timeline.take() is None) == (delay_ms > 0)
+    for at_ns, step_ms in list(zip(RECORDED_NS, steps_ms, strict=True))[0 if delay_ms else 1 :]:
+        due_ns = began_ns + (step_ms + delay_ms) * MS
+        assert timeline.due_ns() == due_ns
+        clock.now_ns = due_ns - 1
+        assert timeline.take() is None
+        clock.now_ns = due_ns + 2
+        assert timeline.take() == (at_ns, f"at {at_ns // MS}", 2)
+        assert timeline.played_ns(at_ns) == began_ns + step_ms * MS
+    assert timeline.exhausted
+    assert timeline.due_ns() is None
+
+
+def test_without_a_speed_all_is_due_at_once_and_keeps_its_recorded_times() -> None:
+    clock = Clock()
+    timeline: Timeline[str] = Timeline(None, clock)
+    timeline.start(items())
+    taken = [timeline.take() for _ in RECORDED_NS]
+    assert [at_ns for at_ns, _, _ in filter(None, taken)] == list(RECORDED_NS)
+    assert [timeline.played_ns(at_ns) - clock.now_ns for at_ns in RECORDED_NS] == [
+        *(0, 10 * MS, 30 * MS),
+    ]
+    assert timeline.exhausted
+
+
+def test_an_error_waits_until_what_is_before_it_was_taken() -> None:
+    def broken() -> Generator[tuple[int, str], None, None]:
+        yield 0, "first"
+        raise RecordingError("x.csv", "no more")  # type: ignore[arg-type]
+
+    timeline: Timeline[str] = Timeline(None, Clock())
+    with pytest.raises(RuntimeError, match="not open"):
+        timeline.take()
+    timeline.start(broken())
+    assert timeline.take() == (0, "first", 0)
+    assert not timeline.exhausted
+    with pytest.raises(RecordingError, match="no more"):
+        timeline.take()
+    assert timeline.exhausted

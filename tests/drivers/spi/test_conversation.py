@@ -1,0 +1,190 @@
+"""What is said with a bridge and when, message by message, by the numbers of its protocol."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from drivers.link import LinkState
+from drivers.spi.conversation import Conversation
+from drivers.spi.messages import Message, Ping, Start, Status, Stop, decode, encode, frame_parser
+from tests.drivers.spi.bridge_bench import FINGERS, MS, hello, sweep
+
+T0 = 5_000_000 * MS
+S = 1000 * MS
+
+
+def said(conversation: Conversation, now_ns: int) -> list[Message]:
+    """What the host says, taken as sent."""
+    messages = []
+    parser = frame_parser()
+    for data in conversation.say(now_ns):
+        conversation.sent(data, now_ns)
+        messages += [decode(*frame) for frame in parser.feed(data)]
+    return [message for message in messages if message is not None]
+
+
+def opened(nonce: int = 41) -> Conversation:
+    conversation = Conversation("port", FINGERS, nonce=nonce)
+    conversation.opened(T0)
+    return conversation
+
+
+def hear(conversation: Conversation, message: Message, now_ns: int) -> int:
+    """How many readings a message makes."""
+    return len(conversation.receive(encode(message), now_ns, now_ns))
+
+
+def state(conversation: Conversation) -> LinkState:
+    return conversation.link.state
+
+
+def greeted(period_ms: int = 10) -> Conversation:
+    conversation = opened()
+    said(conversation, T0)
+    answer = dataclasses.replace(hello(42), period_ticks=1000 * period_ms)
+    assert hear(conversation, answer, T0) == 0
+    return conversation
+
+
+def test_a_bridge_is_asked_four_times_half_a_second_apart_and_given_up() -> None:
+    conversation, now_ns = opened(), T0
+    for number in range(4):
+        assert conversation.due_ns == now_ns
+        assert said(conversation, now_ns - 1) == [] or number == 0
+        assert said(conversation, now_ns) in ([], [Stop(), Ping(42 + number)])
+        now_ns += 500 * MS
+    assert conversation.due_ns == now_ns
+    assert said(conversation, now_ns - 1) == []
+    assert state(conversation) is LinkState.GREETING
+    assert said(conversation, now_ns) == []
+    assert state(conversation) is LinkState.WAITING
+    assert conversation.counters.unanswered_pings == 4
+    assert conversation.counters.link_failures == 1
+
+
+def test_a_nonce_is_never_that_of_a_reset() -> None:
+    conversation = opened(nonce=(1 << 32) - 2)
+    pings = [said(conversation, T0 + tries * 500 * MS)[1] for tries in range(3)]
+    assert pings == [Ping((1 << 32) - 1), Ping(1), Ping(2)]
+
+
+def test_eight_pings_come_each_50_ms_and_then_one_a_second() -> None:
+    conversation, sent_ms = greeted(1000), [0]
+    assert said(conversation, T0) == [Start()]
+    for number in range(10):
+        now_ns = conversation.due_ns
+        assert said(conversation, now_ns) == [Ping(43 + number)]
+        sent_ms.append((now_ns - T0) // MS)
+    assert sent_ms == [0, 50, 100, 150, 200, 250, 300, 350, 1350, 2350, 3350]
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "silence_ms"), [(1, 100), (10, 100), (20, 200), (1000, 10_000)]
+)
+def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
+    period_ms: int, silence_ms: int
+) -> None:
+    conversation = greeted(period_ms)
+    assert said(conversation, T0) == [Start()]
+    heard_ns = T0 + 7 * MS
+    assert hear(conversation, sweep(0, 10**9), heard_ns) == 1
+    assert state(conversation) is LinkState.UP
+    said(conversation, heard_ns + silence_ms * MS - 1)
+    assert state(conversation) is LinkState.UP
+    said(conversation, heard_ns + silence_ms * MS)
+    assert state(conversation) is LinkState.WAITING
+    assert conversation.link.reason == f"no sweep for {silence_ms} ms"
+
+
+def test_a_bridge_that_sweeps_less_than_once_a_second_is_refused() -> None:
+    conversation = greeted(1001)
+    assert conversation.link.reason == "port: the bridge sweeps once in 1.001 s only"
+    assert conversation.counters.refused_bridges == 1
+
+
+def test_of_pings_without_an_answer_eight_are_remembered() -> None:
+    conversation, now_ns = greeted(1000), T0
+    said(conversation, T0)
+    for _ in range(8):
+        now_ns = conversation.due_ns
+        assert len(said(conversation, now_ns)) == 1
+    assert conversation.counters.unanswered_pings == 0
+    now_ns = conversation.due_ns
+    assert said(conversation, now_ns) == [Ping(51)]
+    assert conversation.counters.unanswered_pings == 1
+    conversation.lost("unplugged", now_ns)
+    assert conversation.counters.unanswered_pings == 9
+
+
+def test_people_are_told_what_is_known() -> None:
+    conversation = opened()
+    assert conversation.describe() == {"port": "port", "link": "greeting"}
+    conversation.lost("unplugged", T0)
+    assert conversation.describe() == {"port": "port", "link": "waiting", "why": "unplugged"}
+    conversation.opened(T0)
+    said(conversation, T0)
+    answer = dataclasses.replace(hello(42), firmware=0x0203, serials=("BTSP-1", "", "BTSP-3"))
+    hear(conversation, answer, T0 + 2 * MS)
+    about = {
+        "board": "b",
+        "firmware": "2.3",
+        "sequence": "24 samples at 100.0 Hz",
+        "sensors": "BTSP-1, none, BTSP-3",
+    }
+    assert conversation.describe() == {
+        "port": "port",
+        "link": "greeting",
+        "why": "unplugged",
+        **about,
+        "clock": "trusted",
+        "round trip": "2.00 ms",
+    }
+    assert conversation.serials == {"ff": "BTSP-1", "th": "BTSP-3"}
+    conversation.lost("unplugged", T0)
+    assert conversation.describe() == {
+        "port": "port",
+        "link": "waiting",
+        "why": "unplugged",
+        **about,
+    }
+
+
+def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words() -> None:
+    conversation = greeted()
+    hear(conversation, Status(1, 2, 3, 4, 5, (6,)), T0)
+    hear(conversation, Ping(7), T0)
+    counters = conversation.counters
+    shown = counters.bridge_overruns, counters.bridge_tx_dropped, counters.bridge_rx_errors
+    assert (*shown, counters.unknown_frames) == (3, 4, 5, 1)
+
+
+@pytest.mark.parametrize(("first", "missed"), [(0, 0), (1, 1), (1000, 1000), (1001, 0)])
+def test_a_high_first_number_is_no_loss(first: int, missed: int) -> None:
+    conversation = greeted()
+    assert hear(conversation, sweep(first, 10**9), T0) == 1
+    assert conversation.counters.missed_readings == missed
+
+
+@pytest.mark.parametrize(
+    ("step", "taken", "missed", "duplicates", "reordered"),
+    [
+        (1, 1, 0, 0, 0),
+        (2, 1, 1, 0, 0),
+        ((1 << 31) - 1, 1, (1 << 31) - 2, 0, 0),
+        (1 << 31, 0, 0, 0, 1),
+        ((1 << 32) - 1, 0, 0, 0, 1),
+        (0, 0, 0, 1, 0),
+    ],
+)
+def test_numbers_of_sweeps_go_round(
+    step: int, taken: int, missed: int, duplicates: int, reordered: int
+) -> None:
+    conversation, first = greeted(), 900
+    assert hear(conversation, sweep(first, 10**9), T0) == 1
+    assert conversation.counters.missed_readings == 900
+    assert hear(conversation, sweep((first + step) % (1 << 32), 2 * 10**9), T0 + MS) == taken
+    counters = conversation.counters
+    assert counters.missed_readings == 900 + missed
+    assert (counters.duplicates, counters.reordered) == (duplicates, reordered)

@@ -1,0 +1,93 @@
+"""What all drivers have in common: counters, fingers, readings."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from drivers.base import (
+    ELECTRODES,
+    FINGERS,
+    DriverCounters,
+    ElectrodeFault,
+    TactileReading,
+    sensor_rows,
+)
+from drivers.can.readings import CanCounters
+from drivers.joints.message import JointCounters
+from drivers.palm.packet import PalmCounters
+from drivers.recordings.faults import ReplayCounters
+from drivers.spi.framing import FrameCounters
+from drivers.spi.sweeps import BridgeCounters
+from drivers.udp.link import DatagramCounters
+
+COUNTERS = (
+    *(DriverCounters, DatagramCounters, JointCounters, PalmCounters),
+    *(CanCounters, BridgeCounters, ReplayCounters, FrameCounters),
+)
+
+
+@pytest.mark.parametrize("counters", COUNTERS, ids=lambda kind: kind.__name__)
+def test_every_counter_begins_at_zero(counters: type[DriverCounters | FrameCounters]) -> None:
+    made = asdict(counters())
+    assert made == dict.fromkeys(made, 0)
+
+
+@pytest.mark.parametrize(
+    ("fingers", "sensors", "rows"),
+    [
+        (("ff", "mf", "th"), None, (0, 1, 2)),
+        (("th", "ff"), ("ff", "mf", "th"), (2, 0)),
+        (("lf",), FINGERS, (3,)),
+    ],
+)
+def test_a_row_is_where_the_device_has_the_finger(
+    fingers: tuple[str, ...], sensors: tuple[str, ...] | None, rows: tuple[int, ...]
+) -> None:
+    assert sensor_rows(fingers, sensors) == rows
+
+
+@pytest.mark.parametrize(
+    ("fingers", "sensors"),
+    [
+        ((), None),
+        (("ff", "ff"), None),
+        (("ff", "pinky"), None),
+        (("ff",), ()),
+        (("ff",), ("ff", "ff")),
+        (("ff",), ("ff", "pinky")),
+        (("ff", "th"), ("ff", "mf")),
+    ],
+)
+def test_fingers_are_different_ones_of_the_hand_and_of_the_device(
+    fingers: tuple[str, ...], sensors: tuple[str, ...] | None
+) -> None:
+    with pytest.raises(ValueError, match="fingers"):
+        sensor_rows(fingers, sensors)
+
+
+@pytest.mark.parametrize(
+    ("counts", "faults"),
+    [((3, 23), (3, 23)), ((3, 25), (3, 25)), ((24,), (24,)), ((3, 24), (2, 24))],
+)
+def test_a_reading_has_24_electrodes_a_finger(
+    counts: tuple[int, ...], faults: tuple[int, ...]
+) -> None:
+    assert ELECTRODES == 24
+    with pytest.raises(ValueError, match="counts"):
+        TactileReading(0, 0, np.zeros(counts, np.uint16), np.zeros(faults, np.uint8))
+
+
+def test_faults_keep_the_bits_that_recordings_hold() -> None:
+    assert {fault.name: int(fault) for fault in ElectrodeFault} == {
+        **{"MISSING": 1, "NOT_A_COUNT": 2, "PARITY": 4},
+        **{"ERROR_WORD": 8, "HELD": 16, "CUT_OFF": 32},
+    }
+
+
+def test_a_recorded_reading_was_made_when_it_was_recorded_a_live_one_when_it_came() -> None:
+    arrays = np.zeros((1, 24), np.uint16), np.zeros((1, 24), np.uint8)
+    assert TactileReading(5, 0, *arrays).made_ns == 5
+    assert TactileReading(5, 0, *arrays, recorded_ns=0).made_ns == 0

@@ -1,0 +1,299 @@
+"""A link of datagrams on a scripted socket: who is heard, when it is silent, what was dropped."""
+
+from __future__ import annotations
+
+import os
+import socket
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from drivers.base import LinkError
+from drivers.link import LinkState
+from drivers.udp.link import DatagramCounters, DatagramLink
+from drivers.udp.receiver import Datagram, DatagramReceiver, Endpoint
+from tests.drivers.spi.bridge_bench import MS, Clock
+
+HERE, THERE = ("127.0.0.1", 7), ("127.0.0.1", 8)
+SILENCE_NS = 100 * MS
+
+
+class Receiver:
+    """A socket that hands over what a test puts in, and breaks when there is an exception."""
+
+    port = 5700
+
+    def __init__(self, dropped: int = 0) -> None:
+        self.waiting: list[Datagram | LinkError] = []
+        self.dropped = dropped
+        self.closed = False
+
+    def receive(self, most: int) -> Iterator[Datagram]:
+        while self.waiting and most:
+            most -= 1
+            datagram = self.waiting.pop(0)
+            if isinstance(datagram, LinkError):
+                raise datagram
+            yield datagram
+
+    def fileno(self) -> int:
+        return 99
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Bench:
+    """A link, its clock, and the sockets that it opens one after the other."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, only_from: str | None = None) -> None:
+        self.sockets = [Receiver(3), Receiver(4)]
+        waiting = list(self.sockets)
+        monkeypatch.setattr("drivers.udp.link.DatagramReceiver", lambda *_: waiting.pop(0))
+        self.clock = Clock()
+        self.link = DatagramLink(
+            *("test", "udp://127.0.0.1:5700", self.clock),
+            bytes_max=100,
+            silence_ns=SILENCE_NS,
+            only_from=only_from,
+        )
+        self.counters = DatagramCounters()
+
+    def hear(self, *sent: Datagram, good: bool = True) -> list[tuple[bytes, int]]:
+        """What comes through of what is sent."""
+        self.sockets[0].waiting += sent
+        heard = []
+        for data, t_ns in self.link.receive():
+            heard.append((data, self.clock.now_ns - t_ns))
+            if good:
+                self.link.confirm("somebody")
+        return heard
+
+    def listening(self) -> tuple[int | None, int | None]:
+        return self.link.fileno(), self.link.port
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    made = Bench(monkeypatch)
+    made.link.open(made.counters)
+    return made
+
+
+def test_the_first_good_sender_is_the_only_one_until_it_is_silent(bench: Bench) -> None:
+    assert bench.hear(Datagram(b"x", 0, THERE), good=False) == [(b"x", 0)]
+    assert bench.link.state is LinkState.GREETING
+    assert bench.hear(Datagram(b"a", 0, HERE), Datagram(b"b", 0, THERE)) == [(b"a", 0)]
+    assert bench.counters.foreign_datagrams == 1
+    assert bench.link.describe() == {
+        "source": "udp://127.0.0.1:5700",
+        "link": "up",
+        "heard": "somebody from 127.0.0.1 port 7",
+    }
+    bench.clock.now_ns += SILENCE_NS
+    assert bench.link.fell_silent()
+    assert bench.hear(Datagram(b"b", 0, THERE)) == [(b"b", 0)]
+
+
+@pytest.mark.parametrize(
+    ("only_from", "heard"), [("127.0.0.1", True), ("127.0.0.2", False), (None, True)]
+)
+def test_only_one_address_is_heard_if_that_is_wanted(
+    monkeypatch: pytest.MonkeyPatch, only_from: str | None, heard: bool
+) -> None:
+    bench = Bench(monkeypatch, only_from)
+    bench.link.open(bench.counters)
+    assert bool(bench.hear(Datagram(b"a", 0, HERE))) == heard
+    assert bench.counters.foreign_datagrams == (not heard)
+
+
+def test_a_datagram_is_as_old_as_the_kernel_says_and_never_older_than_the_one_before(
+    bench: Bench,
+) -> None:
+    sent = [Datagram(b"a", 5, HERE), Datagram(b"b", 7, HERE), Datagram(b"c", 2, HERE)]
+    assert bench.hear(*sent) == [(b"a", 5), (b"b", 5), (b"c", 2)]
+
+
+def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
+    assert bench.link.due_ns() is None
+    assert not bench.link.fell_silent()
+    bench.hear(Datagram(b"a", 10 * MS, HERE))
+    assert bench.link.due_ns() == bench.clock.now_ns + SILENCE_NS - 10 * MS
+    bench.clock.now_ns += SILENCE_NS - 10 * MS - 1
+    assert not bench.link.fell_silent()
+    bench.clock.now_ns += 1
+    assert bench.link.fell_silent()
+    assert not bench.link.fell_silent()
+    assert (bench.link.state, bench.counters.link_losses) == (LinkState.GREETING, 1)
+    assert bench.link.describe()["why"] == "nothing good for 100 ms"
+    assert bench.link.due_ns() is None
+
+
+def test_a_link_that_never_was_up_does_not_fall_silent(bench: Bench) -> None:
+    bench.hear(Datagram(b"x", 0, HERE), good=False)
+    bench.clock.now_ns += 10 * SILENCE_NS
+    assert not bench.link.fell_silent()
+    assert bench.counters.link_losses == 0
+
+
+def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> None:
+    first, second = bench.sockets
+    bench.hear(Datagram(b"a", 0, HERE))
+    assert bench.counters.kernel_drops == 3
+    first.waiting.append(LinkError("Network is down"))
+    assert bench.hear() == []
+    assert (bench.link.state, first.closed) == (LinkState.WAITING, True)
+    assert bench.listening() == (None, None)
+    due_ns = bench.link.due_ns()
+    assert due_ns is not None
+    bench.clock.now_ns = due_ns - 1
+    assert bench.hear() == []
+    assert bench.listening() == (None, None)
+    bench.clock.now_ns = due_ns
+    assert bench.hear() == []
+    assert bench.listening() == (99, 5700)
+    assert bench.counters.kernel_drops == 3 + 4
+    second.waiting.append(LinkError("Network is down"))
+    assert bench.hear() == []
+    assert bench.counters.kernel_drops == 3 + 4
+
+
+def test_at_most_256_datagrams_are_taken_at_once(bench: Bench) -> None:
+    assert len(bench.hear(*[Datagram(b"a", 0, HERE)] * 300)) == 256
+    assert len(bench.hear()) == 300 - 256
+
+
+def test_a_socket_keeps_128_kilobytes() -> None:
+    """0.2 s of palm packets; the kernel gives what it gives to whoever asks for as much."""
+    receiver = DatagramReceiver(Endpoint("127.0.0.1", 0), 100)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 131_072)
+        with socket.socket(fileno=os.dup(receiver.fileno())) as same:
+            sizes = {each.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) for each in (same, other)}
+    receiver.close()
+    assert len(sizes) == 1
+
+
+def test_a_closed_link_says_what_it_was_and_cannot_be_read(bench: Bench) -> None:
+    bench.hear(Datagram(b"a", 0, HERE))
+    bench.link.close()
+    assert bench.link.describe()["link"] == "up"
+    with pytest.raises(RuntimeError, match="test link is not open"):
+        next(bench.link.receive())
+
+
+@pytest.mark.parametrize(
+    ("source", "endpoint"),
+    [
+        ("udp://127.0.0.1:0", Endpoint("127.0.0.1", 0)),
+        ("udp://127.0.0.1:65535", Endpoint("127.0.0.1", 65535)),
+        ("udp://[::1]:5700", Endpoint("::1", 5700)),
+        ("udp://127.0.0.1:65536", None),
+        ("udp://127.0.0.1:-1", None),
+        ("udp://127.0.0.1:", None),
+        ("udp://127.0.0.1", None),
+        ("udp://127.0.0.1:\u0661", None),
+        ("127.0.0.1:5700", None),
+        ("tcp://127.0.0.1:5700", None),
+        ("udp://localhost:5700", None),
+    ],
+)
+def test_a_source_is_an_address_and_a_port(source: str, endpoint: Endpoint | None) -> None:
+    if endpoint is None:
+        with pytest.raises(ValueError, match=r"is not (like udp://|an IP address)"):
+            Endpoint.parse(source)
+    else:
+        assert Endpoint.parse(source) == endpoint
+        assert str(endpoint) == source
+
+
+class Kernel:
+    """A socket that hands over what the kernel would: datagrams with notes, or errors."""
+
+    def __init__(self, *_: object) -> None:
+        self.script: list[tuple[bytes, list[tuple[int, int, bytes]]] | OSError] = []
+        self.options: dict[int, int] = {}
+
+    def setsockopt(self, level: int, option: int, value: int) -> None:
+        assert level == socket.SOL_SOCKET
+        self.options[option] = value
+
+    def setblocking(self, _on: bool) -> None: ...
+
+    def bind(self, _address: object) -> None: ...
+
+    def close(self) -> None: ...
+
+    def recvmsg(self, most: int, _room: int) -> tuple[bytes, list[object], int, tuple[object, ...]]:
+        if not self.script:
+            raise BlockingIOError
+        step = self.script.pop(0)
+        if isinstance(step, OSError):
+            raise step
+        return step[0][:most], list(step[1]), 0, ("::1", 7, 0, 0)
+
+
+def noted(
+    monkeypatch: pytest.MonkeyPatch, *script: tuple[bytes, list[tuple[int, int, bytes]]] | OSError
+) -> tuple[DatagramReceiver, Kernel]:
+    kernel = Kernel()
+    kernel.script += script
+    monkeypatch.setattr("drivers.udp.receiver.socket.socket", lambda *_: kernel)
+    monkeypatch.setattr("drivers.udp.receiver.time.time_ns", lambda: 5_000_000_010)
+    return DatagramReceiver(Endpoint("::1", 5700), 100), kernel
+
+
+SOL, STAMP, LOST = socket.SOL_SOCKET, 35, 40
+"""Of asm-generic/socket.h: SO_TIMESTAMPNS and SO_RXQ_OVFL."""
+
+
+@pytest.mark.parametrize(
+    ("notes", "age_ns", "dropped"),
+    [
+        ([(SOL, STAMP, struct.pack("@ll", 5, 7))], 3, 0),
+        ([(SOL, STAMP, struct.pack("@ll", 4, 7))], 1_000_000_003, 0),
+        ([(SOL, STAMP, struct.pack("@ll", 5, 11))], 0, 0),  # the wall clock was set back
+        ([(SOL, STAMP, b"short")], 0, 0),
+        ([(0, STAMP, struct.pack("@ll", 5, 7)), (0, LOST, struct.pack("@I", 9))], 0, 0),
+        ([(SOL, LOST, struct.pack("@I", 9))], 0, 9),
+        ([(SOL, LOST, struct.pack("@Q", 9))], 0, 0),
+        ([(SOL, STAMP, struct.pack("@ll", 5, 7)), (SOL, LOST, struct.pack("@I", 2))], 3, 2),
+        ([(0, 1, b""), (SOL, LOST, struct.pack("@I", 2))], 0, 2),
+        ([(SOL, 99, struct.pack("@I", 9))], 0, 0),
+        ([], 0, 0),
+    ],
+)
+def test_age_and_losses_are_what_the_kernel_notes(
+    monkeypatch: pytest.MonkeyPatch,
+    notes: list[tuple[int, int, bytes]],
+    age_ns: int,
+    dropped: int,
+) -> None:
+    receiver, kernel = noted(monkeypatch, (b"a", notes))
+    assert list(receiver.receive(5)) == [Datagram(b"a", age_ns, ("::1", 7))]
+    assert receiver.dropped == dropped
+    assert kernel.options[STAMP]
+    assert kernel.options[LOST]
+
+
+def test_a_datagram_that_is_too_long_shows_by_one_byte(monkeypatch: pytest.MonkeyPatch) -> None:
+    receiver, _ = noted(monkeypatch, (bytes(100), []), (bytes(500), []))
+    assert [len(datagram.data) for datagram in receiver.receive(5)] == [100, 101]
+
+
+def test_an_interrupted_call_is_made_again_and_an_error_is_a_broken_link(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    broken = OSError(100, "Network is down")
+    receiver, _ = noted(monkeypatch, InterruptedError(), (b"a", []), broken)
+    taken = receiver.receive(5)
+    assert next(taken).data == b"a"
+    with pytest.raises(LinkError, match="cannot receive: Network is down"):
+        next(taken)
+
+
+def test_no_more_are_taken_than_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:
+    receiver, _ = noted(monkeypatch, *[(b"a", [])] * 4)
+    assert len(list(receiver.receive(3))) == 3
+    assert len(list(receiver.receive(3))) == 1
