@@ -8,11 +8,12 @@ stopped by SIGINT and SIGTERM before the work was done.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import importlib
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 
 from daemon.process import logs
@@ -82,7 +83,8 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
         if name == named:
             run = _load(name, module_name, command)
-    args = parser.parse_args(arguments)
+    with _saying_which_extra(named):  # a report is imported when its arguments are read
+        args = parser.parse_args(arguments)
     logs.set_up(os.environ)
     if run is None:
         parser.error(f"'{args.command}' must come first")
@@ -92,13 +94,19 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
 def _load(
     command: str, module: str, parser: argparse.ArgumentParser
 ) -> Callable[[argparse.Namespace], int]:
-    try:
+    with _saying_which_extra(command):
         loaded = importlib.import_module(module)
         loaded.add_arguments(parser)
+    run: Callable[[argparse.Namespace], int] = loaded.run
+    return run
+
+
+@contextlib.contextmanager
+def _saying_which_extra(command: str | None) -> Iterator[None]:
+    try:
+        yield
     except ModuleNotFoundError as error:
         if command not in EXTRAS:
             raise
         complain(needs(command, EXTRAS[command], error))
         raise SystemExit(WRONG) from None
-    run: Callable[[argparse.Namespace], int] = loaded.run
-    return run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+from typing import Any
 
 REPORTS = {
     "error-vs-time": (
@@ -22,12 +23,24 @@ REPORTS = {
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 
 
+class _Report(argparse.ArgumentParser):
+    """Imports its report, which takes seconds, once that is chosen."""
+
+    module = ""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
+        importlib.import_module(self.module).add_arguments(self)
+        return super().parse_known_args(args, namespace)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the reports and their arguments."""
-    reports = parser.add_subparsers(dest="report", metavar="WHAT", required=True)
+    """Declare the reports."""
+    reports = parser.add_subparsers(
+        dest="report", metavar="WHAT", required=True, parser_class=_Report
+    )
     for name, (module, text) in REPORTS.items():
         report = reports.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        importlib.import_module(module).add_arguments(report)
+        report.module = module
 
 
 def run(args: argparse.Namespace) -> int:

@@ -181,13 +181,24 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
             _check(wanted, model, session.state())
         # Of which sensors they are is not known before the daemon hears from them.
         state = None if session is None else session.state()
-        file.save(state, wanted.hand.fingers, {}, None if trust is None else _taught(trust))
+        learned = _learned_before(file) if trust is None else _taught(trust)
+        file.save(state, wanted.hand.fingers, {}, learned)
         file.remove_former()
     grasps = outcomes if session is None else session.grasps
     sys.stdout.write(
         f"{printable(str(wanted.session_path))}: {grasps} grasps of {read} readings taken in, "
         f"{outcomes} outcomes learned\n"
     )
+
+
+def _learned_before(file: SessionFile) -> TrustState | None:
+    """What is kept stays where nothing learns: it is of use once something does again."""
+    try:
+        kept = file.load()
+        return None if kept is None or kept.trust is None else decode(kept.trust)
+    except (SessionFileError, ValueError) as error:
+        complain(f"what was learned is lost: {error}")
+        return None
 
 
 def _taught(trust: Trust) -> TrustState:

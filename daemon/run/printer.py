@@ -57,7 +57,7 @@ class Printer(Companion):
         """Count how a lift ended that was judged before."""
         self.result.outcome(grasp, slipped=outcome == "slip")
 
-    def summary(self, trust: Trust | None = None) -> None:
+    def summary(self, trust: Trust | None) -> None:
         """Write the summary of everything since the start; `trust` is what outcomes have taught."""
         wall_s = time.monotonic() - self._start_s
         if self._as_json:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.realtime import RealtimeMode
     from daemon.run.systemd import Systemd
+    from daemon.trust.trust import Trust
 
 log = logging.getLogger("graspd")
 
@@ -75,6 +76,8 @@ class Runner:
         self._manager = manager
         self._sockets: Sockets | None = None
         self._running = False
+        self._trust: Trust | None = None
+        """Of the scene that ran last."""
 
     def run(self) -> None:
         """Run until stopped or until a recording ends.
@@ -88,7 +91,7 @@ class Runner:
             if self._sockets is not None:
                 self._sockets.close()
         if self._printer is not None:
-            self._printer.summary()
+            self._printer.summary(self._trust)
 
     def _run(self, parts: Parts) -> None:
         former: Parts | None = None
@@ -160,6 +163,7 @@ class Runner:
             stack.callback(sockets.publisher.forget)
             stack.callback(loop.close)
             self._running = True
+            self._trust = parts.pipeline.trust
             _announce(wanted)
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")

@@ -3,7 +3,8 @@
 `python -m tests.bench.novelty DIR` prints two tables; DIR is the folder that holds `bts3/`. The
 streams are those of `graspd evaluate --protocol days`, in random order, judged by what a test holds
 to the daemon. Nonsense is shown to a calibrated session that does not learn from it. Poison comes
-before the stream: what counts is how many of the stream's slips are called stable after it.
+before the stream: what counts is how many of the stream's slips are called stable after it. It is
+`told` where the outcomes of those that were called stable are known.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.trust.learner import Learner
 from models.training.arrays import Bools, Ints
 from models.training.data.datasets import COUNT_MAX, Grasps, read_all
 from models.training.data.folds import fold_seed
@@ -65,13 +67,21 @@ def watch(trained: Trained, stream: Counts, seed: int) -> tuple[Bools, dict[str,
     return refused, caught
 
 
-def stable(trained: Trained, before: Counts, stream: Counts) -> Bools:
-    """Which grasps (N,) of a stream are called stable, after what came before it."""
-    day = SessionDay(trained)
-    for reading in before:
-        day.judge(reading)
-    verdicts = [day.judge(reading) for reading in stream]
-    return np.array([margin <= 0.0 and not refused for margin, refused in verdicts])
+def stable(trained: Trained, before: Counts, stream: Counts, *, told: bool = False) -> Bools:
+    """Which grasps (N,) of a stream are called stable, after what came before it.
+
+    If it is `told`, what came before were slips, and the outcomes of those that were called stable,
+    and so lifted, are known.
+    """
+    day, said = SessionDay(trained), []
+    learner = Learner(len(day.inputs))
+    for index, reading in enumerate(np.concatenate((before, stream))):
+        margin, refused = day.judge(reading)
+        features = learner.features(margin, day.inputs)
+        said.append(not refused and learner.log_odds(features) <= 0.0)
+        if told and said[-1] and index < len(before):
+            learner.learn(features, slipped=True)
+    return np.array(said[len(before) :])
 
 
 def poisoned(
@@ -88,6 +98,9 @@ def poisoned(
         again = slips[np.arange(number) % len(slips)]
         before = np.concatenate((first, again))
         yield f"{FIRST} grasps, {number} slips", stable(trained, before, stream)
+    first_slips = slips[np.arange(SLIPS[0]) % len(slips)]
+    yield f"{SLIPS[0]} slips", stable(trained, first_slips, stream)
+    yield f"{SLIPS[0]} slips, told", stable(trained, first_slips, stream, told=True)
     held = counts[:1] + random.normal(0.0, NOISE_COUNTS, (REPEATS, *stream.shape[1:]))
     before = np.clip(held, 0.0, COUNT_MAX).astype(np.uint16)
     yield f"one grasp {REPEATS} times, with noise", stable(trained, before, stream)

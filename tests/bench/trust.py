@@ -21,6 +21,7 @@ from daemon.measure.worth.streams import ORDERS, Plan, Stream, streams
 from daemon.trust.learner import Learner
 from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import read_all
+from models.training.evaluating.day_figures import VerdictFigures
 
 OUTCOMES = (0, 5, 10, 20, 50, 100, 200)
 REST = 200
@@ -43,9 +44,8 @@ def frozen(stream: Stream, outcomes: Sequence[int]) -> Iterator[NDArray[np.bool_
 
 def f1_and_slips(said: NDArray[np.bool_], slipped: NDArray[np.bool_]) -> tuple[float, float]:
     """F1 of slip, and the share of slips among what is called stable, %."""
-    hits, missed = int((said & slipped).sum()), int((~said & slipped).sum())
-    f1 = 2.0 * hits / max(2 * hits + missed + int((said & ~slipped).sum()), 1)
-    return 100.0 * f1, 100.0 * missed / max(int((~said).sum()), 1)
+    figures = VerdictFigures.of(said, slipped)
+    return 100.0 * figures.f1, 100.0 * (figures.slips_among_stable or 0.0)
 
 
 def worst_window(life: Life) -> float:

@@ -7,11 +7,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from daemon import scene as scenes
 from daemon.assembly import assembly
 from daemon.session.file import SessionFile, former_of, load
+from daemon.trust.ledger import GraspId
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_TABLE
@@ -129,6 +131,30 @@ def test_a_model_without_session_learns_from_outcomes_or_refuses(tmp_path: Path)
     document = shown(path)
     assert document["session"]["statistics"] is None
     assert document["calibrated"] is False
+
+
+def test_seeding_where_nothing_learns_keeps_what_was_learned(tmp_path: Path) -> None:
+    learned = seed(scene_at(tmp_path), DEMO_TABLE)
+    assert learned is not None
+    assert learned.learner.outcomes > 0
+    off = scene_at(tmp_path, more="[learn]\nenabled = false\n")
+    assert seed(off, without_labels(tmp_path)) == learned
+
+
+def test_a_run_that_prints_ends_with_what_outcomes_have_taught(tmp_path: Path) -> None:
+    path = scene_at(tmp_path, "mlp", "keep = true\n[risk]\nmax_slip_when_stable = 0.1\n")
+    played = f'driver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]'
+    text = path.read_text().replace('driver = "spi"\nport = "/nowhere"', played)
+    path.write_text(f'{text}[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n')
+    trust, grasp = live_trust(path), GraspId("0" * 32, 1)
+    trust.note(grasp, trust.judge(grasp, 0.01, -5.0, np.zeros(0)), stable=True)
+    trust.outcome(grasp, slipped=True)
+    with SessionFile(tmp_path / "right.json") as file:
+        file.save(None, FINGERS, {}, trust.state())
+    result = graspd("run", path, "--print")
+    assert result.returncode == 0, result.stderr
+    assert "\nlearned from 1 outcomes\n" in result.stdout
+    assert "\nrisk: of 1 lifts of `stable` 1 slipped, allowed are 10 %" in result.stdout
 
 
 def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:

@@ -287,6 +287,27 @@ def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training(
     assert "drivers.recordings.csv_player" in modules
 
 
+@pytest.mark.parametrize("missing", [False, True])
+def test_one_report_loads_nothing_of_the_others(missing: bool) -> None:
+    code = (
+        "import json, sys; from daemon.cli import parse; "
+        f"sys.modules.update({{'matplotlib': None}} if {missing} else {{}}); "
+        "parse(['report', 'stability']); print(json.dumps(sorted(sys.modules)))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    modules = tuple(json.loads(result.stdout))
+    assert "daemon.measure.stability.report" in modules
+    assert below({"daemon.measure.worth", "daemon.measure.error_vs_time", "torch"}, modules) == []
+    other = subprocess.run(
+        [sys.executable, "-c", code.replace("'stability'", "'worth', '--data', '.'")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = "graspd: report needs the package 'matplotlib': run pip install"
+    assert (other.returncode, said in other.stderr) == ((2, True) if missing else (0, False))
+
+
 def test_what_is_measured_leaves_sockets_and_sessions_alone(tmp_path: Path) -> None:
     text = (
         '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:9870"\n'
