@@ -257,7 +257,7 @@ _SESSION = (
         "CNN1 on session-calibrated features.",
         SESSION,
         replace(CNN1, dropout=0.3),
-        Recipe(weight_decay=1.0, input_noise=0.2),
+        SESSION_RECIPE,
     ),
     System(
         "small-session",

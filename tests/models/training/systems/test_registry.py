@@ -81,7 +81,7 @@ DIGESTS = {
     "small-electrodes": "791afa534dcfdfea",
     "svm-session": "18418424dbb018dc",
     "hgb-session": "55e8da68027a2237",
-    "cnn1-session": "fe2e5adb3ae4be37",
+    "cnn1-session": "1c1bf2e2aff948d1",
     "small-session": "0c08d8572eacdc69",
     "blend-session": "8f94a987c3c2f29c",
     "distilled-session": "52e0f227795e8e62",
