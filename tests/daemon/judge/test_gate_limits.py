@@ -11,7 +11,7 @@ import pytest
 from daemon.judge.findings import Watched
 from daemon.judge.gate import CHANGES_MAX, Gate
 from daemon.judge.grip import Grip
-from daemon.judge.limits import GateLimits
+from daemon.judge.limits import GateLimits, JointLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from tests.daemon.judge.test_gate import (
     ALL,
@@ -375,3 +375,25 @@ def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_
             assert np.abs(counts.astype(np.int64) - reading.counts).max() < 30
             return
     pytest.fail("it was never judged")
+
+
+@pytest.mark.parametrize(("missing", "tared"), [((0.5, 1.4), FINGERS), ((0.3, 1.45), ())])
+def test_sensors_that_were_away_for_more_than_a_second_may_be_others(
+    missing: tuple[float, float], tared: tuple[str, ...]
+) -> None:
+    away = Scenario("away for 0.9 s, or 1.2", GRASPED, "", missing=missing)
+    assert play(away).grip.tared == tared
+
+
+def test_joints_are_lost_when_readings_go_on_without_them() -> None:
+    silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=JointLimits()))
+    assert not Grip(FINGERS, silent.limits).joints_lost, "nothing came yet"
+    assert play(silent).grip.joints_lost
+    assert play(replace(silent, joint=lambda t_s: 0.7 if t_s <= 0.0 else None)).grip.joints_lost
+    assert not play(replace(silent, joint=lambda t_s: 0.7)).grip.joints_lost
+    assert not play(replace(silent, limits=LIMITS)).grip.joints_lost, "nobody asks"
+
+
+def test_readings_of_the_same_time_are_no_gap() -> None:
+    pairs = Scenario("pairs", GRASPED, UP, retime=lambda t_s: np.floor(t_s * 50.0) / 50.0)
+    assert play(pairs).story == UP
