@@ -101,7 +101,7 @@ class Gate:
         memory = self.memory
         if memory.still_since_ns is None or memory.last_ns is None:
             return 0
-        return memory.last_ns - memory.still_since_ns
+        return max(memory.last_ns - memory.still_since_ns, 0)
 
     @property
     def early(self) -> bool:

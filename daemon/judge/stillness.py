@@ -85,7 +85,7 @@ class MotionMemory:
     """For how many sweeps it has not been usable, up to `LOST_MAX` and one."""
     usable_since_ns: NDArray[np.int64]
     """Since when an electrode has been usable, but for so many sweeps now and then."""
-    all_usable_since_ns: int
+    all_usable_since_ns: Number
     """Since when all have."""
     total: NDArray[np.float32]
     """Sum of the sweeps of the step at hand."""
@@ -99,9 +99,9 @@ class MotionMemory:
     """Steps that are remembered."""
     sweeps: Number = 0
     """Sweeps of the step at hand."""
-    total_ns: int = 0
+    total_ns: Number = 0
     """Sum of their times since the step before."""
-    last_ns: int | None = None
+    last_ns: Number | None = None
     """Time of the last sweep that ended a step."""
     block_steps: Number = 0
     """Steps of the block at hand."""

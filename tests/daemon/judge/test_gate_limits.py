@@ -397,3 +397,43 @@ def test_joints_are_lost_when_readings_go_on_without_them() -> None:
 def test_readings_of_the_same_time_are_no_gap() -> None:
     pairs = Scenario("pairs", GRASPED, UP, retime=lambda t_s: np.floor(t_s * 50.0) / 50.0)
     assert play(pairs).story == UP
+
+
+def test_after_readings_were_left_out_three_more_count_for_nothing() -> None:
+    firm, none = Scenario("firm", GRASPED, UP), Watched((), ~ALL)
+    grip, since = Grip(FINGERS, LIMITS), 0
+    for t_s, reading in readings(firm):
+        if abs(t_s - 0.8) < 1e-6:
+            assert grip.settled
+            grip.interrupt()
+        grip.observe(reading, none)
+        if grip.counts_to_judge(reading, none) is not None:
+            grip.judged()
+        since += t_s > 0.8 - 1e-6
+        if since and grip.settled:
+            break
+    # The third begins the motion anew; 24 readings later the long window is full.
+    assert since == 3 + 24
+
+
+def test_motion_is_told_as_soon_as_one_window_knows_it_and_of_the_one_nearer_to_its_limit() -> None:
+    firm, none = Scenario("firm", GRASPED, UP, missing=(0.8, 1.0)), Watched((), ~ALL)
+    grip, told = Grip(FINGERS, LIMITS), []
+    for t_s, reading in readings(firm):
+        if 0.8 - 1e-6 <= t_s < 1.0 - 1e-6:
+            continue
+        grip.observe(reading, none)
+        felt = grip.felt(None)
+        windows = grip.memories()["hand"]["motion"]
+        assert felt.motion is not None
+        assert felt.motion_limits is not None
+        told.append((round(t_s, 2), felt.motion["ff"], felt.motion_limits["ff"], windows.number))
+    known = {t_s: (moves, limit) for t_s, moves, limit, _ in told}
+    assert known[1.09][0] is None
+    assert known[1.1][0] is not None
+    # While the fingers close, the fast window shows it; noise alone is 1 over the slow one, whose
+    # limit is nearer.
+    assert known[0.15][0] is not None
+    assert known[0.15][0] > 2.0 * known[0.15][1]
+    assert 1.0 < known[0.79][1] < 1.4
+    assert known[1.12][1] > 1.4

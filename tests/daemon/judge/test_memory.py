@@ -220,3 +220,28 @@ def test_whatever_is_in_a_memory_is_refused_or_can_be_gone_on_from(
 def test_what_is_no_memory_is_refused(spare: tuple[Pipeline, list[int]], data: bytes) -> None:
     with pytest.raises(ValueError, match=r".+"):
         recall(spare[0], data, same_model=True)
+
+
+@pytest.mark.parametrize(
+    ("group", "part", "field", "value"),
+    [
+        ("judge", "judge", "readings", -1),
+        ("hand", "motion", "last_ns", 2**63 - 1),
+        ("hand", "motion", "total_ns", 2**63 - 1),
+        ("hand", "motion", "number", 53),
+        ("hand", "motion", "first", 100),
+    ],
+)
+def test_numbers_that_no_judge_counts_to_are_refused(
+    known: bytes,
+    spare: tuple[Pipeline, list[int]],
+    group: str,
+    part: str,
+    field: str,
+    value: int,
+) -> None:
+    tree = msgspec.msgpack.decode(zlib.decompress(known))
+    assert isinstance(tree[group][part][field], int)
+    tree[group][part][field] = value
+    with pytest.raises(ValueError, match=r".+"):
+        recall(spare[0], zlib.compress(msgspec.msgpack.encode(tree)), same_model=True)
