@@ -25,8 +25,8 @@ from tests.daemon.fakes import FINGERS, MS, Clock
 
 START_NS = 10**12
 MAX_AGE_NS = 100 * MS
-GATE = GateLimits(gap_ns=100 * MS, release_ns=100 * MS)
-JOINTS = JointLimits(rad_per_s=0.1, window_ns=80 * MS, late_ns=150 * MS, lost_ns=1000 * MS)
+GATE = GateLimits()
+JOINTS = JointLimits()
 UNDER_FAULT = 30
 """Periods of the readings."""
 KEPT = 20

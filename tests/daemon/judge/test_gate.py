@@ -26,12 +26,7 @@ NOISE = 3.5
 PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: 0.467 in the mean, and the third deepest
 falls by 0.8 of the depth further than the median one."""
-GATE = GateLimits(
-    change_counts=40.0,
-    gap_ns=100 * MS,
-    release_ns=100 * MS,
-    request_ns=1000 * MS,
-)
+GATE = GateLimits()
 LIMITS = GripLimits(gate=GATE)
 ALLOWED = {
     *((GateState.IDLE, GateState.CLOSING), (GateState.CLOSING, GateState.SETTLED)),

@@ -20,7 +20,7 @@ START_NS = 10**12
 NAMES = ("FFJ1", "FFJ2", "FFJ3")
 HALL_RAD = 0.0006
 """One count of a Hall sensor."""
-LIMITS = JointLimits(rad_per_s=0.1, window_ns=80 * MS, late_ns=150 * MS, lost_ns=1000 * MS)
+LIMITS = JointLimits()
 
 
 def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] = NAMES) -> None:
