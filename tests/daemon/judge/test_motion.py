@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -141,6 +143,7 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     for index in range(30):
         motion.add(10**10 + index * 10_000_000, np.rint(counts[index]).astype(np.uint16), FINGER)
         fast.append(tuple(np.isfinite(motion.motion[:, 0]).tolist()))
+        assert motion.known == fast[-1][0]
     # The first sweep that is 100 ms older than another is the 11th; that is 240 ms older, the 25th.
     assert fast == [(False, False)] * 10 + [(True, False)] * 14 + [(True, True)] * 6
     motion.forget()
@@ -229,6 +232,15 @@ def test_memory_is_bounded_however_fast_readings_come() -> None:
     fed(motion, counts, 20_000.0)
     assert motion.memory.number <= STEPS
     assert motion.memory.first + motion.memory.number <= len(motion.memory.steps)
+    assert replace(motion.memory).number == STEPS, "what is full may be taken over"
+
+
+def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
+    motion, counts = Motion(1, 0.05), np.rint(wavering(2.0, 100.0, 3.5, 15)).astype(np.uint16)
+    for index, sweep in enumerate(counts):
+        motion.add(index * 10_000_000, sweep, FINGER if index < 150 else ~FINGER)
+    assert np.isinf(motion.motion).all()
+    assert not motion.sure
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, -1.0, float("nan")])

@@ -349,10 +349,14 @@ def check(gate: GripLimits, feels: Sequence[Feel]) -> set[Decision]:
 
 
 def test_a_hand_that_closes_and_keeps_still_gets_a_verdict() -> None:
-    decisions = [said.decision for said in tared(limits()).play(Feel(times=40))]
+    said = tared(limits()).play(Feel(times=40))
+    decisions = [judgement.decision for judgement in said]
     # Two or three sweeps until the median touches, and 240 ms of stillness.
     first = decisions.index(Decision.STABLE)
     assert first in {1 + 24, 2 + 24}
+    assert said[first].still_ms == 240.0
+    assert said[first].judged_counts is not None
+    assert not said[first].early
     assert set(decisions[first:]) == {Decision.STABLE}
 
 
@@ -393,3 +397,9 @@ def test_fingers_that_repeat_themselves_are_frozen_with_a_flagged_electrode_too(
     missing = tuple(Flaw(finger, 0, 1, int(ElectrodeFault.MISSING), 0) for finger in range(3))
     _, *repeated = hand.play(Feel(times=10, repeats=True, flaws=missing))
     assert {said.decision for said in repeated} == {Decision.UNKNOWN}
+
+
+def test_only_a_hand_with_a_gate_that_waits_is_asked() -> None:
+    assert not tared(limits()).pipeline.on_request
+    assert tared(limits(on_request=True)).pipeline.on_request
+    assert not pipeline(FakeModel(), Clock()).on_request
