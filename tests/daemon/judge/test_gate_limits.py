@@ -418,17 +418,15 @@ def test_after_readings_were_left_out_three_more_count_for_nothing() -> None:
 
 def test_motion_is_told_as_soon_as_one_window_knows_it_and_of_the_one_nearer_to_its_limit() -> None:
     firm, none = Scenario("firm", GRASPED, UP, missing=(0.8, 1.0)), Watched((), ~ALL)
-    grip, told = Grip(FINGERS, LIMITS), []
+    grip, known = Grip(FINGERS, LIMITS), {}
     for t_s, reading in readings(firm):
         if 0.8 - 1e-6 <= t_s < 1.0 - 1e-6:
             continue
         grip.observe(reading, none)
         felt = grip.felt(None)
-        windows = grip.memories()["hand"]["motion"]
         assert felt.motion is not None
         assert felt.motion_limits is not None
-        told.append((round(t_s, 2), felt.motion["ff"], felt.motion_limits["ff"], windows.number))
-    known = {t_s: (moves, limit) for t_s, moves, limit, _ in told}
+        known[round(t_s, 2)] = felt.motion["ff"], felt.motion_limits["ff"]
     assert known[1.09][0] is None
     assert known[1.1][0] is not None
     # While the fingers close, the fast window shows it; noise alone is 1 over the slow one, whose

@@ -44,16 +44,21 @@ def test_before_the_period_is_known_it_is_taken_for_that_of_the_fastest_board(
     assert counters.lost_frames == (0 if sweeps == 1 else 24)
 
 
+def missed_when_late(number: int, late_ns: int) -> int:
+    """Sweeps said to be missed when after `number` of them all samples come so late."""
+    made, counters = assembler()
+    for sweep in range(number + 2):
+        for channel, words, t_ns in samples(sweep):
+            made.push(channel, words, t_ns + (late_ns if sweep >= number else 0))
+    return counters.missed_readings
+
+
 @pytest.mark.parametrize(("late_ns", "missed"), [(5 * MS - 1, 0), (5 * MS, 1)])
 def test_a_sweep_less_than_five_milliseconds_late_tells_of_no_missed_one(
     late_ns: int, missed: int
 ) -> None:
     """Of a fast board, whose sweeps take 5.4 ms: it may be the host that is late."""
-    made, counters = assembler()
-    for sweep in range(12):
-        for channel, words, t_ns in samples(sweep):
-            made.push(channel, words, t_ns + (late_ns if sweep > 9 else 0))
-    assert counters.missed_readings == missed
+    assert missed_when_late(10, late_ns) == missed
 
 
 @pytest.mark.parametrize(
@@ -62,11 +67,7 @@ def test_a_sweep_less_than_five_milliseconds_late_tells_of_no_missed_one(
 def test_an_outage_of_more_than_two_seconds_counts_as_one_missed_sweep(
     gap_ns: int, missed: int
 ) -> None:
-    made, counters = assembler()
-    for sweep in range(10):
-        for channel, words, t_ns in samples(sweep):
-            made.push(channel, words, t_ns + (gap_ns - PERIOD_NS if sweep == 9 else 0))
-    assert counters.missed_readings == missed
+    assert missed_when_late(9, gap_ns - PERIOD_NS) == missed
 
 
 @pytest.mark.parametrize(("distance", "readings"), [(3, 9), (4, 10)])
