@@ -1,0 +1,1 @@
+"""What an attacker or a broken board may try, and what happens: see `__main__`."""

@@ -1,0 +1,65 @@
+"""One thing that an attacker or a broken board tries, and what came of it."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+
+class Aim(Enum):
+    """What would be lost."""
+
+    FALSE_STABLE = "a false `stable`"
+    FALLS = "the daemon falls or is late"
+    WHO_MAY = "somebody may what they may not"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What an attack is given."""
+
+    seconds: float
+    """How long it shall go on, s; a round that has begun is ended. It does one at least."""
+    random: random.Random
+    """For all that it draws."""
+    folder: Path
+    """For its files and sockets; removed afterwards."""
+
+    def rounds(self) -> Iterator[int]:
+        """0, 1, 2 ... until the time is over."""
+        end_s = time.monotonic() + self.seconds
+        tried = 0
+        while tried == 0 or time.monotonic() < end_s:
+            yield tried
+            tried += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What came of it."""
+
+    tried: int
+    """How often."""
+    happened: str
+    """In plain words with figures, such as "0 of 995 verdicts `stable`"."""
+    held: bool
+    """Whether graspd did what it must."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attack:
+    """Something to try over a door of the daemon."""
+
+    name: str
+    """Such as `ring-spi`."""
+    aim: Aim
+    what: str
+    """What is tried, in one sentence without its full stop."""
+    unit: str
+    """What `tried` counts, such as "connections"."""
+    run: Callable[[Plan], Outcome]
+    """Tries it. What it raises counts as broken."""
