@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
 from tests.bench.attacks import __main__ as command
@@ -46,3 +49,9 @@ def test_an_attack_that_cannot_be_made_has_not_held(
 def test_every_attack_has_a_name_of_its_own() -> None:
     names = [attack.name for attack in command.attacks()]
     assert len(names) == len(set(names))
+
+
+def test_the_page_has_a_row_for_every_attack() -> None:
+    page = Path(__file__).parents[2] / "deploy" / "ATTACKS.md"
+    told = re.findall(r"^\| `([a-z0-9-]+)` \|", page.read_text(), re.M)
+    assert told == [attack.name for attack in command.attacks()]
