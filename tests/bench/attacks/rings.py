@@ -167,15 +167,13 @@ def scene_in(folder: Path, sections: str) -> Path:
     return scene
 
 
-def heard(subscriber: Subscriber, until: Callable[[Verdict], bool]) -> Iterator[Verdict]:
-    """Verdicts up to the first like that. Raises `TimeoutError`."""
+def wait_for(subscriber: Subscriber, wanted: Callable[[Verdict], bool]) -> None:
+    """Hear verdicts up to the first like that. Raises `TimeoutError`."""
     deadline_s = time.monotonic() + PATIENCE_S
     while message := subscriber.take(deadline_s - time.monotonic()):
-        verdict = decode_verdict(message[1])
-        yield verdict
-        if until(verdict):
+        if wanted(decode_verdict(message[1])):
             return
-    raise TimeoutError("the hand was never judged")
+    raise TimeoutError("the hand was never judged, or fell silent")
 
 
 def under_attack(
@@ -195,13 +193,14 @@ def under_attack(
     with (
         Subscriber(f"ipc://{folder}/graspd") as subscriber,
         start_daemon(scene, folder / "log"),
-        serving(*serve, stop=stop),
+        contextlib.ExitStack() as within,
     ):
-        for _ in heard(
+        wait_for(subscriber, lambda _: True)  # it is there, and sees the hand at rest
+        within.enter_context(serving(*serve, stop=stop))
+        wait_for(
             subscriber,
             lambda verdict: verdict.verdict is Decision.STABLE and next(stable) >= STABLE_FIRST,
-        ):
-            pass
+        )
         begin.set()
         late: list[Decision] = []
 
@@ -212,8 +211,7 @@ def under_attack(
             late.append(verdict.verdict)
             return verdict.t_mono_ns - began_ns > UNDER_ATTACK_S * 1e9
 
-        for _ in heard(subscriber, is_over):
-            pass
+        wait_for(subscriber, is_over)
     return len(late), late.count(Decision.STABLE)
 
 
