@@ -13,7 +13,7 @@ SWEEPS = 128
 """Different sweeps of each finger that are remembered: rings of so many are seen at once. Of any
 two real sweeps of a finger at most 14 electrodes of 24 were equal, in 1.4 million pairs."""
 READ_MIN = 12
-"""Electrodes that must have been read in both sweeps: by chance one in seven is equal."""
+"""Electrodes that must have been read in both sweeps: by chance one in 14 is equal."""
 NO_COUNT = 0x8000
 """In place of a count: far from every one of 12 bits, upwards and, modulo 2**16, downwards."""
 SWEEP_BYTES = ELECTRODES * 2
