@@ -103,6 +103,11 @@ class Grip:
             return False
         return joints.is_lost(last_ns) or joints.some_lost
 
+    @property
+    def joints_frozen(self) -> bool:
+        """Whether joint angles come that do not change by a bit."""
+        return self._joints is not None and self._joints.is_frozen
+
     def ask(self) -> None:
         """Have the grasp at hand judged once it has settled."""
         self._gate.ask()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.findings import Number, Watched
 from daemon.judge.reasons import Reason
+from daemon.judge.recurrence import NO_COUNT, PastSweeps
 from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
 
 REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
@@ -50,8 +51,6 @@ JUMPS_MAX = 2.0
 JUMPS_FADE = 0.9
 JUMPS_FORGOTTEN = 1e-9
 """Of a jump, after 200 readings: as good as none."""
-NO_COUNT = 0x8000
-"""In place of a count: far from every one of 12 bits, upwards and, modulo 2**16, downwards."""
 
 
 @dataclass(slots=True, eq=False)
@@ -70,6 +69,12 @@ class HealthMemory:
     """Whether there are any."""
     faults: NDArray[np.uint8]
     """What the driver flagged in the last reading."""
+    sweeps: PastSweeps
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for the sweeps of another hand."""
+        if len(self.sweeps.past) != len(self.previous):
+            raise ValueError("sweeps of as many fingers as counts are needed")
 
 
 class Health:
@@ -84,6 +89,7 @@ class Health:
             jumps=np.zeros(shape),
             has_jumped=False,
             faults=np.zeros(shape, dtype=np.uint8),
+            sweeps=PastSweeps.none(fingers),
         )
         self._no_faults = self.memory.faults.tobytes()
         nothing = np.zeros(shape, dtype=np.bool_)
@@ -105,6 +111,7 @@ class Health:
         broken = railed | self._worn_out()
         changes = np.count_nonzero(differs)
         repeats = bool(changes <= differs.size - ELECTRODES and not differs.any(axis=1).all())
+        repeats |= self.memory.sweeps.recurs(counts)
         if not repeats and not np.count_nonzero(broken):
             return self._sound
         return self._found(0, railed, broken, repeats=repeats)
@@ -122,8 +129,9 @@ class Health:
         faults = int(np.bitwise_or.reduce(flags, axis=None))
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
             return Watched(_fault_reasons(faults), broken)
-        repeats = sound.any(axis=1) & ~(differs & sound).any(axis=1)
-        return self._found(faults, railed, broken, repeats=bool(repeats.any()))
+        repeats = bool((sound.any(axis=1) & ~(differs & sound).any(axis=1)).any())
+        repeats |= self.memory.sweeps.recurs(counts, sound)
+        return self._found(faults, railed, broken, repeats=repeats)
 
     def _found(
         self, faults: int, railed: NDArray[np.bool_], broken: NDArray[np.bool_], *, repeats: bool

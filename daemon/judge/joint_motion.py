@@ -31,6 +31,8 @@ class JointMemory:
     """When each set was heard of last."""
     waits_since_ns: int | None = None
     """Since when no joint was heard of."""
+    changed_ns: int | None = None
+    """When the angle of some joint was seen to change last, by a bit or more."""
     lost: list[str] = field(default_factory=list)
     """Joints that came once, and no longer."""
 
@@ -68,12 +70,18 @@ class JointMotion:
             memory.latest_ns.clear()
         past = memory.past.setdefault(names, [])
         latest_ns = memory.latest_ns.get(names, t_ns)
+        before = past[-1][1] if past else None
         if not 0 <= t_ns - latest_ns <= self._limits.late_ns:
             past.clear()  # time went back, or nobody knows what the joints did meanwhile
         memory.latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
-            past.append((t_ns, reading.position_rad[valid]))
+            angles = reading.position_rad[valid]
+            past.append((t_ns, angles))
             del past[:-ANGLES_KEPT]
+            # Joints that were not heard of before tell nothing: they may come and go.
+            changed = before is not None and angles.tobytes() != before.tobytes()
+            if changed or memory.changed_ns is None or t_ns < memory.changed_ns:
+                memory.changed_ns = t_ns
 
     def against(self, t_ns: int) -> Reason | None:
         """What the joints say against settling at `t_ns`; None if they are still, or are lost."""
@@ -85,12 +93,22 @@ class JointMotion:
             return None if self.is_lost(t_ns) else Reason.JOINTS_LATE
         if any(t_ns - at_ns > self._limits.late_ns for at_ns in memory.latest_ns.values()):
             return Reason.JOINTS_LATE
-        return None if all(map(self._is_still, memory.past.values())) else Reason.MOVING
+        if not all(map(self._is_still, memory.past.values())):
+            return Reason.MOVING
+        return Reason.JOINTS_FROZEN if self.is_frozen else None
 
     @property
     def some_lost(self) -> bool:
         """Whether judging goes on without a joint that came once."""
         return bool(set(self.memory.lost).difference(*self.memory.past))
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether angles came for too long without a change of any."""
+        memory = self.memory
+        if memory.changed_ns is None or not memory.latest_ns:
+            return False
+        return max(memory.latest_ns.values()) - memory.changed_ns > self._limits.frozen_ns
 
     def is_lost(self, t_ns: int) -> bool:
         """Whether judging goes on without any joints at `t_ns`."""

@@ -59,6 +59,9 @@ class JointLimits:
     """Angles that are older than this speak against settling, ns ..."""
     lost_ns: int = 1_000_000_000
     """... until they are this old, ns: then the stream is lost, and judging goes on without it."""
+    frozen_ns: int = 1_000_000_000
+    """When none of them has changed by a bit for so long, ns, somebody repeats old ones. A Hall
+    sensor's noise is one count, so that even a single joint changes many times in it."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.health import NO_COUNT
+from daemon.judge.recurrence import NO_COUNT
 
 VALUES = 3
 

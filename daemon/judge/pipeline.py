@@ -262,6 +262,8 @@ class Pipeline:
             found |= dict.fromkeys(untared, Reason.NOT_TARED)
             if self.grip.joints_lost:
                 found["joints"] = Reason.JOINTS_LATE
+            if self.grip.joints_frozen:
+                found["joints"] = Reason.JOINTS_FROZEN
         if Reason.MODEL_FAILED in opinion.reasons:
             found["model"] = Reason.MODEL_FAILED
         if self._session is not None and not self._session.calibrated:

@@ -47,6 +47,7 @@ class Reason(StrEnum):
     SETTLING = "settling"
     SEQUENCE_GAP = "sequence-gap"
     JOINTS_LATE = "joints-late"
+    JOINTS_FROZEN = "joints-frozen"
     NOT_ASKED = "not-asked"
     NOT_CALIBRATED = "not-calibrated"
     LOW_CONFIDENCE = "low-confidence"
@@ -64,7 +65,7 @@ ADVICE: dict[Reason, str] = {
     Reason.PARITY: "words with bad parity: check the SPI wiring and clock",
     Reason.ERROR_WORD: "the sensor answers with error words: check the sampling delay",
     Reason.HELD: "values repeat an earlier sweep: wait for a fresh sweep",
-    Reason.FROZEN: "a finger repeats itself to the count: power-cycle the sensor",
+    Reason.FROZEN: "a finger repeats a sweep to the count: power-cycle it; who sends old data?",
     Reason.SATURATED: "electrodes at 0 or 4095: a dead electrode or far too much force",
     Reason.FLAT: "a finger's electrodes read about the same: it touches nothing or does not work",
     Reason.NEVER_SEEN: "counts unlike all grasps of the training: check sensor, reset session",
@@ -78,6 +79,7 @@ ADVICE: dict[Reason, str] = {
     Reason.SETTLING: "still for too short a time yet: keep the hand as it is",
     Reason.SEQUENCE_GAP: "readings were lost, so motion is not known: check cable, bus and PC load",
     Reason.JOINTS_LATE: "joint angles are late: check their sender; soon judged without them",
+    Reason.JOINTS_FROZEN: "no joint angle changes by a bit: restart their sender",
     Reason.NOT_ASKED: "settled; gate.mode is request: ask for a judgement",
     Reason.NOT_CALIBRATED: "the session has too few grasps: `graspd session seed`, or grasp more",
     Reason.LOW_CONFIDENCE: "too close to call for min_confidence or for [risk]: grasp again",

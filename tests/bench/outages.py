@@ -35,6 +35,7 @@ from tests.bench.live import (
 
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
 JOINT_PERIOD_S = 0.01
+JOINT_NOISE_RAD = 0.0003
 
 
 class Bench:
@@ -105,10 +106,11 @@ class Bench:
         return path
 
     def _send_joints(self, joint_socket: socket.socket) -> None:
-        seq = 0
+        seq, random = 0, np.random.default_rng(1)
         while not self._stop.wait(JOINT_PERIOD_S):
             if self.joints_flow.is_set():
-                message = JointMessage(seq, None, JOINTS, np.full(len(JOINTS), 0.8))
+                angles = 0.8 + JOINT_NOISE_RAD * random.standard_normal(len(JOINTS))
+                message = JointMessage(seq, None, JOINTS, angles)
                 with contextlib.suppress(OSError):  # the daemon is not there
                     joint_socket.send(message.to_bytes())
                 seq += 1

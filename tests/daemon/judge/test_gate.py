@@ -125,7 +125,7 @@ def play(scenario: Scenario) -> Played:
         angle = None if scenario.joint is None else scenario.joint(t_s)
         if angle is not None:
             grip.observe_joints(
-                JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), np.array([angle, 0.4]))
+                JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), np.array([angle, 0.4 + t_s / 1e9]))
             )
         if scenario.missing[0] <= t_s < scenario.missing[1]:
             continue

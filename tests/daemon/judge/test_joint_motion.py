@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import itertools
 import sys
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -23,8 +24,13 @@ HALL_RAD = 0.0006
 LIMITS = JointLimits()
 
 
+NOISE_RAD = 1e-9
+"""Far below all limits: what is measured is never the same to the bit."""
+
+
 def send(motion: JointMotion, t_ns: int, *angles: float, names: tuple[str, ...] = NAMES) -> None:
-    motion.observe(JointReading(t_ns, 0, names, np.array(angles)), t_ns)
+    measured = np.array(angles) + NOISE_RAD * np.sin(t_ns / MS)
+    motion.observe(JointReading(t_ns, 0, names, measured), t_ns)
 
 
 def turning(
@@ -398,3 +404,92 @@ def test_a_memory_that_cannot_have_been_is_refused(
     with pytest.raises(ValueError, match=message):
         JointMemory(past, latest_ns)
     JointMemory({("FFJ1",): [(1, np.zeros(1))]}, {("FFJ1",): 1})
+
+
+def held(rates_hz: Mapping[tuple[str, ...], float], seconds: float) -> JointMotion:
+    """Senders whose angles stay the same to the bit, by the names of their joints."""
+    motion = JointMotion(LIMITS)
+    times = sorted(
+        (START_NS + round(place / rate_hz * 1e9), names)
+        for names, rate_hz in rates_hz.items()
+        for place in range(round(seconds * rate_hz) + 1)
+    )
+    for t_ns, names in times:
+        motion.observe(JointReading(t_ns, 0, names, np.full(len(names), 0.8)), t_ns)
+    return motion
+
+
+@pytest.mark.parametrize("rate_hz", [10.0, 71.43, 100.0, 1000.0])
+def test_angles_that_do_not_change_by_a_bit_for_a_second_are_frozen(rate_hz: float) -> None:
+    assert held({NAMES: rate_hz}, 0.95).against(START_NS + 950 * MS) is None
+    motion = held({NAMES: rate_hz}, 1.1)
+    now_ns = START_NS + 1100 * MS
+    assert motion.against(now_ns) is Reason.JOINTS_FROZEN
+    assert motion.is_frozen
+
+
+@pytest.mark.parametrize("changed", [0, 2])
+def test_one_joint_that_changes_by_a_bit_is_enough(changed: int) -> None:
+    motion = held({NAMES: 100.0}, 1.5)
+    angles = np.full(len(NAMES), 0.8)
+    angles[changed] = np.nextafter(0.8, 1.0)
+    now_ns = START_NS + 1510 * MS
+    assert motion.against(now_ns) is Reason.JOINTS_FROZEN
+    motion.observe(JointReading(now_ns, 0, NAMES, angles), now_ns)
+    assert motion.against(now_ns) is None
+
+
+def test_another_sender_whose_angles_change_speaks_for_the_hand() -> None:
+    """A sender of a single joint may well be quiet for a second."""
+    motion = held({("THJ1",): 100.0}, 1.5)
+    assert motion.against(START_NS + 1500 * MS) is Reason.JOINTS_FROZEN
+    for ms in range(1500, 1700, 10):
+        send(motion, START_NS + ms * MS, 0.3, 1.2, -0.1)
+        motion.observe(JointReading(0, 0, ("THJ1",), np.array([0.8])), START_NS + ms * MS)
+    assert motion.against(START_NS + 1690 * MS) is None
+
+
+def test_senders_that_are_all_frozen_are_frozen_whatever_their_number() -> None:
+    motion = held({("THJ1",): 100.0, ("THJ2",): 50.0, NAMES: 20.0}, 1.5)
+    assert motion.against(START_NS + 1500 * MS) is Reason.JOINTS_FROZEN
+
+
+@pytest.mark.parametrize("gap_ms", [200, 900, 1500, 5000])
+def test_silence_does_not_make_frozen_angles_fresh(gap_ms: int) -> None:
+    motion = held({NAMES: 100.0}, 1.5)
+    for ms in range(0, 301, 10):
+        t_ns = START_NS + (1500 + gap_ms + ms) * MS
+        motion.observe(JointReading(t_ns, 0, NAMES, np.full(len(NAMES), 0.8)), t_ns)
+        found = motion.against(t_ns)
+    assert found is Reason.JOINTS_FROZEN
+
+
+def test_angles_that_have_fallen_silent_are_late_and_not_frozen() -> None:
+    motion, now_ns = turning(100.0, 0.0)
+    for ms in range(10, 2000, 10):
+        found = motion.against(now_ns + ms * MS)
+        assert found is (Reason.JOINTS_LATE if 150 < ms <= 1000 else None)
+        assert not motion.is_frozen
+
+
+def test_after_time_went_back_angles_have_a_second_to_change() -> None:
+    motion = held({NAMES: 100.0}, 1.5)
+    early_ns = START_NS - 10**11
+    reasons = []
+    for ms in range(0, 1201, 10):
+        t_ns = early_ns + ms * MS
+        motion.observe(JointReading(t_ns, 0, NAMES, np.full(len(NAMES), 0.8)), t_ns)
+        reasons.append(motion.against(t_ns))
+    assert reasons == [Reason.MOVING] * 8 + [None] * 93 + [Reason.JOINTS_FROZEN] * 20
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("joints", [1, 3, 24])
+def test_joints_with_the_noise_of_a_hall_sensor_are_never_frozen(joints: int, seed: int) -> None:
+    """Words as Shadow documents them, 1 ms apart: plus or minus a count, so 1 in 3 is equal."""
+    rng, motion = np.random.default_rng(seed), JointMotion(LIMITS)
+    names = tuple(f"J{place}" for place in range(joints))
+    for ms in range(0, 60_000, 10):
+        angles = HALL_RAD * (1000.0 + rng.integers(-1, 2, joints))
+        motion.observe(JointReading(0, 0, names, angles), START_NS + ms * MS)
+        assert not motion.is_frozen, f"seed {seed}"

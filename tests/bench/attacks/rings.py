@@ -1,0 +1,354 @@
+"""Old sweeps in a ring, and joint angles that stand still to the bit, while the hand opens.
+
+A bridge, relay or recording goes on with new numbers and times, but what it sends was read before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import random
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from daemon.judge.reasons import Decision
+from daemon.publish.messages import Verdict, decode_verdict
+from drivers.joints.message import JointMessage
+from drivers.twins.can import CanTwin
+from drivers.twins.grasps.grasp_script import JOINT_NAMES, Durations
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.whole_grasps import (
+    PALM_RATE_HZ,
+    RATE_HZ,
+    Moment,
+    synthetic_grasps,
+    write_stream,
+)
+from drivers.twins.palm import PalmTwin
+from drivers.twins.spi import SpiTwin
+from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
+from tests.bench.live import (
+    HELD,
+    PATIENCE_S,
+    SEED,
+    Subscriber,
+    can_id,
+    start_daemon,
+    tactile_section,
+    where_of,
+)
+
+RINGS = (2, 3, 8, 64)
+"""Sweeps that are repeated."""
+GRACE = 3
+"""So many sweeps after the first turn of a ring no verdict may be `stable` any more."""
+UNDER_ATTACK_S = 2.5
+"""How long the ring turns, s, the first turn and the grace not counted."""
+STABLE_FIRST = 30
+"""Verdicts `stable` before it begins."""
+HOLD_S = 1.5
+"""How long the grasp of a recording is held before it begins, s."""
+JOINTS_MAY_STAND_S = 1.5
+"""How long joint angles may be equal to the bit before no verdict may be `stable`, s."""
+
+Serve = Callable[[Path, Iterator[Counts], threading.Event], tuple[str, Callable[[], None]]]
+"""The scene's `[tactile]`, and what sends the counts until told to stop."""
+
+
+class Ring:
+    """A held grasp whose last sweeps are repeated from `begin` on, of one finger or of all."""
+
+    def __init__(self, sweeps: int, finger: int | None, rate_hz: float) -> None:
+        """`finger` is its row; None: all."""
+        self.sweeps = sweeps
+        self.finger = finger
+        self.begin = threading.Event()
+        self.turned_ns: int | None = None
+        """When the first sweep after turn and grace was asked for, monotonic ns."""
+        moments = synthetic_grasps(1, durations=HELD, seed=SEED, rate_hz=rate_hz)
+        self._held = (moment.counts for moment in moments)
+
+    def counts(self) -> Iterator[Counts]:
+        """What the board sends."""
+        last: deque[Counts] = deque(maxlen=self.sweeps)
+        for counts in self._held:
+            if self.begin.is_set():
+                break
+            last.append(counts)
+            yield counts
+        for number, (old, fresh) in enumerate(zip(itertools.cycle(last), self._held, strict=False)):
+            if number == self.sweeps + GRACE:
+                self.turned_ns = time.monotonic_ns()
+            yield ringed(old, fresh, self.finger)
+
+
+def ringed(old: Counts, fresh: Counts, finger: int | None) -> Counts:
+    """A sweep whose finger, or all of it, is the old one."""
+    if finger is None:
+        return old
+    counts = fresh.copy()
+    counts[finger] = old[finger]
+    return counts
+
+
+def over_spi(
+    folder: Path, counts: Iterator[Counts], stop: threading.Event
+) -> tuple[str, Callable[[], None]]:
+    twin = SpiTwin(folder / "bridge", counts, rate_hz=RATE_HZ)
+
+    def serve() -> None:
+        with twin:
+            twin.serve(stop.is_set)
+
+    return tactile_section("spi", str(folder / "bridge")), serve
+
+
+def over_can(
+    format_: str, folder: Path, counts: Iterator[Counts], stop: threading.Event
+) -> tuple[str, Callable[[], None]]:
+    where = where_of("can", folder)
+    identifier = can_id(where)
+    twin = CanTwin(
+        "udp_multicast", where, counts, format=format_, arbitration_id=identifier, rate_hz=RATE_HZ
+    )
+
+    def serve() -> None:
+        with twin:
+            twin.serve(stop)
+
+    return (
+        f'[tactile]\ndriver = "can"\ninterface = "udp_multicast"\nchannel = "{where}"\n'
+        f'format = "{format_}"\narbitration_id = {identifier}\n'
+    ), serve
+
+
+def over_palm(
+    _folder: Path, counts: Iterator[Counts], stop: threading.Event
+) -> tuple[str, Callable[[], None]]:
+    target = f"udp://127.0.0.1:{free_port()}"
+    serve = partial(PalmTwin(counts).serve, target, stop)
+    return f'[tactile]\ndriver = "palm"\nsource = "{target}"\n', serve
+
+
+def free_port() -> int:
+    """A UDP port of this computer that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+@contextlib.contextmanager
+def serving(*serve: Callable[[], None], stop: threading.Event) -> Iterator[None]:
+    """Each in a thread, until the block is left."""
+    threads = [threading.Thread(target=one) for one in serve]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+def scene_in(folder: Path, sections: str) -> Path:
+    """The scene of a daemon whose verdicts are heard there."""
+    scene = folder / "scene.toml"
+    endpoint = f"ipc://{folder}/graspd"
+    scene.write_text(f'{sections}[model]\nname = "cnn1"\n[publish]\nendpoint = "{endpoint}"\n')
+    return scene
+
+
+def wait_for(subscriber: Subscriber, wanted: Callable[[Verdict], bool]) -> None:
+    """Hear verdicts up to the first like that. Raises `TimeoutError`."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while message := subscriber.take(deadline_s - time.monotonic()):
+        if wanted(decode_verdict(message[1])):
+            return
+    raise TimeoutError("the hand was never judged, or fell silent")
+
+
+def under_attack(
+    folder: Path,
+    sections: str,
+    serve: Sequence[Callable[[], None]],
+    stop: threading.Event,
+    begin: threading.Event,
+    since_ns: Callable[[], int | None],
+) -> tuple[int, int]:
+    """Verdicts of readings since then, and how many of them were `stable`.
+
+    The attack begins when the grasp has been `stable` for a while.
+    """
+    stable = itertools.count(1)
+    scene = scene_in(folder, sections)
+    with (
+        Subscriber(f"ipc://{folder}/graspd") as subscriber,
+        start_daemon(scene, folder / "log"),
+        contextlib.ExitStack() as within,
+    ):
+        wait_for(subscriber, lambda _: True)  # it is there, and sees the hand at rest
+        within.enter_context(serving(*serve, stop=stop))
+        wait_for(
+            subscriber,
+            lambda verdict: verdict.verdict is Decision.STABLE and next(stable) >= STABLE_FIRST,
+        )
+        begin.set()
+        late: list[Decision] = []
+
+        def is_over(verdict: Verdict) -> bool:
+            began_ns = since_ns()
+            if began_ns is None or verdict.t_mono_ns < began_ns:
+                return False
+            late.append(verdict.verdict)
+            return verdict.t_mono_ns - began_ns > UNDER_ATTACK_S * 1e9
+
+        wait_for(subscriber, is_over)
+    return len(late), late.count(Decision.STABLE)
+
+
+def rounds(plan: Plan) -> Iterator[tuple[int, int | None]]:
+    """Length of each ring, and the finger that it is of; None: all."""
+    for _ in plan.rounds():
+        finger = None if plan.random.random() < 0.5 else plan.random.randrange(3)
+        yield plan.random.choice(RINGS), finger
+
+
+def tallied(verdicts: Iterable[tuple[int, int]]) -> Outcome:
+    """What came of all rounds: verdicts, and `stable` ones among them."""
+    tried, said, stable = 0, 0, 0
+    for in_round, stable_in_round in verdicts:
+        tried += 1
+        said += in_round
+        stable += stable_in_round
+    return Outcome(tried, f"{stable} of {said:,} verdicts `stable`", said > 0 and stable == 0)
+
+
+def ring_over(over: Serve, rate_hz: float, plan: Plan) -> Outcome:
+    """A ring over a link."""
+
+    def one(number: int, sweeps: int, finger: int | None) -> tuple[int, int]:
+        folder = plan.folder / str(number)
+        folder.mkdir()
+        ring, stop = Ring(sweeps, finger, rate_hz), threading.Event()
+        section, serve = over(folder, ring.counts(), stop)
+        return under_attack(folder, section, [serve], stop, ring.begin, lambda: ring.turned_ns)
+
+    return tallied(one(number, *each) for number, each in enumerate(rounds(plan)))
+
+
+def recorded(ring: int, finger: int | None, random_: random.Random) -> tuple[list[Moment], int]:
+    """Rows of a recording, and from which on no verdict may be `stable`."""
+    hold_s = HOLD_S + random_.random()
+    durations = Durations(first_rest_s=(1.5, 1.5), settle_s=(hold_s + 2.0, hold_s + 2.0))
+    moments = list(synthetic_grasps(1, durations=durations, seed=SEED))
+    grasps = synthetic_grasps(1, durations=durations, seed=SEED)
+    closed_s = next(iter(grasps.timetables())).closed_s
+    begin = round((closed_s + hold_s) * RATE_HZ)
+    last = [moment.counts for moment in moments[begin - ring : begin]]
+    for number, moment in enumerate(moments[begin:]):
+        counts = ringed(last[number % ring], moment.counts, finger)
+        moments[begin + number] = Moment(
+            moment.t_s,
+            counts,
+            moment.joint_names,
+            moment.position_rad,
+            moment.phase,
+            moment.grasp,
+            moment.slipped,
+            moment.object_name,
+        )
+    return moments, begin + ring + GRACE
+
+
+def ring_replayed(plan: Plan) -> Outcome:
+    """A ring in a recording that is played."""
+
+    def one(number: int, ring: int, finger: int | None) -> tuple[int, int]:
+        folder = plan.folder / str(number)
+        folder.mkdir()
+        moments, late_from = recorded(ring, finger, plan.random)
+        with (folder / "rows.csv").open("w") as file:
+            write_stream(moments, file, 2)
+        said: list[Verdict] = []
+        section = f'[tactile]\ndriver = "replay"\nrecordings = ["{folder / "rows.csv"}"]\n'
+        with (
+            Subscriber(f"ipc://{folder}/graspd") as subscriber,
+            start_daemon(scene_in(folder, section), folder / "log"),
+        ):
+            while (message := subscriber.take(2.0 if said else PATIENCE_S)) is not None:
+                said.append(decode_verdict(message[1]))
+        # By their times, for nobody may be there yet to hear the first.
+        end_ns = max(verdict.t_mono_ns for verdict in said)
+        late_ns = end_ns - round((len(moments) - 1 - late_from) / RATE_HZ * 1e9)
+        before = [verdict for verdict in said if verdict.t_mono_ns < late_ns - 1_000_000]
+        late = {verdict.t_mono_ns: verdict.verdict for verdict in said[len(before) :]}
+        if Decision.STABLE not in {verdict.verdict for verdict in before}:
+            raise RuntimeError("the recorded grasp was not judged before the ring began")
+        return len(late), list(late.values()).count(Decision.STABLE)
+
+    return tallied(one(number, *each) for number, each in enumerate(rounds(plan)))
+
+
+def joints_frozen(plan: Plan) -> Outcome:
+    """Joint angles that stand still to the bit beside sweeps that go on."""
+
+    def one(number: int) -> tuple[int, int]:
+        folder = plan.folder / str(number)
+        folder.mkdir()
+        port, stop, begin = free_port(), threading.Event(), threading.Event()
+        frozen_ns: list[int] = []
+        counts = Ring(1, None, RATE_HZ).counts()
+        section, serve = over_spi(folder, counts, stop)
+        section += f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
+        rng = np.random.default_rng(plan.random.randrange(1 << 32))
+
+        def send_joints() -> None:
+            angles = np.full(len(JOINT_NAMES), 0.8)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                for seq in itertools.count():
+                    if stop.wait(1.0 / RATE_HZ):
+                        return
+                    if not begin.is_set():
+                        angles = 0.8 + rng.normal(0.0, 0.0003, len(JOINT_NAMES))
+                    elif not frozen_ns:
+                        frozen_ns.append(time.monotonic_ns())
+                    message = JointMessage(seq, None, JOINT_NAMES, angles)
+                    sender.sendto(message.to_bytes(), ("127.0.0.1", port))
+
+        def since_ns() -> int | None:
+            return frozen_ns[0] + round(JOINTS_MAY_STAND_S * 1e9) if frozen_ns else None
+
+        return under_attack(folder, section, [serve, send_joints], stop, begin, since_ns)
+
+    return tallied(one(number) for number in plan.rounds())
+
+
+def _ring(door: str, run: Callable[[Plan], Outcome]) -> Attack:
+    what = f"the last 2 to 64 sweeps of a held grasp, of a finger or all, for ever {door}"
+    name = f"ring-{door.split()[-1].lower().replace('_', '-')}"
+    return Attack(name, Aim.FALSE_STABLE, what, "rings", run)
+
+
+ATTACKS = (
+    _ring("over SPI", partial(ring_over, over_spi, RATE_HZ)),
+    _ring("over CAN as sweep_fd", partial(ring_over, partial(over_can, "sweep_fd"), RATE_HZ)),
+    _ring("over CAN as syntouch", partial(ring_over, partial(over_can, "syntouch"), RATE_HZ)),
+    _ring("over the palm", partial(ring_over, over_palm, PALM_RATE_HZ)),
+    _ring("in a recording", ring_replayed),
+    Attack(
+        "joints-frozen",
+        Aim.FALSE_STABLE,
+        "joint angles that stay equal to the bit beside sweeps that go on",
+        "rounds",
+        joints_frozen,
+    ),
+)
