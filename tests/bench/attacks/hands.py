@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import socket
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from daemon.publish.messages import Verdict, decode_verdict
-from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.palm import PalmTwin
@@ -33,9 +30,6 @@ class Heard:
     """Verdicts, in the order in which they came."""
 
     verdicts: list[Verdict] = field(default_factory=list)
-
-    def count(self, verdict: str) -> int:
-        return Counter(each.verdict for each in self.verdicts)[verdict]
 
 
 @contextmanager
@@ -99,12 +93,12 @@ def second_palm(plan: Plan) -> Outcome:
         tactile = f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{port}"\n'
         with daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n") as subscriber:
             with sending(grasped(), port):
-                first = hear(subscriber, lambda heard: any_valid(heard), UP_S)
+                first = hear(subscriber, any_valid, UP_S)
             known += any_valid(first)
             time.sleep(SILENCE_S)
-            hear(subscriber, lambda _: False, 0.02)
+            hear(subscriber, never, 0.02)
             with sending(judged_counts(), port):
-                second = hear(subscriber, lambda _: False, HELD_S)
+                second = hear(subscriber, never, HELD_S)
             told += len(second.verdicts)
             stable += sum(verdict.valid for verdict in second.verdicts)
     happened = f"{stable} of {told} verdicts on the second hand by the first one's tare"
@@ -114,6 +108,10 @@ def second_palm(plan: Plan) -> Outcome:
 def any_valid(heard: Heard) -> bool:
     """Whether something was judged."""
     return bool(heard.verdicts) and heard.verdicts[-1].valid
+
+
+def never(_heard: Heard) -> bool:
+    return False
 
 
 ATTACKS = (
