@@ -189,7 +189,9 @@ class Driver(Protocol):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial number of each finger's sensor, by finger, as far as they are known by now."""
+        """Serial number of each finger's sensor, by finger, as far as they are known by now; where
+        the link tells none, who sends. Another one is another sensor: `read_ready` has given
+        nothing once between the readings of the two."""
 
     def describe(self) -> dict[str, str]:
         """What is known about the device, for people: versions, serials, why a link is down."""

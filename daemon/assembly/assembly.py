@@ -207,7 +207,8 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
         from drivers.joints.driver import JointStreamDriver
 
         with _section("joints"):
-            drivers.append(JointStreamDriver(scene.joints.source, clock=clock))
+            source, only_from = scene.joints.source, scene.joints.only_from
+            drivers.append(JointStreamDriver(source, only_from=only_from, clock=clock))
     return drivers
 
 

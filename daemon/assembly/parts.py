@@ -14,11 +14,13 @@ from daemon.publish.companion import Companion
 from daemon.publish.outbox import Outbox, Output
 from daemon.publish.sockets import Sockets
 from daemon.scene import Scene
+from daemon.session.sensors import SensorWatch
 from drivers.base import Driver
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.record.link_log import Tap
+    from daemon.session.file import SessionFile
 
 log = logging.getLogger("graspd")
 
@@ -78,23 +80,20 @@ class Assembly:
             self._stack.callback(driver.close)
             assembly.open_driver(driver)
 
-    def keep_session(self) -> None:
-        """Restore and keep the session and what outcomes teach, if model and scene want that and
-        there is a place for it.
+    def keep_session(self) -> bool:
+        """Have the judge forget sensors that were exchanged. Restore and keep the session and what
+        outcomes teach, if model and scene want that and there is a place for it.
 
-        The file is saved for the last time when the stack closes.
+        The file is saved for the last time when the stack closes. False if there is none.
         """
         scene, pipeline = self._parts.scene, self._parts.pipeline
-        if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
-            return
-        from daemon.session.file import SessionFile, SessionFileError
+        file = self._session_file()
+        if file is None:
+            watch = SensorWatch(self._parts.drivers[0], pipeline.sensors_exchanged)
+            self.companions.append(watch)
+            return False
         from daemon.session.keeper import SessionKeeper
 
-        try:
-            file = SessionFile(scene.session_path)
-        except SessionFileError as error:
-            log.warning("%s; every start begins a new session", error)
-            return
         self._stack.callback(file.close)
         keeper = SessionKeeper(
             pipeline.session,
@@ -106,6 +105,20 @@ class Assembly:
         )
         self._stack.callback(keeper.save)
         self.companions.insert(0, keeper)  # what it answers quietens the socket that is read next
+        return True
+
+    def _session_file(self) -> SessionFile | None:
+        """The file of the session, taken; None if none is to be kept or it cannot be."""
+        scene, pipeline = self._parts.scene, self._parts.pipeline
+        if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
+            return None
+        from daemon.session.file import SessionFile, SessionFileError
+
+        try:
+            return SessionFile(scene.session_path)
+        except SessionFileError as error:
+            log.warning("%s; every start begins a new session", error)
+            return None
 
     def record(self) -> None:
         """Record, if the scene wants that; the session is by now what it is at the start.

@@ -6,7 +6,9 @@ import argparse
 import contextlib
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -15,6 +17,7 @@ from daemon.assembly import assembly
 from daemon.process.text import complain, printable
 from daemon.scene import drivers as scene_drivers
 from drivers.base import DriverError
+from drivers.udp.receiver import SCHEME, Endpoint
 from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
@@ -93,14 +96,32 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         "in": _what_is_in(wanted, model, limits, period_ns),
         "left_out": _what_is_left_out(wanted, model, limits),
     }
+    warnings = _warnings(wanted)
+    for warning in warnings:
+        complain(f"{path}: {warning}")
     if args.json:
-        _write_json(path, parts, cost)
+        _write_json(path, {**parts, "warnings": warnings}, cost)
     elif cost is None or len(args.scene) == 1:
         _write(path, parts, cost)
     return _Checked(0, cost)
 
 
-def _write_json(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None) -> None:
+def _warnings(wanted: scene.Scene) -> list[str]:
+    """What works and is not wise."""
+    warnings = []
+    for name, section in (("tactile", wanted.tactile), ("joints", wanted.joints)):
+        if not isinstance(section, scene_drivers.PalmTactile | scene_drivers.StreamJoints):
+            continue
+        is_heard = section.source.startswith(SCHEME) and section.only_from is None
+        if is_heard and ip_address(Endpoint.parse(section.source).address).is_unspecified:
+            warnings.append(
+                f"[{name}] listens to {section.source}, so anybody who can reach this computer is "
+                "taken for the hand: name its sender with only_from, or listen on one address"
+            )
+    return warnings
+
+
+def _write_json(path: Path, parts: Mapping[str, object], cost: Footprint | None) -> None:
     content: dict[str, object] = {"scene": str(path), **parts}
     if cost is not None:
         import msgspec

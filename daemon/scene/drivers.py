@@ -27,6 +27,11 @@ def _without_nul(value: StrOrPath) -> StrOrPath:
     return value
 
 
+def _ip_address(address: str) -> str:
+    ipaddress.ip_address(address)
+    return address
+
+
 def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
     base: Path = (info.context or {}).get("base", Path())
     return base / path
@@ -34,6 +39,7 @@ def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+Address = Annotated[str, AfterValidator(_ip_address)]
 FilePath = Annotated[
     Path, Field(strict=False), AfterValidator(_without_nul), AfterValidator(_beside_the_scene)
 ]
@@ -141,7 +147,7 @@ class PalmTactile(Section):
     driver: Literal["palm"]
     source: Name
     """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
-    only_from: str | None = None
+    only_from: Address | None = None
     """IP address of the relay, if packets of no other may be heard."""
     heed_finger_bits: bool = True
     """False for a palm that does not set the bits which say that a finger's data is valid."""
@@ -150,13 +156,6 @@ class PalmTactile(Section):
     @classmethod
     def _file_beside_the_scene(cls, source: str, info: ValidationInfo) -> str:
         return source if "://" in source else str(_beside_the_scene(Path(source), info))
-
-    @field_validator("only_from")
-    @classmethod
-    def _is_an_address(cls, address: str | None) -> str | None:
-        if address is not None:
-            ipaddress.ip_address(address)
-        return address
 
 
 Tactile = Annotated[
@@ -179,6 +178,8 @@ class StreamJoints(Section):
     driver: Literal["stream"]
     source: Annotated[Name, Field(pattern=r"^udp://")]
     """`udp://ADDRESS:PORT` to listen on."""
+    only_from: Address | None = None
+    """IP address of the sender, if messages of no other may be heard."""
 
 
 Joints = Annotated[PalmJoints | StreamJoints, Field(discriminator="driver")]

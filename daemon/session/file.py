@@ -208,11 +208,6 @@ def read(path: Path) -> KeptSession | None:
         raise SessionFileError(f"{path}: not a session: {error}") from error
 
 
-def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Fingers whose sensor is known to be another one than before."""
-    return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]
-
-
 def statistics_of(kept: KeptSession, fingers: Sequence[str]) -> SessionState:
     """What is kept of these fingers. Raises `SessionFileError` if it is of others, or nothing."""
     of_fingers(kept, fingers)

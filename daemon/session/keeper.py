@@ -10,20 +10,20 @@ import select
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from queue import SimpleQueue
 from typing import Final, NamedTuple
 
 from daemon.judge.calibration import SessionCalibration
-from daemon.publish.companion import Answer, Companion, Requests
+from daemon.publish.companion import Answer, Requests
 from daemon.session.file import (
     KeptSession,
     SessionFile,
     SessionFileError,
-    exchanged,
     of_fingers,
     statistics_of,
 )
+from daemon.session.sensors import SensorWatch
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Driver
 from models.session_statistics import SessionState
@@ -49,7 +49,7 @@ class Known(NamedTuple):
     trust: TrustState | None = None
 
 
-class SessionKeeper(Companion):
+class SessionKeeper(SensorWatch):
     """Restores, saves and drops one session; a file that fails costs a warning, not the run."""
 
     def __init__(
@@ -71,12 +71,10 @@ class SessionKeeper(Companion):
         """
         self._session = session
         self._trust = trust
-        self._on_exchange = on_exchange or self._reset
+        super().__init__(tactile, on_exchange or self._reset)
         self._fingers = tuple(fingers)
-        self._tactile = tactile
         self._file = file
         self._clock = clock
-        self._serials: dict[str, str] = {}
         self._unused = Known({})
         """What was kept and this run has no use for."""
         self._restore()
@@ -107,7 +105,7 @@ class SessionKeeper(Companion):
 
     def before_readings(self) -> None:
         """Drop the session if a sensor has been exchanged; save it if it is time."""
-        self._check_serials()
+        super().before_readings()
         if self._clock() >= self._save_due_ns and self._written is None:
             self._begin_to_save()
 
@@ -225,15 +223,9 @@ class SessionKeeper(Companion):
         if self._trust is not None:
             self._trust.sensors_exchanged()
 
-    def _check_serials(self) -> None:
-        serials = self._tactile.serials
-        changed = exchanged(self._serials, serials)
-        if changed:
-            grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
-            log.warning(
-                "new sensor on %s: the session%s no longer count", ", ".join(changed), grasps
-            )
-            self._unused = Known({})
-            self._on_exchange()
-            self._save_due_ns = self._clock()
-        self._serials.update(serials)
+    def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
+        grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
+        log.warning("new sensor on %s: the session%s no longer count", ", ".join(changed), grasps)
+        self._unused = Known({})
+        self._on_exchange()
+        self._save_due_ns = self._clock()

@@ -62,20 +62,30 @@ class PalmDriver(DatagramDriver):
             PalmStream, fingers, heed_finger_bits=heed_finger_bits
         )
         self._stream = self._make_stream()
+        self._fingers = tuple(fingers)
         self._calibration = calibration
         self._clock = clock
         self._attention_ns = 0
+        self._rests = False
 
     @property
     def counters(self) -> PalmCounters:
         """Counters since `open`."""
         return self._stream.counters
 
+    @property
+    def serials(self) -> dict[str, str]:
+        """Who sends, for each finger: no packet carries a serial number, and another sender is
+        another hand."""
+        sender = self.link.sender
+        return {} if sender is None else dict.fromkeys(self._fingers, sender)
+
     def open(self) -> None:
         """Read the calibration, then listen."""
         self.close()
         self._stream = self._make_stream(calibration=self._calibration)
         self._attention_ns = self._clock()
+        self._rests = False
         self.link.open(self._stream.counters)
 
     def fileno(self) -> int | None:
@@ -95,6 +105,9 @@ class PalmDriver(DatagramDriver):
 
     def read_ready(self) -> Sequence[Reading]:
         """Readings that are complete, from `drivers.udp.link.DRAIN_MAX` packets at most."""
+        if self._rests:
+            self._rests = False
+            return ()
         readings: list[Reading] = []
         for data, t_ns in self.link.receive():
             made = self._stream.receive(data, t_ns)
@@ -103,6 +116,7 @@ class PalmDriver(DatagramDriver):
                 readings.extend(made)
         if self.link.fell_silent():
             self._stream.interrupt()
+            self._rests = bool(readings)  # what comes next may be of others: see `Driver.serials`
         self._attention_ns = self._clock() + self._nothing_for_ns()
         return readings
 

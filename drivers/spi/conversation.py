@@ -33,8 +33,8 @@ NAME: Final = "spi"
 GREETING_NS = 500_000_000
 """How long the bridge may take to answer a PING at the start."""
 GREETING_TRIES = 4
-"""PINGs at the start before the port is opened anew: a board that resets when its port is opened
-needs a second or two."""
+"""PINGs at the start before the port is opened anew, and one more if the last answer needs another
+that agrees: a board that resets when its port is opened needs a second or two."""
 PING_PERIOD_NS = 1_000_000_000
 PING_FIRST_NS = 50_000_000
 PINGS_FIRST = 8
@@ -77,6 +77,10 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
+        self._believed: tuple[str, ...] = ()
+        """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
+        self._doubted: tuple[str, ...] | None = None
+        """Those of a HELLO that told others, until the next one."""
         self.status: Status | None = None
         """The last STATUS, None before the first."""
         self._sensors = sensor_rows(fingers, sensors)
@@ -174,12 +178,14 @@ class Conversation:
             is_first = self._pings_sent + 1 < PINGS_FIRST
             self._ping_due_ns = now_ns + (PING_FIRST_NS if is_first else PING_PERIOD_NS)
             return [*said, self._next_ping()]
-        elif self._pings_sent < GREETING_TRIES:
+        elif self._pings_sent < GREETING_TRIES + (self._doubted is not None):
             self._ping_due_ns = now_ns + GREETING_NS
             # The zero byte ends whatever the line held before.
             return [DELIMITER + encode(Stop()), self._next_ping()]
         else:
-            self.lost(f"no answer from {self._port}", now_ns)
+            no_answer = f"no answer from {self._port}"
+            others = f"{self._port}: the bridge names other sensors each time"
+            self.lost(no_answer if self._doubted is None else others, now_ns)
         return []
 
     def sent(self, data: bytes, t_ns: int) -> None:
@@ -262,12 +268,25 @@ class Conversation:
         if sent_ns is None:
             return  # an answer that came twice or too late says nothing about time
         if self._sweeps is None:
-            self._begin(hello, arrival_ns)
+            self._greet(hello, arrival_ns)
         elif not self._sweeps.fits(hello):
             self.lost("the bridge changed what it samples", arrival_ns)
+        elif not self._believes(hello.serials):
+            # Misread or exchanged: at STOP it reads them again.
+            self.lost("the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
             self.hello = hello
             self._sweeps.round_trip(hello, sent_ns, arrival_ns)
+
+    def _believes(self, told: tuple[str, ...]) -> bool:
+        """Whether a HELLO tells the sensors that are known, or the same as the one before it."""
+        before = self._believed if len(self._believed) == len(told) else ("",) * len(told)
+        together = tuple(now or known for now, known in zip(told, before, strict=True))
+        if together != before and told != self._doubted:
+            self._doubted = told
+            return False
+        self._believed, self._doubted = together, None
+        return True
 
     def _on_reset(self, now_ns: int) -> None:
         """The bridge says that it has just been reset."""
@@ -277,16 +296,20 @@ class Conversation:
         elif self._pings_sent < GREETING_TRIES:
             self._ping_due_ns = now_ns
 
-    def _begin(self, hello: Hello, now_ns: int) -> None:
-        """Begin sweeping with a bridge that has just answered for the first time."""
+    def _greet(self, hello: Hello, now_ns: int) -> None:
+        """Begin sweeping with a bridge that has just answered, if its sensors are believed."""
         needed = max(self._sensors) + 1
         if hello.sensors < needed:
             self._refuse(f"has {hello.sensors} sensors, the scene needs {needed}", now_ns)
         elif hello.period_ns > PERIOD_MAX_NS:
             self._refuse(f"sweeps once in {hello.period_ns / 1e9:g} s only", now_ns)
+        elif not self._believes(hello.serials):
+            if self._pings_sent <= GREETING_TRIES:
+                self._ping_due_ns = now_ns
         else:
             self.hello = hello
             self._starts = True
+            self._pings_sent = 1
             self._ping_due_ns = now_ns + PING_FIRST_NS
             self._silent_at_ns = now_ns + self._silence_ns()
             self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)

@@ -30,8 +30,8 @@ class DatagramLink:
     """Hands over the datagrams of one sender, each with its time of arrival.
 
     The first sender of a good datagram is the sender until the link is lost: two hands on one port
-    would otherwise be mixed, as nothing else tells them apart. With `only_from` no other address
-    is ever heard.
+    would otherwise be mixed, as nothing else tells them apart. Its address and its port do: two
+    relays may run on one computer. With `only_from` no other address is ever heard.
     """
 
     def __init__(
@@ -64,6 +64,8 @@ class DatagramLink:
         self._earlier_drops = 0
         self._sender: Sender | None = None
         self._heard: Sender = ("", 0)
+        self.sender: str | None = None
+        """Who was heard last, `udp://ADDRESS:PORT`; None before the first good datagram."""
         self._t_ns = 0
         self._good_t_ns = 0
         self._heard_from: str | None = None
@@ -147,6 +149,7 @@ class DatagramLink:
         self._good_t_ns = self._t_ns
         if self._link.state is not LinkState.UP:
             self._sender = self._heard
+            self.sender = str(Endpoint(*self._heard))
             self._heard_from = f"{what} from {self._heard[0]} port {self._heard[1]}"
             self._link.up(self._heard_from, self._clock())
 
@@ -214,7 +217,7 @@ class DatagramDriver(Opened):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Always empty: no datagram carries a sensor's serial number."""
+        """Empty, unless who derives knows of sensors."""
         return {}
 
     def describe(self) -> dict[str, str]:

@@ -205,8 +205,7 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     from daemon.publish.sockets import Sockets
 
     around = Assembly(parts, stack)
-    around.keep_session()
-    if around.companions:
+    if around.keep_session():
         meter.take("session file")
     around.add_sockets(stack.enter_context(Sockets(parts.scene)))
     outbox = around.build_outbox()

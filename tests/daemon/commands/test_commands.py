@@ -168,6 +168,33 @@ def test_check_does_not_look_for_devices(tmp_path: Path) -> None:
 
 
 PALM = '[tactile]\ndriver = "palm"\n'
+
+
+@pytest.mark.parametrize(
+    ("source", "only_from", "warned"),
+    [
+        ("udp://0.0.0.0:9870", "", True),
+        ("udp://[::]:9870", "", True),
+        ("udp://0.0.0.0:9870", "10.0.0.2", False),
+        ("udp://[::]:9870", "fd00::2", False),
+        ("udp://127.0.0.1:9870", "", False),
+        ("udp://10.0.0.1:9870", "", False),
+    ],
+)
+def test_check_warns_of_udp_that_anybody_can_send_to(
+    tmp_path: Path, source: str, only_from: str, warned: bool
+) -> None:
+    scene = tmp_path / "scene.toml"
+    heard = f'source = "{source}"\n' + (f'only_from = "{only_from}"\n' if only_from else "")
+    stream = f'[joints]\ndriver = "stream"\n{heard.replace(":98", ":99")}'
+    scene.write_text(f"{PALM}{heard}{stream}")
+    result = graspd("check", scene, "--json")
+    assert result.returncode == 0
+    told = json.loads(result.stdout)["warnings"]
+    assert [warning[: warning.index(" ")] for warning in told] == ["[tactile]", "[joints]"] * warned
+    assert result.stderr.count("name its sender with only_from") == len(told)
+
+
 WRONG_PARTS = {
     '[tactile]\ndriver = "can"\nbitrate = 500000\n': "[tactile] bit rates of socketcan are set by",
     PALM + 'source = "udp://127.0.0.1:9870"\n[joints]\ndriver = "palm"\n'

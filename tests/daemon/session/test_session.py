@@ -21,8 +21,9 @@ from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.session.file import SessionFile, SessionFileError, exchanged, load
+from daemon.session.file import SessionFile, SessionFileError, load
 from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
+from daemon.session.sensors import exchanged
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.whole_grasps import synthetic_grasps

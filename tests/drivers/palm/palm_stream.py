@@ -104,6 +104,12 @@ class Sender:
         assert driver.port is not None
         self.target = ("127.0.0.1", driver.port)
 
+    @property
+    def port(self) -> int:
+        """Its own, once it has sent."""
+        port: int = self.socket.getsockname()[1]
+        return port
+
     def send(self, *datagrams: bytes) -> None:
         for data in datagrams:
             self.socket.sendto(data, self.target)

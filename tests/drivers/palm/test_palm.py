@@ -25,6 +25,7 @@ from drivers.twins.palm import PalmTwin
 from drivers.udp.receiver import DatagramReceiver
 from tests.conftest import ROOT, data_dir
 from tests.drivers.palm.palm_stream import (
+    FINGERS,
     MS,
     ROUND,
     Clock,
@@ -187,6 +188,38 @@ def test_another_sender_is_not_mixed_in(driver: PalmDriver, clock: Clock) -> Non
     assert driver.describe()["heard"].startswith("palm 0220 from 127.0.0.1 port ")
     driver.close()
     assert driver.describe()["source"].startswith("udp://127.0.0.1:")
+
+
+def test_who_sends_stands_for_the_serial_numbers(driver: PalmDriver, clock: Clock) -> None:
+    """Two relays may run on one computer, so the port tells them apart too."""
+    assert driver.serials == {}
+    with Sender(driver) as sender, Sender(driver) as stranger:
+        sender.send(*datagrams(1))
+        driver.read_ready()
+        first = driver.serials
+        assert first == dict.fromkeys(FINGERS, f"udp://127.0.0.1:{sender.port}")
+        clock.now_ns += 200 * MS
+        driver.read_ready()
+        assert driver.serials == first  # nobody else has come yet
+        stranger.send(*datagrams(2)[ROUND:])
+        driver.read_ready()
+        assert driver.serials == dict.fromkeys(FINGERS, f"udp://127.0.0.1:{stranger.port}")
+
+
+def test_readings_of_two_senders_never_come_in_a_row(driver: PalmDriver) -> None:
+    """The loop was away until the first one's silence was over, and takes all that it finds."""
+    with Sender(driver) as sender, Sender(driver) as stranger:
+        sender.send(*datagrams(2))
+        time.sleep(0.15)
+        readings = tactile(driver.read_ready())
+        first = driver.serials
+        stranger.send(*datagrams(4)[2 * ROUND :])
+        assert len(readings) == 2
+        assert state(driver) is LinkState.GREETING
+        assert driver.read_ready() == ()
+        assert driver.serials == first
+        assert len(driver.read_ready()) == 2
+        assert driver.serials != first
 
 
 def test_an_address_that_is_not_wanted_is_never_heard() -> None:

@@ -14,11 +14,23 @@ import numpy as np
 import pytest
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
+from drivers.palm.driver import SILENCE_NS, PalmDriver
 from drivers.palm.packet import PalmCounters, PalmParser
 from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
-from tests.drivers.palm.palm_stream import FINGERS, MS, ROUND, Played, play, row_of, rows
+from tests.drivers.palm.palm_stream import (
+    FINGERS,
+    MS,
+    ROUND,
+    Clock,
+    Played,
+    Sender,
+    play,
+    row_of,
+    rows,
+    tactile,
+)
 
 ROUNDS = 300
 
@@ -183,6 +195,27 @@ def test_rounds_of_damaged_packets_keep_no_memory_and_end_with_the_damage() -> N
     readings = [reading for cycle, data in enumerate(good, 20_000) for reading in feed(data, cycle)]
     assert np.array_equal(readings[-1].counts, rows(40)[-1]), f"seed {seed}"
     assert not any(reading.faults.any() for reading in readings[3:]), f"seed {seed}"
+
+
+@pytest.mark.parametrize("into_round", range(ROUND))
+def test_a_second_palm_after_silence_is_told_and_never_mixed_in(into_round: int) -> None:
+    """The first one breaks off in a round, the second is heard from anywhere in one of its own."""
+    clock, hands = Clock(), (rows(4, seed=1), rows(4, seed=2))
+    with (
+        PalmDriver("udp://127.0.0.1:0", clock=clock) as driver,
+        Sender(driver) as first,
+        Sender(driver) as second,
+    ):
+        for sender, hand in zip((first, second), hands, strict=True):
+            sent = [packet.to_bytes() for packet in PalmTwin(hand).packets()]
+            sender.send(*sent[into_round : 3 * ROUND + into_round])
+            readings = tactile(driver.read_ready())
+            assert len(readings) >= 2
+            assert all(row_of(reading, hand) is not None for reading in readings)
+            assert not any(reading.faults.any() for reading in readings)
+            assert driver.serials["ff"] == f"udp://127.0.0.1:{sender.port}"
+            clock.now_ns += SILENCE_NS
+            assert driver.read_ready() == []
 
 
 def test_the_faults_of_a_twin_come_again_with_the_same_seed() -> None:

@@ -125,12 +125,16 @@ def take(driver: SpiBridgeDriver, bridge: ScriptedBridge) -> list[TactileReading
 def greeted(
     driver: SpiBridgeDriver, bridge: ScriptedBridge, answer: Callable[[int], Message] = hello
 ) -> list[Message]:
-    """Open the driver and answer its PING; what it had said until then."""
+    """Open the driver and answer its PINGs; what it had said until the first."""
     driver.open()
-    said = bridge.heard(Ping)
-    (ping,) = (message for message in said if isinstance(message, Ping))
-    bridge.send(answer(ping.nonce))
-    take(driver, bridge)
+    said = heard = bridge.heard(Ping)
+    for _ in range(2):  # the serial numbers are believed when they are told again
+        (ping,) = (message for message in heard if isinstance(message, Ping))
+        bridge.send(answer(ping.nonce))
+        take(driver, bridge)
+        if driver.link_state is LinkState.WAITING or driver.conversation.hello is not None:
+            break
+        heard = bridge.heard(Ping)
     return said
 
 

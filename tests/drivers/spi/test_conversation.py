@@ -41,10 +41,11 @@ def state(conversation: Conversation) -> LinkState:
 
 
 def greeted(period_ms: int = 10) -> Conversation:
-    conversation = opened()
-    said(conversation, T0)
-    answer = dataclasses.replace(hello(42), period_ticks=1000 * period_ms)
-    assert hear(conversation, answer, T0) == 0
+    conversation = opened(nonce=40)
+    for nonce in (41, 42):
+        said(conversation, T0)
+        answer = dataclasses.replace(hello(nonce), period_ticks=1000 * period_ms)
+        assert hear(conversation, answer, T0) == 0
     return conversation
 
 
@@ -124,9 +125,11 @@ def test_people_are_told_what_is_known() -> None:
     conversation.lost("unplugged", T0)
     assert conversation.describe() == {"port": "port", "link": "waiting", "why": "unplugged"}
     conversation.opened(T0)
-    said(conversation, T0)
-    answer = dataclasses.replace(hello(42), firmware=0x0203, serials=("BTSP-1", "", "BTSP-3"))
-    hear(conversation, answer, T0 + 2 * MS)
+    for nonce, t_ns in ((42, T0), (43, T0 + 2 * MS)):
+        said(conversation, t_ns)
+        told = ("BTSP-1", "", "BTSP-3")
+        answer = dataclasses.replace(hello(nonce), firmware=0x0203, serials=told)
+        hear(conversation, answer, t_ns + 2 * MS)
     about = {
         "board": "b",
         "firmware": "2.3",
@@ -188,3 +191,90 @@ def test_numbers_of_sweeps_go_round(
     counters = conversation.counters
     assert counters.missed_readings == 900 + missed
     assert (counters.duplicates, counters.reordered) == (duplicates, reordered)
+
+
+def told(conversation: Conversation, serials: tuple[str, ...], now_ns: int) -> None:
+    """A HELLO that answers the PING which is due; if the link is lost, it is opened again."""
+    (nonce,) = (each.nonce for each in said(conversation, now_ns) if isinstance(each, Ping))
+    hear(conversation, dataclasses.replace(hello(nonce), serials=serials), now_ns)
+    if state(conversation) is LinkState.WAITING:
+        conversation.opened(now_ns)
+
+
+SERIALS, MISREAD, OTHERS = ("A", "B", "C"), ("A", "8", "C"), ("A", "D", "C")
+BY_FINGER = {"ff": "A", "mf": "B", "th": "C"}
+
+
+@pytest.mark.parametrize(
+    ("hellos", "believed"),
+    [
+        ([SERIALS], None),
+        ([SERIALS, SERIALS], "B"),
+        ([MISREAD, SERIALS], None),
+        ([MISREAD, SERIALS, SERIALS], "B"),
+        ([SERIALS, ("A", "", "C")], None),
+        ([("A", "", "C"), SERIALS, SERIALS], "B"),
+        ([MISREAD, SERIALS, MISREAD, SERIALS], None),
+    ],
+)
+def test_nothing_is_handed_over_before_two_hellos_in_a_row_tell_the_same_sensors(
+    hellos: list[tuple[str, ...]], believed: str | None
+) -> None:
+    conversation = opened()
+    for at, serials in enumerate(hellos, 1):
+        assert conversation.hello is None
+        (nonce,) = (each.nonce for each in said(conversation, T0) if isinstance(each, Ping))
+        hear(conversation, dataclasses.replace(hello(nonce), serials=serials), T0)
+        made = hear(conversation, sweep(0, 10**9), T0)
+        assert made == (at == len(hellos) and believed is not None)
+    assert conversation.serials.get("mf") == believed
+
+
+def test_a_bridge_that_never_names_the_same_sensors_twice_is_given_up() -> None:
+    conversation = opened()
+    for number in range(5):
+        told(conversation, (f"A{number}", "B", "C"), T0)
+    assert said(conversation, T0) == []
+    assert said(conversation, T0 + 500 * MS) == []
+    assert state(conversation) is LinkState.WAITING
+    assert conversation.link.reason == "port: the bridge names other sensors each time"
+
+
+@pytest.mark.parametrize(
+    ("second", "third", "serials"),
+    [
+        (SERIALS, None, SERIALS),  # it was misread
+        (OTHERS, None, OTHERS),  # it was exchanged
+        (MISREAD, OTHERS, OTHERS),  # exchanged, and misread once more
+    ],
+)
+def test_another_serial_number_stops_readings_until_it_is_told_again(
+    second: tuple[str, ...], third: tuple[str, ...] | None, serials: tuple[str, ...]
+) -> None:
+    conversation = opened()
+    for _ in range(2):
+        told(conversation, SERIALS, T0)
+    assert hear(conversation, sweep(0, 10**9), T0) == 1
+    now_ns = T0 + 50 * MS
+    told(conversation, OTHERS, now_ns)
+    assert conversation.counters.link_losses == 1
+    for at, each in enumerate((second, *(() if third is None else (third, third)))):
+        assert hear(conversation, sweep(1 + at, 2 * 10**9), now_ns) == 0
+        assert conversation.serials == BY_FINGER
+        told(conversation, each, now_ns)
+    assert hear(conversation, sweep(9, 3 * 10**9), now_ns) == 1
+    assert tuple(conversation.serials.values()) == serials
+
+
+def test_a_sensor_that_does_not_answer_is_none_that_was_exchanged() -> None:
+    conversation = opened()
+    for _ in range(2):
+        told(conversation, SERIALS, T0)
+    now_ns = T0
+    for serials in (("A", "", "C"), SERIALS):
+        now_ns += 50 * MS
+        assert hear(conversation, sweep(now_ns // MS % 1000, now_ns), now_ns) == 1
+        told(conversation, serials, now_ns)
+        assert conversation.counters.link_losses == 0
+        known = zip(("ff", "mf", "th"), serials, strict=True)
+        assert conversation.serials == {finger: serial for finger, serial in known if serial}

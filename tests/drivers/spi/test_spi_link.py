@@ -155,9 +155,10 @@ def test_a_hello_that_was_damaged_is_asked_for_again(rig: Rig) -> None:
     rig.bridge.send(bytes(damaged))
     take(rig.driver, rig.bridge)
     rig.wait(500)
-    (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
-    rig.bridge.send(hello(ping.nonce), sweep(0, 100))
-    assert len(take(rig.driver, rig.bridge)) == 1
+    for taken in (0, 1):
+        (ping,) = (m for m in rig.bridge.heard(Ping) if isinstance(m, Ping))
+        rig.bridge.send(hello(ping.nonce), sweep(0, 100))
+        assert len(take(rig.driver, rig.bridge)) == taken
 
 
 def test_a_hello_that_answers_nothing_begins_nothing(rig: Rig) -> None:

@@ -1,0 +1,39 @@
+"""Notices that the hand's sensors are others than before, by their serial numbers."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+
+from daemon.publish.companion import Companion
+from drivers.base import Driver
+
+log = logging.getLogger("graspd")
+
+
+class SensorWatch(Companion):
+    """Has the judge forget sensors that were exchanged, before readings of the new ones come."""
+
+    def __init__(self, tactile: Driver, on_exchange: Callable[[], None]) -> None:
+        """`tactile` knows the serial numbers; `on_exchange` is called when one is another."""
+        self._tactile = tactile
+        self._on_exchange = on_exchange
+        self._serials: dict[str, str] = {}
+        """What was known last of each finger."""
+
+    def before_readings(self) -> None:
+        """Compare the sensors with those before."""
+        serials = self._tactile.serials
+        changed = exchanged(self._serials, serials)
+        if changed:
+            self._exchange(changed, serials)
+        self._serials.update(serials)
+
+    def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
+        log.warning("new sensor on %s: the hand must be seen open first", ", ".join(changed))
+        self._on_exchange()
+
+
+def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Fingers whose sensor is known to be another one than before."""
+    return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]

@@ -1,0 +1,250 @@
+"""Another hand on the link, a serial number that was misread, and sweeps that are torn apart."""
+
+from __future__ import annotations
+
+import itertools
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from daemon.assembly import assembly
+from daemon.publish.messages import Verdict, decode_verdict
+from daemon.scene import load as load_scene
+from daemon.session.file import SessionFile, load
+from drivers.spi.messages import Hello
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
+from drivers.twins.palm import PalmTwin
+from drivers.twins.spi import SpiTwin
+from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
+from tests.bench.live import (
+    HELD,
+    SEED,
+    Subscriber,
+    judged_counts,
+    start_daemon,
+    tactile_section,
+)
+
+PALM_HZ = 1000.0 / 14.0
+SILENCE_S = 0.16
+"""Above the 140 ms after which the palm's link is given up."""
+HELD_S = 2.0
+KEPT_GRASPS = 30
+SPI_VERDICTS = 60
+UP_S = 15.0
+"""Longest wait for a daemon's first verdict, s."""
+
+
+@dataclass
+class Heard:
+    """Verdicts, in the order in which they came."""
+
+    verdicts: list[Verdict] = field(default_factory=list)
+
+
+@contextmanager
+def daemon_of(folder: Path, tactile: str, model: str, more: str = "") -> Iterator[Subscriber]:
+    """A daemon that judges settled grasps, and who hears it."""
+    endpoint = f"ipc://{folder}/verdicts"
+    scene = folder / "scene.toml"
+    scene.write_text(
+        f'{tactile}[hand]\nname = "right"\n[model]\nname = "{model}"\n'
+        f'[publish]\nendpoint = "{endpoint}"\n{more}'
+    )
+    with start_daemon(scene, folder / "log") as daemon, Subscriber(endpoint) as subscriber:
+        yield subscriber
+        daemon.terminate()
+
+
+def hear(subscriber: Subscriber, until: Callable[[Heard], bool], seconds: float) -> Heard:
+    """Verdicts until a condition holds or the time is over."""
+    heard, end_s = Heard(), time.monotonic() + seconds
+    while time.monotonic() < end_s and not until(heard):
+        message = subscriber.take(min(0.1, max(end_s - time.monotonic(), 0.0)))
+        if message is not None:
+            heard.verdicts.append(decode_verdict(message[1]))
+    return heard
+
+
+def grasped() -> Iterator[Counts]:
+    """An open hand that closes and holds."""
+    return (
+        moment.counts for moment in synthetic_grasps(1, rate_hz=PALM_HZ, durations=HELD, seed=SEED)
+    )
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        port: int = one.getsockname()[1]
+        return port
+
+
+@contextmanager
+def sending(counts: Iterator[Counts], port: int) -> Iterator[None]:
+    """A palm's relay, on a socket of its own, for as long as the block."""
+    stop = threading.Event()
+    twin = PalmTwin(counts)
+    thread = threading.Thread(target=twin.serve, args=(f"udp://127.0.0.1:{port}", stop))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def second_palm(plan: Plan) -> Outcome:
+    """The first hand is judged and falls silent; another one, which holds, sends instead of it."""
+    known, told, stable, rounds = 0, 0, 0, 0
+    for rounds in plan.rounds():
+        folder = plan.folder / str(rounds)
+        folder.mkdir()
+        port = free_port()
+        tactile = f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{port}"\n'
+        with daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n") as subscriber:
+            with sending(grasped(), port):
+                first = hear(subscriber, any_valid, UP_S)
+            known += any_valid(first)
+            time.sleep(SILENCE_S)
+            hear(subscriber, never, 0.02)
+            with sending(judged_counts(), port):
+                second = hear(subscriber, never, HELD_S)
+            told += len(second.verdicts)
+            stable += sum(verdict.valid for verdict in second.verdicts)
+    happened = f"{stable} of {told} verdicts on the second hand by the first one's tare"
+    return Outcome(rounds + 1, happened, stable == 0 and told > 50 and known == rounds + 1)
+
+
+class MisreadTwin(SpiTwin):
+    """A bridge that reads some serial numbers wrong."""
+
+    def __init__(self, path: Path, misread: Callable[[int], bool]) -> None:
+        """`misread` says whether the HELLO of this number, from 0, is wrong by a character."""
+        self._misread = misread
+        self.hellos = 0
+        super().__init__(path, judged_counts())
+
+    def _hello(self, nonce: int) -> Hello:
+        hello = super()._hello(nonce)
+        wrong = self._misread(self.hellos)
+        self.hellos += 1
+        first, *others = hello.serials
+        return replace(hello, serials=(first.replace("W", "V"), *others)) if wrong else hello
+
+
+@contextmanager
+def bridge(twin: SpiTwin) -> Iterator[None]:
+    """A twin at work in a thread."""
+    stop = threading.Event()
+    with twin:
+        thread = threading.Thread(target=twin.serve, args=(stop.is_set,))
+        thread.start()
+        try:
+            yield
+        finally:
+            stop.set()
+            thread.join()
+
+
+def keep_grasps(folder: Path, text: str) -> SessionFile:
+    """A kept session of the twin's sensors, calibrated, as a daemon would have left it."""
+    scene = folder / "before.toml"
+    scene.write_text(text)
+    wanted = load_scene(scene)
+    session = assembly.build_pipeline(wanted, assembly.load_model(wanted)).session
+    if session is None:
+        raise ValueError("the model keeps no session")
+    for counts in itertools.islice(judged_counts(), KEPT_GRASPS):
+        session.observe(counts)
+    serials = {finger: f"BTSP-TWIN-{at}" for at, finger in enumerate(wanted.hand.fingers)}
+    with SessionFile(wanted.session_path) as file:
+        file.save(session.state(), wanted.hand.fingers, serials)
+    return file
+
+
+def kept_grasps(file: SessionFile) -> int:
+    kept = load(file.path)
+    return 0 if kept is None or kept.statistics is None else kept.statistics.grasps
+
+
+def misread_serial(plan: Plan) -> Outcome:
+    """One HELLO of the first eight is wrong."""
+    wiped, rounds = 0, 0
+    for rounds in plan.rounds():
+        folder = plan.folder / str(rounds)
+        folder.mkdir()
+        tactile = tactile_section("spi", str(folder / "bridge"))
+        session = f'[session]\nfile = "{folder}/session.json"\n'
+        file = keep_grasps(folder, tactile + session)
+        wrong = 1 + plan.random.randrange(8)
+        with (
+            bridge(MisreadTwin(folder / "bridge", lambda number, wrong=wrong: number == wrong)),
+            daemon_of(folder, tactile, "small-session", session) as subscriber,
+        ):
+            heard = hear(subscriber, lambda heard: len(heard.verdicts) >= SPI_VERDICTS, UP_S)
+        wiped += kept_grasps(file) < KEPT_GRASPS or len(heard.verdicts) < SPI_VERDICTS
+    happened = f"{wiped} of {rounds + 1} kept sessions of {KEPT_GRASPS} grasps wiped"
+    return Outcome(rounds + 1, happened, wiped == 0)
+
+
+def exchanged_sensor(plan: Plan) -> Outcome:
+    """A sensor is exchanged for another while the bridge is unplugged, and later put back."""
+    kept: list[tuple[int, int]] = []
+    for rounds in plan.rounds():
+        folder = plan.folder / str(rounds)
+        folder.mkdir()
+        tactile = tactile_section("spi", str(folder / "bridge"))
+        session = f'[session]\nfile = "{folder}/session.json"\n'
+        file = keep_grasps(folder, tactile + session)
+        found = []
+        for is_other in (True, False):
+            with (
+                bridge(MisreadTwin(folder / "bridge", lambda _, other=is_other: other)),
+                daemon_of(folder, tactile, "small-session", session) as subscriber,
+            ):
+                hear(subscriber, lambda heard: len(heard.verdicts) >= SPI_VERDICTS, UP_S)
+            found.append(kept_grasps(file))
+        kept.append((found[0], found[1]))
+    held = all(other < KEPT_GRASPS <= back for other, back in kept)
+    happened = f"{kept[-1][0]} grasps known of the other sensor, {kept[-1][1]} when it was back"
+    return Outcome(len(kept), happened, held)
+
+
+def any_valid(heard: Heard) -> bool:
+    """Whether something was judged."""
+    return bool(heard.verdicts) and heard.verdicts[-1].valid
+
+
+def never(_heard: Heard) -> bool:
+    return False
+
+
+ATTACKS = (
+    Attack(
+        "second-palm",
+        Aim.FALSE_STABLE,
+        "a second palm sends after 160 ms of silence of the first, and holds something",
+        "times",
+        second_palm,
+    ),
+    Attack(
+        "misread-serial",
+        Aim.FALLS,
+        "a bridge misreads one character of a serial number in one of its first HELLOs",
+        "times",
+        misread_serial,
+    ),
+    Attack(
+        "exchanged-sensor",
+        Aim.FALSE_STABLE,
+        "a sensor is exchanged for another and later put back",
+        "times",
+        exchanged_sensor,
+    ),
+)
