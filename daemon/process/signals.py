@@ -6,11 +6,25 @@ import contextlib
 import os
 import signal
 from types import FrameType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKEUPS_MAX = 4096
 """Bytes that a look takes out of the pipe: more signals than ever come between two."""
+
+
+class Stop(Protocol):
+    """What the loop looks at to know when to end."""
+
+    @property
+    def received(self) -> signal.Signals | None:
+        """The signal by which the process is asked to stop; None before it."""
+
+    def fileno(self) -> int:
+        """Descriptor that becomes readable when a signal arrives."""
+
+    def take_reload(self) -> bool:
+        """Whether a reload is due since the last look."""
 
 
 class StopSignal:

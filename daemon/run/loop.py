@@ -10,7 +10,7 @@ from enum import Enum
 from typing import Literal
 
 from daemon.judge.pipeline import Pipeline
-from daemon.process.signals import StopSignal
+from daemon.process.signals import Stop
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import Answer, Companion, overridden
 from daemon.publish.deadlines import Deadlines
@@ -69,7 +69,7 @@ class Loop:
         drivers: Sequence[Driver],
         pipeline: Pipeline,
         outbox: Outbox,
-        stop: StopSignal,
+        stop: Stop,
         companions: Sequence[Companion],
         timing: Timing,
     ) -> None:

@@ -15,7 +15,8 @@ from daemon.process.signals import StopSignal
 from daemon.publish.binding import PublishError
 from daemon.publish.sockets import Sockets, plan
 from daemon.run.loop import Ended, Loop, Timing
-from drivers.base import DriverError, RecordingError
+from daemon.run.reload import Reload
+from drivers.base import DriverError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
@@ -39,12 +40,10 @@ def prepare(path: Path) -> Parts:
     return Parts.of(wanted, assembly.load_model(wanted))
 
 
-def enter_realtime(parts: Parts, stack: ExitStack) -> RealtimeMode | None:
-    """Rehearse a grasp, then be in realtime until `stack` closes; None if the scene does not want
-    that. Imported only where it does."""
+def rehearse_grasp(parts: Parts) -> None:
+    """Judge a synthetic grasp, if the scene wants realtime. Imported only where it does."""
     if parts.scene.realtime is None:
-        return None
-    from daemon.run.realtime import RealtimeMode
+        return
     from daemon.run.rehearsal import rehearse
 
     # With a model of its own: how a model's inputs are scaled follows who judges with it.
@@ -55,6 +54,19 @@ def enter_realtime(parts: Parts, stack: ExitStack) -> RealtimeMode | None:
         )
     except ModelError as error:  # the file has changed since; the one in memory is sound
         log.warning("no rehearsal: %s", error)
+
+
+def enter_realtime(
+    parts: Parts, stack: ExitStack, *, rehearsed: bool = False
+) -> RealtimeMode | None:
+    """Rehearse a grasp unless that is done, then be in realtime until `stack` closes; None if the
+    scene does not want that. Imported only where it does."""
+    if parts.scene.realtime is None:
+        return None
+    from daemon.run.realtime import RealtimeMode
+
+    if not rehearsed:
+        rehearse_grasp(parts)
     return stack.enter_context(RealtimeMode(parts.scene.realtime))
 
 
@@ -75,7 +87,11 @@ class Runner:
         self._printer = printer
         self._manager = manager
         self._sockets: Sockets | None = None
+        self._reload = Reload(stop, self._prepare_anew, self._say_reloading)
         self._running = False
+        self._rehearsed = False
+        self._former: Parts | None = None
+        """What ran before a reload, until what follows it runs."""
         self._trust: Trust | None = None
         """Of the scene that ran last."""
 
@@ -83,18 +99,18 @@ class Runner:
         """Run until stopped or until a recording ends.
 
         Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`; at a
-        reload it logs them, and what ran before goes on.
+        reload it logs them and whatever else is raised, and what ran before goes on.
         """
         try:
             self._run(prepare(self._path))
         finally:
+            self._reload.close()
             if self._sockets is not None:
                 self._sockets.close()
         if self._printer is not None:
             self._printer.summary(self._trust)
 
     def _run(self, parts: Parts) -> None:
-        former: Parts | None = None
         woken = False
         while True:
             self._running = False
@@ -102,21 +118,20 @@ class Runner:
                 if woken:
                     parts = Parts.of(parts.scene, parts.model)
                 ended, following = self._work(parts)
-            except (scene.SceneError, ModelError, PublishError, DriverError) as error:
-                if self._running or (former is None and not woken):
+            except Exception as error:
+                if self._running or (self._former is None and not (woken and _is_told(error))):
                     raise
-                if former is not None:
+                if self._former is not None:
                     self._refuse(error)
-                    parts, former = former, None
+                    parts, self._former = self._former, None
                 elif not self._waits_for_the_rest(error):
                     return
                 continue
             woken = ended is Ended.SLEPT
             if woken:
                 log.warning("the computer has slept: everything starts anew")
-                former = None
             elif following is not None:
-                parts, former = following, parts
+                parts, self._former = following, parts
             else:
                 return
 
@@ -149,48 +164,63 @@ class Runner:
             around.add_sockets(sockets)
             around.open_drivers()
             around.keep_session()
-            realtime = enter_realtime(parts, stack)
+            realtime = enter_realtime(parts, stack, rehearsed=self._rehearsed)
+            self._rehearsed = True
             around.record()
-            companions = [self._manager, *around.companions, self._printer, realtime]
+            companions = [
+                *(self._reload, self._manager, *around.companions, self._printer, realtime)
+            ]
             loop = Loop(
                 parts.drivers,
                 parts.pipeline,
                 around.build_outbox(),
-                self._stop,
+                self._reload,
                 [companion for companion in companions if companion is not None],
                 Timing(wanted.max_age_ns),
             )
             stack.callback(sockets.publisher.forget)
             stack.callback(loop.close)
-            self._running = True
+            self._running, self._former = True, None
             self._trust = parts.pipeline.trust
             _announce(wanted)
             if self._manager is not None:
                 self._manager.ready(f"ready: {wanted.tactile.driver}, {parts.model.contract.name}")
             following: Parts | None = None
             ended = loop.run()
-            while ended is Ended.RELOAD and (following := self._reload()) is None:
+            while ended is Ended.RELOAD and (following := self._taken()) is None:
                 ended = loop.run()
             return ended, following
 
-    def _reload(self) -> Parts | None:
-        """What the scene file says now; None, and an error in the log, if that is wrong."""
+    def _say_reloading(self) -> None:
         if self._manager is not None:
             self._manager.reloading()
-        try:
-            parts = prepare(self._path)
-        except (scene.SceneError, ModelError, RecordingError) as error:
-            self._refuse(error)
-            if self._manager is not None:
-                self._manager.ready("the new scene is wrong, the former one goes on")
-            return None
-        log.info("%s: taken anew", self._path)
+
+    def _prepare_anew(self) -> Parts:
+        parts = prepare(self._path)
+        rehearse_grasp(parts)
         return parts
 
+    def _taken(self) -> Parts | None:
+        """What the scene file says now; None, and an error in the log, if that is wrong."""
+        prepared = self._reload.take()
+        if isinstance(prepared, Parts):
+            log.info("%s: taken anew", self._path)
+            return prepared
+        self._refuse(prepared)
+        if self._manager is not None:
+            self._manager.ready("the new scene is wrong, the former one goes on")
+        return None
+
     def _refuse(self, error: Exception) -> None:
-        for line in str(error).splitlines():
+        said = str(error) if _is_told(error) else f"{type(error).__name__}: {error}"
+        for line in said.splitlines():
             log.error("%s", line)
         log.error("%s: not taken anew, the former scene goes on", self._path)
+
+
+def _is_told(error: Exception) -> bool:
+    """Whether it says what to mend, and not that graspd is wrong or out of memory."""
+    return isinstance(error, scene.SceneError | ModelError | PublishError | DriverError)
 
 
 def _announce(wanted: scene.Scene) -> None:

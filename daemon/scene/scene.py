@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -32,10 +31,12 @@ from daemon.scene.drivers import (
     Tactile,
 )
 from daemon.scene.endpoints import check_endpoint, is_private
+from drivers import toml
 from models.contract import Finger
 
-SCENE_MAX_BYTES = 1 << 20
-"""A scene has a kilobyte; a larger file was named by mistake."""
+SCENE_MAX_BYTES = 128 << 10
+"""A scene has a kilobyte, and one with the names of a thousand recordings a hundred; a larger file
+was named by mistake."""
 
 
 STATE_DIRECTORY = Path("/var/lib/graspd")
@@ -344,9 +345,9 @@ def load(path: Path) -> Scene:
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: not a text file (byte {error.start} is not UTF-8)") from error
     try:
-        data = tomllib.loads(text)
-    except RecursionError as error:
-        raise SceneError(f"{path}: not TOML that can be read: nested too deeply") from error
+        data = toml.loads(text)
+    except toml.NestedTooDeeplyError as error:
+        raise SceneError(f"{path}: not TOML that can be read: {error}") from error
     except ValueError as error:  # TOMLDecodeError, and Python's own limit on long numbers
         from daemon.scene.errors import MESSAGE_MAX
 

@@ -137,7 +137,7 @@ def test_two_mistakes_are_two_lines(tmp_path: Path) -> None:
         (b"a = " + b"[" * 20_000, "not TOML that can be read: nested too deeply"),
         (b"a = " + b"9" * 5000, "not TOML: Exceeds the limit"),
         (b"[" + b"a" * 10_000 + b"]\n[" + b"a" * 10_000 + b"]", r"not TOML: .{320}$"),
-        (b"#" * (SCENE_MAX_BYTES + 1), "larger than 1048576 bytes"),
+        (b"#" * (SCENE_MAX_BYTES + 1), "larger than 131072 bytes"),
     ],
 )
 def test_what_is_not_toml_is_said_in_one_line(tmp_path: Path, content: bytes, says: str) -> None:
