@@ -191,7 +191,8 @@ class Curve(Section):
     secret_key: FilePath
     """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
-    """Folder with the `.key` files of those who may connect; looked at once a second."""
+    """Folder with the `.key` files of those who may connect; looked at once a second. Nobody but
+    root and the daemon's user may write there: it lets nobody in then."""
 
 
 class Ask(Section):
