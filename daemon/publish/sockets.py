@@ -6,6 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -62,7 +63,8 @@ class Sockets(Companion):
             from daemon.publish.questions import Questions
 
             patience_ns = round(wanted.gate.request_ms * 1e6)
-            self.questions = Questions(wanted.ask_endpoint, patience_ns, binding)
+            asked = replace(binding, file_mode=wanted.ask_file_mode, group=wanted.ask_group)
+            self.questions = Questions(wanted.ask_endpoint, patience_ns, asked)
         self._watch()
 
     def _let_in_only_known(self, curve: Curve) -> tuple[bytes, bytes]:
@@ -198,7 +200,7 @@ class Sockets(Companion):
 
 def plan(wanted: Scene) -> object:
     """What of a scene is about its sockets: equal for scenes that can share them."""
-    asked = (wanted.ask_endpoint, wanted.gate.request_ms)
+    asked = (wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group, wanted.gate.request_ms)
     own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
     return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
 
