@@ -167,13 +167,15 @@ def _try_drivers(wanted: scene.Scene) -> int | None:
 def _try_keys(wanted: scene.Scene) -> None:
     if wanted.curve is None:
         return
-    from daemon.publish.keys import KeysError, load_clients, load_pair
+    from daemon.publish.keys import KeysError, load_clients, load_own
 
     try:
-        load_pair(wanted.curve.secret_key)
-        load_clients(wanted.curve.clients)
+        load_own(wanted.curve.secret_key)
+        refused = load_clients(wanted.curve.clients).refused
     except KeysError as error:
         raise scene.SceneError(str(error)) from error
+    if refused:
+        raise scene.SceneError("\n".join(refused))
 
 
 def _what_is_in(

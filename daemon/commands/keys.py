@@ -53,13 +53,15 @@ def _list(args: argparse.Namespace) -> int:
     problems = []
     for path in sorted(args.dir.glob(f"*{keys.SECRET}")):
         try:
-            found["own"][path.stem] = keys.load_pair(path)[0].decode()
+            found["own"][path.stem] = keys.load_own(path)[0].decode()
         except KeysError as error:
             problems.append(str(error))
     folder = args.dir / CLIENTS
     try:
         if folder.is_dir():
-            found[CLIENTS] = {name: key.decode() for key, name in keys.load_clients(folder).items()}
+            clients = keys.load_clients(folder)
+            found[CLIENTS] = {name: key.decode() for key, name in clients.admitted.items()}
+            problems += clients.refused
     except KeysError as error:
         problems.append(str(error))
     if args.json:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import os
-import resource
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -23,10 +22,6 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
-DESCRIPTORS_MAX = 1024
-"""The loop waits by select(2), which is exact to the microsecond and knows no more of them."""
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", type=Path, help="scene file (TOML)")
@@ -39,7 +34,6 @@ def run(args: argparse.Namespace) -> int:
     SIGHUP reads the scene again, and a wrong one changes nothing. On a terminal it means that the
     terminal is gone, as for any other command.
     """
-    _limit_descriptors()
     try:
         with ExitStack() as stack:
             stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
@@ -52,13 +46,6 @@ def run(args: argparse.Namespace) -> int:
         complain(error)
         return 1
     return 0
-
-
-def _limit_descriptors() -> None:
-    """Have peers without number refused by the kernel, before a driver gets a number too high."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft > DESCRIPTORS_MAX or soft == resource.RLIM_INFINITY:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS_MAX, hard))
 
 
 def _on_terminal() -> bool:

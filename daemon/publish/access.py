@@ -58,7 +58,7 @@ class Authenticator:
         self, context: zmq.Context[zmq.Socket[bytes]], admitted: Mapping[bytes, str]
     ) -> None:
         """`admitted` maps public keys (Z85, 40 bytes) to the names of who may connect."""
-        self.counters = Counter(admitted=0, turned_away=0)
+        self.counters = Counter(admitted=0, turned_away=0, files_refused=0)
         self._admitted = dict(admitted)
         self._context = context
         self._requests = context.socket(zmq.ROUTER)

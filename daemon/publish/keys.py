@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import pwd
 import re
 import stat
 from pathlib import Path
+from typing import NamedTuple
 
 import zmq.auth
+
+from daemon.process.files import read_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
 """Endings of key files, as pyzmq and czmq have them."""
@@ -16,10 +21,25 @@ Z85_KEY = re.compile(rb"[0-9A-Za-z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 """A key of 32 bytes as text (RFC 32)."""
 CLIENTS_MAX = 1000
 """Keys in the folder of those who may connect; more were put there by mistake."""
+FILE_MAX_BYTES = 1 << 16
+"""A key file has half a kilobyte."""
+SERVICE = "graspd"
+"""The user of the service, whose keys root may look at."""
+LINKS_MAX = 40
+"""Symbolic links on the way to a file, as the kernel has it (path_resolution(7))."""
 
 
 class KeysError(Exception):
     """Keys are missing, wrong, or open to others; the message says which file."""
+
+
+class Clients(NamedTuple):
+    """Those who may connect."""
+
+    admitted: dict[bytes, str]
+    """Their names, by public key, Z85."""
+    refused: list[str]
+    """What is wrong with the other key files, which count for nothing."""
 
 
 def make(folder: Path, name: str) -> tuple[Path, Path]:
@@ -50,7 +70,7 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
 
     Raises `KeysError`.
     """
-    public, secret = _load(path)
+    public, secret = _load(path, "the key")
     if secret is None:
         raise KeysError(f"{path}: has no secret key; name the {SECRET} file")
     loose = _looser_than_0600(path)
@@ -59,34 +79,105 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
     return public, secret
 
 
+def load_own(path: Path) -> tuple[bytes, bytes]:
+    """Likewise, of the daemon: nobody else may write the file, nor a folder that leads to it."""
+    _refuse_open(path)
+    return load_pair(path)
+
+
 def load_public(path: Path, what: str = "the key") -> bytes:
     """Public key, Z85, of a file that holds one; errors call it `what`. Raises `KeysError`."""
     return _load(path, what)[0]
 
 
-def load_clients(folder: Path) -> dict[bytes, str]:
-    """Names of those who may connect, by their public key, Z85. Raises `KeysError`."""
+def load_clients(folder: Path) -> Clients:
+    """Those who may connect, by the key files of a folder; a file that is wrong admits nobody.
+
+    Raises `KeysError` for a folder that cannot be read, or that others may write: nobody may.
+    """
+    _refuse_open(folder)
     try:
-        paths = sorted(p for p in folder.iterdir() if p.suffix == PUBLIC and p.is_file())
+        paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)
     except OSError as error:
         raise KeysError(f"{folder}: cannot list the keys: {error.strerror}") from error
     if len(paths) > CLIENTS_MAX:
         raise KeysError(f"{folder}: more than {CLIENTS_MAX} keys")
-    return {load_public(path): path.stem for path in paths}
+    found = Clients({}, [])
+    for path in paths:
+        try:
+            _refuse_open(path)
+            found.admitted[load_public(path)] = path.stem
+        except KeysError as error:
+            found.refused.append(str(error))
+    return found
 
 
-def _load(path: Path, what: str = "the key") -> tuple[bytes, bytes | None]:
+def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
     try:
-        public, secret = zmq.auth.load_certificate(path)
+        content = read_regular(path, FILE_MAX_BYTES)
     except OSError as error:
-        reason = error.strerror or "there is no such file"
-        raise KeysError(f"{path}: cannot read {what}: {reason}") from error
-    except ValueError as error:
-        raise KeysError(f"{path}: has no public key") from error
+        raise KeysError(f"{path}: cannot read {what}: {error.strerror}") from error
+    found: dict[bytes, bytes] = {}
+    for line in content.splitlines():
+        name, is_set, value = line.partition(b"=")
+        if is_set:
+            found.setdefault(name.strip(), value.strip(b" \t'\""))
+    if b"public-key" not in found:
+        raise KeysError(f"{path}: has no public key")
+    public, secret = found[b"public-key"], found.get(b"secret-key")
     for key in (public, secret):
         if key is not None and not Z85_KEY.fullmatch(key):
             raise KeysError(f"{path}: a key must have 40 characters of Z85")
     return public, secret
+
+
+def _refuse_open(path: Path) -> None:
+    """Raise `KeysError` if somebody else may write what is at a path, or put another thing there.
+
+    By any folder on the way to it, also by those to which symbolic links lead.
+    """
+    at, ahead, links = Path("/"), [*reversed((Path.cwd() / path).parts[1:])], 0
+    while True:
+        try:
+            status = at.lstat()
+            if stat.S_ISLNK(status.st_mode):
+                _refuse_owner(at, status)
+                links += 1
+                if links > LINKS_MAX:
+                    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+                target = at.readlink()
+                at = Path("/") if target.is_absolute() else at.parent
+                ahead += reversed(target.relative_to(target.anchor).parts)
+            elif ahead and status.st_mode & stat.S_ISVTX:
+                _refuse_owner(at, status)  # what is in it only its owner may replace
+            else:
+                _refuse_writers(at, status)
+        except OSError as error:
+            raise KeysError(f"{path}: cannot look at {at}: {error.strerror}") from error
+        if not ahead:
+            return
+        name = ahead.pop()
+        at = at.parent if name == ".." else at / name
+
+
+def _refuse_writers(path: Path, status: os.stat_result) -> None:
+    """Raise `KeysError` if others than its owner may write it."""
+    _refuse_owner(path, status)
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise KeysError(f"{path}: mode {mode:04o}; others may write it: chmod go-w")
+
+
+def _refuse_owner(path: Path, status: os.stat_result) -> None:
+    """Raise `KeysError` unless it belongs to root or to this process's user."""
+    if status.st_uid in (0, os.geteuid()):
+        return
+    try:
+        owner = pwd.getpwuid(status.st_uid).pw_name
+    except KeyError:
+        owner = str(status.st_uid)
+    if os.geteuid() or owner != SERVICE:
+        raise KeysError(f"{path}: belongs to {owner}, who may put another key there")
 
 
 def _looser_than_0600(path: Path) -> str:

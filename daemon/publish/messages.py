@@ -21,10 +21,10 @@ WIRE_VERSION: Final = 1
 Count = Annotated[int, msgspec.Meta(ge=0)]
 Duration = Annotated[float, msgspec.Meta(ge=0.0)]
 Probability = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-OBJECT_PATTERN: Final = r"[!#-&(-+\--~]{1,64}"
-"""Name of an object: printable ASCII but blank, quotes and comma, so that it is one word of a
-message and one bare cell of a CSV file."""
-ObjectName = Annotated[str, msgspec.Meta(pattern=f"^{OBJECT_PATTERN}$")]
+OBJECT_PATTERN: Final = r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}"
+"""Name of an object: one word of a message, one bare cell of a CSV file that no spreadsheet takes
+for a formula, and no path."""
+ObjectName = Annotated[str, msgspec.Meta(pattern=rf"^{OBJECT_PATTERN}$(?!\n)")]
 _HAND = msgspec.Meta(max_length=5)
 """A hand has five fingers."""
 Motion = Annotated[dict[Finger, Duration | None], _HAND]

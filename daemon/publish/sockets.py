@@ -6,6 +6,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -20,6 +21,7 @@ from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Authenticator
+    from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
@@ -61,20 +63,28 @@ class Sockets(Companion):
             from daemon.publish.questions import Questions
 
             patience_ns = round(wanted.gate.request_ms * 1e6)
-            self.questions = Questions(wanted.ask_endpoint, patience_ns, binding)
+            asked = replace(binding, file_mode=wanted.ask_file_mode, group=wanted.ask_group)
+            self.questions = Questions(wanted.ask_endpoint, patience_ns, asked)
         self._watch()
 
     def _let_in_only_known(self, curve: Curve) -> tuple[bytes, bytes]:
         from daemon.publish.access import Authenticator
-        from daemon.publish.keys import KeysError, load_clients, load_pair
+        from daemon.publish.keys import KeysError, load_clients, load_own
 
+        self._keys_seen = _state(curve.clients)
         try:
-            pair, admitted = load_pair(curve.secret_key), load_clients(curve.clients)
+            pair, clients = load_own(curve.secret_key), load_clients(curve.clients)
         except KeysError as error:
             raise SceneError(str(error)) from error
-        self._keys_seen = _state(curve.clients)
-        self.authenticator = Authenticator(self._context, admitted)
+        self.authenticator = Authenticator(self._context, clients.admitted)
+        self._tell_refused(self.authenticator, clients)
         return pair
+
+    @staticmethod
+    def _tell_refused(authenticator: Authenticator, clients: Clients) -> None:
+        authenticator.counters["files_refused"] += len(clients.refused)
+        for why in clients.refused:
+            log.error("%s; no key there may connect", why)
 
     def _watch(self) -> None:
         if self.authenticator is not None:
@@ -137,25 +147,26 @@ class Sockets(Companion):
     def check_keys(self) -> None:
         """If the list of those who may connect has changed, take it; who is off it is cut off.
 
-        A list that cannot be read changes nothing, and is tried again. A port that somebody else
-        has taken meanwhile is left to them, and tried again.
+        A list that cannot be read, or that others may write, lets nobody in, and is tried again
+        when it changes. A port that somebody else has taken meanwhile is left to them, and tried
+        again.
         """
         if self._curve is None or self.authenticator is None:
             return
         now = _state(self._curve.clients)
         if now == self._keys_seen and not self._lost:
             return
-        from daemon.publish.keys import KeysError, load_clients
+        from daemon.publish.keys import Clients, KeysError, load_clients
 
         try:
-            admitted = load_clients(self._curve.clients)
+            clients = load_clients(self._curve.clients)
         except KeysError as error:
-            log.error("%s; the former list stands", error)
-            return
+            clients = Clients({}, [str(error)])
         if now != self._keys_seen:
-            log.info("%d keys may connect", len(admitted))
+            self._tell_refused(self.authenticator, clients)
+            log.info("%d keys may connect", len(clients.admitted))
         self._keys_seen = now
-        if self.authenticator.admit(admitted) or self._lost:
+        if self.authenticator.admit(clients.admitted) or self._lost:
             self._cut_off()
 
     def _cut_off(self) -> None:
@@ -189,16 +200,27 @@ class Sockets(Companion):
 
 def plan(wanted: Scene) -> object:
     """What of a scene is about its sockets: equal for scenes that can share them."""
-    asked = (wanted.ask_endpoint, wanted.gate.request_ms)
+    asked = (wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group, wanted.gate.request_ms)
     own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
     return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
 
 
 def _state(folder: Path) -> object:
-    """Differs from one look to the next when a file in the folder was put, changed or removed."""
+    """Differs from one look to the next when a file in the folder was put, changed or removed, or
+    who may write there."""
     try:
         with os.scandir(folder) as entries:
-            found = [(entry.name, entry.stat()) for entry in entries]
+            found = {entry.name: _signature(entry) for entry in entries}
+        about = os.stat(folder)
     except OSError as error:
         return error.errno
-    return sorted((name, each.st_mtime_ns, each.st_ctime_ns, each.st_size) for name, each in found)
+    return found, about.st_ino, about.st_ctime_ns
+
+
+def _signature(entry: os.DirEntry[str]) -> object:
+    """Differs when a file was replaced or changed, or its rights."""
+    try:
+        about = entry.stat()
+    except OSError as error:  # such as a link that leads nowhere
+        return error.errno
+    return about.st_ino, about.st_mtime_ns, about.st_ctime_ns, about.st_size

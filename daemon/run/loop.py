@@ -17,6 +17,7 @@ from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.overload import Overload, after
+from daemon.run.selector import ExactSelector
 from daemon.trust.ledger import GraspId
 from drivers.base import Driver, JointReading, Reading, TactileReading
 
@@ -57,7 +58,7 @@ class Timing:
     """Says whether the computer has slept."""
     rest: Callable[[float], None] = time.sleep
     """Has the kernel put this thread to sleep, s."""
-    selector: Callable[[], selectors.BaseSelector] = selectors.SelectSelector
+    selector: Callable[[], selectors.BaseSelector] = ExactSelector
     """Makes what waits for descriptors."""
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion, Requests
-from daemon.publish.messages import Verdict
+from daemon.publish.messages import OBJECT_PATTERN, Verdict
 from daemon.run.summary import Summary
 from drivers.base import TactileReading
 from models.runtime import TactileModel
@@ -55,7 +56,7 @@ class Controller(Companion):
             boot_id=verdict.boot_id,
             grasp=verdict.grasp,
             outcome="slip" if note.slipped else "stable",
-            object_name=note.object_name,
+            object_name=_sent(note.object_name),
             allowed=again or verdict.verdict == "stable" or verdict.supervised,
             over=verdict.gate is None,
         )
@@ -71,6 +72,11 @@ class Controller(Companion):
         if lift is None or self._requests is None or (self._only_lifted and not lift.allowed):
             return
         self._requests.outcome(lift.boot_id, lift.grasp, lift.outcome, lift.object_name)
+
+
+def _sent(object_name: str | None) -> str | None:
+    """The name, if it is one that an outcome may have: tables may have any."""
+    return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
 
 
 class Comparison(Companion):

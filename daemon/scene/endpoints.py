@@ -18,7 +18,9 @@ def check_endpoint(endpoint: str) -> None:
         raise ValueError("has a NUL character")
     if scheme == "tcp":
         _check_tcp(address)
-    elif address in {"", "@"} or len(address.encode()) > IPC_PATH_MAX_BYTES:
+    elif address.startswith("@"):
+        raise ValueError("needs a path: abstract sockets have no file mode, all may connect")
+    elif not address or len(address.encode()) > IPC_PATH_MAX_BYTES:
         raise ValueError(f"needs a path of 1 to {IPC_PATH_MAX_BYTES} bytes after ipc://")
     elif address.startswith("*"):
         raise ValueError("needs a path that subscribers can know, not '*'")

@@ -169,6 +169,10 @@ def _checked(endpoint: str) -> str:
 
 
 Endpoint = Annotated[str, AfterValidator(_checked)]
+FileMode = Annotated[str, Field(pattern=r"^0?[0-7]{3}$")]
+"""Of a socket's file, as in chmod: who may write may connect."""
+OTHERS = 0o007
+"""Of a file's mode, what those have who are neither its owner nor in its group."""
 
 
 class Publish(Section):
@@ -179,11 +183,11 @@ class Publish(Section):
     addresses."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000)] = 1000
     """Messages kept for a subscriber that is slow; those that come then are lost to it."""
-    file_mode: Annotated[str, Field(pattern=r"^0?[0-7]{3}$")] | None = None
-    """Of the files of `ipc://` sockets, as in chmod: who may write may connect. As the umask has it
-    unless given."""
+    file_mode: FileMode | None = None
+    """Of the file of an `ipc://` socket, as in chmod: who may write may connect. As the umask has
+    it unless given."""
     group: Name | None = None
-    """Of the files of `ipc://` sockets; the process's unless given."""
+    """Of the file of an `ipc://` socket; the process's unless given."""
 
 
 class Curve(Section):
@@ -192,7 +196,8 @@ class Curve(Section):
     secret_key: FilePath
     """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
-    """Folder with the `.key` files of those who may connect; looked at once a second."""
+    """Folder with the `.key` files of those who may connect; looked at once a second. Nobody but
+    root and the daemon's user may write there: it lets nobody in then."""
 
 
 class Ask(Section):
@@ -201,6 +206,11 @@ class Ask(Section):
     endpoint: Endpoint | None = None
     """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
     addresses."""
+    file_mode: FileMode | None = None
+    """Of the file of an `ipc://` socket: who may write may ask, and tell outcomes. That of
+    `[publish]` unless given, but others than owner and group may not ask then."""
+    group: Name | None = None
+    """Of the file of an `ipc://` socket; that of `[publish]` unless given."""
 
 
 class Realtime(Section):
@@ -303,6 +313,20 @@ class Scene(Section):
             return None
         endpoint = None if self.ask is None else self.ask.endpoint
         return endpoint or f"ipc:///run/graspd/{self.hand.name}.ask.ipc"
+
+    @property
+    def ask_file_mode(self) -> int | None:
+        """Of the file of the socket for questions; None: as the umask has it."""
+        if self.ask is not None and self.ask.file_mode is not None:
+            return int(self.ask.file_mode, 8)
+        mode = self.publish.file_mode
+        return None if mode is None else int(mode, 8) & ~OTHERS
+
+    @property
+    def ask_group(self) -> str | None:
+        """Of that file; None: the process's."""
+        own = None if self.ask is None else self.ask.group
+        return own or self.publish.group
 
     @property
     def session_path(self) -> Path:

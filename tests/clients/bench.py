@@ -30,10 +30,11 @@ class Daemon:
         *,
         whole_grasps: bool = False,
         endpoint: str | None = None,
+        publish: str = "",
     ) -> None:
         """Judges each row of the demo table; with `whole_grasps`, one from touch to lift.
 
-        `more` is what else there is in the scene, from `[tactile]` on.
+        `more` is what else there is in the scene, from `[tactile]` on, `publish` in `[publish]`.
         """
         self.endpoint = endpoint or f"ipc://{folder}/graspd"
         self.ask_endpoint = f"ipc://{folder}/ask"
@@ -41,7 +42,7 @@ class Daemon:
         self._scene = folder / "scene.toml"
         recording = _one_grasp(folder / "grasp.csv") if whole_grasps else DEMO_TABLE
         self._scene.write_text(
-            f'[publish]\nendpoint = "{self.endpoint}"\n'
+            f'[publish]\nendpoint = "{self.endpoint}"\n{publish}\n'
             f'[ask]\nendpoint = "{self.ask_endpoint}"\n'
             f'[tactile]\ndriver = "replay"\nrecordings = ["{recording}"]\nloop = true\n{more}'
         )

@@ -345,8 +345,10 @@ inline std::string telling(const Verdict& lifted_on, Outcome how, const std::str
     const auto told = "outcome " + lifted_on.boot_id + ' ' + std::to_string(*lifted_on.grasp) +
                       ' ' + name(how);
     if (object.empty()) return told;
-    const auto fits = [](char c) {
-        return c > ' ' && c <= '~' && c != '"' && c != '\'' && c != ',';
+    const auto fits = [&object](const char& c) {
+        const bool plain = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') ||
+                           (c >= '0' && c <= '9') || c == '_';
+        return plain || (&c != object.data() && (c == '-' || c == '.'));
     };
     if (object.size() > OBJECT_MAX || !std::all_of(object.begin(), object.end(), fits))
         throw std::invalid_argument("no name of an object: " + object);
@@ -701,8 +703,8 @@ public:
     // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
     // comes later is taken in by later calls; without one, tell it again. Throws
     // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, for
-    // `Outcome::unknown`, and for a name that is no 1 to 64 printable ASCII characters without
-    // blank, quotes and comma.
+    // `Outcome::unknown`, and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`,
+    // or begins with one of the last two.
     OutcomeAnswer tell(const Verdict& lifted_on, Outcome how, const std::string& object = {},
                        double wait_s = 2.0) {
         const std::string telling = detail::telling(lifted_on, how, object);

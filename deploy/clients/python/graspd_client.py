@@ -56,8 +56,8 @@ DRIFT = 1e-3
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
 # On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-# Name of an object: printable ASCII but blank, quotes and comma.
-OBJECT = re.compile(r"[!#-&(-+\--~]{1,64}")
+# Name of an object, as the daemon takes it.
+OBJECT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
 WARN_EVERY = 10  # lifts whose outcome was never told
 
@@ -296,7 +296,8 @@ class Graspd:
         Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
         comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
         without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` that is none,
-        and for a name that is no 1 to 64 printable ASCII characters without blank, quotes, comma.
+        and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins with one
+        of the last two.
         """
         telling = _telling(lifted_on, Outcome(how), object_name)
         if not self._asks:

@@ -16,9 +16,10 @@ import pytest
 import zmq
 
 from daemon import scene
-from daemon.publish.keys import KeysError, load_clients, load_pair, make
+from daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
 from daemon.publish.sockets import Sockets
 from daemon.scene import SceneError
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
 
 PORT = 25931
@@ -58,6 +59,19 @@ class Door:
     def client(self, name: str, folder: Path) -> Keys:
         self.clients.mkdir(exist_ok=True)
         return load_pair(make(folder, name)[1])
+
+    def admitted(self, name: str, folder: Path) -> Keys:
+        """Keys that the daemon has on its list from now on."""
+        keys = self.client(name, folder)
+        (folder / f"{name}.key").rename(self.clients / f"{name}.key")
+        self.sockets.check_keys()
+        return keys
+
+    def is_deaf(self, subscriber: zmq.Socket[bytes]) -> None:
+        """Nothing more comes there than what waits."""
+        while subscriber.poll(100):
+            subscriber.recv_multipart()
+        assert not self.hears(subscriber, QUIET_S)
 
     def connect(
         self, keys: Keys | None, kind: int = zmq.SUB, server: bytes | None = None
@@ -213,12 +227,99 @@ def test_a_key_that_is_taken_off_the_list_is_cut_off_while_connected(
     assert door.hears(staying, PATIENCE_S)
 
 
-def test_a_list_that_cannot_be_read_changes_nothing(
+def test_a_file_that_is_no_key_is_skipped_named_and_counted_once(
     door: Door, caplog: pytest.LogCaptureFixture
 ) -> None:
     (door.clients / "broken.key").write_text("nothing")
     door.sockets.check_keys()
-    assert "the former list stands" in caplog.text
+    door.sockets.check_keys()
+    assert caplog.text.count("broken.key: has no public key; no key there may connect") == 1
+    assert door.counted("files_refused") == 1
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+
+
+def half_copied(clients: Path) -> None:
+    whole = (clients / "controller.key").read_bytes()
+    (clients / "new.key").write_bytes(whole[: len(whole) // 2])
+
+
+def leads_nowhere(clients: Path) -> None:
+    (clients / "new.key").symlink_to("nowhere")
+
+
+def of_no_file(clients: Path) -> None:
+    (clients / "new.key").mkdir()
+
+
+@pytest.mark.parametrize("beside", [half_copied, leads_nowhere, of_no_file])
+def test_a_removal_counts_whatever_lies_beside_the_key(
+    door: Door, tmp_path: Path, beside: Callable[[Path], None]
+) -> None:
+    friend = door.admitted("friend", tmp_path / "friends")
+    beside(door.clients)
+    door.sockets.check_keys()
+    leaving = door.connect(friend)
+    assert door.hears(leaving, PATIENCE_S)
+    (door.clients / "friend.key").unlink()
+    door.sockets.check_keys()
+    door.is_deaf(leaving)
+    door.is_deaf(door.connect(friend))
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+
+
+def vanishes(clients: Path) -> None:
+    clients.rename(clients.with_name("away"))
+
+
+def is_no_folder(clients: Path) -> None:
+    vanishes(clients)
+    clients.write_text("")
+
+
+def is_open_to_the_group(clients: Path) -> None:
+    clients.chmod(0o770)
+
+
+def is_open_to_all(clients: Path) -> None:
+    clients.chmod(0o1777)
+
+
+def leads_over_a_folder_that_is_open(clients: Path) -> None:
+    vanishes(clients)
+    way = clients.with_name("way")
+    way.mkdir()
+    (way / "clients").symlink_to("../away")
+    way.chmod(0o777)
+    clients.symlink_to("way/clients")
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        vanishes,
+        is_no_folder,
+        is_open_to_the_group,
+        is_open_to_all,
+        leads_over_a_folder_that_is_open,
+    ],
+)
+def test_a_folder_that_cannot_be_trusted_lets_nobody_in_until_it_can(
+    door: Door, caplog: pytest.LogCaptureFixture, spoil: Callable[[Path], None]
+) -> None:
+    former = door.connect(door.known)
+    assert door.hears(former, PATIENCE_S)
+    spoil(door.clients)
+    door.sockets.check_keys()
+    assert caplog.text.count("no key there may connect") == 1
+    door.is_deaf(former)
+    door.is_deaf(door.connect(door.known))
+    with pytest.raises(KeysError):
+        load_clients(door.clients)
+    if door.clients.with_name("away").exists():
+        door.clients.unlink(missing_ok=True)
+        door.clients.with_name("away").rename(door.clients)
+    door.clients.chmod(0o755)
+    door.sockets.check_keys()
     assert door.hears(door.connect(door.known), PATIENCE_S)
 
 
@@ -234,8 +335,66 @@ def test_a_secret_key_that_others_may_read_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["", "public-key = 'short'", 'curve\n    public-key = "é"\n'])
 def test_a_file_that_is_no_key_is_named(tmp_path: Path, content: str) -> None:
     (tmp_path / "broken.key").write_text(content)
-    with pytest.raises(KeysError, match=r"broken\.key"):
-        load_clients(tmp_path)
+    make(tmp_path, "laptop")
+    admitted, refused = load_clients(tmp_path)
+    assert list(admitted.values()) == ["laptop"]
+    assert [re.search(r"broken\.key: ", why) is not None for why in refused] == [True]
+
+
+def test_a_file_too_large_for_a_key_is_none(tmp_path: Path) -> None:
+    public = make(tmp_path, "laptop")[0]
+    with public.open("ab") as file:
+        file.write(bytes(1 << 20))
+    admitted, refused = load_clients(tmp_path)
+    assert (len(admitted), len(refused)) == (0, 1)
+
+
+@pytest.mark.parametrize("mode", [0o664, 0o646, 0o666])
+def test_a_key_that_others_may_write_is_refused(tmp_path: Path, mode: int) -> None:
+    public, secret = make(tmp_path, "laptop")
+    public.chmod(mode)
+    admitted, refused = load_clients(tmp_path)
+    assert admitted == {}
+    assert ["others may write it" in why for why in refused] == [True]
+    tmp_path.chmod(0o777)
+    with pytest.raises(KeysError, match=f"{tmp_path}: mode 0777; others may write it"):
+        load_own(secret)
+
+
+def test_below_a_folder_in_which_all_may_put_files_of_their_own_keys_are_safe(
+    tmp_path: Path,
+) -> None:
+    """As below /tmp, where nobody may replace what is somebody else's."""
+    keys = tmp_path / "keys"
+    public, secret = make(keys, "laptop")
+    tmp_path.chmod(0o1777)
+    assert load_own(secret)[0] in load_clients(keys).admitted
+    public.rename(tmp_path / "laptop.key")
+    public.symlink_to(tmp_path / "laptop.key")
+    assert list(load_clients(keys).admitted.values()) == ["laptop"]
+    tmp_path.chmod(0o777)
+    with pytest.raises(KeysError, match=f"{tmp_path}: mode 0777"):
+        load_clients(keys)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
+@pytest.mark.parametrize("which", [".", "clients", "clients/laptop.key"])
+def test_keys_of_another_user_are_refused(tmp_path: Path, which: str) -> None:
+    keys = tmp_path / "keys"
+    make(keys / "clients", "laptop")
+    os.chown(keys / which, 12345, -1)
+    try:
+        why = load_clients(keys / "clients").refused[0]
+    except KeysError as error:
+        why = str(error)
+    assert why == f"{keys / which}: belongs to 12345, who may put another key there"
+
+
+def test_links_that_lead_round_and_round_are_followed_no_further(tmp_path: Path) -> None:
+    (tmp_path / "one").symlink_to("two")
+    (tmp_path / "two").symlink_to("one")
+    with pytest.raises(KeysError, match="Too many levels"):
+        load_clients(tmp_path / "one" / "clients")
 
 
 def test_a_public_key_is_no_secret_one_and_keys_are_never_overwritten(tmp_path: Path) -> None:
@@ -273,34 +432,59 @@ def test_the_command_makes_lists_and_complains(tmp_path: Path) -> None:
         ["own", "daemon"],
         ["clients", "laptop"],
     ]
+    (tmp_path / "clients" / "half.key").write_text("public-key = ")
+    listed = graspd("keys", "list", "--dir", tmp_path)
+    assert (listed.returncode, listed.stdout.count("laptop")) == (2, 1)
+    assert "half.key" in listed.stderr
+    (tmp_path / "clients" / "half.key").unlink()
+    (tmp_path / "clients").chmod(0o777)
+    assert "others may write it" in graspd("keys", "list", "--dir", tmp_path).stderr
+    (tmp_path / "clients").chmod(0o755)
     (tmp_path / "daemon.key_secret").chmod(0o644)
     assert graspd("keys", "list", "--dir", tmp_path).returncode == 2
     assert graspd("keys", "make", "daemon", "--dir", tmp_path).returncode == 2
 
 
-def test_a_list_that_could_not_be_read_is_tried_again(door: Door, tmp_path: Path) -> None:
-    """A key is taken off while another one is broken: once that is mended, it is off."""
-    friend = door.client("friend", tmp_path / "friends")
-    (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
-    door.sockets.check_keys()
+def test_a_file_that_could_not_be_read_is_tried_again(door: Door, tmp_path: Path) -> None:
+    """A key is taken off while another one is broken: it is off, and once that is mended too."""
+    friend = door.admitted("friend", tmp_path / "friends")
     leaving = door.connect(friend)
     assert door.hears(leaving, PATIENCE_S)
     good = (door.clients / "controller.key").read_text()
     (door.clients / "controller.key").write_text("nothing")
     (door.clients / "friend.key").unlink()
     door.sockets.check_keys()
-    assert door.hears(leaving, PATIENCE_S)
+    door.is_deaf(leaving)
     (door.clients / "controller.key").write_text(good)
     door.sockets.check_keys()
-    while leaving.poll(100):
-        leaving.recv_multipart()
-    assert not door.hears(leaving, QUIET_S)
+    door.is_deaf(leaving)
+    assert door.hears(door.connect(door.known), PATIENCE_S)
+
+
+@pytest.mark.parametrize("command", ["check", "run"])
+def test_a_folder_that_others_may_write_is_refused_before_anything_starts(
+    tmp_path: Path, command: str
+) -> None:
+    make(tmp_path / "keys", "daemon")
+    make(tmp_path / "keys" / "clients", "laptop")
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "{ENDPOINT}"\n'
+        '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'
+    )
+    (tmp_path / "keys").chmod(0o777)
+    done = graspd(command, scene)
+    assert done.returncode == 2
+    assert f"{tmp_path}/keys: mode 0777; others may write it" in done.stderr
 
 
 def test_what_is_no_file_is_no_key_and_holds_nobody_up(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.key")
     make(tmp_path, "laptop")
-    assert list(load_clients(tmp_path).values()) == ["laptop"]
+    admitted, refused = load_clients(tmp_path)
+    assert list(admitted.values()) == ["laptop"]
+    assert ["not a regular file" in why for why in refused] == [True]
 
 
 def test_a_port_that_is_lost_to_another_costs_that_port_alone(

@@ -213,7 +213,11 @@ def test_answers_are_on_their_way_before_the_socket_closes(tmp_path: Path) -> No
         assert json.loads(teller.recv()) == {"v": 1, "ok": True}
 
 
-@pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "a/b;c=1", "x" * 64, "-", "~"])
+NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", "a=1", "a|b", "~")
+"""What a spreadsheet or a shell takes for more than a name."""
+
+
+@pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "_.-", "x" * 64, "Z"])
 def test_the_object_arrives_as_it_was_told(
     questions: Questions, teller: zmq.Socket[bytes], name: str | None
 ) -> None:
@@ -249,6 +253,7 @@ def test_the_object_arrives_as_it_was_told(
         f"outcome {BOOT} 7 slip mug\x7f",
         f"outcome {BOOT} 7 slip mug\0",
         f"outcome {BOOT} 7 slip " + "x" * 65,
+        *(f"outcome {BOOT} 7 slip {name}" for name in NO_NAMES),
     ],
 )
 def test_an_outcome_that_is_malformed_is_answered_and_counted(

@@ -256,7 +256,8 @@ def test_a_status_of_before_there_was_a_learner_is_still_read() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["", "a mug", "mug,cup", 'the "mug"', "mug's", "x" * 65, "m\u00fcg"]
+    "name",
+    ["", "a mug", "mug,cup", 'the "mug"', "mug's", "x" * 65, "m\u00fcg", "mug\n", "=1", "-", "a/b"],
 )
 def test_an_object_that_is_no_word_of_a_message_is_no_outcome(name: str) -> None:
     content = json.loads((GOLDEN / "outcome.json").read_text()) | {"object": name}

@@ -96,6 +96,9 @@ def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
         ),
         (GOOD + "[publish]\nendpoint = 'ipc://*'", "publish.endpoint", "not '*'"),
         (GOOD + "[publish]\nendpoint = 'ipc://@'", "publish.endpoint", "needs a path"),
+        (GOOD + "[publish]\nendpoint = 'ipc://@graspd'", "publish.endpoint", "no file mode"),
+        (GOOD + "[ask]\nendpoint = 'ipc://@graspd'", "ask.endpoint", "no file mode"),
+        (GOOD + "[ask]\nfile_mode = '0888'", "ask.file_mode", "should match pattern"),
         (GOOD + '[publish]\nendpoint = "ipc:///tmp/\\u0000"', "publish.endpoint", "NUL"),
         (GOOD + '[model]\npath = "\\u0000.onnx"', "model.path", "NUL"),
         (GOOD + '[model]\nname = "cnn1\\u0000"', "model.name", "NUL"),
@@ -226,7 +229,7 @@ def test_faults_at_the_limit_are_taken_by_both() -> None:
 
 @pytest.mark.parametrize(
     "endpoint",
-    ["ipc:///run/graspd/right.ipc", "ipc://@graspd", "tcp://127.8.9.1:65535", "tcp://[::1]:5555"],
+    ["ipc:///run/graspd/right.ipc", "tcp://127.8.9.1:65535", "tcp://[::1]:5555"],
 )
 def test_an_endpoint_of_this_computer_is_taken(endpoint: str) -> None:
     check_endpoint(endpoint)

@@ -1,0 +1,56 @@
+"""What goes along with a replay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from daemon.publish.companion import Answer
+from daemon.publish.messages import decode_verdict
+from daemon.run.replaying import Controller
+from drivers.base import Annotation
+from tests.daemon.fakes import reading
+
+GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
+
+
+class Requests:
+    """Keeps what is told."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, str | None]] = []
+
+    def ask(self) -> None:
+        raise AssertionError
+
+    def outcome(
+        self,
+        boot_id: str,
+        grasp: int,
+        outcome: Literal["stable", "slip"],
+        object_name: str | None = None,
+    ) -> str | None:
+        self.told.append((outcome, object_name))
+        return None
+
+    def keep(self, answer: Answer) -> None:
+        answer(None)
+
+
+@pytest.mark.parametrize(
+    ("in_the_table", "told"),
+    [("mug", "mug"), ('a "red" pen', None), ("=HYPERLINK(0)", None), ("mug\n", None), (None, None)],
+)
+def test_an_object_is_told_by_a_name_that_outcomes_may_have(
+    in_the_table: str | None, told: str | None
+) -> None:
+    controller, requests = Controller(only_lifted=False), Requests()
+    controller.before_wait(requests)
+    note = Annotation(Path("any.csv"), 1, in_the_table, slipped=True)
+    verdict = decode_verdict(GOLDEN.read_bytes())
+    controller.on_verdict(verdict, b"", replace(reading(0), annotation=note))
+    controller.tell()
+    assert requests.told == [("slip", told)]
