@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
-DESCRIPTORS_MAX = 1024
-"""The loop waits by select(2), which is exact to the microsecond and knows no more of them."""
+DESCRIPTORS_MAX = 4096
+"""All peers that both sockets admit, and as many again for files, devices and peers with keys, of
+which libzmq alone knows how many there are."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,10 +56,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _limit_descriptors() -> None:
-    """Have peers without number refused by the kernel, before a driver gets a number too high."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft > DESCRIPTORS_MAX or soft == resource.RLIM_INFINITY:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS_MAX, hard))
+    """Have enough of them for all peers, and have peers without number refused by the kernel."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = DESCRIPTORS_MAX if hard == resource.RLIM_INFINITY else min(DESCRIPTORS_MAX, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _on_terminal() -> bool:
