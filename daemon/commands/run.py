@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import os
+import resource
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +23,11 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
+DESCRIPTORS_MAX = 4096
+"""All peers that both sockets admit, and as many again for files, devices and peers with keys, of
+which libzmq alone knows how many there are."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument("scene", type=Path, help="scene file (TOML)")
@@ -34,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     SIGHUP reads the scene again, and a wrong one changes nothing. On a terminal it means that the
     terminal is gone, as for any other command.
     """
+    _limit_descriptors()
     try:
         with ExitStack() as stack:
             stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
@@ -46,6 +53,13 @@ def run(args: argparse.Namespace) -> int:
         complain(error)
         return 1
     return 0
+
+
+def _limit_descriptors() -> None:
+    """Have enough of them for all peers, and have peers without number refused by the kernel."""
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = DESCRIPTORS_MAX if hard == resource.RLIM_INFINITY else min(DESCRIPTORS_MAX, hard)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _on_terminal() -> bool:

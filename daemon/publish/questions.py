@@ -4,38 +4,34 @@ from __future__ import annotations
 
 import json
 import re
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Literal
 
-import zmq
-
-from daemon.publish.binding import Binding, Bound
+from daemon.publish.binding import Binding, Bound, Peer
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OBJECT_PATTERN
+from daemon.publish.zmtp import Message, Role
+from daemon.trust.ledger import GRASPS_MAX, GraspId
 
 QUESTION = b"judge"
 TELLING = b"outcome"
 """First word of `outcome <boot_id> <grasp> <stable|slip> [<object>]`."""
-FRAMES_MAX = 3
-"""Of a question: who asks, an empty frame from a REQ socket, the question."""
 MESSAGE_MAX_BYTES = 128
 """The longest outcome; a peer that sends more asks nothing and is disconnected."""
-WAITING_MAX = 16
-"""Questions that wait for an answer; the oldest is given up for a newer one."""
+WAITING_MAX: Final = 256
+"""Questions that wait for an answer, one of each peer; the oldest is given up for a newer one."""
 QUEUE_MAX = 16
-"""Messages queued per peer in either direction."""
+"""Answers queued per peer."""
 _TOLD = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
 )
 MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
 NOBODY = "nobody takes outcomes here"
-TAKEN_MAX = 64
-"""Messages, and at most so many frames, taken in one round: a flood must not hold up readings."""
-LINGER_MS: Final = 100
-"""How long the end waits for answers to be on their way."""
+NOT_YOURS = "not yours: somebody else has asked about this grasp"
+CONTRADICTS = "contradicts: another outcome of this grasp was told before"
 
 TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
 """Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
@@ -51,50 +47,51 @@ def at_once(answer: Answer) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Question:
-    envelope: tuple[bytes, ...]
+    envelope: Message
     due_ns: int
+
+
+@dataclass(slots=True)
+class _Lift:
+    """A grasp that was asked about, or whose outcome was told."""
+
+    owner: Peer
+    """Who asked first, or told."""
+    outcome: str | None = None
 
 
 class Questions(Bound):
     """Takes questions and answers them; never blocks.
 
-    libzmq has no limit on the number of frames of a message, and holds them all before it hands the
-    first one over. So only those who may make the daemon grow should be able to connect: keep the
-    socket in a folder of yours.
+    A peer has one question at a time; another one replaces it. Who was first to get an answer about
+    a grasp is the one who tells its outcome: nobody else may, unless it stands for who is gone.
+    What was told stays.
     """
 
     def __init__(self, endpoint: str, patience_ns: int, binding: Binding | None = None) -> None:
         """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
-        super().__init__(endpoint, binding)
-        self.counters: Counter[str] = Counter()
-        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken, and kept where
-        that is wanted, and `outcomes_refused`."""
+        super().__init__(endpoint, Role.ROUTER, QUEUE_MAX, binding)
+        self._counted: Counter[str] = Counter()
         self._patience_ns = patience_ns
-        self._waiting: deque[_Question] = deque()
-        self._frames: list[bytes] = []
-        """Of the message at hand, as far as it has been read."""
-        self.renew()
+        self._waiting: dict[Peer, _Question] = {}
+        """Oldest first."""
+        self._lifts: dict[GraspId, _Lift] = {}
+        """Oldest first, as many as outcomes are taken of."""
 
-    def _open(self) -> zmq.Socket[bytes]:
-        made = self._context.socket(zmq.ROUTER)
-        made.linger = LINGER_MS
-        made.sndhwm = made.rcvhwm = QUEUE_MAX
-        made.maxmsgsize = MESSAGE_MAX_BYTES
-        self._bind(made, "take questions")
-        return made
+    @property
+    def counters(self) -> Counter[str]:
+        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken, and kept where
+        that is wanted, and `outcomes_refused`; and what the door counts."""
+        return self._with_the_doors(self._counted)
 
     @property
     def waiting(self) -> int:
         """Questions without an answer."""
         return len(self._waiting)
 
-    def fileno(self) -> int:
-        """Becomes readable when something may have come; call `take` before waiting for it."""
-        return int(self.socket.fileno())
-
     def due_ns(self) -> int | None:
         """When the oldest question must be answered, monotonic ns."""
-        return self._waiting[0].due_ns if self._waiting else None
+        return next(iter(self._waiting.values())).due_ns if self._waiting else None
 
     def take(self, now_ns: int, outcome: TakeOutcome | None = None, keep: Keep = at_once) -> int:
         """Take in what has come; how many questions it was.
@@ -102,69 +99,84 @@ class Questions(Bound):
         Outcomes go to `outcome`; those that it takes are answered when `keep` says so.
         """
         taken = 0
-        if not self.is_open:
-            return taken
-        for _ in range(TAKEN_MAX):
-            if not int(self.socket.get(zmq.EVENTS)) & zmq.POLLIN:
-                break
-            frame = self.socket.recv(zmq.NOBLOCK)
-            if len(self._frames) <= FRAMES_MAX:
-                self._frames.append(frame)
-            if not self.socket.get(zmq.RCVMORE):
-                taken += self._take_message(now_ns, outcome, keep)
-                self._frames.clear()
-        self.counters["asked"] += taken
+        for peer, message in self.door.receive():
+            *envelope, question = message
+            well = envelope in ([], [b""])
+            if well and question.partition(b" ")[0] == TELLING:
+                why = self._pass_on(peer, question, outcome)
+                answer = partial(self._answer_outcome, peer, envelope)
+                if why is None:
+                    keep(answer)
+                else:
+                    answer(why)
+            elif well and question == QUESTION:
+                self._wait(peer, _Question(envelope, now_ns + self._patience_ns))
+                taken += 1
+            else:
+                self._counted["malformed"] += 1
+        self._counted["asked"] += taken
         return taken
 
-    def _take_message(self, now_ns: int, outcome: TakeOutcome | None, keep: Keep) -> bool:
-        *envelope, question = self._frames
-        well = len(self._frames) <= FRAMES_MAX and envelope[1:] in ([], [b""])
-        if well and question.partition(b" ")[0] == TELLING:
-            why = _pass_on(question, outcome)
-            answer = partial(self._answer_outcome, tuple(envelope))
-            if why is None:
-                keep(answer)
-            else:
-                answer(why)
-            return False
-        if question != QUESTION or not well:
-            self.counters["malformed"] += 1
-            return False
-        if len(self._waiting) >= WAITING_MAX:
-            self._waiting.popleft()
-            self.counters["given_up"] += 1
-        self._waiting.append(_Question(tuple(envelope), now_ns + self._patience_ns))
-        return True
+    def _wait(self, peer: Peer, question: _Question) -> None:
+        if self._waiting.pop(peer, None) is not None:
+            self._counted["given_up"] += 1
+        elif len(self._waiting) >= WAITING_MAX:
+            gone = (each for each in self._waiting if not each.is_open)
+            del self._waiting[next(gone, next(iter(self._waiting)))]
+            self._counted["given_up"] += 1
+        self._waiting[peer] = question
 
-    def _answer_outcome(self, envelope: tuple[bytes, ...], why: str | None) -> None:
+    def _pass_on(self, peer: Peer, text: bytes, take_outcome: TakeOutcome | None) -> str | None:
+        """Pass on how a lift ended; None, or why that is of no use."""
+        told = _TOLD.fullmatch(text)
+        if told is None:
+            return MALFORMED
+        if take_outcome is None:
+            return NOBODY
+        outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
+        named = None if told[4] is None else told[4].decode()
+        grasp = GraspId(told[1].decode(), int(told[2]))
+        lift = self._lifts.get(grasp)
+        if lift is not None and not peer.stands_for(lift.owner):
+            return NOT_YOURS
+        if lift is not None and lift.outcome not in (None, outcome):
+            return CONTRADICTS
+        why = take_outcome(*grasp, outcome, named)
+        if why is None:
+            self._own(grasp, peer).outcome = outcome
+        return why
+
+    def _own(self, grasp: GraspId, peer: Peer) -> _Lift:
+        """Who owns a grasp: this peer if nobody does yet."""
+        if grasp not in self._lifts and len(self._lifts) >= GRASPS_MAX:
+            del self._lifts[next(iter(self._lifts))]
+        return self._lifts.setdefault(grasp, _Lift(peer))
+
+    def _answer_outcome(self, peer: Peer, envelope: Message, why: str | None) -> None:
         """Say whether an outcome was of use. Whoever is gone misses it."""
         refused = "malformed" if why == MALFORMED else "outcomes_refused"
-        self.counters["outcomes" if why is None else refused] += 1
+        self._counted["outcomes" if why is None else refused] += 1
         said = {"v": 1, "ok": True} if why is None else {"v": 1, "ok": False, "why": why}
         answer = json.dumps(said, separators=(",", ":")).encode()
-        if self.is_open:
-            self.socket.send_multipart((*envelope, answer), flags=zmq.NOBLOCK)
+        self.door.send(peer, (*envelope, answer))
 
-    def answer(self, payload: bytes, now_ns: int | None = None) -> None:
+    def answer(
+        self, payload: bytes, now_ns: int | None = None, grasp: GraspId | None = None
+    ) -> None:
         """Answer all questions, or with `now_ns` those that can wait no longer.
 
-        Whoever is gone misses it.
+        `grasp` is the one that the answer is about. Whoever is gone misses it.
         """
-        while (
-            self.is_open and self._waiting and (now_ns is None or self._waiting[0].due_ns <= now_ns)
-        ):
-            question = self._waiting.popleft()
-            self.socket.send_multipart((*question.envelope, payload), flags=zmq.NOBLOCK)
-            self.counters["answered"] += 1
-
-
-def _pass_on(text: bytes, take_outcome: TakeOutcome | None) -> str | None:
-    """Pass on how a lift ended; None, or why that is of no use."""
-    told = _TOLD.fullmatch(text)
-    if told is None:
-        return MALFORMED
-    if take_outcome is None:
-        return NOBODY
-    outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
-    named = None if told[4] is None else told[4].decode()
-    return take_outcome(told[1].decode(), int(told[2]), outcome, named)
+        answered = []
+        for peer, question in self._waiting.items():
+            if now_ns is not None and question.due_ns > now_ns:
+                break
+            self.door.send(peer, (*question.envelope, payload))
+            answered.append(peer)
+        if not answered:
+            return
+        for peer in answered:
+            del self._waiting[peer]
+        self._counted["answered"] += len(answered)
+        if grasp is not None and grasp.grasp:
+            self._own(grasp, answered[0])

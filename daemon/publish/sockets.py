@@ -10,21 +10,33 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-import zmq
+import msgspec
 
-from daemon.publish.binding import Binding, PublishError
+from daemon.publish.binding import Binding, OwnKeys, PublishError
 from daemon.publish.companion import Companion, Requests
 from daemon.publish.messages import Status, Verdict
 from daemon.publish.publisher import Publisher
 from daemon.scene import Curve, Scene, SceneError
+from daemon.trust.ledger import GraspId
 from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Authenticator
+    from daemon.publish.curve import CurveDoor
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
+
+
+class _Judged(msgspec.Struct):
+    """Which grasp a verdict is about."""
+
+    boot_id: str
+    grasp: int
+
+
+_decode = msgspec.json.Decoder(_Judged).decode
 
 
 class Sockets(Companion):
@@ -37,11 +49,11 @@ class Sockets(Companion):
         """
         self.plan = plan(wanted)
         self._clock = clock
-        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context(io_threads=1)
         self._curve = wanted.curve
         self._keys_seen: object = None
         self._lost = False
         """Whether a port could not be had again."""
+        self._own_keys: OwnKeys | None = None
         self.authenticator: Authenticator | None = None
         self.publisher: Publisher
         self.questions: Questions | None = None
@@ -52,12 +64,11 @@ class Sockets(Companion):
             raise
 
     def _open(self, wanted: Scene) -> None:
-        pair = None
         if wanted.curve is not None:
-            pair = self._let_in_only_known(wanted.curve)
+            self._let_in_only_known(wanted.curve)
         publish = wanted.publish
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
-        binding = Binding(self._context, mode, publish.group, pair)
+        binding = Binding(mode, publish.group, self._own_keys)
         self.publisher = Publisher(wanted.endpoint, publish.high_water_mark, binding)
         if wanted.ask_endpoint is not None:
             from daemon.publish.questions import Questions
@@ -67,7 +78,9 @@ class Sockets(Companion):
             self.questions = Questions(wanted.ask_endpoint, patience_ns, asked)
         self._watch()
 
-    def _let_in_only_known(self, curve: Curve) -> tuple[bytes, bytes]:
+    def _let_in_only_known(self, curve: Curve) -> None:
+        import zmq  # only where there are keys
+
         from daemon.publish.access import Authenticator
         from daemon.publish.keys import KeysError, load_clients, load_own
 
@@ -76,9 +89,9 @@ class Sockets(Companion):
             pair, clients = load_own(curve.secret_key), load_clients(curve.clients)
         except KeysError as error:
             raise SceneError(str(error)) from error
-        self.authenticator = Authenticator(self._context, clients.admitted)
+        self._own_keys = OwnKeys(zmq.Context(io_threads=1), *pair)
+        self.authenticator = Authenticator(self._own_keys.context, clients.admitted)
         self._tell_refused(self.authenticator, clients)
-        return pair
 
     @staticmethod
     def _tell_refused(authenticator: Authenticator, clients: Clients) -> None:
@@ -88,9 +101,16 @@ class Sockets(Companion):
 
     def _watch(self) -> None:
         if self.authenticator is not None:
-            for bound in self._bound():
-                if bound.endpoint.startswith("tcp://") and bound.is_open:
-                    self.authenticator.watch(bound.socket)
+            for door in self._with_keys():
+                if door.is_open:
+                    self.authenticator.watch(door.socket)
+
+    def _with_keys(self) -> list[CurveDoor]:
+        if self._curve is None:
+            return []
+        from daemon.publish.curve import CurveDoor
+
+        return [bound.door for bound in self._bound() if isinstance(bound.door, CurveDoor)]
 
     def _bound(self) -> list[Publisher | Questions]:
         wanted = (getattr(self, "publisher", None), self.questions)
@@ -127,13 +147,15 @@ class Sockets(Companion):
 
     def on_answer(self, payload: bytes) -> None:
         """Answer all who have asked."""
-        if self.questions is not None:
-            self.questions.answer(payload)
+        if self.questions is not None and self.questions.waiting:
+            judged = _decode(payload)
+            self.questions.answer(payload, grasp=GraspId(judged.boot_id, judged.grasp))
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Answer those who have waited too long for a better answer."""
         if self.questions is not None:
-            self.questions.answer(payload, self._clock())
+            grasp = GraspId(verdict.boot_id, verdict.grasp)
+            self.questions.answer(payload, self._clock(), grasp)
 
     def on_status(self, status: Status) -> None:
         """Take the list of those who may connect, if it has changed."""
@@ -174,13 +196,12 @@ class Sockets(Companion):
         if self.authenticator is not None:
             self.authenticator.unwatch()
         self._lost = False
-        for bound in self._bound():
-            if bound.endpoint.startswith("tcp://"):
-                try:
-                    bound.renew()
-                except PublishError as error:
-                    log.error("%s; nobody can connect there", error)
-                    self._lost = True
+        for door in self._with_keys():
+            try:
+                door.renew()
+            except PublishError as error:
+                log.error("%s; nobody can connect there", error)
+                self._lost = True
         self._watch()
 
     def close(self) -> None:
@@ -189,7 +210,8 @@ class Sockets(Companion):
             bound.close()
         if self.authenticator is not None:
             self.authenticator.close()
-        self._context.term()
+        if self._own_keys is not None:
+            self._own_keys.context.term()
 
     def __enter__(self) -> Self:
         return self

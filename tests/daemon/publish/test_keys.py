@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from daemon import scene
+from daemon.publish.curve import CurveDoor
 from daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
 from daemon.publish.sockets import Sockets
 from daemon.scene import SceneError
@@ -495,7 +496,8 @@ def test_a_port_that_is_lost_to_another_costs_that_port_alone(
     (tmp_path / "friends" / "friend.key").rename(door.clients / "friend.key")
     door.sockets.check_keys()
     (door.clients / "friend.key").unlink()
-    publisher = door.sockets.publisher
+    publisher = door.sockets.publisher.door
+    assert isinstance(publisher, CurveDoor)
     publisher.socket.close(linger=0)
     with socket.socket() as thief:
         thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

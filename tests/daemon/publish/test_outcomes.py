@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -21,7 +24,9 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
+from daemon.publish.peers import PlainPeer
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
+from daemon.publish.zmtp import Role
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.trust import Trust
 from tests.daemon.fakes import FINGERS, Clock
@@ -211,6 +216,89 @@ def test_answers_are_on_their_way_before_the_socket_closes(tmp_path: Path) -> No
             waiting[0](None)
         assert teller.poll(5000)
         assert json.loads(teller.recv()) == {"v": 1, "ok": True}
+
+
+def ask_about(questions: Questions, asker: zmq.Socket[bytes], grasp: int) -> None:
+    """Ask, and be answered about a grasp."""
+    asker.send(b"judge")
+    deadline_s = time.monotonic() + 10.0
+    while not questions.take(0):
+        assert time.monotonic() < deadline_s
+    questions.answer(b"{}", grasp=GraspId(BOOT, grasp))
+    assert asker.recv() == b"{}"
+
+
+def test_a_grasp_that_somebody_asked_about_is_told_of_by_nobody_else(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
+    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
+        other.linger = 0
+        other.connect(questions.endpoint)
+        ask_about(questions, teller, 7)
+        ask_about(questions, other, 7)  # who comes second owns nothing
+        refused = told(questions, other, slip)
+        assert (refused["ok"], refused["why"].partition(":")[0]) == (False, "not yours")
+        assert told(questions, teller, stable)["ok"]
+        assert not told(questions, other, stable)["ok"]
+    assert questions.counters["outcomes_refused"] == 2
+    assert questions.counters["outcomes"] == 1
+
+
+def test_who_owns_a_grasp_and_has_gone_is_stood_for_by_another_connection_of_its(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    with zmq.Context() as context, context.socket(zmq.DEALER) as former:
+        former.linger = 0
+        former.connect(questions.endpoint)
+        ask_about(questions, former, 7)
+    deadline_s = time.monotonic() + 10.0
+    while not told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"]:
+        assert time.monotonic() < deadline_s
+
+
+def test_what_was_told_stays_and_may_be_told_again(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
+    ask_about(questions, teller, 7)
+    assert told(questions, teller, slip)["ok"]
+    assert told(questions, teller, slip)["ok"]
+    refused = told(questions, teller, stable)
+    assert (refused["ok"], refused["why"].partition(":")[0]) == (False, "contradicts")
+
+
+def test_a_grasp_that_nobody_asked_about_is_of_who_tells_of_it_first(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    text = f"outcome {BOOT} 7 slip".encode()
+    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
+        other.linger = 0
+        other.connect(questions.endpoint)
+        assert told(questions, other, text)["ok"]
+        assert not told(questions, teller, text)["ok"]
+
+
+def test_who_stands_for_whom() -> None:
+    """By process and user, as the kernel tells them for Unix sockets."""
+    with subprocess.Popen(["true"]) as ended:
+        pass
+    left, right = socket.socketpair()
+    with left, right:
+        owner, other = (PlainPeer(each, Role.ROUTER, 0) for each in (left, right))
+        assert (owner.process, owner.user) == (os.getpid(), os.getuid())
+        assert owner.stands_for(owner)
+        assert not other.stands_for(owner)  # which is there, and speaks for itself
+        owner.socket = None
+        assert other.stands_for(owner)
+        other.process = 1
+        assert not other.stands_for(owner)  # its process still runs, and could have connected again
+        owner.process = ended.pid
+        assert other.stands_for(owner)
+        other.user += 1
+        assert not other.stands_for(owner)
+        other.process = owner.process
+        assert not other.stands_for(owner)
 
 
 NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", "a=1", "a|b", "~")
