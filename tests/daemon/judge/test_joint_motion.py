@@ -490,6 +490,6 @@ def test_joints_with_the_noise_of_a_hall_sensor_are_never_frozen(joints: int, se
     rng, motion = np.random.default_rng(seed), JointMotion(LIMITS)
     names = tuple(f"J{place}" for place in range(joints))
     for ms in range(0, 60_000, 10):
-        angles = HALL_RAD * (1000.0 + rng.integers(-1, 2, joints))
+        angles = np.asarray(HALL_RAD * (1000.0 + rng.integers(-1, 2, joints)), dtype=np.float64)
         motion.observe(JointReading(0, 0, names, angles), START_NS + ms * MS)
         assert not motion.is_frozen, f"seed {seed}"
