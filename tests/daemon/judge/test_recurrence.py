@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.judge.recurrence import PastSweeps
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, Sampling, synthetic_grasps
+from tests.bench.recurrence import TABLES, UNTOUCHED, again
 from tests.daemon.fakes import FINGERS
 from tests.daemon.judge.fault_bench import Finding, Grasp, Step
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
@@ -213,3 +216,13 @@ def test_sweeps_that_nobody_can_have_read_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match="sweep"):
         PastSweeps(past, lacking)
+
+
+def test_no_real_sweep_comes_again(bts3_dir: Path) -> None:
+    """A grasp in each row of the tables, and 9.8 s of sensors that nothing touches."""
+    untouched = bts3_dir.parent / UNTOUCHED
+    streams = [bts3_dir / f"{name}.csv" for name in TABLES]
+    for path in [*streams, untouched] if untouched.is_file() else streams:
+        number, found = again(recorded_counts(path))
+        assert number > 900
+        assert found == 0
