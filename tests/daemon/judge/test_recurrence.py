@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -11,16 +12,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.decision import Limits
 from daemon.judge.health import Health
+from daemon.judge.limits import GripLimits
+from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.judge.recurrence import PastSweeps
 from drivers.base import ElectrodeFault, TactileReading
+from drivers.palm.packet import ROUND, PalmCounters, PalmPacket
+from drivers.palm.rounds import RoundAssembler
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, Sampling, synthetic_grasps
+from drivers.twins.palm import PalmTwin
 from tests.bench.recurrence import TABLES, UNTOUCHED, again
-from tests.daemon.fakes import FINGERS
-from tests.daemon.judge.fault_bench import Finding, Grasp, Step
+from tests.daemon.fakes import FINGERS, MS, Clock
+from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
 
 # By the words of `daemon.judge.recurrence`.
@@ -68,6 +75,30 @@ def test_a_ring_between_palm_and_host_is_frozen_too(sweeps: int) -> None:
     assert Decision.STABLE in decisions[:sweeps]
     # Rounds end within their time, so the judgement may lag behind by one.
     assert set(decisions[sweeps + 1 :]) == {Decision.UNKNOWN}
+
+
+@pytest.mark.parametrize("packets", [15, 20, 27, 29, 35, 50, 64, 71, 896])
+def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stable(
+    packets: int,
+) -> None:
+    """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
+    counters, clock = PalmCounters(), Clock(START_NS)
+    sweeps = RoundAssembler(FINGERS, counters)
+    pipeline = Pipeline(network(), FINGERS, Limits(), clock, grip=GripLimits())
+    moments = synthetic_grasps(1, rate_hz=PALM_RATE_HZ, durations=HELD, seed=0)
+    source = PalmTwin(moment.counts for moment in moments).packets()
+    last: deque[PalmPacket] = deque(maxlen=packets)
+    stable, turning = 0, 0
+    while turning < packets + (GRACE + UNDER_RING) * ROUND:
+        clock.now_ns += MS
+        packet = last[0] if stable >= UNDER_RING else next(source)
+        last.append(packet)
+        turning += stable >= UNDER_RING
+        for reading in () if sweeps.repeats(packet) else sweeps.push(packet, clock.now_ns):
+            is_stable = pipeline.judge(reading).decision is Decision.STABLE
+            assert not (is_stable and turning > packets + GRACE * ROUND)
+            stable += is_stable
+    assert stable >= UNDER_RING
 
 
 def test_after_a_ring_the_hand_settles_anew_and_is_judged() -> None:
