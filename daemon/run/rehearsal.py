@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from random import Random
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +35,14 @@ def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
     typical = np.array(seen.centre) + away.reshape(np.shape(seen.centre))
     place_of = np.arange(typical.size).reshape(typical.shape)
     rest = np.minimum(typical + FALL_COUNTS * (place_of % 4), COUNTS_MAX)
+    chance = Random(1)
     for number in range(REST + readings):
         place = (number - REST) % GRASP_EVERY
         far = min(place + 1, CLOSING, max(2 * CLOSING + HELD - 1 - place, 0)) / CLOSING
         touch = 0.0 if number < REST else far
-        noise = (5 * number + 3 * place_of) % 7 - 3
+        # No sweep may come again: that would be frozen. numpy's own chance takes megabytes.
+        drawn = np.frombuffer(chance.randbytes(typical.size), dtype=np.uint8)
+        noise = drawn.reshape(typical.shape) % 7 - 3.0
         yield (rest + touch * (typical - rest) + noise).astype(np.uint16)
 
 

@@ -239,17 +239,18 @@ def _played(driver: Driver) -> Iterator[Reading]:
 
 
 def _synthetic(counts: list[NDArray[np.uint16]], *, joints: bool) -> Iterator[Reading]:
-    """Readings of these counts made now, and with `joints` still angles before each."""
+    """Readings of these counts made now, and with `joints` angles that waver before each."""
     import numpy as np
 
     from daemon.run.rehearsal import PERIOD_NS
     from drivers.base import JointReading, TactileReading
 
     sound = np.zeros(counts[0].shape, dtype=np.uint8)
-    angles = np.full(2, 0.2)
+    hall_rad = 0.0006
     for number, values in enumerate(counts):
         now_ns, made_ns = time.monotonic_ns(), number * PERIOD_NS
         if joints:
+            angles = np.array([0.2, 0.2 + hall_rad * (number % 2)])
             yield JointReading(now_ns, number, ("FFJ3", "MFJ3"), angles, made_ns)
         yield TactileReading(now_ns, number, values, sound, recorded_ns=made_ns)
 

@@ -89,10 +89,12 @@ class _Hand:
 class Grasp:
     """One whole grasp, what is said of it, and what is said of it under faults."""
 
-    def __init__(self, rate_hz: float, *, on_request: bool) -> None:
+    def __init__(
+        self, rate_hz: float, *, on_request: bool, durations: Durations = DURATIONS
+    ) -> None:
         """Play it soundly. With `on_request` nobody asks, so a settled grasp stays `settled`."""
         self._period_ns = round(1e9 / rate_hz)
-        self._steps = self._sound_steps(rate_hz)
+        self._steps = self._sound_steps(rate_hz, durations)
         clock = Clock(START_NS)
         grip = GripLimits(on_request=on_request, gate=GATE, joints=JOINTS)
         pipeline = Pipeline(network(), FINGERS, Limits(MAX_AGE_NS), clock, grip=grip)
@@ -105,14 +107,16 @@ class Grasp:
             if number % KEPT == 0:
                 self._kept[number] = hand.copy()
 
-    def under(self, fault: Fault, state: GateState, *, earlier: int = 0) -> list[Finding]:
-        """What is said in the 30 periods after the first reading of a state.
+    def under(
+        self, fault: Fault, state: GateState, *, earlier: int = 0, periods: int = UNDER_FAULT
+    ) -> list[Finding]:
+        """What is said in the 30 or so many periods after the first reading of a state.
 
         A fault may begin so many readings `earlier`.
         """
         at = self._first(state)
         begin = at - earlier
-        sound = self._steps[begin : at + UNDER_FAULT + 1]
+        sound = self._steps[begin : at + periods + 1]
         return [
             Finding(judgement.decision, judgement.reasons, self._judgement_at(step.now_ns))
             for step, judgement in self._hand_at(begin).play([sound[0], *fault(sound)])
@@ -142,10 +146,10 @@ class Grasp:
             pass
         return hand
 
-    def _sound_steps(self, rate_hz: float) -> list[Step]:
+    def _sound_steps(self, rate_hz: float, durations: Durations) -> list[Step]:
         steps = []
         for number, moment in enumerate(
-            synthetic_grasps(1, rate_hz=rate_hz, durations=DURATIONS, seed=0)
+            synthetic_grasps(1, rate_hz=rate_hz, durations=durations, seed=0)
         ):
             t_ns = START_NS + number * self._period_ns
             faults = np.zeros(moment.counts.shape, dtype=np.uint8)

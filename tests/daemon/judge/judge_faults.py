@@ -105,6 +105,24 @@ def standing_still(reading: TactileReading, before: TactileReading) -> TactileRe
     return dataclasses.replace(reading, t_ns=before.t_ns)
 
 
+def ring(sweeps: int, fingers: tuple[int, ...] = (0, 1, 2)) -> Fault:
+    """So many sweeps come once more as they were read, and again and again, of these fingers."""
+
+    def spoil(sound: Sequence[Step]) -> list[Step]:
+        steps: list[Step] = []
+        for number, step in enumerate(sound[1:]):
+            old = steps[number - sweeps].tactile if number >= sweeps else None
+            if step.tactile is not None and old is not None:
+                counts = step.tactile.counts.copy()
+                counts[fingers, :] = old.counts[fingers, :]
+                tactile = dataclasses.replace(step.tactile, counts=counts)
+                step = dataclasses.replace(step, tactile=tactile)
+            steps.append(step)
+        return steps
+
+    return spoil
+
+
 def in_joints(change: Callable[[NDArray[np.float64], float], NDArray[np.float64]]) -> Fault:
     """A change of the angles, given the seconds under fault."""
 
@@ -120,6 +138,12 @@ def in_joints(change: Callable[[NDArray[np.float64], float], NDArray[np.float64]
         return steps
 
     return spoil
+
+
+def frozen_joints(sound: Sequence[Step]) -> list[Step]:
+    """Angles that do not change by a bit any more."""
+    last = next(step.joints for step in sound if step.joints is not None)
+    return in_joints(lambda _angles, _s: last.position_rad)(sound)
 
 
 def without_joints(sound: Sequence[Step]) -> list[Step]:
@@ -157,6 +181,12 @@ def on_a_palm_link(faults: LinkFaults) -> Fault:
     return spoil
 
 
+def ring_on_a_palm(sweeps: int) -> Fault:
+    """The same between palm and host, with packets that lack nothing."""
+    link = on_a_palm_link(LinkFaults())
+    return lambda sound: link([sound[0], *ring(sweeps)(sound)])
+
+
 SINGLE = (
     ElectrodeFault.MISSING,
     ElectrodeFault.NOT_A_COUNT,
@@ -184,9 +214,14 @@ FAULTS: dict[str, Fault] = {
     "at 0, nine": reading_only(0, NINE),
     "at 4095, one": reading_only(COUNT_MAX, ONE),
     "at 4095, nine": reading_only(COUNT_MAX, NINE),
+    "ring of 2": ring(2),
+    "ring of 8": ring(8),
+    "ring of 64": ring(64),
+    "ring of 8, finger": ring(8, (1,)),
     "joints silent": without_joints,
     "joints lost": without_joints,
     "joints not valid": in_joints(lambda angles, _: np.full_like(angles, np.nan)),
+    "joints frozen": frozen_joints,
     "joints move": in_joints(lambda angles, s: angles + 0.5 * s),
     "time stands still": in_tactile(standing_still),
     "time back by 50 ms": shifted(-50),
@@ -202,7 +237,17 @@ FAULTS: dict[str, Fault] = {
     "palm, later version": on_a_palm_link(LinkFaults(wrong_version=True)),
     "palm, dead electrode": on_a_palm_link(LinkFaults(dead_electrodes=((0, 6),))),
     "palm, unplugged": on_a_palm_link(LinkFaults(unplugged_fingers=(2,))),
+    "palm, ring of 8": ring_on_a_palm(8),
     "palm's request stands": on_a_palm_link(LinkFaults(stuck_clock=True)),
 }
 """`one`, `nine`: electrodes of one finger. Those of a palm come through its packets."""
-EARLIER = {"joints lost": JOINTS_LOST_FOR}
+EARLIER = {
+    "joints lost": JOINTS_LOST_FOR,
+    "joints frozen": JOINTS_LOST_FOR,
+    "ring of 2": 2,
+    "ring of 8": 8,
+    "ring of 64": 64,
+    "ring of 8, finger": 8,
+    "palm, ring of 8": 8,
+}
+"""Readings before the state from which on it is under the fault; a ring's first turn is sound."""

@@ -57,9 +57,14 @@ at 0, one             =               =               =               =         
 at 0, nine            saturated       saturated       saturated       saturated       saturated
 at 4095, one          =               =               =               =               =
 at 4095, nine         saturated       saturated       saturated       saturated       saturated
+ring of 2             frozen          frozen          frozen          frozen          frozen
+ring of 8             frozen          frozen          frozen          frozen          frozen
+ring of 64            frozen          frozen          frozen          frozen          frozen
+ring of 8, finger     frozen          frozen          frozen          frozen          frozen
 joints silent         =               joints-late     joints-late     ~joints-late    =
 joints lost           =               =               =               =               =
 joints not valid      =               joints-late     joints-late     ~joints-late    =
+joints frozen         =               joints-frozen   joints-frozen   joints-frozen   =
 joints move           =               =               moving          ~moving         =
 time stands still     stale           stale           stale           ~stale          stale
 time back by 50 ms    =               sequence-gap    settling        ~settling       =
@@ -75,6 +80,7 @@ palm disconnects      stale           stale           stale           ~stale    
 palm, later version   stale           stale           stale           stale           stale
 palm, dead electrode  =               =               =               =               =
 palm, unplugged       sensor-missing  sensor-missing  sensor-missing  sensor-missing  sensor-missing
+palm, ring of 8       frozen          frozen          frozen          frozen          frozen
 palm's request stands stale           stale           stale           stale           stale
 """
 """`=`: as without the fault, reading by reading, for it is harmless there. A reason: always
@@ -101,6 +107,7 @@ ALSO: dict[Reason, set[Reason]] = {
     Reason.SETTLING: {Reason.SEQUENCE_GAP, Reason.MOVING},
     Reason.SEQUENCE_GAP: set(),
     Reason.JOINTS_LATE: set(),
+    Reason.JOINTS_FROZEN: set(),
 }
 """Reasons that may come along with the one in the cell. Garbage has counts among it."""
 

@@ -11,10 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.decision import Limits
 from daemon.judge.joint_motion import JointMemory, JointMotion
-from daemon.judge.limits import JointLimits
+from daemon.judge.limits import GripLimits, JointLimits
+from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Reason
 from drivers.base import JointReading
+from tests.daemon.fakes import FINGERS
+from tests.daemon.judge.fault_bench import network
 
 MS = 1_000_000
 START_NS = 10**12
@@ -490,6 +494,16 @@ def test_joints_with_the_noise_of_a_hall_sensor_are_never_frozen(joints: int, se
     rng, motion = np.random.default_rng(seed), JointMotion(LIMITS)
     names = tuple(f"J{place}" for place in range(joints))
     for ms in range(0, 60_000, 10):
-        angles = HALL_RAD * (1000.0 + rng.integers(-1, 2, joints))
+        angles = np.asarray(HALL_RAD * (1000.0 + rng.integers(-1, 2, joints)), dtype=np.float64)
         motion.observe(JointReading(0, 0, names, angles), START_NS + ms * MS)
         assert not motion.is_frozen, f"seed {seed}"
+
+
+def test_the_health_says_that_joints_are_frozen_until_one_changes() -> None:
+    grip = GripLimits(joints=JointLimits())
+    pipeline = Pipeline(network(), FINGERS, Limits(), lambda: START_NS, grip=grip)
+    for ms in range(0, 1501, 10):
+        angles = np.array([0.8, 0.4 + (ms == 1500)])
+        pipeline.observe_joints(JointReading(START_NS + ms * MS, 0, ("FFJ3", "THJ1"), angles))
+        frozen = pipeline.health().get("joints") is Reason.JOINTS_FROZEN
+        assert frozen is (1000 < ms < 1500)

@@ -1,0 +1,259 @@
+"""Old sweeps that come again: never `stable`, found as the definition says, and not by chance."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.decision import Limits
+from daemon.judge.health import Health
+from daemon.judge.limits import GripLimits
+from daemon.judge.pipeline import Pipeline
+from daemon.judge.reasons import Decision, GateState, Reason
+from daemon.judge.recurrence import PastSweeps
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.palm.packet import ROUND, PalmCounters, PalmPacket
+from drivers.palm.rounds import RoundAssembler
+from drivers.twins.grasps.grasp_script import Durations
+from drivers.twins.grasps.grasps import recorded_counts
+from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, Sampling, synthetic_grasps
+from drivers.twins.palm import PalmTwin
+from tests.bench.recurrence import TABLES, UNTOUCHED, again
+from tests.daemon.fakes import FINGERS, MS, Clock
+from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
+from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
+
+# By the words of `daemon.judge.recurrence`.
+SWEEPS, READ_MIN = 128, 12
+GRACE = 3
+"""So many sweeps after the first turn of a ring no verdict may be `stable` any more."""
+UNDER_RING = 30
+"""Sweeps after that."""
+HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
+RINGS = range(2, 65)
+
+
+@cache
+def held(rate_hz: float) -> Grasp:
+    """A grasp that is held for longer than the longest ring takes."""
+    return Grasp(rate_hz, on_request=False, durations=HELD)
+
+
+def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...]) -> list[Finding]:
+    """What is said of a judged hand from the first sweep of the ring on."""
+    periods = 2 * sweeps + GRACE + UNDER_RING
+    return held(rate_hz).under(ring(sweeps, fingers), GateState.JUDGED, periods=periods)
+
+
+@pytest.mark.parametrize("sweeps", RINGS)
+@pytest.mark.parametrize("fingers", [(0, 1, 2), (0,), (1,), (2,)])
+@pytest.mark.parametrize("rate_hz", [PALM_RATE_HZ, RATE_HZ])
+def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(
+    rate_hz: float, fingers: tuple[int, ...], sweeps: int
+) -> None:
+    found = under_ring(rate_hz, sweeps, fingers)
+    assert {finding.sound.decision for finding in found} == {Decision.STABLE}, "it is held"
+    first, again = found[:sweeps], found[sweeps:]
+    assert {finding.decision for finding in first} == {Decision.STABLE}
+    assert len(again) >= sweeps + GRACE
+    assert {finding.decision for finding in again} == {Decision.UNKNOWN}
+    assert all(Reason.FROZEN in finding.reasons for finding in again)
+
+
+@pytest.mark.parametrize("sweeps", [2, 3, 8, 31, 64])
+def test_a_ring_between_palm_and_host_is_frozen_too(sweeps: int) -> None:
+    periods = 2 * sweeps + GRACE + UNDER_RING
+    found = held(PALM_RATE_HZ).under(ring_on_a_palm(sweeps), GateState.JUDGED, periods=periods)
+    decisions = [finding.decision for finding in found]
+    assert Decision.STABLE in decisions[:sweeps]
+    # Rounds end within their time, so the judgement may lag behind by one.
+    assert set(decisions[sweeps + 1 :]) == {Decision.UNKNOWN}
+
+
+@pytest.mark.parametrize("packets", [15, 20, 27, 29, 35, 50, 64, 71, 896])
+def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stable(
+    packets: int,
+) -> None:
+    """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
+    counters, clock = PalmCounters(), Clock(START_NS)
+    sweeps = RoundAssembler(FINGERS, counters)
+    pipeline = Pipeline(network(), FINGERS, Limits(), clock, grip=GripLimits())
+    moments = synthetic_grasps(1, rate_hz=PALM_RATE_HZ, durations=HELD, seed=0)
+    source = PalmTwin(moment.counts for moment in moments).packets()
+    last: deque[PalmPacket] = deque(maxlen=packets)
+    stable, turning = 0, 0
+    while turning < packets + (GRACE + UNDER_RING) * ROUND:
+        clock.now_ns += MS
+        packet = last[0] if stable >= UNDER_RING else next(source)
+        last.append(packet)
+        turning += stable >= UNDER_RING
+        for reading in () if sweeps.repeats(packet) else sweeps.push(packet, clock.now_ns):
+            is_stable = pipeline.judge(reading).decision is Decision.STABLE
+            assert not (is_stable and turning > packets + GRACE * ROUND)
+            stable += is_stable
+    assert stable >= UNDER_RING
+
+
+def test_after_a_ring_the_hand_settles_anew_and_is_judged() -> None:
+    """Ten turns of five sweeps are half a second; then 240 ms of stillness, as after any gap."""
+
+    def for_a_moment(sound: Sequence[Step]) -> list[Step]:
+        return [*ring(5)(sound[:56]), *sound[56:]]
+
+    found = held(RATE_HZ).under(for_a_moment, GateState.JUDGED, periods=110)
+    decisions = [finding.decision for finding in found]
+    assert decisions[:5] == [Decision.STABLE] * 5
+    assert decisions[5:55] == [Decision.UNKNOWN] * 50
+    assert decisions[55:79] == [Decision.UNKNOWN] * 24
+    assert decisions[-20:] == [Decision.STABLE] * 20
+
+
+Sweep = list[int | None]
+
+
+class Definition:
+    """Which sweeps come again: plain lists, the counts that were not read are None."""
+
+    def __init__(self) -> None:
+        self.past: list[list[Sweep]] = [[] for _ in FINGERS]
+
+    def recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_]) -> bool:
+        found = False
+        for past, values, read in zip(self.past, counts.tolist(), sound.tolist(), strict=True):
+            now = [value if is_read else None for value, is_read in zip(values, read, strict=True)]
+            if sum(read) < READ_MIN:
+                continue
+            for former in past:
+                both = [
+                    (one, other)
+                    for one, other in zip(former, now, strict=True)
+                    if one is not None and other is not None
+                ]
+                equal = all(one == other for one, other in both)
+                found |= equal and (len(both) >= READ_MIN)
+            if now in past:
+                past.remove(now)
+            past.append(now)
+            del past[:-SWEEPS]
+        return found
+
+
+def sweeps_of(
+    random: np.random.Generator, number: int, flagged: float
+) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
+    """Few different counts, old sweeps among them, and electrodes that were not read."""
+    counts = 1000 + random.integers(0, 2, (number, len(FINGERS), 24))
+    for sweep in range(1, number):
+        for finger in range(len(FINGERS)):
+            if random.random() < 0.1:
+                old = max(0, sweep - int(random.integers(1, 150)))
+                counts[sweep, finger] = counts[old, finger]
+    sound = random.random(counts.shape) >= flagged * (random.random((number, 1, 1)) < 0.5)
+    return counts.astype(np.uint16), sound
+
+
+@pytest.mark.parametrize("flagged", [0.0, 0.02, 0.2, 0.5])
+@pytest.mark.parametrize("seed", range(3))
+def test_what_recurs_is_what_the_definition_says(flagged: float, seed: int) -> None:
+    past, definition = PastSweeps.none(len(FINGERS)), Definition()
+    found = 0
+    random = np.random.default_rng(seed)
+    for number, (counts, sound) in enumerate(zip(*sweeps_of(random, 500, flagged), strict=True)):
+        recurs = past.recurs(counts, None if sound.all() else sound)
+        assert recurs == definition.recurs(counts, sound), f"seed {seed}, sweep {number}"
+        found += recurs
+    assert 20 < found < 480
+
+
+@pytest.mark.parametrize("faulty", ["always the same", "another each time", "at first", "later"])
+def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
+    """Its count means nothing, whoever flags it."""
+    health, random = Health(3), np.random.default_rng(1)
+    old = random.integers(500, 3500, (9, 3, 24)).astype(np.uint16)
+    said = []
+    for number in range(60):
+        counts, faults = old[number % 9].copy(), np.zeros((3, 24), dtype=np.uint8)
+        where = {
+            "always the same": [4],
+            "another each time": random.choice(24, 3, replace=False).tolist(),
+            "at first": [number % 24] if number < 9 else [],
+            "later": [number % 24] if number >= 9 else [],
+        }[faulty]
+        faults[:, where] = ElectrodeFault.PARITY
+        counts[:, where] = random.integers(0, 4096, (3, len(where)))
+        said.append(health.watch(TactileReading(number, number, counts, faults)).reasons)
+    assert all(Reason.FROZEN not in reasons for reasons in said[:9])
+    assert all(Reason.FROZEN in reasons for reasons in said[9:])
+
+
+def test_old_sweeps_in_any_order_are_frozen() -> None:
+    health, random = Health(3), np.random.default_rng(2)
+    fresh = random.integers(500, 3500, (SWEEPS, 3, 24)).astype(np.uint16)
+    faults = np.zeros((3, 24), dtype=np.uint8)
+    for number, counts in enumerate(fresh):
+        assert not health.watch(TactileReading(number, number, counts, faults)).reasons
+    for number in range(500):
+        counts = fresh[random.integers(SWEEPS)]
+        reading = TactileReading(SWEEPS + number, SWEEPS + number, counts, faults)
+        assert Reason.FROZEN in health.watch(reading).reasons
+
+
+def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:
+    past, random = PastSweeps.none(3), np.random.default_rng(3)
+    sound = np.ones((3, 24), dtype=np.bool_)
+    sound[1] = False
+    for _ in range(300):
+        counts = random.integers(500, 3500, (3, 24)).astype(np.uint16)
+        counts[1] = 0
+        assert not past.recurs(counts, sound)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "sampling"),
+    [(PALM_RATE_HZ, Sampling.FRESH), (RATE_HZ, Sampling.FRESH), (RATE_HZ, Sampling.HELD)],
+)
+def test_a_hand_with_measured_noise_never_recurs(rate_hz: float, sampling: Sampling) -> None:
+    """A minute of grasps; held values are those of a palm's rounds, read at 100 Hz."""
+    past = PastSweeps.none(3)
+    moments = synthetic_grasps(rate_hz=rate_hz, sampling=sampling, loop=True, seed=4)
+    for moment in itertools.islice(moments, round(60 * rate_hz)):
+        assert not past.recurs(moment.counts)
+
+
+def test_memory_does_not_grow() -> None:
+    past, random = PastSweeps.none(3), np.random.default_rng(5)
+    for _ in range(1000):
+        past.recurs(random.integers(0, 4096, (3, 24)).astype(np.uint16))
+        assert max(map(len, past.past)) <= SWEEPS
+
+
+@pytest.mark.parametrize(
+    ("past", "lacking"),
+    [
+        ([{}, {}], [0]),
+        ([{b"short": None}], [0]),
+        ([{bytes(46) + number.to_bytes(2, "big"): None for number in range(129)}], [0]),
+    ],
+)
+def test_sweeps_that_nobody_can_have_read_are_refused(
+    past: list[dict[bytes, None]], lacking: list[int]
+) -> None:
+    with pytest.raises(ValueError, match="sweep"):
+        PastSweeps(past, lacking)
+
+
+def test_no_real_sweep_comes_again(bts3_dir: Path) -> None:
+    """A grasp in each row of the tables, and 9.8 s of sensors that nothing touches."""
+    untouched = bts3_dir.parent / UNTOUCHED
+    streams = [bts3_dir / f"{name}.csv" for name in TABLES]
+    for path in [*streams, untouched] if untouched.is_file() else streams:
+        number, found = again(recorded_counts(path))
+        assert number > 900
+        assert found == 0
