@@ -16,7 +16,7 @@ from daemon.publish.companion import Companion
 from daemon.publish.messages import OutcomeMessage
 from daemon.record.mcap import header_of
 from daemon.record.player import McapReplayDriver
-from daemon.record.topics import Topic
+from daemon.record.topics import Exchanged, Topic
 from daemon.scene import Scene, SceneError, parse
 from daemon.trust.ledger import GraspId
 from daemon.trust.trust import decode
@@ -89,9 +89,9 @@ class RecordedRun:
         if driver is not None:
             driver.on_event = {
                 Topic.ASKED: pipeline.ask,
-                Topic.EXCHANGED: pipeline.sensors_exchanged,
                 Topic.SKIPPED: pipeline.skip,
             }
+            driver.on_exchange = lambda told: _exchange(pipeline, told)
             driver.on_outcome = lambda told: pipeline.outcome(
                 GraspId(told.grasp_boot_id or header.boot_id, told.grasp),
                 slipped=told.outcome == "slip",
@@ -127,3 +127,11 @@ class RecordedRun:
                 companion.on_outcome(told.grasp, told.outcome, told.object)
 
         driver.on_outcome = both
+
+
+def _exchange(pipeline: Pipeline, told: Exchanged) -> None:
+    """Have the judge forget the sensors as it was recorded; another model knows nothing of them."""
+    try:
+        pipeline.sensors_exchanged(told.session, told.learned)
+    except ValueError:
+        pipeline.sensors_exchanged()

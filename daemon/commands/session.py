@@ -22,7 +22,15 @@ from daemon.judge.reasons import Reason
 from daemon.process.extras import needs
 from daemon.process.text import complain, printable
 from daemon.scene import drivers as scene_drivers
-from daemon.session.file import KeptSession, SessionFile, SessionFileError, former_of, load, read
+from daemon.session.file import (
+    KeptSession,
+    SessionFile,
+    SessionFileError,
+    former_of,
+    load,
+    others,
+    read,
+)
 from daemon.trust.ledger import GraspId, Ledger
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
@@ -86,6 +94,10 @@ def _show(wanted: scene.Scene, model: TactileModel, *, as_json: bool) -> None:
             "calibrated": calibrated,
             "session": None if known is None else {**known, "trust": _learned(kept)},
             "former_saved_at": None if (former := _former(path)) is None else former.saved_at,
+            "put_aside": [
+                {"serials": each.serials, "grasps": _grasps(each), "saved_at": each.saved_at}
+                for each in others(path)
+            ],
         }
         sys.stdout.write(json.dumps(document) + "\n")
         return
@@ -116,6 +128,9 @@ def _lines(path: Path, kept: KeptSession | None, from_on: float | None) -> Itera
     former = _former(path)
     if former is not None and former != kept:
         yield f"  before   {_when(former)}, {_grasps(former)} grasps"
+    for each in others(path):
+        names = ", ".join(f"{finger} {serial}" for finger, serial in each.serials.items())
+        yield f"  aside    {_when(each)}, {_grasps(each)} grasps of {printable(names)}"
     for finger in kept.fingers:
         yield f"  {finger:8} sensor {printable(kept.serials.get(finger, 'of unknown serial'))}"
     learned = _learned(kept)

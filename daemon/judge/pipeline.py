@@ -26,7 +26,9 @@ from models.runtime import TactileModel
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
     from daemon.judge.grip import Grip
+    from daemon.trust.learner import LearnerState
     from daemon.trust.trust import Assessment, Trust
+    from models.session_statistics import SessionState
 
 WITHHELD: Final = {
     Permission.ALLOWED: None,
@@ -147,8 +149,8 @@ class Pipeline:
         self.memory = PipelineMemory()
         self._to_learn: tuple[NDArray[np.generic], bool | None] | None = None
         self._latest: TactileReading | None = None
-        self.on_exchange: Callable[[], None] | None = None
-        """Called when the sensors were exchanged."""
+        self.on_exchange: Callable[[SessionState | None, LearnerState | None], None] | None = None
+        """Called when the sensors were exchanged, with what was known of the new ones."""
 
     @property
     def session(self) -> SessionCalibration | None:
@@ -172,18 +174,26 @@ class Pipeline:
         if self.grip is not None:
             self.grip.ask()
 
-    def sensors_exchanged(self) -> None:
-        """Forget session, tare and grasp: the sensors are others."""
+    def sensors_exchanged(
+        self, session: SessionState | None = None, learned: LearnerState | None = None
+    ) -> None:
+        """Forget session, tare and grasp: the sensors are others.
+
+        `session` and `learned` are what was known of them when they were there before. Raises
+        `ValueError` for ones that are of another model.
+        """
         self.memory.opinion = NO_OPINION
         self._to_learn = None
         if self._session is not None:
             self._session.reset()
+            if session is not None:
+                self._session.restore(session)
         if self.trust is not None:
-            self.trust.sensors_exchanged()
+            self.trust.sensors_exchanged(learned)
         if self.grip is not None:
             self.grip.forget()
         if self.on_exchange is not None:
-            self.on_exchange()
+            self.on_exchange(session, learned)
 
     def knows(self, grasp: GraspId) -> bool:
         """Whether an outcome of a grasp would be taken."""

@@ -10,14 +10,21 @@ from pathlib import Path
 
 from daemon.publish.messages import OutcomeMessage, decode_outcome
 from daemon.record.mcap import McapReader, RecordedMessage, header_of
-from daemon.record.topics import EVENTS, Topic, joint_reading, tactile_reading
+from daemon.record.topics import (
+    EVENTS,
+    Exchanged,
+    Topic,
+    decode_exchanged,
+    joint_reading,
+    tactile_reading,
+)
 from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import RecordedDriver, Timeline
 
 _log = logging.getLogger(__name__)
 
-_Item = Reading | Topic | OutcomeMessage
+_Item = Reading | Topic | OutcomeMessage | Exchanged
 
 
 @dataclass(slots=True)
@@ -27,7 +34,8 @@ class McapCounters(DriverCounters):
     late: int = 0
     """Readings handed over more than one period after they were due."""
     malformed: int = 0
-    """Messages on the topics of readings or outcomes that are none, or not of these fingers."""
+    """Messages on the topics of readings, outcomes or exchanges that are none, or not of these
+    fingers."""
     cut_off: int = 0
     """Files that were cut off, as by a daemon that was killed, or are damaged."""
 
@@ -60,6 +68,8 @@ class McapReplayDriver(RecordedDriver[_Item]):
         """What to call at an event; events that are not in it are passed over."""
         self.on_outcome: Callable[[OutcomeMessage], None] | None = None
         """What to call where an outcome was told."""
+        self.on_exchange: Callable[[Exchanged], None] | None = None
+        """What to call where a sensor was exchanged."""
         self._reset()
 
     def _reset(self) -> None:
@@ -93,6 +103,10 @@ class McapReplayDriver(RecordedDriver[_Item]):
             if self.on_outcome is not None:
                 self.on_outcome(item)
             return ()
+        if isinstance(item, Exchanged):
+            if self.on_exchange is not None:
+                self.on_exchange(item)
+            return ()
         if self.timeline.speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
         if isinstance(item, TactileReading):
@@ -108,7 +122,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 
-    def _items(self) -> Generator[tuple[int, Reading | Topic | OutcomeMessage], None, None]:
+    def _items(self) -> Generator[tuple[int, _Item], None, None]:
         for path in self.paths:
             with open_recording(path) as stream:
                 recording = McapReader(path, stream)
@@ -129,6 +143,8 @@ class McapReplayDriver(RecordedDriver[_Item]):
                 return joint_reading(message.payload)
             if message.kind == Topic.OUTCOME:
                 return decode_outcome(message.payload)
+            if message.kind == Topic.EXCHANGED:
+                return decode_exchanged(message.payload)
         except (ValueError, OverflowError):
             self.counters.malformed += 1
             return None

@@ -25,12 +25,14 @@ from daemon.publish.companion import Companion
 from daemon.record.files import Retention
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapWriter
-from daemon.record.topics import EVENT, Joints, Judged, Topic
+from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
 from daemon.scene import Record
 
 if TYPE_CHECKING:
     from daemon.judge.pipeline import Judgement
+    from daemon.trust.learner import LearnerState
     from drivers.base import JointReading
+    from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
 
@@ -179,9 +181,9 @@ class Recorder(Companion):
         """Record that the controller asks for a judgement."""
         self._put(self._names[Topic.ASKED], EVENT)
 
-    def exchanged(self) -> None:
-        """Record that a sensor is another one than before."""
-        self._put(self._names[Topic.EXCHANGED], EVENT)
+    def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
+        """Record that a sensor is another one than before, and what was known of the new ones."""
+        self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
 
     def on_skipped(self) -> None:
         """Record that readings were left out before the next one."""

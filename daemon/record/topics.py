@@ -20,7 +20,9 @@ from daemon.publish.messages import (
     Verdict,
     decode_tactile,
 )
+from daemon.trust.learner import LearnerState
 from drivers.base import ELECTRODES, JointReading, TactileReading
+from models.session_statistics import SessionState
 
 
 class Joints(msgspec.Struct, frozen=True, kw_only=True):
@@ -71,10 +73,19 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
+class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A sensor is another one than before: an event, empty unless that one was known already."""
+
+    session: SessionState | None = None
+    """What was known of them."""
+    learned: LearnerState | None = None
+    """What outcomes had taught of them."""
+
+
 class Topic(StrEnum):
     """First part of a topic's name, `<kind>.<hand>`, and the struct of its messages.
 
-    A topic without a struct is an event: its messages are empty objects.
+    A topic without a struct is an event: its messages are empty objects, mostly.
     """
 
     message: type[msgspec.Struct] | None
@@ -97,7 +108,7 @@ class Topic(StrEnum):
     JOINTS = "joints", Joints  # read by replay
     JUDGED = "judged", Judged  # read by export
     ASKED = "asked"  # read by replay: somebody has asked for a judgement
-    EXCHANGED = "exchanged"  # read by replay: a sensor was exchanged
+    EXCHANGED = "exchanged"  # read by replay: a sensor was exchanged, see `Exchanged`
     SKIPPED = "skipped"  # read by replay: readings before the next one were left out
 
 
@@ -106,6 +117,7 @@ EVENT: Final = b"{}"
 """Payload of an event."""
 
 _decode_joints = msgspec.json.Decoder(Joints).decode
+decode_exchanged = msgspec.json.Decoder(Exchanged).decode
 decode_judged = msgspec.json.Decoder(Judged).decode
 
 

@@ -25,6 +25,10 @@ log = logging.getLogger("graspd")
 
 MAX_BYTES: Final = 2 << 20
 """A kept session has 7 kB, and up to 330 kB more with what outcomes have taught."""
+DIGITS: Final = 12
+"""Of the digest of their serial numbers, in the name of the file of other sensors."""
+OTHERS_MAX: Final = 4
+"""Sessions of other sensors that are kept, the newest."""
 
 
 class SessionFileError(Exception):
@@ -81,9 +85,10 @@ class SessionFile:
             raise SessionFileError(
                 f"{path}: in use by another graspd, stop that one first"
             ) from error
-        for part in path.parent.glob(f"{glob.escape(path.name)}.{'[0-9a-f]' * 8}"):
-            with suppress(OSError):  # a daemon was killed while it wrote this
-                part.unlink()
+        for written in (glob.escape(path.name), _beside_any(path)):
+            for part in path.parent.glob(f"{written}.{'[0-9a-f]' * 8}"):
+                with suppress(OSError):  # a daemon was killed while it wrote this
+                    part.unlink()
 
     def close(self) -> None:
         """Let others have it. May be called more than once."""
@@ -122,19 +127,18 @@ class SessionFile:
         trust: TrustState | None = None,
     ) -> None:
         """Replace the file in one step, keeping the former one. Raises `SessionFileError`."""
-        learned = None if trust is None else encode(trust)
-        kept = KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned)
-        content = msgspec.json.encode(kept)
-        sealed = _Version2(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
         former = former_of(self.path) if self._newest_is_whole else None
-        try:
-            write_atomically(self.path, msgspec.json.encode(sealed) + b"\n", former=former)
-        except OSError as error:
-            self._newest_is_whole = False
-            raise SessionFileError(
-                f"{self.path}: cannot keep the session: {error.strerror}"
-            ) from error
+        self._newest_is_whole = False
+        _write(self.path, kept_now(statistics, fingers, serials, trust), former)
         self._newest_is_whole = True
+
+    def put_aside(self, kept: KeptSession) -> None:
+        """Keep the session of sensors that are others than today's beside it, and of such ones the
+        newest `OTHERS_MAX`. Raises `SessionFileError`."""
+        _write(_beside(self.path, kept.serials), kept, None)
+        newest = {path for _, path in _others(self.path)[:OTHERS_MAX]}
+        for path in set(self.path.parent.glob(_beside_any(self.path))) - newest:
+            self._remove(path)
 
     def remove(self) -> bool:
         """Forget what is kept; False if nothing was. Raises `SessionFileError`."""
@@ -142,8 +146,10 @@ class SessionFile:
         return bool(self.remove_former() + self._remove(self.path))
 
     def remove_former(self) -> bool:
-        """Forget what was kept before; False if nothing was. Raises `SessionFileError`."""
-        return self._remove(former_of(self.path))
+        """Forget what was kept before, of other sensors too; False if nothing was. Raises
+        `SessionFileError`."""
+        paths = [former_of(self.path), *self.path.parent.glob(_beside_any(self.path))]
+        return bool(sum([self._remove(path) for path in paths]))
 
     def _remove(self, path: Path) -> bool:
         try:
@@ -158,6 +164,54 @@ class SessionFile:
 def former_of(path: Path) -> Path:
     """Where what was kept at `path` before is kept."""
     return path.with_name(path.name + ".former")
+
+
+def kept_now(
+    statistics: SessionState | None,
+    fingers: Sequence[str],
+    serials: Mapping[str, str],
+    trust: TrustState | None = None,
+) -> KeptSession:
+    """What is to be kept at this time."""
+    learned = None if trust is None else encode(trust)
+    return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned)
+
+
+def others(path: Path) -> list[KeptSession]:
+    """Sessions of other sensors beside `path`, the newest first; a warning for a damaged one."""
+    return [kept for kept, _ in _others(path)]
+
+
+def _others(path: Path) -> list[tuple[KeptSession, Path]]:
+    found = []
+    for each in path.parent.glob(_beside_any(path)):
+        try:
+            kept = read(each)
+        except SessionFileError as error:
+            log.warning("%s; it counts for nothing", error)
+            continue
+        if kept is not None:
+            found.append((kept, each))
+    return sorted(found, key=lambda both: both[0].saved_at, reverse=True)
+
+
+def _beside(path: Path, serials: Mapping[str, str]) -> Path:
+    digest = hashlib.sha256(msgspec.json.encode(sorted(serials.items()))).hexdigest()
+    return path.with_name(f"{path.name}.of-{digest[:DIGITS]}")
+
+
+def _beside_any(path: Path) -> str:
+    """As a pattern; not of files that are still being written."""
+    return f"{glob.escape(path.name)}.of-{'[0-9a-f]' * DIGITS}"
+
+
+def _write(path: Path, kept: KeptSession, former: Path | None) -> None:
+    content = msgspec.json.encode(kept)
+    sealed = _Version2(hashlib.sha256(content).hexdigest(), msgspec.Raw(content))
+    try:
+        write_atomically(path, msgspec.json.encode(sealed) + b"\n", former=former)
+    except OSError as error:
+        raise SessionFileError(f"{path}: cannot keep the session: {error.strerror}") from error
 
 
 def load(path: Path) -> KeptSession | None:

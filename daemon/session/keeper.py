@@ -17,13 +17,17 @@ from typing import Final, NamedTuple
 from daemon.judge.calibration import SessionCalibration
 from daemon.publish.companion import Answer, Requests
 from daemon.session.file import (
+    OTHERS_MAX,
     KeptSession,
     SessionFile,
     SessionFileError,
+    kept_now,
     of_fingers,
+    others,
     statistics_of,
 )
 from daemon.session.sensors import SensorWatch
+from daemon.trust.learner import LearnerState
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Driver
 from models.session_statistics import SessionState
@@ -38,6 +42,7 @@ WAITING_MAX: Final = 64
 """Answers that wait for the disk; the oldest is given up for a newer one."""
 BUSY: Final = "busy: too many wait for the disk, tell it again"
 UNEXPECTED: Final = "it could not be written"
+OnExchange = Callable[[SessionState | None, LearnerState | None], None]
 HANGS: Final = "not kept: the disk does not answer"
 
 
@@ -47,6 +52,12 @@ class Known(NamedTuple):
     serials: dict[str, str]
     statistics: SessionState | None = None
     trust: TrustState | None = None
+
+    @property
+    def is_nothing(self) -> bool:
+        """Whether no grasp and no outcome is known."""
+        no_grasps = self.statistics is None or not self.statistics.grasps
+        return no_grasps and (self.trust is None or not self.trust.learner.outcomes)
 
 
 class SessionKeeper(SensorWatch):
@@ -59,25 +70,32 @@ class SessionKeeper(SensorWatch):
         tactile: Driver,
         file: SessionFile,
         clock: Callable[[], int] = time.monotonic_ns,
-        on_exchange: Callable[[], None] | None = None,
+        on_exchange: OnExchange | None = None,
         trust: Trust | None = None,
     ) -> None:
         """Restore what `file` holds; if that is no session of these fingers, warn and begin anew.
 
         `session` is None for a model without one, `trust` where nothing learns: what is kept for
         those stays as it is. `tactile` knows the serial numbers of the sensors. `on_exchange` is
-        called when one of them is another than before, and must reset session and trust; unless
-        given, only that is done.
+        called when one of them is another than before, with what is kept of the new ones, and must
+        reset session and trust to that; unless given, only that is done.
         """
         self._session = session
         self._trust = trust
-        super().__init__(tactile, on_exchange or self._reset)
+        self._exchanged = on_exchange or self._reset
+        super().__init__(tactile, lambda: self._exchanged(None, None))
         self._fingers = tuple(fingers)
         self._file = file
         self._clock = clock
         self._unused = Known({})
         """What was kept and this run has no use for."""
         self._restore()
+        self._others = [
+            _known_of(kept) for kept in others(file.path) if kept.fingers == self._fingers
+        ]
+        """What is kept of other sensors, the newest first."""
+        self._leaving: deque[Known] = deque(maxlen=OTHERS_MAX)
+        """Of these, what is not yet on the disk."""
         self._saved = self._known()
         self._save_due_ns = clock() + SAVE_PERIOD_NS
         self._warned = False
@@ -146,7 +164,7 @@ class SessionKeeper(SensorWatch):
     def _begin_to_save(self) -> None:
         self._save_due_ns = self._clock() + SAVE_PERIOD_NS
         known = self._known()
-        if known == self._saved:
+        if known == self._saved and not self._leaving:
             self._answer(len(self._waiting), None)
             return
         self._in_writing = len(self._waiting)
@@ -163,6 +181,7 @@ class SessionKeeper(SensorWatch):
             known, written = job
             self._failure = UNEXPECTED
             try:
+                self._put_aside()  # first, so that a session is always in one of the files
                 self._file.save(known.statistics, self._fingers, known.serials, known.trust)
                 self._saved, self._failure = known, None
             except SessionFileError as error:
@@ -171,6 +190,17 @@ class SessionKeeper(SensorWatch):
                 if self._failure is UNEXPECTED:
                     self._thread = None
                 os.eventfd_write(written, 1)
+
+    def _put_aside(self) -> None:
+        """Write the sessions of sensors that have left. Raises `SessionFileError`."""
+        while self._leaving:
+            left = self._leaving.popleft()
+            kept = kept_now(left.statistics, self._fingers, left.serials, left.trust)
+            try:
+                self._file.put_aside(kept)
+            except SessionFileError:
+                self._leaving.appendleft(left)  # to be tried again with the next save
+                raise
 
     def _answer(self, number: int, why: str | None) -> None:
         """Answer those who have waited longest."""
@@ -217,15 +247,57 @@ class SessionKeeper(SensorWatch):
         except ValueError as error:
             log.warning("%s: what was learned %s; learning begins anew", self._file.path, error)
 
-    def _reset(self) -> None:
+    def _reset(
+        self, session: SessionState | None = None, learned: LearnerState | None = None
+    ) -> None:
         if self._session is not None:
             self._session.reset()
+            if session is not None:
+                self._session.restore(session)
         if self._trust is not None:
-            self._trust.sensors_exchanged()
+            self._trust.sensors_exchanged(learned)
 
     def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
+        """Put the session aside, and take up that of the sensors that are there now, if any."""
         grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
         log.warning("new sensor on %s: the session%s no longer count", ", ".join(changed), grasps)
+        now = serials.items()
+        former = next((each for each in self._others if now <= each.serials.items()), None)
+        leaving = self._known()
+        if not leaving.is_nothing:
+            rest = [each for each in self._others if each.serials != leaving.serials]
+            self._others = [leaving, *rest[: OTHERS_MAX - 1]]
+            self._leaving.append(leaving)
         self._unused = Known({})
-        self._on_exchange()
+        if former is None or not self._take_up(former):
+            self._on_exchange()
         self._save_due_ns = self._clock()
+
+    def _take_up(self, former: Known) -> bool:
+        """Go on with the session of sensors that were there before; False if it is of no use."""
+        trust = former.trust
+        if trust is not None and self._trust is not None and not self._trust.fits(trust):
+            trust = None
+        try:
+            self._exchanged(former.statistics, None if trust is None else trust.learner)
+        except ValueError as error:
+            log.warning("what was kept of these sensors %s; a new session begins", error)
+            return False
+        self._unused = Known(
+            {},
+            former.statistics if self._session is None else None,
+            trust if self._trust is None else None,
+        )
+        self._serials = dict(former.serials)
+        grasps = "" if self._session is None else f" of {self._session.grasps} grasps"
+        log.warning("these sensors were there before: their session%s goes on", grasps)
+        return True
+
+
+def _known_of(kept: KeptSession) -> Known:
+    """What a file holds; without what was learned where that cannot be read."""
+    learned = None
+    if kept.trust is not None:
+        with contextlib.suppress(ValueError):
+            learned = decode(kept.trust)
+    return Known(dict(kept.serials), kept.statistics, learned)

@@ -153,9 +153,12 @@ class Trust:
             )
         return self._report
 
-    def sensors_exchanged(self) -> None:
-        """Start learning again; slips that were counted stay counted."""
+    def sensors_exchanged(self, learned: LearnerState | None = None) -> None:
+        """Start learning again, or go on from what the sensors have taught before; slips that were
+        counted stay counted. Raises `ValueError` for what is of another model."""
         self.learner.reset()
+        if learned is not None:
+            self.learner.restore(learned)
         self.risk.exchanged()
         self.ledger.exchanged()
         self._report = None

@@ -245,6 +245,26 @@ def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_fil
         assert again(path) == [each for each in expected if each.t_ns in times]
 
 
+def test_sensors_that_are_back_bring_their_session_into_the_replay_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daemon = Daemon(tmp_path, monkeypatch)
+    expected, states = [], []
+    for reading in sweeps()[:2000]:
+        if reading.seq in (1250, 1500):
+            assert daemon.pipeline.session is not None
+            states.append(daemon.pipeline.session.state())
+            daemon.pipeline.sensors_exchanged(states[0] if reading.seq == 1500 else None)
+        expected.append(daemon.judge(reading))
+    daemon.recorder.close()
+    assert states[0].grasps > 3 > states[1].grasps
+    paths = files(tmp_path)
+    assert again(*paths) == expected
+    for path in paths:
+        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
+        assert again(path) == [each for each in expected if each.t_ns in times]
+
+
 def test_where_readings_were_left_out_the_replay_knows_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -367,6 +367,30 @@ def test_an_exchanged_sensor_ends_what_was_learned(tmp_path: Path) -> None:
     assert other.risk.lifts == lifts > 0  # slips that were counted stay counted
 
 
+def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
+    tmp_path: Path,
+) -> None:
+    driver, part = sensors(ff="A"), trust()
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(None, FINGERS, driver, file, Clock(), trust=part)
+        keeper.before_readings()
+        for first, sensor in ((0, "B"), (20, "A")):
+            for grasp in range(first, first + 20):
+                judge(part, grasp)
+                tell(part, grasp)
+            learned, counted = part.learner.state(), part.risk.state()
+            if first == 0:
+                taught = learned
+            driver.known = {"ff": sensor}
+            keeper.before_readings()
+            lifts = part.risk.state().lifts, part.risk.state().slips
+            assert lifts == (counted.lifts, counted.slips)
+            assert part.risk.proven == 0
+        keeper.save()
+    assert part.learner.state() == taught != learned
+    assert part.risk.lifts > 0
+
+
 def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
     file: SessionFile, disk: Disk, keeper_of: KeeperOf
 ) -> None:

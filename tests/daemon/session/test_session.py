@@ -21,7 +21,7 @@ from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.session.file import SessionFile, SessionFileError, load
+from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
 from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
 from daemon.session.sensors import exchanged
 from drivers.base import ElectrodeFault, TactileReading
@@ -108,6 +108,104 @@ def test_an_exchanged_sensor_ends_the_session(
     assert kept is not None
     assert grasps_of(kept) == 0
     assert kept.serials["mf"] == "X"
+
+
+def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
+    clock, session, driver = Clock(), calibration(), sensors(ff="A", mf="B")
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, driver, file, clock)
+        keeper.before_readings()
+        observe(session, 30)
+        known = session.state()
+        driver.known = {"ff": "A", "mf": "X"}
+        keeper.before_readings()
+        assert session.grasps == 0
+        observe(session, 7, seed=1)
+        driver.known = {"ff": "A"}  # the other one does not answer yet
+        keeper.before_readings()
+        driver.known = {"ff": "A", "mf": "B"}
+        keeper.before_readings()
+        assert session.state() == known
+        observe(session, 1, seed=2)
+        keeper.save()
+    again = calibration()
+    driver.known = {"ff": "A", "mf": "X"}  # between two starts
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
+        assert again.grasps == 31
+        keeper.before_readings()
+        assert again.grasps == 7
+        driver.known = {"ff": "A", "mf": "B"}
+        keeper.before_readings()
+        assert again.grasps == 31
+        keeper.save()
+
+
+def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
+    session, driver = calibration(), sensors(ff="0")
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
+        keeper.before_readings()
+        for number in range(1, 8):
+            observe(session, 30 + number, seed=number)
+            driver.known = {"ff": str(number)}
+            keeper.before_readings()
+            keeper.save()
+            assert session.grasps == 0
+        kept = [(each.serials["ff"], grasps_of(each)) for each in others(file.path)]
+        assert kept == [(str(6 - at), 37 - at) for at in range(4)]
+        for number in (2, 6):
+            driver.known = {"ff": str(number)}
+            keeper.before_readings()
+            assert session.grasps == (37 if number == 6 else 0)
+        keeper.save()
+        assert len(list(tmp_path.iterdir())) == 4 + 3  # the session, the former one, the lock
+        assert file.remove()
+        assert [path.name for path in tmp_path.iterdir()] == ["right.json.lock"]
+
+
+@pytest.mark.parametrize("spoil", ["cut", "flip", "empty"])
+def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
+    tmp_path: Path, spoil: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    session, driver = calibration(), sensors(ff="A")
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
+        keeper.before_readings()
+        observe(session, 30)
+        driver.known = {"ff": "B"}
+        keeper.before_readings()
+        keeper.save()
+    (path,) = tmp_path.glob("right.json.of-*")
+    data = path.read_bytes()
+    spoiled = {"cut": data[:-9], "flip": data.replace(b'"A"', b'"C"'), "empty": b""}[spoil]
+    path.write_bytes(spoiled)
+    again = calibration()
+    driver.known = {"ff": "A"}
+    with SessionFile(tmp_path / "right.json") as file:
+        keeper = SessionKeeper(again, FINGERS, driver, file, Clock())
+        keeper.before_readings()
+        assert again.grasps == 0
+        keeper.save()
+    assert f"{path}: not a session" in caplog.text
+
+
+def test_a_session_of_another_model_that_is_back_is_a_new_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    session, driver = calibration(), sensors(ff="A")
+    observe(session, 30)
+    state = session.state()
+    odd = msgspec.structs.replace(state, mean=state.mean[:-1], squares=state.squares[:-1])
+    with SessionFile(tmp_path / "right.json") as file:
+        file.put_aside(kept_now(odd, FINGERS, {"ff": "B"}))
+        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
+        keeper.before_readings()
+        driver.known = {"ff": "B"}
+        keeper.before_readings()
+        keeper.save()
+    assert session.grasps == 0
+    assert "a new session begins" in caplog.text
 
 
 @pytest.mark.parametrize(
