@@ -288,8 +288,8 @@ def endless(folder: Path) -> Path:
     return path
 
 
-def giant(folder: Path) -> Path:
-    """A zoo model of a few bytes more that multiplies matrices for minutes."""
+def giant(folder: Path, side: int = 5000) -> Path:
+    """A zoo model of a few bytes more that multiplies matrices of so many rows for minutes."""
     import onnx
     from onnx import TensorProto, helper
 
@@ -297,7 +297,6 @@ def giant(folder: Path) -> Path:
     graph = model.graph
     node = next(node for node in graph.node if "probability" in node.output)
     node.output[0] = "sound"
-    side = 5000
     graph.initializer.append(helper.make_tensor("sides", TensorProto.INT64, [2], [side, side]))
     graph.initializer.append(helper.make_tensor("none", TensorProto.FLOAT, [], [0.0]))
     graph.node.append(helper.make_node("ReduceSum", ["sound"], ["sum"], keepdims=0))
