@@ -10,6 +10,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from models import onnx_file, zoo
 from models.contract import METADATA_KEY, OUTPUT_NAME, ModelContract, ModelError
 from models.inputs import InputBuilder, builder
 
@@ -26,11 +27,16 @@ class TactileModel:
     `run`.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent."""
-        data = _read(path)
+    def __init__(self, path: Path, tried: bytes | None = None) -> None:
+        """Load the model file. Raises `ModelError` if it is missing, broken or inconsistent.
+
+        `tried` is its content, where that has been read and checked (`models.trial`).
+        """
+        data = read(path) if tried is None else tried
         self.path = path
         self.sha256 = hashlib.sha256(data).hexdigest()
+        if tried is None and not zoo.ships(path, self.sha256):
+            check_operators(path, data)
         self._session = _session(path, data)
         self.contract, self.inputs = _contract(path, self._session)
         _check_signature(path, self._session, self.inputs)
@@ -57,7 +63,8 @@ class TactileModel:
         return p_stable, p_slip
 
 
-def _read(path: Path) -> bytes:
+def read(path: Path) -> bytes:
+    """The content of a model file. Raises `ModelError`."""
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode):
@@ -71,6 +78,14 @@ def _read(path: Path) -> bytes:
         raise ModelError(f"{str(path)!r}: cannot read the model: {error}") from error
 
 
+def check_operators(path: Path, data: bytes) -> None:
+    """Raise `ModelError` unless the content is the whole model, and must come to an end."""
+    try:
+        onnx_file.check(data)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
 def single_threaded(model: bytes) -> ort.InferenceSession:
     """A session as the daemon runs one. Raises what onnxruntime raises for no usable model."""
     options = ort.SessionOptions()
@@ -79,6 +94,8 @@ def single_threaded(model: bytes) -> ort.InferenceSession:
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Not the other format, in which nobody has looked for operators.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
     options.log_severity_level = 3
     return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 

@@ -26,7 +26,7 @@ from daemon.scene.drivers import (
 from daemon.trust.risk import RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import Driver, DriverError, LinkError
-from models import zoo
+from models import trial, zoo
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
 
@@ -57,7 +57,7 @@ def model_path(scene: Scene) -> Path:
 
 def load_model(scene: Scene) -> TactileModel:
     """The scene's model, warm. Raises `ModelError`."""
-    return TactileModel(model_path(scene))
+    return trial.load(model_path(scene))
 
 
 def build_pipeline(

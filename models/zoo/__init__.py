@@ -7,6 +7,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, get_args
 
+import msgspec
+
 from models.contract import Finger, ModelError
 
 ZOO = Path(__file__).parent
@@ -44,6 +46,26 @@ def card(name: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ModelError(f"{path}: is no card")
     return content
+
+
+class _File(msgspec.Struct):
+    sha256: str
+
+
+class _Card(msgspec.Struct):
+    file: _File
+
+
+def ships(path: Path, sha256: str) -> bool:
+    """Whether the file at `path`, of this digest (hexadecimal), is a model of the zoo as its card
+    has it."""
+    if path.resolve().parent != ZOO.resolve():
+        return False
+    try:
+        said = msgspec.json.decode(path.with_suffix(".json").read_bytes(), type=_Card)
+    except (OSError, msgspec.DecodeError):
+        return False
+    return said.file.sha256 == sha256
 
 
 def find(name: str) -> Path:

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from drivers.recordings.csv_player import DEMO_RECORDING
 from models import zoo
@@ -28,7 +29,7 @@ MIB = 1024
 """KiB."""
 GROWTH_MAX_MIB = 32
 """Memory that no file may cost a running daemon for good, or a refused scene ever, MiB."""
-GAP_MAX_S = 0.25
+GAP_MAX_S = 0.5
 """Between two verdicts while a scene is read, s: readings come every 10 ms, shared computers
 stall."""
 SWAP_MAX_S = 1.5
@@ -39,6 +40,8 @@ STOP_MAX_S = 2.0
 """Until a daemon that was told to stop is gone, s."""
 REPLAY_MAX_MIB = 256
 """Memory of a replay; one of a sound recording of minutes takes half of it."""
+
+REFUSED = "the new scene is wrong, the former one goes on"
 
 SCENE = """
 [tactile]
@@ -77,14 +80,14 @@ class Reloaded:
     """What happened at a SIGHUP."""
 
     alive: bool
-    answered: bool
-    """Whether the daemon said in time what became of it."""
+    told: str
+    """What the daemon told the service manager became of it; nothing if it did not in time."""
     gap_s: float
     """Longest time without a verdict."""
 
 
 class Running:
-    """A daemon on `folder`'s scene, with somebody who hears its verdicts."""
+    """A daemon on `folder`'s scene, with a service manager and somebody who hears its verdicts."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -94,7 +97,14 @@ class Running:
 
     def __enter__(self) -> Running:
         with contextlib.ExitStack() as stack:
-            with contextlib.chdir(self.folder):  # where weights of other files would be looked for
+            self.manager = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+            self.manager.bind(str(self.folder / "notify"))
+            stack.callback((self.folder / "notify").unlink)
+            self.manager.setblocking(False)
+            with (  # in the folder, where weights of other files would be looked for
+                contextlib.chdir(self.folder),
+                patch.dict(os.environ, NOTIFY_SOCKET=str(self.folder / "notify")),
+            ):
                 self.daemon: Child = stack.enter_context(start_daemon(self.scene, self.log))
             self.ears = stack.enter_context(Subscriber(f"ipc://{self.folder}/v"))
             if self.ears.take(PATIENCE_S) is None:
@@ -122,18 +132,30 @@ class Running:
                 longest_ns, last_ns = max(longest_ns, now_ns - last_ns), now_ns
         return max(longest_ns, time.monotonic_ns() - last_ns) / 1e9
 
-    def said(self, what: str = "taken anew") -> int:
-        """How often the log has it."""
-        return self.log.read_text(errors="replace").count(what)
+    def told(self) -> str:
+        """What the manager was told to be the end of a reload, since the last call."""
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                ready, _, status = self.manager.recv(4096).decode().partition("\nSTATUS=")
+                if ready == "READY=1":
+                    return status.partition("\n")[0]
+        return ""
 
     def reload(self, text: str, patience_s: float = END_MAX_S) -> Reloaded:
         """Put a scene in the place of the former one and tell the daemon."""
         self.scene.write_text(text)
-        before = self.said()
+        said: list[str] = []
+
+        def is_told() -> bool:
+            said.extend(filter(None, [self.told()]))
+            return bool(said)
+
+        while self.told():
+            pass  # of former reloads
         self.daemon.process.send_signal(signal.SIGHUP)
-        gap_s = self.hear(patience_s, lambda: self.said() > before)
+        gap_s = self.hear(patience_s, is_told)
         gap_s = max(gap_s, self.hear(0.3))
-        return Reloaded(self.alive, self.said() > before, gap_s)
+        return Reloaded(self.alive, "".join(said), gap_s)
 
     def rss_mib(self) -> float:
         return usage(self.daemon.pid).rss_kib / MIB if self.alive else 0.0
@@ -169,7 +191,7 @@ def _dotted(plan: Plan) -> Outcome:
             gap_s = max(gap_s, found.gap_s)
             growth_mib = max(growth_mib, running.peak_mib() - rest_mib)
             fits = found.gap_s < GAP_MAX_S and growth_mib < GROWTH_MAX_MIB
-            held = held and found.alive and found.answered and fits
+            held = held and found.alive and found.told == REFUSED and fits
             if not found.alive:
                 return Outcome(tried, f"the daemon is gone after {way}, {size} bytes", False)
             if tried >= len(ways) and time.monotonic() > end_s:
@@ -184,7 +206,7 @@ def _dotted(plan: Plan) -> Outcome:
 def _storm(plan: Plan) -> Outcome:
     sent, gap_s = 0, 0.0
     with Running(plan.folder) as running:
-        running.reload(scene(plan.folder))  # what one reload needs, it keeps
+        running.hear(3.0)  # all that it needs it has by then
         rest_mib = running.rss_mib()
         stop = threading.Event()
 
@@ -203,11 +225,11 @@ def _storm(plan: Plan) -> Outcome:
             stop.set()
             sender.join()
         growth_mib = running.rss_mib() - rest_mib
+        running.hear(2.0)  # the last one was late
         other = running.reload(scene(plan.folder, 'name = "mlp"'))
-        running.hear(3.0, lambda: running.said("taken anew") == 0)
-        alive = running.alive
         stops_s = running.stops_in_s()
-    held = alive and other.answered and gap_s < SWAP_MAX_S and growth_mib < GROWTH_MAX_MIB
+    taken = other.alive and other.told.endswith("mlp")
+    held = taken and gap_s < SWAP_MAX_S and growth_mib < GROWTH_MAX_MIB
     happened = (
         f"memory {growth_mib:+.0f} MiB, longest gap in the verdicts {gap_s * 1e3:.0f} ms, "
         f"ends {stops_s:.1f} s after SIGTERM"
@@ -266,8 +288,8 @@ def endless(folder: Path) -> Path:
     return path
 
 
-def giant(folder: Path) -> Path:
-    """A zoo model of a few bytes more that multiplies matrices for minutes."""
+def giant(folder: Path, side: int = 5000) -> Path:
+    """A zoo model of a few bytes more that multiplies matrices of so many rows for minutes."""
     import onnx
     from onnx import TensorProto, helper
 
@@ -275,7 +297,6 @@ def giant(folder: Path) -> Path:
     graph = model.graph
     node = next(node for node in graph.node if "probability" in node.output)
     node.output[0] = "sound"
-    side = 5000
     graph.initializer.append(helper.make_tensor("sides", TensorProto.INT64, [2], [side, side]))
     graph.initializer.append(helper.make_tensor("none", TensorProto.FLOAT, [], [0.0]))
     graph.node.append(helper.make_node("ReduceSum", ["sound"], ["sum"], keepdims=0))
@@ -331,7 +352,7 @@ def _model(make: Callable[[Path], Path]) -> Callable[[Plan], Outcome]:
             held = held and code == 2 and str(path) in said and seconds < END_MAX_S
             with Running(plan.folder) as running:
                 found = running.reload(wanted)
-                refused = found.answered and running.said("not taken anew") == 1
+                refused = found.told == REFUSED
                 gap_s = max(gap_s, found.gap_s)
                 held = held and found.alive and refused and found.gap_s < GAP_MAX_S
                 running.scene.write_text(wanted)

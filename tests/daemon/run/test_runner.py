@@ -183,9 +183,10 @@ def test_a_wrong_scene_changes_nothing_and_is_told(
     assert "the former scene goes on" in said
 
 
-def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> None:
+@pytest.mark.parametrize("text", ["[hand\n", ".".join(["a"] * 24_000) + " = 1"])
+def test_a_broken_file_changes_nothing_not_even_the_count(running: Running, text: str) -> None:
     before = running.verdict()
-    running.scene.write_text("[hand\n")
+    running.scene.write_text(text)
     running.hang_up()
     running.told("READY=1")
     after = running.verdict()

@@ -1,0 +1,177 @@
+"""A scene is prepared beside the loop, one at a time, and what is raised there ends nothing."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import cast
+
+import pytest
+
+from daemon.assembly.parts import Parts
+from daemon.process.signals import StopSignal
+from daemon.run import reload
+from daemon.run.reload import Reload
+
+PATIENCE_S = 10.0
+PARTS = cast(Parts, object())
+
+
+class Preparing:
+    """Ends each preparation when it is told to, with what it is told to."""
+
+    def __init__(self) -> None:
+        self.began: list[int] = []
+        """Threads of the preparations."""
+        self.go = threading.Semaphore(0)
+        self.ends: Callable[[], Parts] = lambda: PARTS
+        self.told = 0
+
+    def tell(self) -> None:
+        self.told += 1
+
+    def prepare(self) -> Parts:
+        self.began.append(threading.get_native_id())
+        assert self.go.acquire(timeout=PATIENCE_S)
+        return self.ends()
+
+
+@contextmanager
+def reloading() -> Iterator[tuple[Reload, Preparing]]:
+    preparing = Preparing()
+    with StopSignal(reloads=True) as stop:
+        found = Reload(stop, preparing.prepare, preparing.tell)
+        try:
+            yield found, preparing
+        finally:
+            preparing.go.release(100)
+            found.close()
+
+
+def hang_up() -> None:
+    os.kill(os.getpid(), signal.SIGHUP)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.002)
+
+
+@pytest.fixture(autouse=True)
+def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reload, "PERIOD_S", 0.05)
+
+
+def test_the_loop_goes_on_until_there_is_what_to_run() -> None:
+    with reloading() as (found, preparing):
+        assert not found.take_reload()
+        assert found.filenos() == []
+        hang_up()
+        assert not found.take_reload()
+        wait_for(lambda: len(preparing.began) == 1)
+        assert preparing.began != [threading.get_native_id()]
+        assert preparing.told == 1
+        for _ in range(100):
+            assert not found.take_reload()
+        preparing.go.release()
+        readable, _, _ = select.select([found, *found.filenos()], [], [], PATIENCE_S)
+        assert readable == found.filenos()
+        assert found.take_reload()
+        assert found.take() is PARTS
+        assert found.filenos() == []
+        assert not found.take_reload()
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(5), KeyError()])
+def test_whatever_is_raised_is_handed_over(error: Exception) -> None:
+    def fail() -> Parts:
+        raise error
+
+    with reloading() as (found, preparing):
+        preparing.ends = fail
+        preparing.go.release()
+        hang_up()
+        wait_for(found.take_reload)
+        assert found.take() is error
+        preparing.ends = lambda: PARTS
+        preparing.go.release()
+        hang_up()
+        wait_for(found.take_reload)
+        assert found.take() is PARTS
+
+
+def test_a_storm_prepares_one_scene_and_one_more() -> None:
+    with reloading() as (found, preparing):
+        hang_up()
+        found.take_reload()
+        wait_for(lambda: len(preparing.began) == 1)
+        for _ in range(500):
+            hang_up()
+            assert not found.take_reload()
+        preparing.go.release()
+        wait_for(found.take_reload)
+        found.take()
+        preparing.go.release()
+        wait_for(found.take_reload)  # what came in between is not forgotten
+        found.take()
+        time.sleep(0.1)
+        assert not found.take_reload()
+        assert len(preparing.began) == preparing.told == 2
+
+
+def test_preparations_keep_their_distance() -> None:
+    with reloading() as (found, preparing):
+        preparing.go.release(100)
+        began_s = time.monotonic()
+        end_s = began_s + 0.5
+        while time.monotonic() < end_s:
+            hang_up()
+            if found.take_reload():
+                found.take()
+        assert 2 <= len(preparing.began) <= 0.5 / 0.05 + 2
+
+
+def test_the_end_does_not_wait_for_what_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reload, "END_S", 0.05)
+    switch_s = sys.getswitchinterval()
+    with reloading() as (found, preparing):
+        hang_up()
+        found.take_reload()
+        wait_for(lambda: bool(preparing.began))
+        began_s = time.monotonic()
+        found.close()
+        assert time.monotonic() - began_s < 5.0
+        assert sys.getswitchinterval() == switch_s
+        preparing.go.release()
+        wait_for(lambda: threading.active_count() == 1 or found.take_reload())
+        found.take()
+
+
+def test_the_end_cuts_short_what_waits_for_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reload, "PERIOD_S", 60.0)
+    with reloading() as (found, preparing):
+        preparing.go.release(2)
+        for _ in range(2):
+            hang_up()
+            found.take_reload()
+            if not preparing.began:
+                wait_for(found.take_reload)
+                found.take()
+        began_s = time.monotonic()
+        found.close()
+        assert time.monotonic() - began_s < 5.0
+        assert len(preparing.began) == 1
+        monkeypatch.setattr(found, "close", lambda: None)
+
+
+def test_nothing_is_there_before_it_is_said_to_be() -> None:
+    with reloading() as (found, _), pytest.raises(RuntimeError):
+        found.take()

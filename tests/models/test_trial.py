@@ -1,0 +1,115 @@
+"""A model that nobody knows is tried in a process of its own, which may be slow or grow."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from models import trial, zoo
+from models.contract import ModelError
+from models.runtime import TactileModel
+from tests.bench.attacks import files
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trial, "passed", deque())
+
+
+@pytest.fixture
+def processes(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Paths of the models that were tried."""
+    tried: list[str] = []
+    run = subprocess.run
+
+    def noted(command: list[str], **options: Any) -> subprocess.CompletedProcess[bytes]:  # noqa: ANN401
+        tried.append(command[3])
+        return run(command, **options)
+
+    monkeypatch.setattr(subprocess, "run", noted)
+    return tried
+
+
+def copy(folder: Path, name: str = "mlp") -> Path:
+    return Path(shutil.copy(zoo.find(name), folder / "mine.onnx"))
+
+
+def test_a_model_of_the_zoo_is_known(processes: list[str]) -> None:
+    assert trial.load(zoo.find("mlp")).contract.name == "mlp"
+    assert processes == []
+
+
+def test_a_model_that_is_not_is_tried_once(tmp_path: Path, processes: list[str]) -> None:
+    path = copy(tmp_path)
+    for _ in range(2):
+        assert trial.load(path).run() == TactileModel(zoo.find("mlp")).run()
+    assert processes == [str(path)]
+    path.write_bytes(path.read_bytes() + b"\x10\x0a")  # the version of the format once more
+    trial.load(path)
+    assert len(processes) == 2
+
+
+def test_a_model_of_the_zoo_that_was_changed_is_not_known(
+    tmp_path: Path, processes: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zoo, "ZOO", tmp_path)
+    path = tmp_path / "mlp.onnx"
+    shutil.copy(ROOT_ZOO / "mlp.json", tmp_path)
+    path.write_bytes((ROOT_ZOO / "mlp.onnx").read_bytes())
+    trial.load(path)
+    assert processes == []
+    path.write_bytes(path.read_bytes() + b"\x10\x0a")
+    trial.load(path)
+    assert processes == [str(path)]
+
+
+ROOT_ZOO = zoo.ZOO
+
+
+def test_what_it_finds_is_said_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "mine.onnx"
+    path.write_bytes(b"nothing")
+    with pytest.raises(ModelError) as error:
+        trial.load(path)
+    assert str(error.value).startswith(f"{path}: not a usable ONNX model")
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_one_that_takes_too_long_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx", reason="needs the train extra")
+    path = files.giant(tmp_path)
+    monkeypatch.setattr(trial, "TRIAL_S", 3.0)
+    began_s = time.monotonic()
+    with pytest.raises(ModelError, match="takes too long: no answer within 3 s"):
+        trial.load(path)
+    assert time.monotonic() - began_s < 10.0
+
+
+def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("onnx", reason="needs the train extra")
+    path = files.giant(tmp_path, side=20_000)
+    with pytest.raises(ModelError, match="Failed to allocate|no answer within|takes more than"):
+        trial.load(path)
+
+
+@pytest.mark.parametrize("make", [files.external, files.endless])
+def test_what_is_not_the_model_alone_is_refused_without_being_loaded(
+    tmp_path: Path,
+    make: Callable[[Path], Path],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("onnx", reason="needs the train extra")
+    path = make(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    for load in (trial.load, TactileModel):
+        with pytest.raises(ModelError, match=r"in another file|no model may use|within its graph"):
+            load(path)
