@@ -13,7 +13,8 @@ usage: deploy/install.sh [--prefix DIR] [--wheelhouse DIR] [--extras LIST] [--py
 
 Run it again to bring an installation up to date; where there is nothing to do it says so.
 
-  --prefix DIR      where the virtual environment goes (/opt/graspd, or where it is already)
+  --prefix DIR      where the virtual environment goes (/opt/graspd, or where it is already); nobody
+                    but root may write there, nor in a folder above it
   --wheelhouse DIR  install from the wheels in DIR and from nowhere else; graspd's own must be among
                     them. On a computer with network and the same Python: pip wheel -w DIR .
   --extras LIST     optional parts of graspd, such as record (those that are there already; none: -)
@@ -125,14 +126,43 @@ find_prefix() {
         fail "graspd is installed in $there; uninstall that first"
     fi
     prefix=${prefix:-${there:-/opt/graspd}}
-    case $prefix/ in
-        /home/* | /root/* | /run/* | /tmp/* | /var/tmp/*)
-            fail "the service cannot see $prefix (ProtectHome, PrivateTmp)"
-            ;;
-    esac
     if [ -e "$root$prefix/venv" ] && [ ! -L "$root$prefix/venv" ]; then
         fail "$prefix/venv is there and was not made here; choose another --prefix"
     fi
+}
+
+# Nobody but root may put anything at the prefix or at what leads there, for root runs it.
+check_prefix() {
+    resolved=$(realpath -m -- "$root$prefix")
+    case $resolved in
+        "$root"/*) ;;
+        *) fail "$prefix leads out of $root" ;;
+    esac
+    for way in "$root$prefix" "$resolved"; do
+        case ${way#"$root"}/ in
+            /home/* | /root/* | /run/* | /tmp/* | /var/tmp/*)
+                fail "the service cannot see ${way#"$root"} (ProtectHome, PrivateTmp)"
+                ;;
+            /dev/* | /proc/* | /sys/*) fail "${way#"$root"} is on no disk" ;;
+        esac
+        while [ "$way" != "$root" ]; do
+            check_folder "${way:-/}"
+            way=${way%/*}
+        done
+    done
+    [ -n "$root" ] || check_folder /
+}
+
+check_folder() {
+    status=$(stat -Lc '%u %a' -- "$1" 2>/dev/null) || return 0 # it will be made
+    case ${status% *} in
+        0 | "$(id -u)") ;;
+        *) fail "${1#"$root"}, on the way to $prefix, is not root's; choose another --prefix" ;;
+    esac
+    case $status in
+        *[2367] | *[2367]?)
+            fail "others may write ${1#"$root"}, on the way to $prefix (mode ${status#* })" ;;
+    esac
 }
 
 # Those that are wanted, or that are there: an update must not take the recorder away.
@@ -149,6 +179,7 @@ check_host() {
         [ -d /run/systemd/system ] || fail "systemd does not run here (see --root)"
     fi
     [ -z "$uninstall" ] || return 0
+    check_prefix
     command -v "$python" >/dev/null || fail "there is no $python"
     "$python" -I -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
         fail "$python is $("$python" --version 2>&1); graspd needs Python 3.11 or newer (--python)"

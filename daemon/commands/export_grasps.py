@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import io
+import re
 import sys
 from pathlib import Path
 
 from daemon.process.files import write_atomically
 from daemon.process.text import complain
+from daemon.publish.messages import OBJECT_PATTERN
 from daemon.record.export import Export, collect, write
 from drivers.base import RecordingError
 
@@ -82,6 +84,8 @@ def _store(found: Export, target: Path, object_name: str) -> None:
 
 
 def _name(text: str) -> str:
-    if not text.strip() or not text.isprintable():
-        raise argparse.ArgumentTypeError("an object needs a name that can be printed")
-    return text.strip()
+    if not re.fullmatch(OBJECT_PATTERN, text):
+        raise argparse.ArgumentTypeError(
+            "an object has a name of letters, digits, '_', '-' and '.'"
+        )
+    return text

@@ -35,24 +35,22 @@ class ExactSelector(selectors.PollSelector):
     """
 
     def __init__(self) -> None:
-        """Raises `OSError` if the process has no descriptor left."""
+        """Where the process has no descriptor left for the timer, waits are whole milliseconds."""
         super().__init__()
-        libc = ctypes.CDLL(None, use_errno=True)
+        libc = ctypes.CDLL(None)
         self._set = libc.timerfd_settime
         self._set.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
         self._spec = _TimerSpec()
         self._due_ns: int | None = None
         """When the timer comes, or has come before that was seen; None: it is not set."""
         self._timer: int = libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
-        if self._timer < 0:
-            super().close()
-            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-        self.register(self._timer, selectors.EVENT_READ)
+        if self._timer >= 0:
+            self.register(self._timer, selectors.EVENT_READ)
 
     def select(self, timeout: float | None = None) -> Ready:
         """What is ready, once anything is, after `timeout` s at the latest; None: no limit."""
-        if timeout is not None and timeout <= 0:
-            return self._others(super().select(0))
+        if self._timer < 0 or (timeout is not None and timeout <= 0):
+            return self._others(super().select(timeout))
         due_ns = None if timeout is None else time.monotonic_ns() + round(timeout * NS_PER_S)
         while True:
             if due_ns is not None and (self._due_ns is None or due_ns < self._due_ns):
@@ -78,4 +76,6 @@ class ExactSelector(selectors.PollSelector):
     def close(self) -> None:
         """Close it, but none of the descriptors that were registered."""
         super().close()
-        os.close(self._timer)
+        if self._timer >= 0:
+            os.close(self._timer)
+            self._timer = -1

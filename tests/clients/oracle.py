@@ -11,6 +11,8 @@ from tests.clients.messages import MS, TOPIC
 
 MAX_AGE_NS = 100 * MS
 CLOCK_SLACK_NS = MS
+MAX_P_SLIP = 0.5
+"""A stable grasp slips less likely than not."""
 WITHHELD = {"unproven", "low-confidence"}
 """What alone may be against a grasp that is to be lifted under supervision."""
 Whole = Annotated[int, msgspec.Meta(ge=0, le=2**60)]
@@ -70,7 +72,17 @@ class Told(Former):
     @property
     def teaches(self) -> bool:
         """Whether it may be lifted while a person watches."""
-        return self.supervised and set(self.reasons) <= WITHHELD
+        return self.supervised and set(self.reasons) <= WITHHELD and self.is_sure
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it does not call stable what more likely slips."""
+        return self.verdict != "stable" or self.p_slip is None or self.p_slip < MAX_P_SLIP
+
+    @property
+    def published_ns(self) -> int:
+        """When it went out, by the daemon's clock."""
+        return self.t_mono_ns + round(self.age_ms * 1e6)
 
 
 def told(payload: bytes) -> Told | None:
@@ -111,6 +123,7 @@ def is_stable(came: Sequence[Sequence[bytes]], now_ns: int) -> bool:
     """Whether all that came says so, and nobody need watch."""
     message = newest(came)
     known = message is not None and message.verdict == "stable" and not message.teaches
+    known &= message is not None and message.is_sure
     return known and message is not None and is_fresh(message, now_ns)
 
 
@@ -132,6 +145,8 @@ def _is_repeat(message: Told, known: Sequence[Told]) -> bool:
 
 
 def _is_over(message: Told, known: Sequence[Told]) -> bool:
-    """Whether another start came after this one's."""
-    starts = [each.boot_id for each in known]
-    return message.boot_id in starts and starts[-1] != message.boot_id
+    """Whether another start came after this one's, or is known by something that is newer."""
+    if not known or known[-1].boot_id == message.boot_id:
+        return False
+    came_before = message.boot_id in [each.boot_id for each in known]
+    return came_before or message.published_ns < known[-1].published_ns

@@ -46,4 +46,5 @@ def _changed(payload: str, how: dict[str, Any]) -> bytes:
             raise ValueError(f"{former} is not there once")
         payload = payload.replace(former, new)
     whole: str = how.get("prepend", "") + payload + how.get("append", "")
+    whole += " " * how.get("pad", 0)
     return whole[: len(whole) - how.get("cut", 0)].encode("latin-1")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import subprocess
 import sys
@@ -185,6 +186,57 @@ def test_another_prefix_is_named_everywhere_and_remembered(wheels: Path, tmp_pat
     assert "uninstall that first" in elsewhere.stderr
     assert installer("--root", root, "--uninstall").returncode == 0
     assert set(content(root)) == {"/etc/graspd/right.toml"}
+
+
+@pytest.mark.parametrize(
+    ("prefix", "why"),
+    [
+        ("/tmp/hand", "cannot see /tmp/hand"),
+        ("/home/hand", "cannot see"),
+        ("/dev/shm/hand", "/dev/shm/hand is on no disk"),
+        ("/opt/../dev/shm/hand", "/dev/shm/hand is on no disk"),
+        ("/srv/a/../../tmp/hand", "cannot see /tmp/hand"),
+        ("/tmp/../srv/hand", "cannot see"),
+        ("/srv/../../hand", "leads out of"),
+        ("/srv/link/hand", "others may write /srv/link, on the way"),
+        ("/srv/away/hand", "leads out of"),
+        ("/srv/shared/hand", "others may write /srv/shared, on the way to /srv/shared/hand"),
+        ("/srv/shared/below/hand", "others may write /srv/shared,"),
+        ("/srv/shared/below/../../hand", "others may write /srv/shared"),
+        ("/srv/to-shared/hand", "others may write /srv/shared, on the way"),
+        ("/srv/team/hand", "others may write /srv/team, on the way to /srv/team/hand (mode 775)"),
+    ],
+)
+def test_a_prefix_where_others_may_write_is_refused(
+    tmp_path: Path, wheels: Path, prefix: str, why: str
+) -> None:
+    root = tmp_path / "root"
+    for name, mode in (("tmp", 0o1777), ("srv/shared/below", 0o755), ("srv/team", 0o775)):
+        (root / name).mkdir(parents=True)
+        (root / name).chmod(mode)
+    (root / "srv/shared").chmod(0o1777)
+    (root / "srv/link").symlink_to("../tmp")
+    (root / "srv/away").symlink_to("/opt")
+    (root / "srv/to-shared").symlink_to("shared/below")
+    before = sorted(root.rglob("*"))
+    done = installer("--root", root, "--wheelhouse", wheels, "--prefix", prefix)
+    assert (done.returncode, sorted(root.rglob("*"))) == (1, before), done.stdout
+    assert why in done.stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")
+def test_a_prefix_in_a_folder_of_somebody_else_is_refused(tmp_path: Path, wheels: Path) -> None:
+    (tmp_path / "srv").mkdir()
+    os.chown(tmp_path / "srv", 12345, -1)
+    done = installer("--root", tmp_path, "--wheelhouse", wheels, "--prefix", "/srv/hand")
+    assert done.returncode == 1
+    assert "/srv, on the way to /srv/hand, is not root's" in done.stderr
+
+
+def test_what_was_installed_where_others_may_write_can_be_removed(staged: Path) -> None:
+    (staged / "opt").chmod(0o777)
+    assert installer("--root", staged, "--uninstall").returncode == 0
+    assert set(content(staged)) == {"/etc/graspd/right.toml"}
 
 
 def test_can0_is_brought_up_only_for_those_who_ask(staged: Path, wheels: Path) -> None:

@@ -25,6 +25,7 @@
 #include <iterator>
 #include <map>
 #include <optional>
+#include <set>
 #include <stdexcept>
 #include <string>
 #include <string_view>
@@ -42,7 +43,9 @@ constexpr std::int64_t VERSION = 1;  // of the messages; what has another is not
 constexpr std::uint64_t INTEGER_MAX = std::uint64_t{1} << 60;  // as a time, 36 years in ns
 constexpr double REAL_MAX = 1e12;                              // as a time, thirty years in ms
 // A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
-constexpr std::int64_t MESSAGE_MAX_BYTES = 1 << 16;
+constexpr std::size_t MESSAGE_MAX_BYTES = 1 << 16;
+// Of lists and objects in a message, and so its depth; a verdict has ten.
+constexpr std::ptrdiff_t OPENINGS_MAX = 100;
 constexpr int QUEUE_MAX = 1000;  // messages that wait to be read: ten seconds at 100 Hz
 // Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
 constexpr Nanoseconds READ_WITHIN_NS = 5'000'000'000;
@@ -174,6 +177,9 @@ struct Options {
     // loopback addresses: say false through a tunnel.
     std::optional<bool> same_computer = {};
     std::optional<Keys> keys = {};
+    // A `stable` with a `p_slip` of so much or more is none: the scene's `slip_threshold`, if that
+    // is higher.
+    double max_p_slip = 0.5;
     // Is told of lifts that were allowed and whose outcome was not: of the first and each tenth.
     std::function<void(const std::string&)> warn = [](const std::string& text) {
         std::cerr << "graspd_client: " << text << '\n';
@@ -323,14 +329,41 @@ inline Message message(const json& told) {
     return all;
 }
 
+// A JSON object, none of whose keys comes twice: which of two values holds, readers see differently.
+// Something that is no object for what is none.
+inline json parsed(std::string_view payload) {
+    const auto opens = [](char c) { return c == '[' || c == '{'; };
+    // A byte order mark is passed over by the parser, and a NUL is its end.
+    if (payload.empty() || payload.front() == '\xEF' ||
+        payload.find('\0') != std::string_view::npos || payload.size() > MESSAGE_MAX_BYTES ||
+        std::count_if(payload.begin(), payload.end(), opens) > OPENINGS_MAX)
+        return nullptr;
+    std::vector<std::set<std::string>> keys;  // of the objects that are open
+    bool twice = false;
+    const auto note = [&](int, json::parse_event_t event, json& value) {
+        if (event == json::parse_event_t::object_start) keys.emplace_back();
+        if (event == json::parse_event_t::object_end) keys.pop_back();
+        if (event == json::parse_event_t::key)
+            twice |= !keys.back().insert(value.get<std::string>()).second;
+        return true;
+    };
+    json told = json::parse(payload, note, false);
+    return twice ? json() : told;
+}
+
 // A verdict message, or why it is none: `malformed` or `version`.
-inline std::pair<std::optional<Message>, std::string> read(std::string_view payload) {
-    if (payload.empty() || payload.front() == '\xEF') return {std::nullopt, "malformed"};  // BOM
-    const json told = json::parse(payload, nullptr, false);
+inline std::pair<std::optional<Message>, std::string> read(std::string_view payload,
+                                                           double max_p_slip) {
+    const json told = parsed(payload);
     if (!told.is_object()) return {std::nullopt, "malformed"};
     try {
         if (integer(told, "v") != VERSION) return {std::nullopt, "version"};
-        return {message(told), ""};
+        Message found = message(told);
+        Verdict& said = found.verdict;
+        // What more likely slips is not stable.
+        if (said.outcome == Outcome::stable && *said.p_slip >= max_p_slip)
+            said = said.unknown({"p-slip"});
+        return {std::move(found), ""};
     } catch (const Malformed&) {
         return {std::nullopt, "malformed"};
     }
@@ -357,8 +390,7 @@ inline std::string telling(const Verdict& lifted_on, Outcome how, const std::str
 
 // The answer to an outcome; none if it is not understood.
 inline std::optional<OutcomeAnswer> taken(std::string_view payload) {
-    if (payload.empty() || payload.front() == '\xEF') return std::nullopt;  // BOM
-    const json told = json::parse(payload, nullptr, false);
+    const json told = parsed(payload);
     if (!told.is_object()) return std::nullopt;
     try {
         if (integer(told, "v") != VERSION) return OutcomeAnswer{"version"};
@@ -375,8 +407,9 @@ inline std::optional<OutcomeAnswer> taken(std::string_view payload) {
 // What the newest message says; no socket and no clock of its own.
 class Newest {
 public:
-    Newest(std::string topic, Nanoseconds max_age_ns, bool same_computer)
-        : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer) {}
+    Newest(std::string topic, Nanoseconds max_age_ns, bool same_computer, double max_p_slip = 0.5)
+        : topic_(std::move(topic)), max_age_ns_(max_age_ns), same_computer_(same_computer),
+          max_p_slip_(max_p_slip) {}
 
     Counts counts;
 
@@ -396,14 +429,14 @@ public:
               Nanoseconds now_ns) {
         if (frames.empty() || frames[0] != topic_) return false;
         auto [found, why] = frames.size() == 2
-            ? read(frames[1]) : std::pair(std::optional<Message>{}, std::string("malformed"));
+            ? read(frames[1], max_p_slip_) : std::pair(std::optional<Message>{}, std::string("malformed"));
         if (!found) {
             ++counts.malformed;
             message_.reset();
             why_ = why;
             return true;
         }
-        if (!is_new(found->verdict)) return false;
+        if (!is_new(*found)) return false;
         ++counts.messages;
         published_ns_ = same_computer_ ? found->published_ns
                                        : by_arrival(found->published_ns, empty_ns, now_ns);
@@ -428,7 +461,7 @@ public:
 
     // An answer; none if it is not understood.
     std::optional<Verdict> answered(std::string_view payload) {
-        if (auto found = read(payload).first) return found->verdict;
+        if (auto found = read(payload, max_p_slip_).first) return found->verdict;
         ++counts.malformed;
         return std::nullopt;
     }
@@ -438,9 +471,15 @@ private:
         return std::find(former_.begin(), former_.end(), boot_id) != former_.end();
     }
 
-    bool is_new(const Verdict& found) {
+    // Whether it went out before what is known, of a start that so is not the newest.
+    bool is_older(const Message& message) const {
+        return same_computer_ && published_ns_ && message.published_ns < *published_ns_;
+    }
+
+    bool is_new(const Message& message) {
+        const Verdict& found = message.verdict;
         if (boot_id_ != found.boot_id) {
-            if (is_former(found.boot_id)) return ++counts.former, false;
+            if (is_former(found.boot_id) || is_older(message)) return ++counts.former, false;
             if (boot_id_) {
                 former_.push_back(*boot_id_);
                 if (former_.size() > FORMER_MAX) former_.pop_front();
@@ -476,6 +515,7 @@ private:
     std::string topic_;
     Nanoseconds max_age_ns_;
     bool same_computer_;
+    double max_p_slip_;
     std::optional<Message> message_;
     std::optional<Nanoseconds> published_ns_;  // of the message, by one's own clock, not later
     std::string why_ = "no-message";
@@ -548,7 +588,7 @@ private:
         zmq::socket_t made(context_, kind);
         made.set(zmq::sockopt::linger, 0);
         made.set(zmq::sockopt::rcvhwm, QUEUE_MAX);
-        made.set(zmq::sockopt::maxmsgsize, MESSAGE_MAX_BYTES);
+        made.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(MESSAGE_MAX_BYTES));
         if (options_.keys) {
             made.set(zmq::sockopt::curve_serverkey, options_.keys->server);
             made.set(zmq::sockopt::curve_publickey, options_.keys->public_key);
@@ -642,10 +682,12 @@ private:
 // Subscribes to the verdicts of one hand. Use it in one thread.
 class Client {
 public:
-    // Throws `zmq::error_t` for an endpoint that is none, `std::invalid_argument` for such an age.
+    // Throws `zmq::error_t` for an endpoint that is none, `std::invalid_argument` for an age or a
+    // probability that is none.
     explicit Client(const Options& options)
         : newest_("verdict." + options.hand, age_ns(options.max_age_ms),
-                  options.same_computer.value_or(detail::is_same_computer(options.endpoint))),
+                  options.same_computer.value_or(detail::is_same_computer(options.endpoint)),
+                  probability(options.max_p_slip)),
           link_(options), asks_(!options.ask_endpoint.empty()), warn_(options.warn) {}
 
     const Counts& counts() const { return newest_.counts; }
@@ -729,6 +771,12 @@ private:
     static Nanoseconds age_ns(double max_age_ms) {
         if (!(max_age_ms > 0.0)) throw std::invalid_argument("max_age_ms must be above 0");
         return duration_ns(max_age_ms / 1e3);
+    }
+
+    static double probability(double max_p_slip) {
+        if (!(max_p_slip > 0.0 && max_p_slip <= 1.0))
+            throw std::invalid_argument("max_p_slip must be above 0 and at most 1");
+        return max_p_slip;
     }
 
     static Nanoseconds duration_ns(double seconds) {

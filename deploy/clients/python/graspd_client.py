@@ -38,6 +38,7 @@ INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
 REAL_MAX = 1e12  # of a message: as a time, thirty years in ms
 # A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
 MESSAGE_MAX_BYTES = 1 << 16
+OPENINGS_MAX = 100  # of lists and objects in a message, and so its depth; a verdict has ten
 QUEUE_MAX = 1000  # messages that wait to be read: ten seconds at 100 Hz
 # Whoever has read nothing for longer connects anew: what waits is old, and what is new is lost.
 READ_WITHIN_NS = 5_000_000_000
@@ -196,20 +197,25 @@ class Graspd:
         ask_endpoint: str | None = None,
         same_computer: bool | None = None,
         keys: Keys | None = None,
+        max_p_slip: float = 0.5,
     ) -> None:
         """`max_age_ms` is how old a reading may be that a lift relies on, ms.
 
         With `ask_endpoint` (`[ask]`), `may_i_lift` asks for a judgement as well, and `tell` has
         somebody to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
         unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
-        Raises `zmq.ZMQError` for an endpoint, `ValueError` for an age that is none.
+        A `stable` with a `p_slip` of `max_p_slip` or more is none: say the scene's `slip_threshold`
+        if that is higher. Raises `zmq.ZMQError` for an endpoint, `ValueError` for an age or a
+        probability that is none.
         """
         if not 0.0 < max_age_ms < math.inf:
             raise ValueError(f"max_age_ms must be above 0 and finite, not {max_age_ms}")
+        if not 0.0 < max_p_slip <= 1.0:
+            raise ValueError(f"max_p_slip must be above 0 and at most 1, not {max_p_slip}")
         if same_computer is None:
             same_computer = is_same_computer(endpoint)
         topic = f"verdict.{hand}".encode()
-        self._newest = Newest(topic, round(max_age_ms * 1e6), same_computer)
+        self._newest = Newest(topic, round(max_age_ms * 1e6), same_computer, max_p_slip)
         self._asks = ask_endpoint is not None
         self._closed = self._behind = False
         self._lifts: dict[tuple[str, int], bool] = {}
@@ -420,10 +426,13 @@ class _Message(NamedTuple):
 class Newest:
     """What the newest message says; no socket and no clock of its own."""
 
-    def __init__(self, topic: bytes, max_age_ns: int, same_computer: bool) -> None:
+    def __init__(
+        self, topic: bytes, max_age_ns: int, same_computer: bool, max_p_slip: float = 0.5
+    ) -> None:
         """`topic` is the hand's; other messages are passed over."""
         self.counts = Counts()
         self._topic, self._max_age_ns, self._same_computer = topic, max_age_ns, same_computer
+        self._max_p_slip = max_p_slip
         self._message: _Message | None = None
         self._published_ns: int | None = None
         """Of the message, by one's own clock: not later than then; None while that is not known."""
@@ -455,7 +464,7 @@ class Newest:
         if isinstance(found, str):
             self._message, self._why = None, found
             return True
-        if not self._is_new(found.verdict):
+        if not self._is_new(found):
             return False
         self.counts.messages += 1
         self._message = found
@@ -487,17 +496,24 @@ class Newest:
         try:
             told = _parsed(payload)
             if _number(told, "v") == VERSION:
-                return _message(told)
+                return self._if_sure(_message(told))
             why = "version"
         except (ValueError, KeyError, RecursionError):
             why = "malformed"
         self.counts.malformed += 1
         return why
 
-    def _is_new(self, said: Verdict) -> bool:
-        boot_id, seq = said.boot_id or "", said.seq or 0
+    def _if_sure(self, found: _Message) -> _Message:
+        """A message, unknown if it calls stable what more likely slips."""
+        said = found.verdict
+        if said.verdict == STABLE and said.p_slip is not None and said.p_slip >= self._max_p_slip:
+            return found._replace(verdict=said.unknown("p-slip"))
+        return found
+
+    def _is_new(self, found: _Message) -> bool:
+        boot_id, seq = found.verdict.boot_id or "", found.verdict.seq or 0
         if boot_id != self._boot_id:
-            if boot_id in self._former:
+            if boot_id in self._former or self._is_older(found):
                 self.counts.former += 1
                 return False
             if self._boot_id is not None:
@@ -511,6 +527,11 @@ class Newest:
         self.counts.lost += seq - self._seq - 1
         self._seq = seq
         return True
+
+    def _is_older(self, found: _Message) -> bool:
+        """Whether it went out before what is known, of a start that so is not the newest."""
+        known_ns = self._published_ns if self._same_computer else None
+        return known_ns is not None and found.published_ns < known_ns
 
     def _by_arrival(self, published_ns: int, empty_ns: int, now_ns: int) -> int | None:
         """When a message went out, by one's own clock: what it took longer than the fastest is age.
@@ -675,12 +696,24 @@ def _slept_ns() -> int:
 
 
 def _parsed(payload: bytes) -> dict[str, Any]:
-    """A JSON object. Raises `ValueError` or `RecursionError`."""
-    told = json.loads(payload.decode())
-    json.dumps(told, allow_nan=False)  # refuses what is no JSON and no number
+    """A JSON object, none of whose keys comes twice. Raises `ValueError` or `RecursionError`."""
+    openings = payload.count(b"[") + payload.count(b"{")
+    if len(payload) > MESSAGE_MAX_BYTES or openings > OPENINGS_MAX:
+        raise ValueError
+    told = json.loads(payload.decode(), object_pairs_hook=_once)
+    # Refuses what is no JSON and no number, and what is no Unicode.
+    json.dumps(told, allow_nan=False, ensure_ascii=False).encode()
     if not isinstance(told, dict):
         raise ValueError
     return told
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object; which of two values holds, readers see differently."""
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError
+    return found
 
 
 def _message(told: dict[str, Any]) -> _Message:

@@ -238,6 +238,23 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
         assert table.slipped.tolist() == [True, False, False, True, False, False]
 
 
+@pytest.mark.parametrize("name", ["=HYPERLINK(0)", "-1+1", "@SUM(1)", "mug\n=1", "a,b"])
+def test_no_name_that_a_spreadsheet_would_calculate_gets_into_a_table(
+    tmp_path: Path, name: str
+) -> None:
+    writer = Writer(tmp_path / "a.mcap")
+    writer.judged(1, sweeps(1)[0])
+    writer.outcome(1, "slip", name)
+    writer.close()
+    out = tmp_path / "t.csv"
+    result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out)
+    assert (result.returncode, out.exists()) == (2, False)
+    assert "a.mcap: outcome message: " in result.stderr
+    result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out, f"--object={name}")
+    assert (result.returncode, out.exists()) == (2, False)
+    assert "an object has a name of letters" in result.stderr
+
+
 def test_grasps_of_two_starts_are_told_apart(tmp_path: Path) -> None:
     recorded(tmp_path / "a.mcap")
     writer = Writer(tmp_path / "b.mcap", boot_id="f" * 32)

@@ -129,6 +129,21 @@ def test_descriptors_that_select_does_not_know_are_waited_for(selector: ExactSel
             selector.unregister(each.reads)
 
 
+def test_without_a_descriptor_for_the_timer_it_still_waits(pipe: Pipe) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    lowest_free = os.dup(pipe.reads)
+    os.close(lowest_free)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+    try:
+        with ExactSelector() as selector:
+            selector.register(pipe.reads, selectors.EVENT_READ)
+            assert late_ns(selector, 1_500_000) >= 0
+            os.write(pipe.writes, b"x")
+            assert ready(selector, None) == [pipe.reads]
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
 def test_what_was_closed_and_opened_again_by_the_same_number_is_waited_for(
     selector: ExactSelector, pipe: Pipe
 ) -> None:
