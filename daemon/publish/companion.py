@@ -15,6 +15,8 @@ R = TypeVar("R")
 
 Answer = Callable[[str | None], None]
 """Takes None for yes, or why not."""
+CONTRADICTS = "contradicts: another outcome of this grasp was told before"
+"""Why an outcome is not taken: what was told first stays."""
 
 
 class Requests(Protocol):

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Final, Literal
 
 from daemon.publish.binding import Binding, Bound, Peer
-from daemon.publish.companion import Answer
+from daemon.publish.companion import CONTRADICTS, Answer
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.publish.zmtp import Message, Role
 from daemon.trust.ledger import GRASPS_MAX, GraspId
@@ -31,7 +31,6 @@ _TOLD = re.compile(
 MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
 NOBODY = "nobody takes outcomes here"
 NOT_YOURS = "not yours: somebody else has asked about this grasp"
-CONTRADICTS = "contradicts: another outcome of this grasp was told before"
 
 TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
 """Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
@@ -55,8 +54,8 @@ class _Question:
 class _Lift:
     """A grasp that was asked about, or whose outcome was told."""
 
-    owner: Peer
-    """Who asked first, or told."""
+    owner: Peer | None
+    """Who asked first; None: nobody."""
     outcome: str | None = None
 
 
@@ -137,20 +136,20 @@ class Questions(Bound):
         named = None if told[4] is None else told[4].decode()
         grasp = GraspId(told[1].decode(), int(told[2]))
         lift = self._lifts.get(grasp)
-        if lift is not None and not peer.stands_for(lift.owner):
+        if lift is not None and lift.owner and not peer.stands_for(lift.owner):
             return NOT_YOURS
         if lift is not None and lift.outcome not in (None, outcome):
             return CONTRADICTS
         why = take_outcome(*grasp, outcome, named)
         if why is None:
-            self._own(grasp, peer).outcome = outcome
+            self._lift(grasp, None).outcome = outcome
         return why
 
-    def _own(self, grasp: GraspId, peer: Peer) -> _Lift:
-        """Who owns a grasp: this peer if nobody does yet."""
+    def _lift(self, grasp: GraspId, owner: Peer | None) -> _Lift:
+        """What is known of a grasp; it gets this owner if nothing is."""
         if grasp not in self._lifts and len(self._lifts) >= GRASPS_MAX:
             del self._lifts[next(iter(self._lifts))]
-        return self._lifts.setdefault(grasp, _Lift(peer))
+        return self._lifts.setdefault(grasp, _Lift(owner))
 
     def _answer_outcome(self, peer: Peer, envelope: Message, why: str | None) -> None:
         """Say whether an outcome was of use. Whoever is gone misses it."""
@@ -179,4 +178,4 @@ class Questions(Bound):
             del self._waiting[peer]
         self._counted["answered"] += len(answered)
         if grasp is not None and grasp.grasp:
-            self._own(grasp, answered[0])
+            self._lift(grasp, answered[0])

@@ -12,7 +12,7 @@ from typing import Literal
 from daemon.judge.pipeline import Pipeline
 from daemon.process.signals import Stop
 from daemon.process.sleep import Sleep
-from daemon.publish.companion import Answer, Companion, overridden
+from daemon.publish.companion import CONTRADICTS, Answer, Companion, overridden
 from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
@@ -159,6 +159,10 @@ class Loop:
     ) -> str | None:
         """Publish and learn how the lift of a judged grasp has ended; None, or why not."""
         judged = GraspId(boot_id, grasp)
+        trust = self._pipeline.trust
+        if trust is not None and trust.ledger.contradicts(judged, slipped=outcome == "slip"):
+            trust.outcome(judged, slipped=outcome == "slip")  # which counts it
+            return CONTRADICTS
         refused = self._outbox.outcome(
             *judged, outcome, object_name, known=self._pipeline.knows(judged)
         )

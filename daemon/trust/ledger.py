@@ -83,6 +83,10 @@ class Ledger:
         known = self._records.get(grasp)
         return known is not None and known.slipped is not None
 
+    def contradicts(self, grasp: GraspId, *, slipped: bool) -> bool:
+        """Whether the opposite outcome of a grasp is known."""
+        return self.is_told(grasp) and self._records[grasp].slipped != slipped
+
     def is_stable(self, grasp: GraspId) -> bool:
         """Whether a grasp was called `stable`."""
         known = self._records.get(grasp)

@@ -268,15 +268,17 @@ def test_what_was_told_stays_and_may_be_told_again(
     assert (refused["ok"], refused["why"].partition(":")[0]) == (False, "contradicts")
 
 
-def test_a_grasp_that_nobody_asked_about_is_of_who_tells_of_it_first(
+def test_a_grasp_that_nobody_asked_about_is_told_of_by_anybody_in_one_word(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
-    text = f"outcome {BOOT} 7 slip".encode()
+    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
     with zmq.Context() as context, context.socket(zmq.DEALER) as other:
         other.linger = 0
         other.connect(questions.endpoint)
-        assert told(questions, other, text)["ok"]
-        assert not told(questions, teller, text)["ok"]
+        assert told(questions, other, slip)["ok"]
+        assert told(questions, teller, slip)["ok"]
+        assert not told(questions, teller, stable)["ok"]
+        assert not told(questions, other, stable)["ok"]
 
 
 def test_who_stands_for_whom() -> None:

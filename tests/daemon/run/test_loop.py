@@ -520,6 +520,22 @@ def test_an_outcome_of_a_grasp_of_an_earlier_start_is_taken_once_it_is_known(
         assert trust.learner.outcomes == int(taken)
 
 
+def test_the_opposite_of_what_an_earlier_start_was_told_is_counted_and_not_published(
+    stop: StopSignal,
+) -> None:
+    clock, earlier, trust = Clock(), GraspId("e" * 32, 1), Trust("fake", 0)
+    trust.note(earlier, trust.judge(earlier, 0.1, -2.0, np.empty(0)), stable=True)
+    assert trust.outcome(earlier, slipped=True) is Told.TAKEN
+    bench = Bench(FakeDriver([], clock), clock, stop, boot_id="b" * 32, trust=trust)
+    refused = bench.loop.outcome(*earlier, "stable")
+    assert refused is not None
+    assert refused.startswith("contradicts")
+    assert trust.ledger.told[Told.CONTRADICTS] == 1
+    assert not [topic for topic, _ in bench.output.sent if topic.startswith(b"outcome.")]
+    assert bench.loop.outcome(*earlier, "slip") is None
+    assert [topic for topic, _ in bench.output.sent] == [b"outcome.right"]
+
+
 def test_companions_are_called_in_their_order_and_only_for_hooks_of_their_own() -> None:
     first, second = Watchdog(), Watchdog()
     hooks = overridden([first, Companion(), second], Companion.after_round)

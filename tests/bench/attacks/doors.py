@@ -1,0 +1,315 @@
+"""Peers that nobody invited: connections without number, messages without an end, floods, lies."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import resource
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import zmq
+
+from drivers.recordings.csv_player import DEMO_TABLE
+from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
+from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon
+
+MEMORY_MAX_MIB = 32.0
+"""So far from rest the daemon's memory may go."""
+PUBLISH_PORT, ASK_PORT = 25951, 25952
+CONNECTIONS = 5000
+"""In one round to each socket, of each kind."""
+OPEN_MAX = 1500
+"""Of those at a time."""
+FLOOD_S = 1.5
+FLOODERS = 8
+QUESTIONS = 10
+PATIENCE_MS = 500
+"""A question is answered by then."""
+GREETING = bytes.fromhex("ff 00 00 00 00 00 00 00 01 7f 03 01 4e 55 4c 4c") + bytes(48)
+READY = bytes.fromhex("04 19 05") + b"READY\x0bSocket-Type\x00\x00\x00\x03"
+AS_SUB, AS_REQ = GREETING + READY + b"SUB", GREETING + READY + b"REQ"
+ENDLESS = bytes.fromhex("01 01 78") * 20_000
+QUESTION = bytes.fromhex("00 05") + b"judge"
+
+Connect = Callable[[], socket.socket]
+
+
+@dataclass(slots=True)
+class Hand:
+    """A daemon, its doors, and a friend that hears it."""
+
+    process: Child
+    publish: str
+    ask: str
+    friend: Subscriber
+    rest_mib: float = 0.0
+    peak_mib: float = 0.0
+
+    def look(self) -> None:
+        """Note its memory; what is gone has none."""
+        with contextlib.suppress(OSError, IndexError):
+            pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+            self.peak_mib = max(self.peak_mib, pages * os.sysconf("SC_PAGESIZE") / 2**20)
+
+    @property
+    def doors(self) -> tuple[Connect, Connect]:
+        """Connect to the messages, and to the questions."""
+        return partial(connect, self.publish), partial(connect, self.ask)
+
+    def outcome(self, tried: int, well: bool = True, said: str = "") -> Outcome:
+        """What became of it: whether it lives, is heard, and has little memory."""
+        while self.friend.take(0.0) is not None:
+            pass  # what was on its way already
+        self.look()
+        grown_mib = self.peak_mib - self.rest_mib
+        lives = self.process.process.poll() is None
+        heard = lives and self.friend.take(2.0) is not None
+        happened = f"{said}memory {self.rest_mib:.0f} + {grown_mib:.1f} MiB, "
+        happened += "the others hear it" if heard else "nobody hears it"
+        if not lives:
+            happened += f", it has ended with {self.process.process.returncode}"
+        return Outcome(tried, happened, well and heard and grown_mib < MEMORY_MAX_MIB)
+
+
+@contextlib.contextmanager
+def hand(folder: Path, scheme: str) -> Iterator[Hand]:
+    """A daemon at rest."""
+    publish, ask = f"ipc://{folder}/v", f"ipc://{folder}/ask"
+    if scheme == "tcp":
+        publish, ask = (f"tcp://127.0.0.1:{port}" for port in (PUBLISH_PORT, ASK_PORT))
+    scene = folder / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[gate]\nmode = "every"\nrequest_ms = {PATIENCE_MS}.0\n[model]\nname = "cnn1"\n'
+        f'[publish]\nendpoint = "{publish}"\n[ask]\nendpoint = "{ask}"\n'
+    )
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    with start_daemon(scene, folder / "log") as process, Subscriber(publish) as friend:
+        made = Hand(process, publish, ask, friend)
+        until_s = time.monotonic() + PATIENCE_S
+        while friend.take(0.1) is None:
+            if time.monotonic() > until_s:
+                raise TimeoutError("the daemon says nothing")
+        for _ in range(100):
+            friend.take(1.0)
+        made.look()
+        made.rest_mib = made.peak_mib
+        yield made
+
+
+def connect(endpoint: str) -> socket.socket:
+    """A connection. Raises `OSError`."""
+    scheme, _, where = endpoint.partition("://")
+    family = socket.AF_UNIX if scheme == "ipc" else socket.AF_INET
+    made = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        if scheme == "tcp":
+            made.settimeout(0.05)
+        host, _, port = where.rpartition(":")
+        made.connect(where if scheme == "ipc" else (host, int(port)))
+    except OSError:
+        made.close()
+        raise
+    made.setblocking(False)
+    return made
+
+
+def connections(scheme: str, plan: Plan) -> Outcome:
+    """Many, that say nothing or half of what they must, or are subscribers and do not read."""
+    tried = 0
+    with hand(plan.folder, scheme) as daemon:
+        for _ in plan.rounds():
+            for door in daemon.doors:
+                for says in (b"", GREETING[:12], AS_SUB + b"\x00\x01\x01"):
+                    tried += _many(daemon, door, says, CONNECTIONS)
+        return daemon.outcome(tried)
+
+
+def _many(daemon: Hand, door: Connect, says: bytes, number: int) -> int:
+    with contextlib.ExitStack() as stack:
+        made = 0
+        for attempt in range(number):
+            if attempt % OPEN_MAX == OPEN_MAX - 1:
+                stack.close()
+                daemon.look()
+            with contextlib.suppress(OSError):
+                connection = stack.enter_context(door())
+                made += 1
+                connection.send(says)
+        daemon.look()
+        return made
+
+
+def _flood(daemon: Hand, door: Connect, first: bytes, then: Callable[[], bytes]) -> int:
+    """Send as fast as can be, with some connections, for a while; how many bytes it was."""
+    sent, until_s = 0, time.monotonic() + FLOOD_S
+    left: list[bytes] = [b""] * FLOODERS
+    flooders: list[socket.socket | None] = [None] * FLOODERS
+    while time.monotonic() < until_s:
+        for number, flooder in enumerate(flooders):
+            try:
+                if flooder is None:
+                    flooders[number], left[number] = door(), first
+                    continue
+                left[number] = left[number] or then()
+                size = flooder.send(left[number])
+                left[number] = left[number][size:]
+                sent += size
+            except BlockingIOError:
+                pass
+            except OSError:
+                if flooder is not None:
+                    flooder.close()
+                flooders[number] = None
+        daemon.look()
+    for flooder in flooders:
+        if flooder is not None:
+            flooder.close()
+    return sent
+
+
+def _floods(
+    scheme: str, plan: Plan, then: Callable[[random.Random], bytes], greets: bool
+) -> Outcome:
+    sent = 0
+    with hand(plan.folder, scheme) as daemon:
+        for _ in plan.rounds():
+            for door, first in zip(daemon.doors, (AS_SUB, AS_REQ), strict=True):
+                sent += _flood(daemon, door, first if greets else b"", partial(then, plan.random))
+        return daemon.outcome(sent)
+
+
+def endless(_random: random.Random) -> bytes:
+    """Frames after each of which another one follows."""
+    return ENDLESS
+
+
+def subscriptions(numbers: random.Random) -> bytes:
+    """Different ones."""
+    return b"".join(b"\x00\x21\x01" + numbers.randbytes(32) for _ in range(100))
+
+
+def noise(numbers: random.Random) -> bytes:
+    """Anything."""
+    return numbers.randbytes(numbers.randrange(1, 300))
+
+
+def questions(plan: Plan) -> Outcome:
+    """A controller among flooders."""
+    answered = asked = 0
+    with hand(plan.folder, "ipc") as daemon:
+        ended = threading.Event()
+
+        def flood() -> None:
+            while not ended.is_set():
+                _flood(daemon, daemon.doors[1], AS_REQ, lambda: QUESTION * 500)
+
+        flooding = threading.Thread(target=flood)
+        flooding.start()
+        try:
+            with zmq.Context() as context, context.socket(zmq.DEALER) as controller:
+                controller.linger = 0
+                controller.connect(daemon.ask)
+                time.sleep(0.3)
+                for _ in plan.rounds():
+                    for _ in range(QUESTIONS):
+                        controller.send(b"judge")
+                        asked += 1
+                        if controller.poll(PATIENCE_MS + 200):
+                            controller.recv()
+                            answered += 1
+        finally:
+            ended.set()
+            flooding.join()
+        return daemon.outcome(asked, answered == asked, f"{answered} of {asked} answers, ")
+
+
+def forged(plan: Plan) -> Outcome:
+    """Outcomes of grasps that the controller asked about, told by somebody else, before and after
+    it."""
+    forged_well = told_well = tried = 0
+
+    def tell(who: zmq.Socket[bytes], boot_id: str, grasp: int, outcome: str) -> bool:
+        who.send(f"outcome {boot_id} {grasp} {outcome}".encode())
+        return bool(who.poll(2000)) and bool(json.loads(who.recv())["ok"])
+
+    with (
+        hand(plan.folder, "ipc") as daemon,
+        zmq.Context() as context,
+        context.socket(zmq.DEALER) as controller,
+        context.socket(zmq.DEALER) as liar,
+    ):
+        for who in (controller, liar):
+            who.linger = 0
+            who.connect(daemon.ask)
+        for _ in plan.rounds():
+            for _ in range(QUESTIONS):
+                controller.send(b"judge")
+                if not controller.poll(2000):
+                    continue
+                answer = json.loads(controller.recv())
+                if not answer["judged"]:
+                    continue
+                tried += 1
+                names = answer["boot_id"], answer["grasp"]
+                forged_well += tell(liar, *names, "slip")
+                told_well += tell(controller, *names, "stable")
+                forged_well += tell(liar, *names, "slip")
+                forged_well += tell(controller, *names, "slip")
+        well = forged_well == 0 and told_well == tried > 0
+        said = f"{forged_well} of {3 * tried} forged, {told_well} of {tried} true ones taken, "
+        return daemon.outcome(4 * tried, well, said)
+
+
+ATTACKS: tuple[Attack, ...] = (
+    *(
+        Attack(
+            f"connections-{scheme}",
+            Aim.FALLS,
+            "connections that say nothing, half a greeting, or subscribe and do not read, up to "
+            f"{OPEN_MAX} at a time, on both sockets",
+            "connections",
+            partial(connections, scheme),
+        )
+        for scheme in ("ipc", "tcp")
+    ),
+    *(
+        Attack(
+            f"{then.__name__}-{scheme}",
+            Aim.FALLS,
+            f"{what}, by {FLOODERS} peers to both sockets as fast as can be",
+            "bytes",
+            partial(_floods, scheme, then=then, greets=then is not noise),
+        )
+        for scheme in ("ipc", "tcp")
+        for then, what in (
+            (endless, "messages without an end"),
+            (subscriptions, "subscriptions, each another one"),
+            (noise, "noise"),
+        )
+    ),
+    Attack(
+        "questions",
+        Aim.FALLS,
+        f"{FLOODERS} peers ask as fast as can be, and a controller asks",
+        "questions of the controller",
+        questions,
+    ),
+    Attack(
+        "forged-outcomes",
+        Aim.WHO_MAY,
+        "another peer tells outcomes of grasps that the controller asked about, first and last, "
+        "and the controller itself changes its word",
+        "outcomes",
+        forged,
+    ),
+)
