@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from daemon.judge.reasons import Decision, Reason
 
@@ -18,6 +18,9 @@ class Limits:
     """`p_slip` from here on is slip, in 0..1."""
     min_confidence: float = 0.0
     """Of what is judged, in 0..1: `p_slip` for slip, `1 - p_slip` for stable."""
+    steady_ns: int = 1_000_000_000
+    """A grasp that was judged otherwise is `stable` only when each judging of so long, ns, says so:
+    some twenty. So nothing flickers at a threshold, and who asks on gets no lucky draw."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +41,33 @@ class Case:
     """Of the reading, ns."""
     against_stable: Reason | None = None
     """Why it must not be called `stable`, whatever the network says; None: nothing is against."""
+    doubt: Decision = Decision.STABLE
+    """What it was judged to be within `steady_ns`, if that was not `stable`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """The latest judging by which a grasp was not `stable`."""
+
+    grasp: int
+    made_ns: int
+    """Of the reading that was judged."""
+    decision: Decision
+
+    def on(self, case: Case, grasp: int, made_ns: int, limits: Limits) -> Case:
+        """The case of a grasp at a reading, in which this still counts."""
+        if grasp != self.grasp or made_ns - self.made_ns >= limits.steady_ns:
+            return case
+        return replace(case, doubt=self.decision)
+
+
+NO_DOUBT = Doubt(0, 0, Decision.STABLE)
+"""Grasps are numbered from 1."""
+
+
+def alone(case: Case, limits: Limits) -> Decision:
+    """What a judging says of a grasp, by itself, whatever the hand does since."""
+    return decide(replace(case, in_contact=True, settled=True, age_ns=0), limits)[0]
 
 
 def decide(case: Case, limits: Limits) -> tuple[Decision, tuple[Reason, ...]]:
@@ -49,12 +79,15 @@ def decide(case: Case, limits: Limits) -> tuple[Decision, tuple[Reason, ...]]:
         reasons.append(Reason.STALE)
     p_slip = case.p_slip
     if p_slip is not None and 0.0 <= p_slip <= 1.0:  # false for NaN
-        decision = Decision.SLIP if p_slip >= limits.slip_threshold else Decision.STABLE
+        slips = p_slip >= limits.slip_threshold or case.doubt is Decision.SLIP
+        decision = Decision.SLIP if slips else Decision.STABLE
         confidence = p_slip if decision is Decision.SLIP else 1.0 - p_slip
-        if confidence < limits.min_confidence:
+        withheld = case.against_stable if decision is Decision.STABLE else None
+        doubted = decision is Decision.STABLE and case.doubt is Decision.UNKNOWN
+        if confidence < limits.min_confidence or (doubted and withheld is None):
             reasons.append(Reason.LOW_CONFIDENCE)
-        if decision is Decision.STABLE and case.against_stable is not None:
-            reasons.append(case.against_stable)
+        if withheld is not None:
+            reasons.append(withheld)
         if not reasons:
             return decision, ()
     return Decision.UNKNOWN, tuple(reasons) or (Reason.MODEL_FAILED,)

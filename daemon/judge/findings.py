@@ -43,7 +43,7 @@ class Felt(NamedTuple):
     counts: NDArray[np.uint16] | None
     """Shape (fingers, 24): what is to be judged; None if nothing is, for now."""
     judged: bool = True
-    """Whether this very reading is one to judge, sound or not."""
+    """Whether this very reading is one to judge, sound or not, and not only to judge anew."""
     in_contact: bool = True
     """Whether all required fingers touch."""
     settled: bool = True

@@ -2,13 +2,14 @@
 
     idle -> closing -> settled -> judged
               ^           |         |     moved, changed, lost a finger, or a gap in the readings:
-              +-----------+---------+     back to closing; asked again: from judged to settled
+              +-----------+---------+     back to closing
     closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
 
-A grasp begins with the first touch and ends when nothing touches any more. It is judged once, when
-all fingers touch and everything has kept still for so long that nothing can slide unseen, and again
-when it has changed or moved on; where `early` is wanted, also once as soon as nothing moves fast.
-Times are those of the readings, so a stall or a burst of old readings settles nothing.
+A grasp begins with the first touch and ends when nothing touches any more. It is judged when all
+fingers touch and everything has kept still for so long that nothing can slide unseen; where `early`
+is wanted, first as soon as nothing moves fast. From then on it is judged anew, without leaving
+`judged`, many times a second and when somebody asks. When it has changed or moved on it must settle
+anew. Times are those of the readings, so a stall or a burst of old readings settles nothing.
 """
 
 from __future__ import annotations
@@ -24,6 +25,11 @@ from daemon.judge.stillness import Motion, mean_distance
 from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
 
+RENEWED_NS = 50_000_000
+"""A standing verdict is judged anew when it is so old, ns: half of what it may be, so that it never
+is older, however slow the readings are, and though one of them is lost."""
+STANDS_NS = 100_000_000
+"""A verdict does not stand longer without being judged anew, ns."""
 CHANGES_MAX = 64
 """Changes kept until somebody takes them; a reading makes three at most."""
 
@@ -33,7 +39,9 @@ class GateMemory:
     """The grasp at hand; but changes that nobody took yet are not for another judge to tell."""
 
     reference: NDArray[np.float32]
-    """Shape (fingers, 24): counts where it was judged; means nothing before."""
+    """Shape (fingers, 24): counts where it had settled; means nothing before."""
+    judged_ns: int = 0
+    """When it was judged last."""
     last_ns: int | None = None
     """Time of the last reading."""
     touched_ns: int = 0
@@ -44,7 +52,7 @@ class GateMemory:
     moved_since_ns: int | None = None
     """Since when a judged grasp has moved; None if it does not."""
     early: bool = False
-    """Whether a grasp that was judged had then only not moved fast."""
+    """Whether a grasp that was judged had then only not moved fast: the sure one comes unasked."""
     released_ns: int = 0
     """When nothing touched any more."""
     asked: bool = False
@@ -124,11 +132,31 @@ class Gate:
     def wants_judgement(self) -> bool:
         """Whether the reading at hand is the one to judge."""
         memory = self.memory
-        return memory.state is GateState.SETTLED and not memory.against and self._is_asked
+        if memory.against:
+            return False
+        if memory.state is GateState.JUDGED:
+            return memory.asked or self._judged_before_ns >= RENEWED_NS
+        return memory.state is GateState.SETTLED and self._is_asked
+
+    @property
+    def renews(self) -> bool:
+        """Whether to judge now only keeps a verdict new that stands already."""
+        asked = self.memory.asked and self._on_request
+        return self.memory.state is GateState.JUDGED and not asked
+
+    @property
+    def overdue(self) -> bool:
+        """Whether the verdict of a judged grasp is too old to stand: judge what there is."""
+        return self.memory.state is GateState.JUDGED and self._judged_before_ns > STANDS_NS
 
     @property
     def _is_asked(self) -> bool:
-        return self.memory.asked or not self._on_request
+        return self.memory.asked or self.memory.early or not self._on_request
+
+    @property
+    def _judged_before_ns(self) -> int:
+        """How long before the last reading the grasp was judged, ns."""
+        return (self.memory.last_ns or 0) - self.memory.judged_ns
 
     def ask(self) -> None:
         """The controller wants a judgement of what settles within `request_ns` of the next reading.
@@ -139,10 +167,17 @@ class Gate:
         self.memory.asked_until_ns = None
 
     def judged(self, t_ns: int, median: NDArray[np.uint16]) -> None:
-        """The settled grasp was judged, by the reading of `t_ns` with these counts."""
+        """The grasp was judged, by the reading of `t_ns` with these counts; maybe anew.
+
+        It is still the same as long as it is near to where it settled, and not to where it was
+        judged last: what creeps would never be another.
+        """
+        self.memory.judged_ns = t_ns
+        self.memory.asked = False
+        if self.memory.state is GateState.JUDGED:
+            return
         self.memory.reference = median.astype(np.float32)
         self.memory.early = self.still_ns < LONG_NS
-        self.memory.asked = self.memory.asked and self.memory.early  # the sure one comes unasked
         self.memory.moved_since_ns = None
         self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
 
@@ -196,8 +231,6 @@ class Gate:
             return
         if memory.asked_until_ns is None:
             memory.asked_until_ns = t_ns + self._limits.request_ns
-            if self._on_request and memory.state is GateState.JUDGED:
-                self._enter(GateState.SETTLED, t_ns, GateCause.ASKED)
         elif t_ns > memory.asked_until_ns:
             memory.asked = False
 
@@ -256,7 +289,7 @@ class Gate:
             return ()
         if self.motion.early if memory.early else self.motion.sure:
             memory.moved_since_ns = None
-            if memory.early and self.still_ns >= LONG_NS and self._is_asked:
+            if memory.early and self.still_ns >= LONG_NS:
                 self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
             return ()
         if memory.moved_since_ns is None:
@@ -292,8 +325,6 @@ class Gate:
         memory = self.memory
         if len(self._changes) < CHANGES_MAX:
             self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
-        if memory.state is GateState.JUDGED and memory.early and state is not GateState.SETTLED:
-            memory.asked = False  # the question was about this grasp
         memory.state = state
-        if state is GateState.CLOSING:
-            memory.moved_since_ns = None
+        if state not in (GateState.SETTLED, GateState.JUDGED):
+            memory.early, memory.moved_since_ns = False, None

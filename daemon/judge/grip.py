@@ -86,6 +86,11 @@ class Grip:
         return self._gate.reasons
 
     @property
+    def renews(self) -> bool:
+        """Whether to judge now only keeps a verdict new that stands already."""
+        return self._gate.renews
+
+    @property
     def touching(self) -> tuple[Finger, ...]:
         """Fingers that touch."""
         return self._names(self._contact.touching)
@@ -109,7 +114,7 @@ class Grip:
         return self._joints is not None and self._joints.is_frozen
 
     def ask(self) -> None:
-        """Have the grasp at hand judged once it has settled."""
+        """Have the grasp at hand judged once it has settled; one that has, by the next reading."""
         self._gate.ask()
 
     def forget(self) -> None:
@@ -174,23 +179,31 @@ class Grip:
     def counts_to_judge(
         self, reading: TactileReading, watched: Watched
     ) -> NDArray[np.uint16] | None:
-        """Shape (fingers, 24), if this reading is the moment to judge the grasp; else None."""
-        if not self._gate.wants_judgement or not self._fresh.is_full(~watched.broken):
+        """Shape (fingers, 24), if this reading is the moment to judge the grasp; else None.
+
+        That waits until all electrodes have three fresh values, but not for longer than a verdict
+        may stand: where values get lost all the time, the newest ones are what there is.
+        """
+        gate, fresh = self._gate, self._fresh
+        if not (gate.wants_judgement and (gate.overdue or fresh.is_full(~watched.broken))):
             return None
-        return self._fresh.counts if self._judges_median else reading.counts
+        return fresh.counts if self._judges_median else reading.counts
 
     def judged(self) -> None:
         """The grasp was judged by the last reading."""
         if self.memory.last_ns is not None:
             self._gate.judged(self.memory.last_ns, self._fresh.counts)
 
-    def felt(self, counts: NDArray[np.uint16] | None) -> Felt:
-        """How the hand holds now; `counts` are what is to be judged of it, shape (fingers, 24)."""
+    def felt(self, counts: NDArray[np.uint16] | None, *, renews: bool = False) -> Felt:
+        """How the hand holds now; `counts` are what is to be judged of it, shape (fingers, 24).
+
+        `renews` says whether that only keeps a verdict new that stands already.
+        """
         gate = self._gate
         return Felt(
             gate.grasp,
             counts,
-            counts is not None,
+            counts is not None and not renews,
             gate.in_contact,
             gate.settled,
             gate.reasons,

@@ -20,7 +20,7 @@ KINDS: Final = {np.dtype(kind).str: np.dtype(kind) for kind in ("u1", "u2", "i8"
 
 
 def remember(pipeline: Pipeline) -> object:
-    """A copy of what it knows now, with all that was judged learnt, but for its session."""
+    """A copy of what it knows now, with all grasps that are over learnt, but for its session."""
     pipeline.learn()
     return _copied(pipeline.memories())
 

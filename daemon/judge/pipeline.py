@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.decision import NO_DOUBT, Case, Doubt, Limits, alone, decide
 from daemon.judge.findings import NO_OPINION, Felt, Number, Opinion, Watched, electrode_name
 from daemon.judge.health import Health
 from daemon.judge.limits import GripLimits
@@ -37,6 +37,8 @@ WITHHELD: Final = {
     Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
 }
 """What is against calling a grasp `stable`, by what the risk permits."""
+NOT_HELD: Final = {GateState.IDLE, GateState.RELEASED}
+"""Where a grasp is over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,8 @@ class Judgement:
     """After what outcomes have taught; None exactly when the decision is unknown."""
     reasons: tuple[Reason, ...]
     judged: bool = True
-    """Whether the network judged, or would have judged, this very reading."""
+    """Whether the network judged, or would have judged, this very reading, because the grasp had
+    settled or somebody waits; not where it only keeps a standing verdict new."""
     repaired: tuple[str, ...] = ()
     """Electrodes that were replaced before judging, such as `ff_7`."""
     session_calibrated: bool | None = None
@@ -88,11 +91,17 @@ class Judgement:
 class PipelineMemory:
     """What is known of the grasps judged so far."""
 
+    to_learn: NDArray[np.float64]
+    """Shape (fingers, 24): counts that the session is to take in; means nothing if none are."""
+    is_to_learn: bool = False
+    to_learn_slip: bool | None = None
+    """Whether they were judged to slip."""
     readings: Number = 0
     learnt_grasp: Number = 0
     """The grasp that the session took in last, or is about to."""
     opinion: Opinion = NO_OPINION
     """Of the grasp at hand."""
+    doubt: Doubt = NO_DOUBT
 
 
 class Pipeline:
@@ -146,15 +155,14 @@ class Pipeline:
             from daemon.judge.grip import Grip  # only where it is needed
 
             self.grip = Grip(fingers, grip)
-        self.memory = PipelineMemory()
-        self._to_learn: tuple[NDArray[np.generic], bool | None] | None = None
+        self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))
         self._latest: TactileReading | None = None
         self.on_exchange: Callable[[SessionState | None, LearnerState | None], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
     @property
     def session(self) -> SessionCalibration | None:
-        """What is known of today's sensors, up to the grasp judged last; None if no model asks."""
+        """What is known of today's sensors, up to the last grasp; None if no model asks."""
         self.learn()
         return self._session
 
@@ -183,7 +191,7 @@ class Pipeline:
         `ValueError` for ones that are of another model.
         """
         self.memory.opinion = NO_OPINION
-        self._to_learn = None
+        self.memory.is_to_learn = False
         if self._session is not None:
             self._session.reset()
             if session is not None:
@@ -206,7 +214,9 @@ class Pipeline:
 
     def restart(self) -> None:
         """What was said of the grasp at hand no longer counts: another model or gate goes on."""
-        self.memory.opinion, self.memory.learnt_grasp = NO_OPINION, 0
+        memory = self.memory
+        memory.opinion, memory.learnt_grasp, memory.doubt = NO_OPINION, 0, NO_DOUBT
+        memory.is_to_learn = False
         if self.grip is not None:
             self.grip.restart()
 
@@ -281,14 +291,17 @@ class Pipeline:
         return found
 
     def learn(self) -> None:
-        """Take what was judged last into the session; at the latest the next reading does it.
+        """Take the grasp that was judged last into the session, if it is over.
 
-        That takes as long as judging, so it waits until the verdict is out; and a grasp must be
-        judged by what came before it.
+        A grasp must be judged by what came before it, however often: else what is like nothing seen
+        before would be seen the next time. It takes as long as judging, so the verdict goes first.
         """
-        if self._session is not None and self._to_learn is not None:
-            (counts, slip), self._to_learn = self._to_learn, None
-            self._session.observe(counts, slip=slip)
+        memory, grip = self.memory, self.grip
+        if self._session is None or not memory.is_to_learn:
+            return
+        if grip is None or grip.grasp != memory.learnt_grasp or grip.state in NOT_HELD:
+            memory.is_to_learn = False
+            self._session.observe(memory.to_learn, slip=memory.to_learn_slip)
 
     def _assess(self, opinion: Opinion, grasp: int) -> Opinion:
         """The opinion with what it is worth by the outcomes that are known."""
@@ -313,22 +326,22 @@ class Pipeline:
     def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
         if self._session is not None and grasp != self.memory.learnt_grasp:
-            self.memory.learnt_grasp = grasp
-            p_slip = self.memory.opinion.p_slip
+            memory, p_slip = self.memory, self.memory.opinion.p_slip
             slip = None if p_slip is None else p_slip >= self._limits.slip_threshold
-            self._to_learn = counts, slip
+            memory.learnt_grasp, memory.is_to_learn = grasp, True
+            memory.to_learn, memory.to_learn_slip = counts.astype(np.float64), slip
 
     def _observe(self, reading: TactileReading, watched: Watched) -> Felt:
         grip = self.grip
         if grip is None:
             return Felt(self.memory.readings, None if watched.reasons else reading.counts)
         grip.observe(reading, watched)
-        counts = None
+        counts, renews = None, grip.renews
         if not watched.reasons and 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
             counts = grip.counts_to_judge(reading, watched)
             if counts is not None:
                 grip.judged()
-        return grip.felt(counts)
+        return grip.felt(counts, renews=renews)
 
     def _decide(
         self,
@@ -354,8 +367,15 @@ class Pipeline:
             age_ns=self._age_ns(t_ns),
             against_stable=self._against_stable(felt.grasp, assessment),
         )
+        memory, made_ns = self.memory, 0 if self._latest is None else self._latest.made_ns
+        judged = felt.counts is not None and p_slip is not None
+        said = alone(case, self._limits) if judged else Decision.STABLE
+        if said is Decision.STABLE:
+            case = memory.doubt.on(case, felt.grasp, made_ns, self._limits)
+        else:
+            memory.doubt = Doubt(felt.grasp, made_ns, said)
         decision, reasons = decide(case, self._limits)
-        known, trust = decision is not Decision.UNKNOWN, self.trust
+        known, trust, worth = decision is not Decision.UNKNOWN, self.trust, assessment or self.trust
         return Judgement(
             t_ns=t_ns,
             grasp=felt.grasp,
@@ -373,7 +393,7 @@ class Pipeline:
             motion=felt.motion,
             motion_limits=felt.motion_limits,
             p_slip_model=opinion.p_slip if known else None,
-            outcomes=_outcomes(assessment, trust),
+            outcomes=0 if worth is None else worth.outcomes,
             supervised=(
                 assessment is not None
                 and assessment.supervised
@@ -390,10 +410,3 @@ class Pipeline:
 
     def _age_ns(self, t_ns: int) -> int:
         return self._clock() - t_ns
-
-
-def _outcomes(assessment: Assessment | None, trust: Trust | None) -> int:
-    """How many what is said rests on."""
-    if assessment is not None:
-        return assessment.outcomes
-    return 0 if trust is None else trust.outcomes

@@ -105,7 +105,7 @@ class GateState(StrEnum):
     SETTLED = "settled"
     """All fingers touch and are still; waits to be judged."""
     JUDGED = "judged"
-    """The verdict of the grasp stands as long as readings confirm it."""
+    """The verdict of the grasp, judged ever anew, stands as long as readings confirm it."""
     RELEASED = "released"
     """Nothing touches any more, for a moment."""
 
@@ -122,7 +122,6 @@ class GateCause(StrEnum):
     CONTACT_LOST = "contact-lost"
     GAP = "gap"
     """No usable reading for too long."""
-    ASKED = "asked"
     TIME = "time"
 
 

@@ -47,9 +47,10 @@ AGES = [(0, True), (1, True), (LIMIT_NS, True), (LIMIT_NS + 1, False), (-1, Fals
 HEALTH: list[tuple[Reason, ...]] = [(), (Reason.PARITY,), (Reason.FLAT, Reason.SATURATED)]
 GATE: list[tuple[Reason, ...]] = [(), (Reason.NO_CONTACT,), (Reason.NOT_TARED, Reason.NO_CONTACT)]
 AGAINST_STABLE = (None, Reason.UNPROVEN)
+DOUBTS = tuple(Decision)
 CASES = list(
     itertools.product(
-        PROBABILITIES, AGES, HEALTH, GATE, (False, True), (False, True), AGAINST_STABLE
+        PROBABILITIES, AGES, HEALTH, GATE, (False, True), (False, True), AGAINST_STABLE, DOUBTS
     )
 )
 
@@ -61,9 +62,12 @@ def expected(
     gate: tuple[Reason, ...],
     well: bool,
     against_stable: Reason | None,
+    doubt: Decision,
 ) -> tuple[str, set[Reason]]:
     """The rule, written down once more: everything must be well, or it is unknown."""
     against = set(health)
+    if worth.endswith("stable") and doubt is Decision.UNKNOWN and against_stable is None:
+        against |= {Reason.LOW_CONFIDENCE}
     if worth.endswith("stable") and against_stable is not None:
         against |= {against_stable}
     if not well:
@@ -81,10 +85,13 @@ def broken_cases(judge: Callable[[Case, Limits], Any]) -> int:
     """How many of all combinations are not judged by the rule; counts an exception too."""
     wrong = 0
     for case_of, limits in itertools.product(CASES, (LIMITS, ANY_CONFIDENCE)):
-        (p_slip, worth), (age_ns, fresh), health, gate, contact, settled, withheld = case_of
+        (p_slip, worth), (age_ns, fresh), health, gate, contact, settled, withheld, doubt = case_of
+        if doubt is Decision.SLIP and worth.endswith("stable"):
+            worth = "unsure slip"  # the more, the likelier it is to hold
         worth = worth.removeprefix("unsure ") if limits is ANY_CONFIDENCE else worth
-        case = Case(p_slip, health, contact, settled, gate, age_ns, withheld)
-        decision, against = expected(worth, fresh, health, gate, contact and settled, withheld)
+        case = Case(p_slip, health, contact, settled, gate, age_ns, withheld, doubt)
+        well = contact and settled
+        decision, against = expected(worth, fresh, health, gate, well, withheld, doubt)
         try:
             found, reasons = judge(case, limits)
             wrong += (found, set(reasons), len(reasons)) != (decision, against, len(against))
@@ -95,7 +102,7 @@ def broken_cases(judge: Callable[[Case, Limits], Any]) -> int:
 
 def test_every_combination_is_judged_by_the_rule() -> None:
     assert broken_cases(decide) == 0
-    assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2 * 2
+    assert len(CASES) == 16 * 6 * 3 * 3 * 2 * 2 * 2 * 3
 
 
 @pytest.mark.parametrize("reason", Reason)

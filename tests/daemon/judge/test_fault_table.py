@@ -74,7 +74,7 @@ palm drops 5 %        sensor-missing  sensor-missing  sensor-missing  ~sensor-mi
 palm drops half       sensor-missing  sensor-missing  sensor-missing  sensor-missing  sensor-missing
 palm sends twice      =               =               =               =               =
 palm reorders         =               =               =               =               =
-palm flips bits       =               =               =               =               =
+palm flips bits       =               =               =               ~never-seen     =
 palm sends in bursts  =               no-contact      =               =               =
 palm disconnects      stale           stale           stale           ~stale          stale
 palm, later version   stale           stale           stale           stale           stale

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ ALLOWED = {
     *((GateState.RELEASED, GateState.IDLE), (GateState.SETTLED, GateState.CLOSING)),
     (GateState.JUDGED, GateState.CLOSING),
     # Not in the drawing, but in its words: a grasp ends when nothing touches any more, and begins
-    # with a touch; on request a grasp is judged again.
+    # with a touch; what was judged early is judged again.
     *((GateState.CLOSING, GateState.RELEASED), (GateState.SETTLED, GateState.RELEASED)),
     *((GateState.RELEASED, GateState.CLOSING), (GateState.JUDGED, GateState.SETTLED)),
 }
@@ -79,6 +79,10 @@ class Played:
     changes: list[GateChange]
     judged: list[Counts]
     grip: Grip
+    judged_s: list[float] = field(default_factory=list)
+    """When anything was judged, also what stood already."""
+    stood_s: list[float] = field(default_factory=list)
+    """When a verdict stood."""
 
     @property
     def story(self) -> str:
@@ -132,13 +136,16 @@ def play(scenario: Scenario) -> Played:
         lost = scenario.unusable[0] <= t_s < scenario.unusable[1]
         watched = Watched((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
         grip.observe(reading, watched)
-        counts = None if lost else grip.counts_to_judge(reading, watched)
+        counts, renews = None if lost else grip.counts_to_judge(reading, watched), grip.renews
         if counts is not None:
-            assert grip.state is GateState.SETTLED
-            assert not grip.settled, "a grasp that is not judged yet has no verdict to confirm"
+            stands = grip.state is GateState.JUDGED
+            assert stands or grip.state is GateState.SETTLED
+            assert stands or not grip.settled, "what is not judged yet has no verdict to confirm"
             grip.judged()
             assert grip.settled
-            played.judged.append(counts)
+            played.judged += [] if renews else [counts]
+            played.judged_s.append(reading.t_ns / 1e9)
+        played.stood_s += [reading.t_ns / 1e9] * (grip.settled and not lost)
         assert not grip.settled or (grip.state is GateState.JUDGED and grip.in_contact)
         assert grip.settled == (not grip.reasons)
         new = grip.take_changes()
@@ -410,7 +417,7 @@ SCENARIOS = [
     Scenario(
         "asked twice",
         GRASPED,
-        f"{UP} settled:asked judged:judged",
+        UP,
         judged=2,
         asks_s=(0.7, 1.1),
         limits=REQUEST,
@@ -458,6 +465,14 @@ def test_gate_follows(scenario: Scenario) -> None:
         earliest, latest = scenario.settled_s
         assert earliest <= played.first_s(GateState.SETTLED) <= latest
     check_chain(played.changes)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
+def test_no_verdict_that_stands_is_older_than_100_ms(scenario: Scenario) -> None:
+    played = play(scenario)
+    for stood_s in played.stood_s:
+        judged_s = max(each for each in played.judged_s if each <= stood_s)
+        assert stood_s - judged_s <= 0.1 + 1e-9
 
 
 def check_chain(changes: list[GateChange]) -> None:

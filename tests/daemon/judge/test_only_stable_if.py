@@ -46,6 +46,10 @@ STEPS_MAX = 150
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
 STILL_RAD = 0.5
 AHEAD_NS = 300 * MS
+STANDS_MS = 100
+"""A verdict that is told was judged within the last of so many."""
+STEADY_MS = 1000
+"""What was called slip is not `stable` before so many without."""
 TURN_RAD = 0.01
 """Per reading: at 100 Hz ten times what a joint that is still may do."""
 
@@ -119,7 +123,11 @@ class Hand:
         still_ms = EARLY_MS if gate.gate.early else STILL_MS
         self.necessity = Necessity(POSES["rest"], FINGERS, gate.required or FINGERS, still_ms)
         self.answer: float | None = None
-        """What the network said when it was last asked."""
+        """What the network said when it was last asked, and of the reading of which time, ns."""
+        self.answered_ns = 0
+        self.slip = 0, 0
+        """The grasp that it last called slip, and when, ns."""
+        self.judged = 0
         self.asked = 0
         self.random = np.random.default_rng(1)
         self.turned_rad = 0.0
@@ -145,7 +153,10 @@ class Hand:
         self.necessity.observe(reading)
         judgement = self.pipeline.judge(reading)
         if self.model.runs != runs:
-            self.answer = answer
+            self.answer, self.answered_ns = answer, reading.t_ns
+            if answer is not None and 0.5 <= answer <= 1.0:
+                self.slip = judgement.grasp, reading.t_ns
+        self.judged += judgement.judged
         unknown = judgement.decision is Decision.UNKNOWN
         assert unknown is bool(judgement.reasons)
         assert unknown is (judgement.p_slip is None)
@@ -154,7 +165,10 @@ class Hand:
             assert p_slip is not None
             assert 0.0 <= p_slip <= 1.0
             assert judgement.p_slip == p_slip
-            assert (judgement.decision is Decision.SLIP) is (p_slip >= 0.5)
+            assert 0 <= reading.t_ns - self.answered_ns <= STANDS_MS * MS
+            grasp, slip_ns = self.slip
+            doubted = grasp == judgement.grasp and reading.t_ns - slip_ns < STEADY_MS * MS
+            assert (judgement.decision is Decision.SLIP) is (p_slip >= 0.5 or doubted)
             assert 0 <= self.clock() - reading.t_ns <= AGE_MAX_MS * MS
             assert not self.necessity.lacks(), self.necessity.lacks()
         return judgement
@@ -344,7 +358,7 @@ def check(gate: GripLimits, feels: Sequence[Feel]) -> set[Decision]:
         decisions |= {said.decision for said in hand.play(part)}
         left -= part.times
     if gate.on_request:
-        assert hand.model.runs <= hand.asked * (2 if gate.gate.early else 1)
+        assert hand.judged <= hand.asked * (2 if gate.gate.early else 1)
     return decisions
 
 
