@@ -32,7 +32,7 @@ class PastSweeps:
         """Raise `ValueError` for what cannot have been read."""
         if len(self.past) != len(self.lacking) or max(map(len, self.past), default=0) > SWEEPS:
             raise ValueError(f"at most {SWEEPS} sweeps of each finger are remembered")
-        if any(len(sweep) != SWEEP_BYTES for past in self.past for sweep in past):
+        if any(set(map(len, past)) - {SWEEP_BYTES} for past in self.past):
             raise ValueError(f"a sweep has {ELECTRODES} counts")
 
     @classmethod
