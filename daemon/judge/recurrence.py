@@ -84,6 +84,6 @@ def _known(past: dict[bytes, None], sweep: bytes) -> bool:
 def _equals_one(past: NDArray[np.uint16], now: NDArray[np.uint16]) -> bool:
     """Whether the sweep equals some other in all electrodes that were read in both."""
     others = past.reshape(-1, ELECTRODES)
-    read = (others != NO_COUNT) & (now != NO_COUNT)
-    differ = ((others != now) & read).any(axis=1)
-    return bool((~differ & (read.sum(axis=1) >= READ_MIN)).any())
+    equal = (others == now) | (others == NO_COUNT) | (now == NO_COUNT)
+    alike = others[equal.all(axis=1)]
+    return any(np.count_nonzero((one != NO_COUNT) & (now != NO_COUNT)) >= READ_MIN for one in alike)
