@@ -32,7 +32,7 @@ class PastSweeps:
         """Raise `ValueError` for what cannot have been read."""
         if len(self.past) != len(self.lacking) or max(map(len, self.past), default=0) > SWEEPS:
             raise ValueError(f"at most {SWEEPS} sweeps of each finger are remembered")
-        if any(len(sweep) != SWEEP_BYTES for past in self.past for sweep in past):
+        if any(set(map(len, past)) - {SWEEP_BYTES} for past in self.past):
             raise ValueError(f"a sweep has {ELECTRODES} counts")
 
     @classmethod
@@ -84,6 +84,6 @@ def _known(past: dict[bytes, None], sweep: bytes) -> bool:
 def _equals_one(past: NDArray[np.uint16], now: NDArray[np.uint16]) -> bool:
     """Whether the sweep equals some other in all electrodes that were read in both."""
     others = past.reshape(-1, ELECTRODES)
-    read = (others != NO_COUNT) & (now != NO_COUNT)
-    differ = ((others != now) & read).any(axis=1)
-    return bool((~differ & (read.sum(axis=1) >= READ_MIN)).any())
+    equal = (others == now) | (others == NO_COUNT) | (now == NO_COUNT)
+    alike = others[equal.all(axis=1)]
+    return any(np.count_nonzero((one != NO_COUNT) & (now != NO_COUNT)) >= READ_MIN for one in alike)

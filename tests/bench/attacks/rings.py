@@ -6,8 +6,8 @@ A bridge, relay or recording goes on with new numbers and times, but what it sen
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
-import random
 import socket
 import threading
 import time
@@ -45,7 +45,7 @@ from tests.bench.live import (
     where_of,
 )
 
-RINGS = (2, 3, 8, 64)
+RING_MIN, RING_MAX = 2, 64
 """Sweeps that are repeated."""
 GRACE = 3
 """So many sweeps after the first turn of a ring no verdict may be `stable` any more."""
@@ -58,8 +58,9 @@ HOLD_S = 1.5
 JOINTS_MAY_STAND_S = 1.5
 """How long joint angles may be equal to the bit before no verdict may be `stable`, s."""
 
-Serve = Callable[[Path, Iterator[Counts], threading.Event], tuple[str, Callable[[], None]]]
-"""The scene's `[tactile]`, and what sends the counts until told to stop."""
+RATES_HZ = (PALM_RATE_HZ, RATE_HZ)
+Serve = Callable[[Path, Iterator[Counts], float, threading.Event], tuple[str, Callable[[], None]]]
+"""The scene's `[tactile]`, and what sends the counts, so many a second, until told to stop."""
 
 
 class Ring:
@@ -99,9 +100,9 @@ def ringed(old: Counts, fresh: Counts, finger: int | None) -> Counts:
 
 
 def over_spi(
-    folder: Path, counts: Iterator[Counts], stop: threading.Event
+    folder: Path, counts: Iterator[Counts], rate_hz: float, stop: threading.Event
 ) -> tuple[str, Callable[[], None]]:
-    twin = SpiTwin(folder / "bridge", counts, rate_hz=RATE_HZ)
+    twin = SpiTwin(folder / "bridge", counts, rate_hz=rate_hz)
 
     def serve() -> None:
         with twin:
@@ -111,12 +112,12 @@ def over_spi(
 
 
 def over_can(
-    format_: str, folder: Path, counts: Iterator[Counts], stop: threading.Event
+    format_: str, folder: Path, counts: Iterator[Counts], rate_hz: float, stop: threading.Event
 ) -> tuple[str, Callable[[], None]]:
     where = where_of("can", folder)
     identifier = can_id(where)
     twin = CanTwin(
-        "udp_multicast", where, counts, format=format_, arbitration_id=identifier, rate_hz=RATE_HZ
+        "udp_multicast", where, counts, format=format_, arbitration_id=identifier, rate_hz=rate_hz
     )
 
     def serve() -> None:
@@ -130,7 +131,7 @@ def over_can(
 
 
 def over_palm(
-    _folder: Path, counts: Iterator[Counts], stop: threading.Event
+    _folder: Path, counts: Iterator[Counts], _rate_hz: float, stop: threading.Event
 ) -> tuple[str, Callable[[], None]]:
     target = f"udp://127.0.0.1:{free_port()}"
     serve = partial(PalmTwin(counts).serve, target, stop)
@@ -219,7 +220,8 @@ def rounds(plan: Plan) -> Iterator[tuple[int, int | None]]:
     """Length of each ring, and the finger that it is of; None: all."""
     for _ in plan.rounds():
         finger = None if plan.random.random() < 0.5 else plan.random.randrange(3)
-        yield plan.random.choice(RINGS), finger
+        # Short rings more often than long ones: what is looked for is the same in all.
+        yield round(RING_MIN * (RING_MAX / RING_MIN) ** plan.random.random()), finger
 
 
 def tallied(verdicts: Iterable[tuple[int, int]]) -> Outcome:
@@ -232,40 +234,32 @@ def tallied(verdicts: Iterable[tuple[int, int]]) -> Outcome:
     return Outcome(tried, f"{stable} of {said:,} verdicts `stable`", said > 0 and stable == 0)
 
 
-def ring_over(over: Serve, rate_hz: float, plan: Plan) -> Outcome:
-    """A ring over a link."""
+def ring_over(over: Serve, rates_hz: Sequence[float], plan: Plan) -> Outcome:
+    """A ring over a link, at one of these rates."""
 
     def one(number: int, sweeps: int, finger: int | None) -> tuple[int, int]:
         folder = plan.folder / str(number)
         folder.mkdir()
+        rate_hz = plan.random.choice(rates_hz)
         ring, stop = Ring(sweeps, finger, rate_hz), threading.Event()
-        section, serve = over(folder, ring.counts(), stop)
+        section, serve = over(folder, ring.counts(), rate_hz, stop)
         return under_attack(folder, section, [serve], stop, ring.begin, lambda: ring.turned_ns)
 
     return tallied(one(number, *each) for number, each in enumerate(rounds(plan)))
 
 
-def recorded(ring: int, finger: int | None, random_: random.Random) -> tuple[list[Moment], int]:
-    """Rows of a recording, and from which on no verdict may be `stable`."""
-    hold_s = HOLD_S + random_.random()
+def recorded(
+    ring: int, finger: int | None, rate_hz: float, hold_s: float
+) -> tuple[list[Moment], int]:
+    """Rows of a recording whose grasp is held so long, and from which on none may be `stable`."""
     durations = Durations(first_rest_s=(1.5, 1.5), settle_s=(hold_s + 2.0, hold_s + 2.0))
-    moments = list(synthetic_grasps(1, durations=durations, seed=SEED))
-    grasps = synthetic_grasps(1, durations=durations, seed=SEED)
-    closed_s = next(iter(grasps.timetables())).closed_s
-    begin = round((closed_s + hold_s) * RATE_HZ)
+    grasps = synthetic_grasps(1, durations=durations, seed=SEED, rate_hz=rate_hz)
+    moments = list(grasps)
+    begin = round((next(grasps.timetables()).closed_s + hold_s) * rate_hz)
     last = [moment.counts for moment in moments[begin - ring : begin]]
     for number, moment in enumerate(moments[begin:]):
         counts = ringed(last[number % ring], moment.counts, finger)
-        moments[begin + number] = Moment(
-            moment.t_s,
-            counts,
-            moment.joint_names,
-            moment.position_rad,
-            moment.phase,
-            moment.grasp,
-            moment.slipped,
-            moment.object_name,
-        )
+        moments[begin + number] = dataclasses.replace(moment, counts=counts)
     return moments, begin + ring + GRACE
 
 
@@ -275,9 +269,10 @@ def ring_replayed(plan: Plan) -> Outcome:
     def one(number: int, ring: int, finger: int | None) -> tuple[int, int]:
         folder = plan.folder / str(number)
         folder.mkdir()
-        moments, late_from = recorded(ring, finger, plan.random)
+        rate_hz = plan.random.choice(RATES_HZ)
+        moments, late_from = recorded(ring, finger, rate_hz, HOLD_S + plan.random.random())
         with (folder / "rows.csv").open("w") as file:
-            write_stream(moments, file, 2)
+            write_stream(moments, file, 6)
         said: list[Verdict] = []
         section = f'[tactile]\ndriver = "replay"\nrecordings = ["{folder / "rows.csv"}"]\n'
         with (
@@ -288,7 +283,7 @@ def ring_replayed(plan: Plan) -> Outcome:
                 said.append(decode_verdict(message[1]))
         # By their times, for nobody may be there yet to hear the first.
         end_ns = max(verdict.t_mono_ns for verdict in said)
-        late_ns = end_ns - round((len(moments) - 1 - late_from) / RATE_HZ * 1e9)
+        late_ns = end_ns - round((len(moments) - 1 - late_from) / rate_hz * 1e9)
         before = [verdict for verdict in said if verdict.t_mono_ns < late_ns - 1_000_000]
         late = {verdict.t_mono_ns: verdict.verdict for verdict in said[len(before) :]}
         if Decision.STABLE not in {verdict.verdict for verdict in before}:
@@ -307,7 +302,7 @@ def joints_frozen(plan: Plan) -> Outcome:
         port, stop, begin = free_port(), threading.Event(), threading.Event()
         frozen_ns: list[int] = []
         counts = Ring(1, None, RATE_HZ).counts()
-        section, serve = over_spi(folder, counts, stop)
+        section, serve = over_spi(folder, counts, RATE_HZ, stop)
         section += f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
         rng = np.random.default_rng(plan.random.randrange(1 << 32))
 
@@ -339,10 +334,10 @@ def _ring(door: str, run: Callable[[Plan], Outcome]) -> Attack:
 
 
 ATTACKS = (
-    _ring("over SPI", partial(ring_over, over_spi, RATE_HZ)),
-    _ring("over CAN as sweep_fd", partial(ring_over, partial(over_can, "sweep_fd"), RATE_HZ)),
-    _ring("over CAN as syntouch", partial(ring_over, partial(over_can, "syntouch"), RATE_HZ)),
-    _ring("over the palm", partial(ring_over, over_palm, PALM_RATE_HZ)),
+    _ring("over SPI", partial(ring_over, over_spi, RATES_HZ)),
+    _ring("over CAN as sweep_fd", partial(ring_over, partial(over_can, "sweep_fd"), RATES_HZ)),
+    _ring("over CAN as syntouch", partial(ring_over, partial(over_can, "syntouch"), RATES_HZ)),
+    _ring("over the palm", partial(ring_over, over_palm, [PALM_RATE_HZ])),
     _ring("in a recording", ring_replayed),
     Attack(
         "joints-frozen",

@@ -6,6 +6,7 @@ electrodes jump or are dead), what depends on it is left open.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -32,11 +33,13 @@ TARE_COUNTS = 5.0
 """What the judge's own tare may differ by, for it follows the rest and has noise."""
 JOINT_RAD_PER_S = 0.1
 JOINTS_LATE_MS, JOINTS_LOST_MS = 150, 1000
+JOINTS_FROZEN_MS = 1000
 LEFT_OUT_NS = WINDOW_MS * MS // 16
 """Angles that come faster than this may be left out."""
 REPAIRABLE_BITS = 1 | 2 | 4 | 8
 BROKEN_MAX, BROKEN_FINGER_MAX = 12, 8
 DEAD_AFTER = 16
+SWEEPS_REMEMBERED = 128
 SICK_FOR = 24
 """Readings for which an electrode that was broken may still count as one that jumps."""
 DOUBT_FOR = 40
@@ -86,6 +89,8 @@ class Necessity:
         self._values = np.repeat(rest[np.newaxis].astype(np.float64), FURTHEST, axis=0)
         """Last values of each electrode, newest first."""
         self._previous: NDArray[np.uint16] | None = None
+        self._before: deque[list[bytes | None]] = deque(maxlen=SWEEPS_REMEMBERED)
+        """Last sweeps, by finger; None where an electrode was flagged."""
         self._unchanged = np.zeros(rest.shape, dtype=np.int64)
         self._sick = np.zeros(rest.shape, dtype=np.int64)
         self._doubt = 0
@@ -93,6 +98,8 @@ class Necessity:
         """The last ones, between which time goes on and no gap is."""
         self._joints: dict[bytes, list[_Angles]] = {}
         """By which are valid: the last ones, between which time goes on and no gap is."""
+        self._changed_ns: int | None = None
+        """When some angle had another value than before; nothing is remembered of other joints."""
         self._without_joints_since_ns: int | None = None
         self._unusable: list[str] = []
 
@@ -103,10 +110,15 @@ class Necessity:
             return
         t_ns = reading.t_ns
         before = self._joints.get(valid.tobytes(), [])
+        # Also from those shortly before the last, for some may be left out.
+        angles_rad = reading.position_rad[valid]
+        is_new = not before or any((one.angles_rad != angles_rad).any() for one in before)
+        if is_new or self._changed_ns is None or t_ns < self._changed_ns:
+            self._changed_ns = t_ns
         if before and not 0 <= t_ns - before[-1].t_ns <= JOINTS_LATE_MS * MS:
             before = []
         kept = [one for one in before if t_ns - one.t_ns <= KEPT_MS * MS]
-        self._joints[valid.tobytes()] = [*kept, _Angles(t_ns, reading.position_rad[valid])]
+        self._joints[valid.tobytes()] = [*kept, _Angles(t_ns, angles_rad)]
 
     def observe(self, reading: TactileReading) -> None:
         """Take in a reading."""
@@ -121,6 +133,8 @@ class Necessity:
             self._unusable.append("flags that can be repaired")
         if self._is_same(counts, faults != 0):
             self._unusable.append("a finger that does not repeat itself")
+        if self._comes_again(counts, faults != 0):
+            self._unusable.append("fingers of which none sends an old sweep")
         if _too_many(broken):
             self._unusable.append("no more broken electrodes than can be repaired")
         self._sick = np.where(broken | (self._unchanged >= DEAD_AFTER), SICK_FOR, self._sick - 1)
@@ -146,6 +160,17 @@ class Necessity:
         self._unchanged = np.where(same, self._unchanged + 1, 0)
         # A flagged electrode neither repeats anything nor hides that the others do.
         return bool(((same | flagged).all(axis=1) & ~flagged.all(axis=1)).any())
+
+    def _comes_again(self, counts: NDArray[np.uint16], flagged: NDArray[np.bool_]) -> bool:
+        """Whether all of a finger, with nothing flagged, is as in a sweep shortly before."""
+        now = [
+            None if flags.any() else sweep.tobytes()
+            for sweep, flags in zip(counts, flagged, strict=True)
+        ]
+        before = zip(*self._before, strict=True)
+        again = any(sweep and sweep in old for sweep, old in zip(now, before, strict=False))
+        self._before.append(now)
+        return again
 
     def _use(self, reading: TactileReading, valid: NDArray[np.bool_]) -> None:
         shifted = np.concatenate([reading.counts[np.newaxis], self._values[:-1]])
@@ -207,6 +232,10 @@ class Necessity:
                 return ["joint angles in time"]
             if not _may_be_still(angles):
                 return ["joints that are still"]
+        latest_ns = max((one[-1].t_ns for one in self._joints.values()), default=0)
+        changed_ns = latest_ns if self._changed_ns is None else self._changed_ns
+        if latest_ns - changed_ns > (JOINTS_FROZEN_MS + KEPT_MS) * MS:
+            return ["angles of which some change"]
         return []
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -131,6 +132,8 @@ class Hand:
         self.asked = 0
         self.random = np.random.default_rng(1)
         self.turned_rad = 0.0
+        self.noise_rad = np.zeros(len(JOINTS))
+        self.sent: deque[Counts] = deque(maxlen=30)
 
     def play(self, feel: Feel) -> list[Judgement]:
         """Feel, and check each judgement."""
@@ -183,6 +186,8 @@ class Hand:
                     counts[where] = flaw.count
         for flaw in feel.flaws:
             faults[flaw.finger, flaw.first : flaw.first + flaw.number] |= flaw.bits
+        if len(counts) == len(faults):
+            self.sent.append(counts)
         return TactileReading(self.clock() - age_ns, 0, counts, faults[: len(counts)])
 
     def _counts(self, pose: str) -> Counts:
@@ -192,6 +197,8 @@ class Hand:
             return self.random.integers(1000, 3000, (3, 24), dtype=np.uint16)
         if pose == "other fingers":
             return self.random.integers(1000, 3000, (2, 24), dtype=np.uint16)
+        if pose == "old":
+            return self.sent[int(self.random.integers(len(self.sent)))].copy()
         noise = self.random.integers(-NOISE, NOISE + 1, (3, 24))
         return (POSES[pose] + noise).astype(np.uint16)
 
@@ -199,8 +206,9 @@ class Hand:
         if kind == "none":
             return
         self.turned_rad += TURN_RAD * (kind == "moving")
-        noise = self.random.uniform(-0.0005, 0.0005, len(JOINTS))
-        angles = STILL_RAD + self.turned_rad + noise
+        if kind != "frozen":
+            self.noise_rad = self.random.uniform(-0.0005, 0.0005, len(JOINTS))
+        angles = STILL_RAD + self.turned_rad + self.noise_rad
         if kind == "not valid":
             angles[:] = np.nan
         elif kind == "one not valid":
@@ -273,7 +281,17 @@ few_everywhere = st.builds(
 feels = st.builds(
     Feel,
     pose=often(
-        "grasp", "rest", "other", "light", "faint", "two", "lifted", "wild", "any", "other fingers"
+        "grasp",
+        "rest",
+        "other",
+        "light",
+        "faint",
+        "two",
+        "lifted",
+        "wild",
+        "any",
+        "other fingers",
+        "old",
     ),
     times=st.sampled_from([1, 3, 10, 20, 30]),
     step_ns=often(PERIOD_NS, 0, MS, 14 * MS, 50 * MS, 3000 * MS, -PERIOD_NS, -1000 * MS),
@@ -283,7 +301,7 @@ feels = st.builds(
     flaws=st.one_of(
         st.just(()), st.just(()), st.lists(flaws, max_size=2).map(tuple), few_everywhere
     ),
-    joints=often("still", "moving", "none", "not valid", "one not valid", "ahead"),
+    joints=often("still", "moving", "none", "not valid", "one not valid", "ahead", "frozen"),
     answer=st.one_of(st.sampled_from([0.1, 0.9, 0.4999, 0.5]), st.floats(), st.none()),
     asks=often(False, True, times=3),
 )
@@ -327,6 +345,12 @@ SCENARIOS = {
     ),
     "joints of a later time": (HELD, Feel(times=10, joints="ahead"), Feel(times=10)),
     "joints that move": (HELD, Feel(times=10, joints="moving"), Feel(times=20)),
+    "joints that do not change by a bit": (
+        HELD,
+        Feel(times=160, joints="frozen"),
+        Feel(times=10),
+    ),
+    "old sweeps, a few at a time": (HELD, Feel(pose="old", times=40), Feel(times=40)),
     "asked once": (HELD, Feel("other", times=40), Feel("grasp", times=40)),
 }
 
