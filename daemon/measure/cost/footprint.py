@@ -189,7 +189,7 @@ def _pipeline(wanted: Scene, model: TactileModel, meter: Meter) -> Pipeline:
     from daemon.assembly import assembly
 
     every = wanted.gate.model_copy(update={"mode": "every", "sweeps": None})
-    learns = wanted.session_learns
+    learns = wanted.session.learn
     simple = wanted.model_copy(update={"gate": every})
     pipeline = assembly.build_pipeline(simple, model, learns=learns)
     meter.take("judge" if pipeline.session is None else "judge, session")
