@@ -127,10 +127,10 @@ class Gate(Section):
     """`[gate]`: when a grasp is judged, and when it is refused."""
 
     mode: GateMode | None = None
-    """`settled`: a grasp is judged when it has settled; `request`: then, and when the controller has
-    asked; `every`: each reading is a grasp of its own, which is for recordings alone: of live
-    sensors most readings are of an open hand. Unless given, `settled` for live sensors and for
-    recorded streams, `every` for grasp tables."""
+    """`settled`: a grasp is judged when it has settled; `request`: when it has and the controller
+    asks; both anew for as long as the verdict stands. `every`: each reading is a grasp of its own,
+    for recordings alone: of live sensors most are of an open hand. Unless given, `settled` for live
+    sensors and for recorded streams, `every` for grasp tables."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
     """An older reading gives `unknown`; so does silence for that long."""
     sweeps: Literal[1, 3] | None = None

@@ -269,7 +269,8 @@ def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, i
     judgement = pipeline.judge(reading)
     judged_ns = time.thread_time_ns()
     outbox.verdict(judgement, judgement.t_ns, SILENCE_NS)
-    return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, judgement.judged
+    ran = judgement.judged or judgement.judged_counts is not None
+    return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, ran
 
 
 def _timed(

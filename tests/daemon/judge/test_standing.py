@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Iterator
@@ -91,7 +92,7 @@ def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool
     assert len(ages) > 300
     assert max(direct.said[-100:]) > 0.7
     decisions = [each.decision for each in told if each.decision is not Decision.UNKNOWN]
-    turns = sum(a is not b for a, b in zip(decisions, decisions[1:], strict=False))
+    turns = sum(a is not b for a, b in itertools.pairwise(decisions))
     assert (decisions[0], decisions[-1], turns) == (Decision.STABLE, Decision.SLIP, 1)
     assert {each.grasp for each in told} == {0, 1}
 
