@@ -40,7 +40,7 @@ class Parts:
     @classmethod
     def of(cls, scene: Scene, model: TactileModel) -> Parts:
         """Those of a scene and its model. Raises `SceneError`, `ModelError` or `RecordingError`."""
-        pipeline = assembly.build_pipeline(scene, model, learns=scene.session_learns)
+        pipeline = assembly.build_pipeline(scene, model, learns=scene.session.learn)
         return cls(scene, model, pipeline, assembly.build_drivers(scene))
 
 

@@ -68,7 +68,7 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
             **wanted.gate.model_dump(mode="json", exclude_none=True),
             "mode": assembly.gate_mode(wanted),
         },
-        "session": {"learn": wanted.session_learns, "required": wanted.session.required},
+        "session": {"learn": wanted.session.learn, "required": wanted.session.required},
         "learn": wanted.learn.model_dump(mode="json"),
     }
     if wanted.risk is not None:

@@ -282,7 +282,7 @@ def _risk(wanted: scene.Risk) -> str:
 
 def _session(wanted: scene.Scene, needs: SessionInput) -> str:
     kept = f"kept in {wanted.session_path}" if wanted.keeps_session else "not kept"
-    learns = "by what is judged" if wanted.session_learns else "by `graspd session seed`"
+    learns = "by what is judged" if wanted.session.learn else "by `graspd session seed`"
     return f"calibrated {learns}, from {needs.calibrated_from:g} grasps on, {kept}"
 
 

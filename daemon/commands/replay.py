@@ -251,7 +251,7 @@ def _comparisons(
         found = assembly.build_pipeline(alone, assembly.load_model(wanted), learns=False)
         yield Comparison(WITHOUT_SESSION, found, result)
     if pipeline.trust is not None and (args.outcomes or recorded is not None):
-        learns = args.session != OFF and wanted.session_learns
+        learns = args.session != OFF and wanted.session.learn
         found = assembly.build_pipeline(alone, assembly.load_model(wanted), learns=learns)
         _begin(args, found, wanted, recorded)
         yield Comparison(WITHOUT_LEARNING, found, result)
@@ -311,7 +311,7 @@ def _pipeline(
 
     Raises `SessionFileError` if that is no session of this hand.
     """
-    learns = args.session != OFF and wanted.session_learns
+    learns = args.session != OFF and wanted.session.learn
     if recorded is None:
         pipeline = assembly.build_pipeline(wanted, model, learns=learns)
     else:

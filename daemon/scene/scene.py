@@ -89,9 +89,8 @@ class Session(Section):
     keep: bool | None = None
     """False: begin a new session at every start, and write nothing. Unless given, kept for live
     sensors and not for recordings."""
-    learn: bool | None = None
-    """Whether what is judged counts as a grasp of the session. Unless given, yes, except for live
-    sensors with gate mode `every`: most of their readings are of an open hand."""
+    learn: bool = True
+    """Whether what is judged counts as a grasp of the session."""
     required: bool = False
     """Whether nothing is judged before the session is calibrated."""
     file: FilePath | None = None
@@ -129,9 +128,10 @@ class Gate(Section):
     """`[gate]`: when a grasp is judged, and when it is refused."""
 
     mode: GateMode | None = None
-    """`settled`: once per grasp, when it has settled; `every`: each reading is a grasp of its own;
-    `request`: when the controller asks. Unless given, `settled` for live sensors and for recorded
-    streams, `every` for grasp tables."""
+    """`settled`: a grasp is judged when it has settled; `request`: when it has and the controller
+    asks; both anew for as long as the verdict stands. `every`: each reading is a grasp of its own,
+    for recordings alone: of live sensors most are of an open hand. Unless given, `settled` for live
+    sensors and for recorded streams, `every` for grasp tables."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
     """An older reading gives `unknown`; so does silence for that long."""
     sweeps: Literal[1, 3] | None = None
@@ -266,6 +266,11 @@ class Scene(Section):
         for finger in self.gate.fingers or ():
             if finger not in fingers:
                 raise ValueError(f"gate.fingers names {finger}, not in hand.fingers")
+        if self.gate.mode == "every" and not isinstance(tactile, ReplayTactile):
+            raise ValueError(
+                "gate.mode every is for grasp tables (tactile.driver replay): of live sensors it "
+                'would judge the open hand too; use "settled" or "request"'
+            )
         if isinstance(tactile, ReplayTactile):
             for finger in tactile.faults.fingers or ():
                 if finger not in fingers:
@@ -346,13 +351,6 @@ class Scene(Section):
         if self.session.keep is None:
             return not isinstance(self.tactile, ReplayTactile)
         return self.session.keep
-
-    @property
-    def session_learns(self) -> bool:
-        """Whether readings are taken into the session."""
-        if self.session.learn is None:
-            return isinstance(self.tactile, ReplayTactile) or self.gate.mode != "every"
-        return self.session.learn
 
     @property
     def max_age_ns(self) -> int:

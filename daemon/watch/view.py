@@ -121,7 +121,8 @@ class View:
             self._lost += verdict.seq - last.seq - 1
         self._received += 1
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
-        if verdict.judged and (verdict.valid or verdict.gate is not None):
+        stands = verdict.valid and (verdict.boot_id, verdict.grasp) in self._grasps
+        if stands or (verdict.judged and (verdict.valid or verdict.gate is not None)):
             self._keep(verdict, now_ns)
 
     def _keep(self, verdict: Verdict, now_ns: int) -> None:

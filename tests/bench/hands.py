@@ -1,8 +1,9 @@
 """What several hands on one computer cost, and several subscribers to one.
 
 `python -m tests.bench.hands` prints a Markdown table: 1, 2, 4 and 8 daemons, each with a twin at
-100 Hz, then one daemon with 1, 10 and 100 subscribers. Every reading is judged; the latency is from
-just before the system call that writes the last byte to a subscriber in another process.
+100 Hz, then one daemon with 1, 10 and 100 subscribers. A question is asked for every reading, so
+that each is judged; the latency, of those that were, is from just before the system call that
+writes the last byte to a subscriber in another process.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+import zmq
 from numpy.typing import NDArray
 
-from daemon.judge.reasons import Reason
 from daemon.publish.messages import decode_verdict
 from models import zoo
 from tests.bench.live import (
@@ -51,8 +52,9 @@ WARM_UP_S = 1.0
 """From the first verdict: what comes before is not counted."""
 KNOWN_MIN_SHARE = 0.95
 """Just after a link has come up, times of readings are cautious."""
-JUDGED_MIN_SHARE = 0.99
-"""The network must judge (almost) every reading, or the figures are of something else."""
+JUDGED_MIN_SHARE = 0.8
+"""The network must judge most readings, or the CPU's share is of something else. In 3 % of them a
+hand that holds is said to move, and some questions come late."""
 
 ECHO = struct.Struct("<qq")
 """What an echo begins with: the number of the sweep, and when it was sent, monotonic ns."""
@@ -70,18 +72,25 @@ class Record:
     numbers: list[int] = field(default_factory=list)
     """Of the sweeps, where an echo tells them."""
     judged: int = 0
-    """Those that the network judged; of a stale one the verdict is `unknown` all the same."""
+    """Those that the network judged."""
+    readings: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
     """Why the others are not."""
 
-    def add(self, payload: bytes, received_ns: int) -> None:
-        """Take in a verdict; one that says that nothing came is none of a reading."""
+    def add(self, payload: bytes, received_ns: int, *, settled: bool) -> None:
+        """Take in a verdict that the network was asked for, or with `settled` any.
+
+        One that says that nothing came is none of a reading.
+        """
         verdict = decode_verdict(payload)
-        if self.told_ns and verdict.t_mono_ns == self.told_ns[-1]:
+        if verdict.still_ms is None:
             return
-        self._note(verdict.t_mono_ns, verdict.t_mono_ns + round(verdict.age_ms * 1e6), received_ns)
-        self.judged += verdict.valid or list(verdict.reasons) == [Reason.STALE]
+        self.readings += 1
         self.reasons.update(verdict.reasons)
+        self.judged += verdict.judged
+        if verdict.judged or settled:
+            published_ns = verdict.t_mono_ns + round(verdict.age_ms * 1e6)
+            self._note(verdict.t_mono_ns, published_ns, received_ns)
 
     def add_echo(self, payload: bytes, received_ns: int) -> None:
         """Take in a message of the echo."""
@@ -89,6 +98,7 @@ class Record:
         self.numbers.append(number)
         self._note(sent_ns, sent_ns, received_ns)
         self.judged += 1
+        self.readings += 1
 
     def _note(self, told_ns: int, published_ns: int, received_ns: int) -> None:
         self.told_ns.append(told_ns)
@@ -99,7 +109,7 @@ class Record:
         """Forget what came so far."""
         for times in (self.told_ns, self.published_ns, self.received_ns, self.numbers):
             times.clear()
-        self.judged = 0
+        self.judged = self.readings = 0
         self.reasons.clear()
 
 
@@ -131,12 +141,12 @@ def percentiles(values: Sequence[Micros]) -> dict[str, float]:
 def scene_text(
     tactile: str, endpoint: str, model: str, hand: str, *, realtime: bool, settled: bool
 ) -> str:
-    """A scene that keeps nothing and judges what has settled, as by default, or each reading."""
+    """A scene that keeps nothing and judges what has settled, as by default, or when asked."""
     text = (
         f'{tactile}[hand]\nname = "{hand}"\n[model]\nname = "{model}"\n'
         f'[session]\nkeep = false\n[publish]\nendpoint = "{endpoint}"\n'
     )
-    text += "" if settled else '[gate]\nmode = "every"\n'
+    text += "" if settled else f'[gate]\nmode = "request"\n[ask]\nendpoint = "{endpoint}.ask"\n'
     return text + (f"[realtime]\npriority = {PRIORITY}\n" if realtime else "")
 
 
@@ -160,7 +170,7 @@ class Hand:
         settled: bool = False,
     ) -> None:
         """`ends`: priority in realtime of the twin; 0 for none. `settled`: whole grasps, each of
-        which is judged once it has settled, and not each reading of one that lasts."""
+        which is judged once it has settled, and not each reading of one that lasts, as `ask`ed."""
         self.folder = folder / name
         self.folder.mkdir()
         self.log = self.folder / "log"
@@ -172,6 +182,7 @@ class Hand:
         self.settled = settled
         self._ends = ends
         self._stack = ExitStack()
+        self._asker: zmq.Socket[bytes] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -187,7 +198,19 @@ class Hand:
             tactile, self.endpoint, model, self.name, realtime=realtime, settled=self.settled
         )
         scene.write_text(text)
+        if not self.settled:
+            context = self._stack.enter_context(zmq.Context())
+            self._asker = self._stack.enter_context(context.socket(zmq.DEALER))
+            self._asker.linger = 0
+            self._asker.connect(f"{self.endpoint}.ask")
         self.publish(start_daemon(scene, self.log))
+
+    def ask(self) -> None:
+        """Have the next reading judged."""
+        if self._asker is not None:
+            while self._asker.poll(0):
+                self._asker.recv()
+            self._asker.send(b"judge")
 
     def publish(self, publisher: Child) -> None:
         """Start what publishes at `endpoint`, and its twin.
@@ -229,8 +252,12 @@ def hear(
     while (left_s := until_s - time.monotonic()) > 0:
         message = subscriber.take(left_s)
         if message is not None:
-            record = hands[message[0]].record
-            (record.add_echo if echo else record.add)(message[1], subscriber.received_ns)
+            hand = hands[message[0]]
+            if echo:
+                hand.record.add_echo(message[1], subscriber.received_ns)
+            else:
+                hand.record.add(message[1], subscriber.received_ns, settled=hand.settled)
+                hand.ask()
 
 
 def measure(
@@ -254,7 +281,7 @@ def measure(
         promote(os.getpid(), 0)
         after = [usage(hand.publisher.pid) for hand in hands]
     for hand in hands:
-        judged, readings = hand.record.judged, len(hand.record.told_ns)
+        judged, readings = hand.record.judged, hand.record.readings
         if not judged or (judged < JUDGED_MIN_SHARE * readings and not hand.settled):
             why = dict(hand.record.reasons)
             raise RuntimeError(f"{judged} of {readings} readings were judged; others: {why}")

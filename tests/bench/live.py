@@ -74,7 +74,7 @@ class TwinPlan(msgspec.Struct, frozen=True, kw_only=True):
     """File of a `Tally`; each process goes on where the one before it ended."""
     rate_hz: float = 100.0
     held: bool = False
-    """Whether one grasp is held for ever, each sweep fit to be judged."""
+    """Whether one grasp is held for ever, each sweep but the first few hundred fit to be judged."""
     faults: LinkFaults = LinkFaults()
     ends: str | None = None
     """File for the time of each sweep's end, monotonic ns, 64-bit integers, in its place by the
@@ -95,11 +95,17 @@ def held_grasp() -> Iterator[Counts]:
 
 
 def judged_counts() -> Iterator[Counts]:
-    """Counts of a held grasp, for ever and without its beginning."""
-    moments = iter(synthetic_grasps(1, durations=HELD, seed=SEED))
-    settled = (moment.counts for moment in moments if moment.phase is Phase.SETTLE)
-    drawn = list(itertools.islice(settled, SETTLED_SWEEPS, SETTLED_SWEEPS + HELD_SWEEPS))
-    return itertools.cycle(drawn)
+    """Counts of a hand that rests, and then holds a grasp for ever."""
+    drawn: list[Counts] = []
+    settled = 0
+    for moment in synthetic_grasps(1, durations=HELD, seed=SEED):
+        yield moment.counts
+        settled += moment.phase is Phase.SETTLE
+        if settled > SETTLED_SWEEPS:
+            drawn.append(moment.counts)
+        if len(drawn) == HELD_SWEEPS:
+            break
+    yield from itertools.cycle(drawn)
 
 
 def _counts(plan: TwinPlan) -> Iterator[Counts]:

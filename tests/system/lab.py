@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import shlex
 import threading
 import time
@@ -30,6 +31,8 @@ SERIAL_RATE_HZ: Final = 20.0
 GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(6.5, 6.5))
 """At a fifth of the usual rate it takes as much longer to learn where the fingers rest (a hundred
 sweeps) and to settle."""
+CAN_GRASPS: Final = Durations(first_rest_s=(13.0, 13.0), settle_s=(4.0, 4.0), rest_s=(13.0, 13.0))
+"""The same at half that rate."""
 PATIENCE_S: Final = 120.0
 """For what takes a second on a computer that is not emulated."""
 LOOK_S: Final = 0.5
@@ -116,7 +119,7 @@ class Lab:
         """The first message of a hand after a time that is wanted. Raises `StepError` if none."""
 
         def fits(message: Message) -> bool:
-            return message.hand == hand and (message.judged if wanted is None else wanted(message))
+            return message.hand == hand and (message.told if wanted is None else wanted(message))
 
         found = self.machine.messages.wait(fits, timeout_s, after_s)
         if found is None:
@@ -149,6 +152,14 @@ class Lab:
             if former.body["seq"] + 1 != following.body["seq"]:
                 raise StepError(f"{hand}: messages were lost after {former.body['seq']}")
         return found
+
+    def judged(self, hand: str) -> int:
+        """Readings that a daemon has given a verdict on since its start, not left out."""
+        last = self.last(hand, "verdict")
+        found = self.machine.messages.between(hand, "verdict", 0.0, math.inf)
+        own = [each for each in found if each.body["boot_id"] == last["boot_id"]]
+        silences = {each.body["seq"] for each in own if not each.told}
+        return int(last["seq"]) + 1 - len(silences)
 
     def observe(self) -> None:
         """Have a member of the group subscribe to both hands."""

@@ -29,9 +29,9 @@ class Message:
     body: dict[str, Any]
 
     @property
-    def judged(self) -> bool:
-        """Whether it is a verdict that is one, `stable` or `slip`."""
-        return self.kind == "verdict" and bool(self.body["valid"])
+    def told(self) -> bool:
+        """Whether it is a verdict on a reading, and none that says that nothing came."""
+        return self.kind == "verdict" and self.body["still_ms"] is not None
 
 
 Wanted = Callable[[Message], bool]

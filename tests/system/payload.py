@@ -10,7 +10,9 @@ import tomllib
 from pathlib import Path
 from typing import Final
 
+from drivers.twins.grasps.whole_grasps import synthetic_grasps, write_stream
 from tests.system.image import ImageError, run
+from tests.system.lab import CAN_GRASPS, CAN_RATE_HZ
 
 PROJECT: Final = Path(__file__).parents[2]
 GUEST: Final = Path(__file__).parent / "guest"
@@ -18,6 +20,8 @@ GUEST_PYTHON: Final = (3, 11)
 """Python of the machine's release; wheels are made by this one for that one."""
 EXTRA: Final = "record"
 """The optional part that the scenes need."""
+RECORDED: Final = 6
+"""Grasps of the recording that the CAN board plays."""
 SLACK_MIB: Final = 24
 """What the file system itself takes, and more."""
 
@@ -33,10 +37,9 @@ def make_payload(cache: Path, disk: Path) -> None:
         shutil.copytree(_dependencies(cache), wheels)
         _wheel(wheels, "--no-deps", str(PROJECT))
         shutil.copytree(PROJECT / "deploy", content / "deploy")
-        shutil.copy(
-            PROJECT / "drivers" / "recordings" / "demo" / "synthetic_grasps.csv",
-            content / "recording.csv",
-        )
+        grasps = synthetic_grasps(RECORDED, rate_hz=CAN_RATE_HZ, durations=CAN_GRASPS)
+        with (content / "recording.csv").open("w") as file:
+            write_stream(grasps, file, t_decimals=1)
         shutil.copytree(GUEST, content / "guest", ignore=shutil.ignore_patterns("__pycache__"))
         bytes_ = sum(path.stat().st_size for path in content.rglob("*"))
         size = f"{(bytes_ >> 20) * 5 // 4 + SLACK_MIB}M"

@@ -52,7 +52,7 @@ def _end_badly(lab: Lab, signal: str, result: str) -> float:
     pid = lab.show("can", "MainPID")
     at_s = lab.deed(f"kill -{signal} {pid}")
     well = lab.await_message(
-        "can", at_s, "a verdict", lambda m: m.judged and m.body["boot_id"] != former
+        "can", at_s, "a verdict", lambda m: m.told and m.body["boot_id"] != former
     )
     said = lab.journal("can", at_s)
     if not any(f"Failed with result '{result}'" in line for line in said):
@@ -106,7 +106,7 @@ def bridge_hung(lab: Lab) -> Outcome:
 
 
 def _unknown(message: Message) -> bool:
-    return message.kind == "verdict" and not message.judged
+    return message.kind == "verdict" and not message.told
 
 
 def _stale(message: Message) -> bool:
@@ -195,7 +195,7 @@ def wrong_reload(lab: Lab) -> Outcome:
 
 
 def _silence_of_2500(message: Message) -> bool:
-    return message.judged and message.body["silence_ms"] == 2500.0
+    return message.told and message.body["silence_ms"] == 2500.0
 
 
 def stopped(lab: Lab) -> Outcome:

@@ -189,7 +189,7 @@ def _pipeline(wanted: Scene, model: TactileModel, meter: Meter) -> Pipeline:
     from daemon.assembly import assembly
 
     every = wanted.gate.model_copy(update={"mode": "every", "sweeps": None})
-    learns = wanted.session_learns
+    learns = wanted.session.learn
     simple = wanted.model_copy(update={"gate": every})
     pipeline = assembly.build_pipeline(simple, model, learns=learns)
     meter.take("judge" if pipeline.session is None else "judge, session")
@@ -269,7 +269,8 @@ def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, i
     judgement = pipeline.judge(reading)
     judged_ns = time.thread_time_ns()
     outbox.verdict(judgement, judgement.t_ns, SILENCE_NS)
-    return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, judgement.judged
+    ran = judgement.judged or judgement.judged_counts is not None
+    return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, ran
 
 
 def _timed(

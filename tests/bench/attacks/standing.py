@@ -134,6 +134,8 @@ class Told:
         self.late += answer.p_slip is not None and self._age_ns(answer) > 0
 
     def _age_ns(self, verdict: Verdict) -> int:
+        if verdict.repaired:
+            return 0  # what the network was given is not known here
         for t_ns, p_slip in reversed(self._said):
             if t_ns <= verdict.t_mono_ns and abs(p_slip - (verdict.p_slip_model or 0.0)) < SAME:
                 return verdict.t_mono_ns - t_ns
@@ -259,7 +261,7 @@ ATTACKS = (
         Attack(
             f"drift-{name}",
             Aim.FALSE_STABLE,
-            f"a held grasp drifts by {DRIFT_COUNTS:.0f} counts towards slip, `{gate}`, with questions",
+            f"a held grasp drifts by {DRIFT_COUNTS:.0f} counts to slip, `{gate}`, with questions",
             "verdicts",
             partial(drifts, gate=gate),
         )

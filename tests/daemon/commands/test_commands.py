@@ -147,7 +147,9 @@ def test_check_says_what_is_known_of_motion_and_when(
 
 def test_check_says_nothing_of_motion_where_each_reading_is_a_grasp(tmp_path: Path) -> None:
     scene = tmp_path / "scene.toml"
-    scene.write_text('[tactile]\ndriver = "can"\n[gate]\nmode = "every"\n')
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n[gate]\nmode = "every"\n'
+    )
     assert "still" not in json.loads(graspd("check", scene, "--json").stdout)["in"]
 
 

@@ -74,6 +74,7 @@ def judge(
     sections = {**SECTIONS, "gate": gate, "model": {"name": named}}
     if gate.get("mode") == "every":
         del sections["joints"]
+        sections["tactile"] = {"driver": "replay", "recordings": [str(DEMO_RECORDING)]}
     wanted = scene.parse(sections, Path("test"))
     loaded = assembly.load_model(wanted) if isinstance(model, str) else model
     return assembly.build_pipeline(wanted, loaded, lambda: now[0])

@@ -195,7 +195,8 @@ def test_the_readings_that_are_timed_are_judged_as_the_gate_of_the_scene_says(
     assert timed.reading is not None
     assert timed.judged is not None
     assert timed.reading.number == 300
-    assert 1 <= timed.judged.number <= 4  # a grasp is judged once
+    # Three seconds with some grasps, each judged as it settles and then twenty times a second.
+    assert 5 <= timed.judged.number <= 4 + 60
     assert 0.0 < timed.reading.p50_us <= timed.reading.p99_us
 
 

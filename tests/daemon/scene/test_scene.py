@@ -111,6 +111,16 @@ def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
         (GOOD + "[tactile.faults]\nslow_every = 0", "tactile.faults.slow_every", "greater"),
         (GOOD + "[tactile.faults]\nfingers = ['lf']", "scene", "names lf, not in hand.fingers"),
         (GOOD + "rate_hz = 1e6", "tactile.rate_hz", "less than or equal to 100000"),
+        *(
+            (f"[tactile]\n{live}\n[gate]\nmode = 'every'", "scene", says)
+            for live in (
+                "driver = 'can'",
+                "driver = 'spi'\nport = 'p'",
+                "driver = 'palm'\nsource = 'udp://127.0.0.1:9870'",
+                "driver = 'palm'\nsource = 'packets.bin'",
+            )
+            for says in ("gate.mode every is for grasp tables", 'use "settled" or "request"')
+        ),
     ],
 )
 def test_a_mistake_is_one_line_naming_file_and_key(

@@ -378,6 +378,13 @@ def test_the_verdict_stays_in_view_until_the_next_grasp_and_is_marked_as_past() 
     assert "(" not in text_of(view.snapshot(0), 80, 24, Canvas())[4]
 
 
+def test_a_grasp_whose_verdict_turns_while_it_stands_is_listed_once_as_it_was_told_last() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
+    turned = verdict(1, Decision.SLIP, grasp=41, judged=False, gate=GateState.JUDGED)
+    view.take(b"verdict.right", turned, 0)
+    assert [(last.grasp, last.verdict) for last in view.snapshot(0).grasps] == [(41, "slip")]
+
+
 def test_silence_hides_what_was_judged_but_in_the_list() -> None:
     view = after((b"verdict.right", verdict(0, Decision.STABLE)))
     seen = view.snapshot(101 * MS)

@@ -79,7 +79,7 @@ def test_a_model_of_two_fingers_judges_a_hand_of_two(tmp_path: Path) -> None:
     scene = parse(
         {
             "hand": {"fingers": ["ff", "th"]},
-            "tactile": {"driver": "spi", "port": "/nowhere"},
+            "tactile": {"driver": "replay", "recordings": ["/nowhere.csv"]},
             "model": {"path": str(tmp_path / "small-session-ff-th.onnx")},
             "gate": {"mode": "every"},
         },

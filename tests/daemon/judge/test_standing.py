@@ -1,0 +1,223 @@
+"""A verdict that stands says what the network says now, of one grasp, without flickering."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+from numpy.typing import NDArray
+
+from daemon.judge.calibration import SessionCalibration
+from daemon.judge.decision import Limits
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import Decision, GateState, Reason
+from daemon.trust.ledger import GraspId
+from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import Trust
+from drivers.base import ElectrodeFault, TactileReading
+from drivers.twins.grasps.grasp_script import Phase
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
+from models import zoo
+from models.runtime import TactileModel
+from tests.bench.attacks.standing import drifting
+from tests.daemon.fakes import MS, Clock
+from tests.daemon.judge.test_only_stable_if import HELD, Feel, Flaw, Hand, limits, tared
+
+PERIOD_NS = 14 * MS
+"""Of a palm's electrodes, 71.43 Hz."""
+SWEEPS = 1000
+"""Rest, closing, a second of holding, five of drift and some more."""
+BOOT = "b" * 32
+
+
+class Direct:
+    """The network alone, run by onnxruntime on the median of the last three sweeps."""
+
+    def __init__(self, model: TactileModel) -> None:
+        self._inputs = model.inputs
+        self._batch = np.zeros((1, *model.inputs.shape), dtype=np.float32)
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = 1
+        self._session = ort.InferenceSession(model.path, options)
+        self._sweeps: deque[Counts] = deque(maxlen=3)
+        self.said: list[float] = []
+        """Of each sweep."""
+
+    def take(self, counts: Counts) -> None:
+        self._sweeps.append(counts)
+        median = np.median(np.array(self._sweeps), axis=0).astype(np.uint16)
+        self._inputs.build(median, self._batch[0])
+        (found,) = self._session.run(["probability"], {self._inputs.name: self._batch})
+        self.said.append(float(found[0, 1]))
+
+
+def never_twice(sweeps: Iterator[Counts]) -> Iterator[Counts]:
+    """The sweeps, so that no electrode repeats what it read: then the last three are fresh."""
+    last = next(sweeps)
+    yield last
+    for sweep in sweeps:
+        last = np.where(sweep == last, sweep + 1, sweep)
+        yield last
+
+
+@pytest.mark.parametrize(
+    ("on_request", "early"), [(False, False), (True, False), (False, True), (True, True)]
+)
+def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool) -> None:
+    model, clock = TactileModel(zoo.find("cnn1")), Clock()
+    grip = limits(on_request=on_request, early=early)
+    judge = Pipeline(model, model.contract.fingers, Limits(), clock, grip=grip)
+    direct, faults = Direct(model), np.zeros((3, 24), dtype=np.uint8)
+    told: list[Judgement] = []
+    asked, ages = False, []
+    for number, counts in zip(range(SWEEPS), never_twice(drifting()), strict=False):
+        clock.now_ns += PERIOD_NS
+        direct.take(counts)
+        asked = asked or number % 25 == 0
+        if number % 25 == 0:
+            judge.ask()
+        told.append(judge.judge(TactileReading(clock(), number, counts, faults)))
+        if told[-1].p_slip is not None and not told[-1].repaired:
+            age = direct.said[::-1].index(told[-1].p_slip)  # to the bit
+            assert age * PERIOD_NS <= 100 * MS
+            assert not (asked and age), "a question is answered by the newest counts"
+            ages.append(age)
+        asked = asked and told[-1].p_slip is None
+    assert len(ages) > 300
+    assert max(direct.said[-100:]) > 0.7
+    decisions = [each.decision for each in told if each.decision is not Decision.UNKNOWN]
+    turns = sum(a is not b for a, b in itertools.pairwise(decisions))
+    assert (decisions[0], decisions[-1], turns) == (Decision.STABLE, Decision.SLIP, 1)
+    assert {each.grasp for each in told} == {0, 1}
+
+
+def test_a_grasp_stays_judged_and_is_one() -> None:
+    hand = tared(limits())
+    said = hand.play(Feel(times=500))
+    first = [each.judged for each in said].index(True)
+    assert sum(each.judged for each in said) == 1
+    assert {each.gate for each in said[first:]} == {GateState.JUDGED}
+    assert not [change for each in said[first + 1 :] for change in each.changes]
+    assert hand.model.runs > 10 * 4.5
+
+
+def test_what_was_slip_is_stable_only_when_it_was_not_for_a_second() -> None:
+    hand = tared(limits())
+    assert hand.play(HELD)[-1].decision is Decision.STABLE
+    slips = hand.play(Feel(times=10, answer=0.6))
+    assert {each.decision for each in slips[5:]} == {Decision.SLIP}
+    said = hand.play(Feel(times=200, answer=0.4))
+    assert {each.p_slip for each in said[5:]} == {0.4}, "what is told is the newest"
+    first = [each.decision for each in said].index(Decision.STABLE)
+    assert 95 <= first <= 105
+    assert {each.decision for each in said[first:]} == {Decision.STABLE}
+
+
+def test_around_the_threshold_a_verdict_does_not_flicker() -> None:
+    hand, said = tared(limits()), []
+    hand.play(HELD)
+    for number in range(100):
+        said += hand.play(Feel(times=5, answer=0.49 + 0.02 * (number % 2)))
+    decisions = [each.decision for each in said]
+    assert set(decisions[20:]) == {Decision.SLIP}
+
+
+def test_a_slip_says_nothing_of_the_next_grasp() -> None:
+    hand = tared(limits())
+    hand.play(Feel("faint", times=35, answer=0.9))
+    hand.play(Feel("rest", times=15))
+    said = hand.play(Feel("faint", times=35))
+    decisions = [each.decision for each in said]
+    assert decisions.index(Decision.STABLE) < 35
+    assert Decision.SLIP not in decisions
+
+
+def test_a_network_that_fails_now_is_told_now() -> None:
+    hand = tared(limits())
+    assert hand.play(HELD)[-1].decision is Decision.STABLE
+    said = hand.play(Feel(times=20, answer=None))
+    assert [each.reasons for each in said[5:]] == [(Reason.MODEL_FAILED,)] * 15
+    assert hand.play(Feel(times=6))[-1].decision is Decision.STABLE
+
+
+def test_where_values_are_missing_all_the_time_the_newest_are_judged() -> None:
+    hand = tared(limits())
+    assert hand.play(HELD)[-1].decision is Decision.STABLE
+    missing = (Flaw(0, 3, 2, int(ElectrodeFault.MISSING), 0),)
+    runs, known = hand.model.runs, 0
+    for _ in range(40):  # so no electrode of it ever has three fresh values
+        known += hand.play(Feel(flaws=missing))[0].decision is Decision.STABLE
+        known += hand.play(Feel())[0].decision is Decision.STABLE
+    assert known > 40
+    assert hand.model.runs - runs >= 80 * 10 // 110
+
+
+def risky(limit: RiskLimits) -> tuple[Hand, Trust]:
+    hand = tared(limits())
+    trust = Trust(hand.model.sha256, 0, limit, learns=False)
+    hand.pipeline.trust, hand.pipeline.boot_id = trust, BOOT
+    return hand, trust
+
+
+def test_under_a_risk_a_grasp_that_is_judged_on_and_on_is_one_lift() -> None:
+    hand, trust = risky(RiskLimits(0.05))
+    said = hand.play(Feel(times=300, answer=0.001))
+    assert said[-1].decision is Decision.STABLE
+    assert trust.report().outstanding == 1
+    (record,) = trust.ledger.state().records
+    first = record.features
+    hand.play(Feel(times=300, answer=0.002))
+    assert trust.ledger.state().records[0].features == first, "what it was called stable by"
+    hand.play(Feel(times=50, answer=0.9))
+    assert trust.ledger.is_stable(GraspId(BOOT, 1)), "it may have been lifted on that"
+    hand.pipeline.outcome(GraspId(BOOT, 1), slipped=True)
+    assert (trust.risk.lifts, trust.risk.slips) == (1, 1)
+
+
+def test_under_a_risk_nobody_gets_a_lucky_draw_by_waiting() -> None:
+    hand, trust = risky(RiskLimits(0.05))
+    theta = 1.0 / (1.0 + math.exp(-trust.risk.theta))
+    said = [
+        each
+        for number in range(200)
+        for each in hand.play(Feel(times=5, answer=theta * (0.9 if number % 3 else 1.1)))
+    ]
+    stable = [each.decision is Decision.STABLE for each in said]
+    assert not any(stable[60:]), "of three judgings two are below the threshold"
+    reasons = {reason for each in said[60:] for reason in each.reasons}
+    assert Reason.LOW_CONFIDENCE in reasons
+    assert trust.report().outstanding <= 1
+
+
+def test_after_its_outcome_was_told_a_grasp_is_not_stable_again() -> None:
+    hand, _ = risky(RiskLimits(0.5))
+    assert hand.play(Feel(times=60))[-1].decision is Decision.STABLE
+    hand.pipeline.outcome(GraspId(BOOT, 1), slipped=False)
+    assert {each.decision for each in hand.play(Feel(times=60))[10:]} == {Decision.UNKNOWN}
+
+
+def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken: list[NDArray[np.generic]] = []
+    monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
+    model, clock = TactileModel(zoo.find("small-session")), Clock()
+    judge = Pipeline(model, model.contract.fingers, Limits(), clock, grip=limits())
+    faults, held, judged = np.zeros((3, 24), dtype=np.uint8), 0, []
+    for number, moment in enumerate(synthetic_grasps(1, seed=1)):
+        clock.now_ns += 10 * MS
+        said = judge.judge(TactileReading(clock(), number, moment.counts, faults))
+        judge.learn()
+        held += moment.phase is Phase.SETTLE
+        judged += [said.judged_counts] if said.judged else []
+        if said.gate is GateState.JUDGED:
+            assert not taken
+    assert held
+    assert len(taken) == 1
+    np.testing.assert_array_equal(taken[0], judged[0])
