@@ -21,7 +21,7 @@ from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Authenticator
-    from daemon.publish.curve import CurveDoor
+    from daemon.publish.curve import CurveDoor, Guard
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
@@ -53,6 +53,7 @@ class Sockets(Companion):
         """Whether a port could not be had again."""
         self._own_keys: OwnKeys | None = None
         self.authenticator: Authenticator | None = None
+        self._guard: Guard | None = None
         self.publisher: Publisher
         self.questions: Questions | None = None
         try:
@@ -74,6 +75,10 @@ class Sockets(Companion):
             patience_ns = round(wanted.gate.request_ms * 1e6)
             self.questions = Questions(wanted.ask_endpoint, patience_ns, binding)
         self._watch()
+        if self._with_keys():
+            from daemon.publish.curve import Guard
+
+            self._guard = Guard(self._cut_off_greedy)
 
     def _let_in_only_known(self, curve: Curve) -> None:
         import zmq  # only where there are keys
@@ -134,6 +139,8 @@ class Sockets(Companion):
             self.publisher.take()
         if self.authenticator is not None:
             self.authenticator.take()
+        if self._guard is not None:
+            self._guard.look(self._clock())
 
     def on_answer(self, payload: bytes) -> None:
         """Answer all who have asked."""
@@ -193,8 +200,17 @@ class Sockets(Companion):
                 self._lost = True
         self._watch()
 
+    def _cut_off_greedy(self) -> None:
+        log.error("peers with keys hold too much memory: all of them have to connect again")
+        for door in self._with_keys():
+            door.counters["all_cut_off"] += 1
+        self._cut_off()
+
     def close(self) -> None:
         """Close them all. May be called again."""
+        if self._guard is not None:
+            self._guard.close()
+            self._guard = None
         for bound in self._bound():
             bound.close()
         if self.authenticator is not None:

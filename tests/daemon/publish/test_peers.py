@@ -135,22 +135,22 @@ def test_an_abstract_name_can_be_heard(tmp_path: Path, friends: Peers) -> None:
 
 def test_a_peer_that_wants_signs_of_life_gets_them(tmp_path: Path, friends: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
-    with Publisher(endpoint) as publisher:
-        with (
-            friends.context.socket(zmq.SUB) as subscriber,
-            subscriber.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor,
-        ):
-            subscriber.linger = 0
-            subscriber.heartbeat_ivl, subscriber.heartbeat_timeout = 20, 100
-            subscriber.subscribe("")
-            subscriber.connect(endpoint)
-            assert hears(publisher, subscriber)
-            for _ in range(100):
-                publisher.take()
-                time.sleep(0.005)
-            assert not monitor.poll(0)
-            assert monitor.poll(2000)  # nobody looks after the publisher any more
-            subscriber.disable_monitor()
+    with (
+        Publisher(endpoint) as publisher,
+        friends.context.socket(zmq.SUB) as subscriber,
+        subscriber.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor,
+    ):
+        subscriber.linger = 0
+        subscriber.heartbeat_ivl, subscriber.heartbeat_timeout = 20, 100
+        subscriber.subscribe("")
+        subscriber.connect(endpoint)
+        assert hears(publisher, subscriber)
+        for _ in range(100):
+            publisher.take()
+            time.sleep(0.005)
+        assert not monitor.poll(0)
+        assert monitor.poll(2000)  # nobody looks after the publisher any more
+        subscriber.disable_monitor()
 
 
 def test_a_subscriber_connects_again_after_a_restart(tmp_path: Path, friends: Peers) -> None:
