@@ -9,13 +9,13 @@ between.
 from __future__ import annotations
 
 import contextlib
+import os
 import select
 import socket
 import struct
 import time
 from collections import Counter, deque
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Final
 
 from daemon.publish.binding import Binding, Door, Peer, PublishError, socket_file
@@ -89,7 +89,7 @@ class PlainPeer:
             return self is former
         if former.is_open or self.user != former.user:
             return False
-        return self.process == former.process or not Path(f"/proc/{former.process}").exists()
+        return self.process == former.process or not _runs(former.process)
 
     def subscribe(self, messages: Sequence[Message]) -> bool:
         """Take in what subscribes; whether that changes anything. Raises `ZmtpError` for a topic
@@ -365,6 +365,18 @@ class PlainDoor(Door):
         self._listener.close()
         if self._file is not None:
             self._file.close()
+
+
+def _runs(process: int) -> bool:
+    """Whether there is such a process; of 0 the kernel does not tell which it is."""
+    try:
+        if process > 0:
+            os.kill(process, 0)
+    except PermissionError:
+        return True
+    except ProcessLookupError:
+        return False
+    return process > 0
 
 
 def _listener(endpoint: str) -> socket.socket:
