@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, Literal
 
-from daemon.publish.binding import Binding, Bound, Peer
+from daemon.publish.binding import Binding, Peer
+from daemon.publish.bound import Bound
 from daemon.publish.companion import CONTRADICTS, Answer
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.publish.zmtp import Message, Role

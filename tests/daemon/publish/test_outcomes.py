@@ -24,7 +24,7 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
-from daemon.publish.peers import PlainPeer
+from daemon.publish.peer import PlainPeer
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
 from daemon.publish.zmtp import Role
 from daemon.trust.ledger import GraspId, Told
