@@ -13,7 +13,7 @@ import zmq
 
 from daemon.publish import access
 from daemon.publish.binding import Peer, PublishError
-from daemon.publish.curve import FREED_NS, GROWTH_MAX_BYTES, LOOK_NS, Guard
+from daemon.publish.curve import FREED_NS, GROWTH_MAX_BYTES, LOOK_NS, CurvePeer, Guard
 from tests.daemon.publish.test_keys import PATIENCE_S, PORT, Door, door
 
 __all__ = ["door"]
@@ -105,6 +105,7 @@ def test_a_key_stands_for_itself_whatever_the_connection(door: Door) -> None:
         door.until(has_asked)
     assert peers[0] != peers[1]
     assert peers[0].stands_for(peers[1])
+    assert [peer.user for peer in peers if isinstance(peer, CurvePeer)] == ["controller"] * 2
 
 
 def test_a_door_that_is_closed_says_so(door: Door) -> None:
