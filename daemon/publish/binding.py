@@ -66,6 +66,9 @@ class Peer(Protocol):
         """Whether it may speak for another peer of the same door: it is the same, or has taken its
         place."""
 
+    def may_follow(self, former: object) -> bool:
+        """Whether it is about to take the other's place, which may be about to go."""
+
 
 class Door(ABC):
     """A listening socket and its connections."""

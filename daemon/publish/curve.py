@@ -64,6 +64,10 @@ class CurvePeer:
         """Whether it has the same key."""
         return isinstance(former, CurvePeer) and self.user == former.user
 
+    def may_follow(self, former: object) -> bool:
+        """Whether it stands for the other once that has gone, but not yet: never."""
+        return False
+
 
 EVERYBODY: Final = CurvePeer(b"", "")
 """libzmq does not say who subscribes, and sends to all alike."""

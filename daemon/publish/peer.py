@@ -54,6 +54,10 @@ class PlainPeer:
             return False
         return self.process == former.process or not _runs(former.process)
 
+    def may_follow(self, former: object) -> bool:
+        """Whether it is of the same process, and stands for the other once that has gone."""
+        return isinstance(former, PlainPeer) and self.process == former.process
+
     def subscribe(self, messages: Sequence[Message]) -> bool:
         """Take in what subscribes; whether that changes anything. Raises `ZmtpError` for a topic
         too many."""

@@ -257,6 +257,26 @@ def test_who_owns_a_grasp_and_has_gone_is_stood_for_by_another_connection_of_its
         assert time.monotonic() < deadline_s
 
 
+def test_who_tells_before_its_former_connection_is_seen_to_go_is_heard(
+    questions: Questions, teller: zmq.Socket[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.publish.questions.GRACE_NS", 5_000_000_000)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as former:
+        former.linger = 0
+        former.connect(questions.endpoint)
+        ask_about(questions, former, 7)
+        teller.send(f"outcome {BOOT} 7 slip".encode())
+        for _ in range(100):
+            questions.take(0, takes_the_seventh)
+            time.sleep(0.001)
+        assert not teller.poll(0)
+    deadline_s = time.monotonic() + 4.0
+    while not teller.poll(1):
+        questions.take(0, takes_the_seventh)
+        assert time.monotonic() < deadline_s
+    assert json.loads(teller.recv()) == {"v": 1, "ok": True}
+
+
 def test_what_was_told_stays_and_may_be_told_again(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
