@@ -37,7 +37,7 @@ HELD_MAX = 16
 """Outcomes that are held because they are too early."""
 GRACE_NS = 100_000_000
 """For how long: who asks, closes, connects again and tells may be heard of in another order."""
-NOT_YOURS = "not yours: somebody else has asked about this grasp"
+NOT_YOURS = "not yours: somebody else asks about grasps here"
 
 TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
 """Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
@@ -164,15 +164,23 @@ class Questions(Bound):
         outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
         named = None if told[4] is None else told[4].decode()
         grasp = GraspId(told[1].decode(), int(told[2]))
+        owners = self._owners(grasp)
+        if owners and not any(map(peer.stands_for, owners)):
+            return TOO_EARLY if any(map(peer.may_follow, owners)) else NOT_YOURS
         lift = self._lifts.get(grasp)
-        if lift is not None and lift.owner and not peer.stands_for(lift.owner):
-            return TOO_EARLY if peer.may_follow(lift.owner) else NOT_YOURS
         if lift is not None and lift.outcome not in (None, outcome):
             return CONTRADICTS
         why = take_outcome(*grasp, outcome, named)
         if why is None:
             self._lift(grasp, None).outcome = outcome
         return why
+
+    def _owners(self, grasp: GraspId) -> set[Peer]:
+        """Who asked about a grasp; if nobody has, whoever asks here; nobody if nobody does."""
+        lift = self._lifts.get(grasp)
+        if lift is not None and lift.owner is not None:
+            return {lift.owner}
+        return {each.owner for each in self._lifts.values() if each.owner is not None}
 
     def _lift(self, grasp: GraspId, owner: Peer | None) -> _Lift:
         """What is known of a grasp; it gets this owner if nothing is."""

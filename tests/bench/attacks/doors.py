@@ -291,9 +291,9 @@ def questions(plan: Plan) -> Outcome:
 
 
 def forged(plan: Plan) -> Outcome:
-    """Outcomes of grasps that the controller asked about, told by somebody else, before and after
-    it."""
-    forged_well = told_well = tried = 0
+    """Outcomes told by somebody else, of grasps that the controller asked about, before and after
+    it, and of others; and a word of its own that it takes back."""
+    forged_well = lies = told_well = tried = 0
 
     def tell(who: zmq.Socket[bytes], boot_id: str, grasp: int, outcome: str) -> bool:
         who.send(f"outcome {boot_id} {grasp} {outcome}".encode())
@@ -322,9 +322,11 @@ def forged(plan: Plan) -> Outcome:
                 told_well += tell(controller, *names, "stable")
                 forged_well += tell(liar, *names, "slip")
                 forged_well += tell(controller, *names, "slip")
+                forged_well += tell(liar, answer["boot_id"], answer["grasp"] - 1, "slip")
+                lies += 4
         well = forged_well == 0 and told_well == tried > 0
-        said = f"{forged_well} of {3 * tried} forged, {told_well} of {tried} true ones taken, "
-        return daemon.outcome(4 * tried, well, said)
+        said = f"{forged_well} of {lies} forged, {told_well} of {tried} true ones taken, "
+        return daemon.outcome(lies + tried, well, said)
 
 
 ATTACKS: tuple[Attack, ...] = (
@@ -372,7 +374,7 @@ ATTACKS: tuple[Attack, ...] = (
         "forged-outcomes",
         Aim.WHO_MAY,
         "another peer tells outcomes of grasps that the controller asked about, first and last, "
-        "and the controller itself changes its word",
+        "and of others, and the controller itself changes its word",
         "outcomes",
         forged,
     ),

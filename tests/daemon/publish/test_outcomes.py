@@ -301,6 +301,20 @@ def test_a_grasp_that_nobody_asked_about_is_told_of_by_anybody_in_one_word(
         assert not told(questions, other, stable)["ok"]
 
 
+def test_who_asks_about_grasps_is_not_forestalled_by_who_does_not(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    """A grasp is known to all once it is judged, and may be asked about later."""
+    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
+    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
+        other.linger = 0
+        other.connect(questions.endpoint)
+        ask_about(questions, teller, 6)
+        assert told(questions, other, slip)["why"].startswith("not yours")
+        ask_about(questions, teller, 7)
+        assert told(questions, teller, stable)["ok"]
+
+
 def test_who_stands_for_whom() -> None:
     """By process and user, as the kernel tells them for Unix sockets."""
     with subprocess.Popen(["true"]) as ended:
