@@ -31,7 +31,15 @@ IN_REAL_TIME = {
     *("test_systemd", "test_outages", "test_outcomes", "test_palm", "test_process"),
     *("test_publisher", "test_questions", "test_link_log", "test_readme"),
     *("test_realtime", "test_record_and_replay", "test_recorder", "test_runner"),
-    *("test_soak", "test_sockets", "test_spi_bridge", "test_spi_twin", "test_subscribers"),
+    *(
+        "test_curve",
+        "test_peers",
+        "test_soak",
+        "test_sockets",
+        "test_spi_bridge",
+        "test_spi_twin",
+        "test_subscribers",
+    ),
     *("test_run_jobs", "test_watch_browser", "test_watch_command", "test_watch_web"),
 }
 """Files whose tests work with processes, links and clocks as they are. A shared computer stalls now

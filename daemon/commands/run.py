@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import faulthandler
 import os
 import resource
@@ -23,9 +24,8 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
-DESCRIPTORS_MAX = 4096
-"""All peers that both sockets admit, and as many again for files, devices and peers with keys, of
-which libzmq alone knows how many there are."""
+DESCRIPTORS = 4096
+"""For all peers of both sockets, and as many again for peers with keys, files and devices."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     SIGHUP reads the scene again, and a wrong one changes nothing. On a terminal it means that the
     terminal is gone, as for any other command.
     """
-    _limit_descriptors()
+    _allow_descriptors()
     try:
         with ExitStack() as stack:
             stop = stack.enter_context(StopSignal(reloads=not _on_terminal()))
@@ -55,11 +55,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _limit_descriptors() -> None:
-    """Have enough of them for all peers, and have peers without number refused by the kernel."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = DESCRIPTORS_MAX if hard == resource.RLIM_INFINITY else min(DESCRIPTORS_MAX, hard)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+def _allow_descriptors() -> None:
+    """Have enough of them, as far as this process may."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = DESCRIPTORS if hard == resource.RLIM_INFINITY else min(DESCRIPTORS, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with contextlib.suppress(OSError):  # a service manager that forbids it has set its own
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _on_terminal() -> bool:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import socket
+import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -19,6 +22,14 @@ REQUEST_FRAMES = 9
 """Of a CURVE request: who asks (2), version, id, domain, address, identity, mechanism, key."""
 TAKEN_MAX = 64
 """Requests and events looked at in one round, so that a flood does not hold up readings."""
+STRANGERS_MAX = 128
+"""Connections to a socket that have not shown a key yet; the oldest makes place for a newer one, so
+that there are always descriptors for files and devices."""
+SHOWN_BYTES = 500
+"""Who has sent less has not shown a key: greeting, HELLO and INITIATE have 64, 202 and 259 bytes at
+least (RFC 26)."""
+TCP_BYTES_RECEIVED = slice(128, 136)
+"""Where in tcp_info (linux/tcp.h, tcpi_bytes_received)."""
 EVENTS = (
     zmq.EVENT_ACCEPTED
     | zmq.EVENT_DISCONNECTED
@@ -58,7 +69,7 @@ class Authenticator:
         self, context: zmq.Context[zmq.Socket[bytes]], admitted: Mapping[bytes, str]
     ) -> None:
         """`admitted` maps public keys (Z85, 40 bytes) to the names of who may connect."""
-        self.counters = Counter(admitted=0, turned_away=0, files_refused=0)
+        self.counters = Counter(admitted=0, turned_away=0, crowded_out=0, files_refused=0)
         self._admitted = dict(admitted)
         self._context = context
         self._requests = context.socket(zmq.ROUTER)
@@ -101,6 +112,10 @@ class Authenticator:
                     break
                 event = parse_monitor_message(watched.monitor.recv_multipart(zmq.NOBLOCK))
                 self._note(watched, event["event"], event["value"])
+            while len(watched.waiting) > STRANGERS_MAX:
+                descriptor = next(iter(watched.waiting))
+                del watched.waiting[descriptor]
+                self.counters["crowded_out"] += _hang_up(descriptor)
 
     def _answer(self, frames: list[bytes]) -> None:
         if len(frames) != REQUEST_FRAMES or frames[2] != ZAP_VERSION or frames[7] != b"CURVE":
@@ -146,3 +161,19 @@ class Authenticator:
         """Answer nobody any more."""
         self.unwatch()
         self._requests.close(linger=0)
+
+
+def _hang_up(descriptor: int) -> bool:
+    """End a connection of libzmq's that has not shown a key, as if its peer had."""
+    try:
+        connection = socket.socket(fileno=descriptor)
+    except OSError:  # it has gone meanwhile
+        return False
+    with contextlib.suppress(OSError):
+        about = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, TCP_BYTES_RECEIVED.stop)
+        if int.from_bytes(about[TCP_BYTES_RECEIVED], sys.byteorder) < SHOWN_BYTES:
+            connection.shutdown(socket.SHUT_RDWR)
+            connection.detach()
+            return True
+    connection.detach()
+    return False

@@ -1,4 +1,4 @@
-"""Binds sockets: never over another program's socket file, and on TCP for known keys."""
+"""What a listening socket must do, and where it may listen: never over another program's file."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Protocol
 
 from daemon.publish.socket_file import OccupiedError, SocketFile
-from daemon.publish.zmtp import Message, Role
+from daemon.publish.zmtp import Message
 
 if TYPE_CHECKING:
     import zmq
@@ -66,6 +66,9 @@ class Peer(Protocol):
         """Whether it may speak for another peer of the same door: it is the same, or has taken its
         place."""
 
+    def may_follow(self, former: object) -> bool:
+        """Whether it is about to take the other's place, which may be about to go."""
+
 
 class Door(ABC):
     """A listening socket and its connections."""
@@ -104,47 +107,3 @@ class Door(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close all connections once what waits is sent, for half a second at most."""
-
-
-class Bound:
-    """A socket with an endpoint; a derived class says what is done with its messages."""
-
-    def __init__(
-        self, endpoint: str, role: Role, high_water_mark: int, binding: Binding | None
-    ) -> None:
-        """Bind, queueing so many messages per peer, without a `binding` for whoever can reach the
-        endpoint. Raises `PublishError`."""
-        self.endpoint = endpoint
-        binding = Binding() if binding is None else binding
-        self.door: Door
-        if binding.curve is not None and endpoint.startswith("tcp://"):
-            from daemon.publish.curve import CurveDoor
-
-            self.door = CurveDoor(endpoint, role, high_water_mark, binding.curve)
-        else:
-            from daemon.publish.peers import PlainDoor
-
-            self.door = PlainDoor(endpoint, role, high_water_mark, binding)
-
-    @property
-    def is_open(self) -> bool:
-        """False once it is closed, or could not be opened again."""
-        return self.door.is_open
-
-    def fileno(self) -> int:
-        """Becomes readable when something may have come; call `take` before waiting for it."""
-        return self.door.fileno()
-
-    def _with_the_doors(self, counted: Counter[str]) -> Counter[str]:
-        """What was counted here, and what the door has counted."""
-        return Counter(dict(counted) | dict(self.door.counters))
-
-    def close(self) -> None:
-        """Close the socket and remove its file. May be called again."""
-        self.door.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self.close()

@@ -1,10 +1,16 @@
-"""Peers with keys, over TCP: libzmq checks them, encrypts, and reads what they send."""
+"""Peers with keys, over TCP: libzmq checks them, encrypts, and reads what they send.
+
+It bounds nobody's unfinished message, and cuts off all peers of a socket or none: so the memory of
+the process is watched, and when it grows too much all of them have to connect again.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import os
 import time
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -35,6 +41,13 @@ second); with two it cannot keep up, and takes some two thousand a second. With 
 heard."""
 TAKEN_MAX: Final = {Role.XPUB: 256, Role.ROUTER: 64}
 """Messages, and at most so many frames, taken in one round, in half a millisecond."""
+GROWTH_MAX_BYTES: Final = 16 << 20
+"""So much more memory than at rest may be the peers'."""
+LOOK_NS: Final = 2_000_000
+"""How often the memory is looked at, at most; it takes 4 us."""
+FREED_NS: Final = 50_000_000
+"""How long libzmq may take to give back what it held for peers that were cut off."""
+PAGE_BYTES: Final = os.sysconf("SC_PAGESIZE")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +63,10 @@ class CurvePeer:
     def stands_for(self, former: object) -> bool:
         """Whether it has the same key."""
         return isinstance(former, CurvePeer) and self.user == former.user
+
+    def may_follow(self, former: object) -> bool:
+        """Whether it stands for the other once that has gone, but not yet: never."""
+        return False
 
 
 EVERYBODY: Final = CurvePeer(b"", "")
@@ -191,3 +208,41 @@ class CurveDoor(Door):
         if self._made is not None:
             self._made.close()
             self._made = None
+
+
+class Guard:
+    """Has all peers cut off when what libzmq holds for them has grown too much.
+
+    It takes any growth of the process's memory for theirs, until cutting them off has not helped.
+    """
+
+    def __init__(self, cut_off: Callable[[], None]) -> None:
+        """`cut_off` closes all connections."""
+        self._cut_off = cut_off
+        self._statm = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
+        self._rest_bytes = self._resident_bytes()
+        self._due_ns = 0
+        self._is_cut_off = False
+
+    def look(self, now_ns: int) -> None:
+        """Look whether there is too much now."""
+        if now_ns < self._due_ns:
+            return
+        self._due_ns = now_ns + LOOK_NS
+        if self._is_cut_off:
+            self._is_cut_off = False
+            ctypes.CDLL(None).malloc_trim(0)
+            resident_bytes = self._resident_bytes()
+            if resident_bytes - self._rest_bytes > GROWTH_MAX_BYTES // 2:
+                self._rest_bytes = resident_bytes
+        elif self._resident_bytes() - self._rest_bytes > GROWTH_MAX_BYTES:
+            self._cut_off()
+            self._is_cut_off = True
+            self._due_ns = now_ns + FREED_NS
+
+    def _resident_bytes(self) -> int:
+        return int(os.pread(self._statm, 100, 0).split()[1]) * PAGE_BYTES
+
+    def close(self) -> None:
+        """Look no more."""
+        os.close(self._statm)

@@ -11,21 +11,17 @@ from __future__ import annotations
 import contextlib
 import select
 import socket
-import struct
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import Final
 
 from daemon.publish.binding import Binding, Door, Peer, PublishError, socket_file
+from daemon.publish.peer import SHARE_BYTES, PlainPeer
 from daemon.publish.socket_file import BACKLOG, SocketFile
 from daemon.publish.zmtp import (
-    CANCEL,
     GREETING,
-    SUBSCRIBE,
     Message,
-    Parser,
     Role,
     ZmtpError,
     message,
@@ -33,8 +29,6 @@ from daemon.publish.zmtp import (
 
 PEERS_MAX: Final = 256
 """Connections at a time."""
-SUBSCRIPTIONS_MAX: Final = 64
-"""Topics of one peer; the daemon has five."""
 HANDSHAKE_NS: Final = 5_000_000_000
 """Who has not said what it is by then is cut off."""
 EVENTS_MAX: Final = 8
@@ -43,8 +37,8 @@ ACCEPTED_MAX: Final = 16
 """Connections accepted in one round."""
 READ_BYTES: Final = 512
 """Taken of one peer in one round."""
-SHARE_NS, SHARE_BYTES = 100_000_000, 4096
-"""Taken of one peer in that time; it has to wait for the next. 580 questions."""
+SHARE_NS: Final = 100_000_000
+"""How often each peer has its share of bytes anew."""
 REST_NS: Final = 100_000_000
 """How long nobody is accepted after the process had no descriptor for somebody."""
 SEND_BUFFER_BYTES: Final = 32 * 1024
@@ -52,60 +46,7 @@ RECEIVE_BUFFER_BYTES: Final = 8 * 1024
 """Held by the kernel for each peer, which counts as the daemon's memory; it doubles them."""
 LINGER_S: Final = 0.5
 """How long closing waits for peers to take what is queued, s."""
-_CREDENTIALS = struct.Struct("3i")
-"""Process, user and group (unix(7), SO_PEERCRED)."""
 _READ, _WRITE = select.EPOLLIN, select.EPOLLOUT
-
-
-class PlainPeer:
-    """One connection."""
-
-    def __init__(self, connection: socket.socket, role: Role, now_ns: int) -> None:
-        """Of a listening socket in this `role`, accepted now."""
-        self.socket: socket.socket | None = connection
-        self.parser = Parser(role)
-        self.since_ns = now_ns
-        self.subscriptions: set[bytes] = set()
-        self.queue: deque[bytes] = deque()
-        """What the kernel has not taken yet."""
-        self.share = SHARE_BYTES
-        """Bytes that are still taken before the others are heard again."""
-        self.events = _READ
-        self.process, self.user = 0, -1
-        """As the kernel tells for Unix sockets; not known over TCP."""
-        if connection.family == socket.AF_UNIX:
-            asked = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-            self.process, self.user, _ = _CREDENTIALS.unpack(asked)
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it may still be connected."""
-        return self.socket is not None
-
-    def stands_for(self, former: object) -> bool:
-        """Whether it is the same connection, or that has gone and this is of the same process, or
-        of the same user once that process has ended. TCP does not tell who that is: anybody."""
-        if self is former or not isinstance(former, PlainPeer):
-            return self is former
-        if former.is_open or self.user != former.user:
-            return False
-        return self.process == former.process or not Path(f"/proc/{former.process}").exists()
-
-    def subscribe(self, messages: Sequence[Message]) -> bool:
-        """Take in what subscribes; whether that changes anything. Raises `ZmtpError` for a topic
-        too many."""
-        changed = False
-        for asked, *_ in messages:
-            known = asked[1:] in self.subscriptions
-            if asked[:1] == CANCEL and known:
-                self.subscriptions.discard(asked[1:])
-                changed = True
-            elif asked[:1] == SUBSCRIBE and not known:
-                self.subscriptions.add(asked[1:])
-                changed = True
-        if len(self.subscriptions) > SUBSCRIPTIONS_MAX:
-            raise ZmtpError("too many subscriptions")
-        return changed
 
 
 class PlainDoor(Door):
@@ -192,20 +133,34 @@ class PlainDoor(Door):
                 self._epoll.modify(self._listening, 0)
                 self._listen_due_ns = time.monotonic_ns() + REST_NS
                 return
+            peer = PlainPeer(connection, self._role, time.monotonic_ns())
             if len(self._peers) >= PEERS_MAX:
                 self.counters["crowded_out"] += 1
-                if not self._strangers:
+                leaving = self._who_makes_place_for(peer)
+                if leaving is None:
                     connection.close()
                     continue
-                self._close(next(iter(self._strangers.values())))
-            self._greet(connection)
+                self._close(leaving)
+            self._greet(peer, connection)
 
-    def _greet(self, connection: socket.socket) -> None:
+    def _who_makes_place_for(self, peer: PlainPeer) -> PlainPeer | None:
+        """Of the process that has far more than this peer's: its oldest stranger, or its
+        newest peer; else the oldest stranger of anybody."""
+        number = Counter(each.process for each in self._peers.values())
+        process, most = number.most_common(1)[0]
+        crowd = most > number[peer.process] + 1
+        for stranger in self._strangers.values():
+            if not crowd or stranger.process == process:
+                return stranger
+        if not crowd:
+            return None
+        return next(each for each in reversed(self._peers.values()) if each.process == process)
+
+    def _greet(self, peer: PlainPeer, connection: socket.socket) -> None:
         connection.setblocking(False)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         if connection.family != socket.AF_UNIX:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        peer = PlainPeer(connection, self._role, time.monotonic_ns())
         descriptor = connection.fileno()
         self._peers[descriptor] = self._strangers[descriptor] = peer
         self._epoll.register(descriptor, _READ)

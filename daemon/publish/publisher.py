@@ -8,7 +8,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
-from daemon.publish.binding import Binding, Bound, Peer
+from daemon.publish.binding import Binding, Peer
+from daemon.publish.bound import Bound
 from daemon.publish.zmtp import SUBSCRIBE, Role
 
 VERDICT = b"verdict."

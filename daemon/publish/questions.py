@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Literal
 
-from daemon.publish.binding import Binding, Bound, Peer
+from daemon.publish.binding import Binding, Peer
+from daemon.publish.bound import Bound
 from daemon.publish.companion import CONTRADICTS, Answer
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.publish.zmtp import Message, Role
@@ -30,7 +32,12 @@ _TOLD = re.compile(
 )
 MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
 NOBODY = "nobody takes outcomes here"
-NOT_YOURS = "not yours: somebody else has asked about this grasp"
+TOO_EARLY = "too early: who asked about this grasp is still there"
+HELD_MAX = 16
+"""Outcomes that are held because they are too early."""
+GRACE_NS = 100_000_000
+"""For how long: who asks, closes, connects again and tells may be heard of in another order."""
+NOT_YOURS = "not yours: somebody else asks about grasps here"
 
 TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
 """Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
@@ -48,6 +55,15 @@ def at_once(answer: Answer) -> None:
 class _Question:
     envelope: Message
     due_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    peer: Peer
+    envelope: Message
+    text: bytes
+    due_ns: int
+    """When it is no longer held, monotonic ns."""
 
 
 @dataclass(slots=True)
@@ -76,6 +92,7 @@ class Questions(Bound):
         """Oldest first."""
         self._lifts: dict[GraspId, _Lift] = {}
         """Oldest first, as many as outcomes are taken of."""
+        self._held: list[_Told] = []
 
     @property
     def counters(self) -> Counter[str]:
@@ -98,16 +115,15 @@ class Questions(Bound):
         Outcomes go to `outcome`; those that it takes are answered when `keep` says so.
         """
         taken = 0
+        held, self._held = self._held, []
+        for told in held:
+            self._take_outcome(told, outcome, keep)
         for peer, message in self.door.receive():
             *envelope, question = message
             well = envelope in ([], [b""])
             if well and question.partition(b" ")[0] == TELLING:
-                why = self._pass_on(peer, question, outcome)
-                answer = partial(self._answer_outcome, peer, envelope)
-                if why is None:
-                    keep(answer)
-                else:
-                    answer(why)
+                due_ns = time.monotonic_ns() + GRACE_NS
+                self._take_outcome(_Told(peer, envelope, question, due_ns), outcome, keep)
             elif well and question == QUESTION:
                 self._wait(peer, _Question(envelope, now_ns + self._patience_ns))
                 taken += 1
@@ -115,6 +131,19 @@ class Questions(Bound):
                 self._counted["malformed"] += 1
         self._counted["asked"] += taken
         return taken
+
+    def _take_outcome(self, told: _Told, outcome: TakeOutcome | None, keep: Keep) -> None:
+        why = self._pass_on(told.peer, told.text, outcome)
+        if why == TOO_EARLY:
+            if len(self._held) < HELD_MAX and time.monotonic_ns() < told.due_ns:
+                self._held.append(told)
+                return
+            why = NOT_YOURS
+        answer = partial(self._answer_outcome, told.peer, told.envelope)
+        if why is None:
+            keep(answer)
+        else:
+            answer(why)
 
     def _wait(self, peer: Peer, question: _Question) -> None:
         if self._waiting.pop(peer, None) is not None:
@@ -135,15 +164,23 @@ class Questions(Bound):
         outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
         named = None if told[4] is None else told[4].decode()
         grasp = GraspId(told[1].decode(), int(told[2]))
+        owners = self._owners(grasp)
+        if owners and not any(map(peer.stands_for, owners)):
+            return TOO_EARLY if any(map(peer.may_follow, owners)) else NOT_YOURS
         lift = self._lifts.get(grasp)
-        if lift is not None and lift.owner and not peer.stands_for(lift.owner):
-            return NOT_YOURS
         if lift is not None and lift.outcome not in (None, outcome):
             return CONTRADICTS
         why = take_outcome(*grasp, outcome, named)
         if why is None:
             self._lift(grasp, None).outcome = outcome
         return why
+
+    def _owners(self, grasp: GraspId) -> set[Peer]:
+        """Who asked about a grasp; if nobody has, whoever asks here; nobody if nobody does."""
+        lift = self._lifts.get(grasp)
+        if lift is not None and lift.owner is not None:
+            return {lift.owner}
+        return {each.owner for each in self._lifts.values() if each.owner is not None}
 
     def _lift(self, grasp: GraspId, owner: Peer | None) -> _Lift:
         """What is known of a grasp; it gets this owner if nothing is."""

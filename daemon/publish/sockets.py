@@ -22,7 +22,7 @@ from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Authenticator
-    from daemon.publish.curve import CurveDoor
+    from daemon.publish.curve import CurveDoor, Guard
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
@@ -55,6 +55,7 @@ class Sockets(Companion):
         """Whether a port could not be had again."""
         self._own_keys: OwnKeys | None = None
         self.authenticator: Authenticator | None = None
+        self._guard: Guard | None = None
         self.publisher: Publisher
         self.questions: Questions | None = None
         try:
@@ -77,6 +78,10 @@ class Sockets(Companion):
             asked = replace(binding, file_mode=wanted.ask_file_mode, group=wanted.ask_group)
             self.questions = Questions(wanted.ask_endpoint, patience_ns, asked)
         self._watch()
+        if self._with_keys():
+            from daemon.publish.curve import Guard
+
+            self._guard = Guard(self._cut_off_greedy)
 
     def _let_in_only_known(self, curve: Curve) -> None:
         import zmq  # only where there are keys
@@ -144,6 +149,8 @@ class Sockets(Companion):
             self.publisher.take()
         if self.authenticator is not None:
             self.authenticator.take()
+        if self._guard is not None:
+            self._guard.look(self._clock())
 
     def on_answer(self, payload: bytes) -> None:
         """Answer all who have asked."""
@@ -204,8 +211,17 @@ class Sockets(Companion):
                 self._lost = True
         self._watch()
 
+    def _cut_off_greedy(self) -> None:
+        log.error("peers with keys hold too much memory: all of them have to connect again")
+        for door in self._with_keys():
+            door.counters["all_cut_off"] += 1
+        self._cut_off()
+
     def close(self) -> None:
         """Close them all. May be called again."""
+        if self._guard is not None:
+            self._guard.close()
+            self._guard = None
         for bound in self._bound():
             bound.close()
         if self.authenticator is not None:

@@ -75,7 +75,7 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
         lifted_on = graspd.verdict()
         assert graspd.outcome(lifted_on, slipped=True, object_name="mug", wait_s=10.0)
         grasp = [str(lifted_on.boot_id), str(lifted_on.grasp)]
-        tell = [lift_gate, "--tell", daemon.endpoint, daemon.ask_endpoint, *grasp]
+        tell = [str(lift_gate), "--tell", daemon.endpoint, daemon.ask_endpoint, *grasp]
         assert subprocess.run([*tell, "stable"], check=False, timeout=40).returncode == 1
         subprocess.run([*tell, "slip"], check=True, timeout=40)
         heard = []

@@ -33,7 +33,6 @@ CORE = (
     ("msgspec", ("msgspec",)),
     ("onnxruntime", ("onnxruntime",)),
     ("pydantic", ("pydantic.main", "pydantic.types")),
-    ("pyzmq", ("zmq",)),
     ("graspd", ("daemon.commands.run",)),
 )
 """Part and modules: what every scene imports."""
@@ -47,6 +46,7 @@ ELSEWHERE = (
     ("session", ("daemon.judge.calibration",)),
     ("session file", ("daemon.session.keeper",)),
     ("questions", ("daemon.publish.questions",)),
+    ("keys", ("daemon.publish.curve", "daemon.publish.access", "daemon.publish.keys")),
 )
 """Part and modules: what only some scenes import."""
 READINGS = 300

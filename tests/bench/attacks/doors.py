@@ -14,12 +14,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Self
 
 import zmq
 
+from daemon.publish.keys import load_pair, make
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
-from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon
+from tests.bench.live import PATIENCE_S, Child, start_daemon
 
 MEMORY_MAX_MIB = 32.0
 """So far from rest the daemon's memory may go."""
@@ -30,6 +32,9 @@ OPEN_MAX = 1500
 """Of those at a time."""
 FLOOD_S = 1.5
 FLOODERS = 8
+MANY_FRAMES = 1_000_000
+MANY_FRAMES_S = 4.0
+"""How long they are on their way."""
 QUESTIONS = 10
 PATIENCE_MS = 500
 """A question is answered by then."""
@@ -42,6 +47,33 @@ QUESTION = bytes.fromhex("00 05") + b"judge"
 Connect = Callable[[], socket.socket]
 
 
+class Friend:
+    """Hears the daemon, and may send to it."""
+
+    def __init__(self, kind: int, endpoint: str, folder: Path) -> None:
+        """With a key if there is one in the folder."""
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self.socket = self._context.socket(kind)
+        self.socket.linger = 0
+        own = folder / "clients" / "friend.key_secret"
+        if own.exists():
+            self.socket.curve_publickey, self.socket.curve_secretkey = load_pair(own)
+            self.socket.curve_serverkey = load_pair(folder / "daemon.key_secret")[0]
+        if kind == zmq.SUB:
+            self.socket.subscribe("verdict.")
+        self.socket.connect(endpoint)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self._context.destroy(0)
+
+    def take(self, timeout_s: float) -> list[bytes] | None:
+        """The next message; None if none comes in time."""
+        return self.socket.recv_multipart() if self.socket.poll(round(timeout_s * 1e3)) else None
+
+
 @dataclass(slots=True)
 class Hand:
     """A daemon, its doors, and a friend that hears it."""
@@ -49,7 +81,7 @@ class Hand:
     process: Child
     publish: str
     ask: str
-    friend: Subscriber
+    friend: Friend
     rest_mib: float = 0.0
     peak_mib: float = 0.0
 
@@ -83,17 +115,25 @@ class Hand:
 def hand(folder: Path, scheme: str) -> Iterator[Hand]:
     """A daemon at rest."""
     publish, ask = f"ipc://{folder}/v", f"ipc://{folder}/ask"
-    if scheme == "tcp":
+    keys = ""
+    if scheme == "curve":
+        make(folder, "daemon")
+        make(folder / "clients", "friend")
+        keys = '[curve]\nsecret_key = "daemon.key_secret"\nclients = "clients"\n'
+    if scheme != "ipc":
         publish, ask = (f"tcp://127.0.0.1:{port}" for port in (PUBLISH_PORT, ASK_PORT))
     scene = folder / "scene.toml"
     scene.write_text(
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
         f'[gate]\nmode = "every"\nrequest_ms = {PATIENCE_MS}.0\n[model]\nname = "cnn1"\n'
-        f'[publish]\nendpoint = "{publish}"\n[ask]\nendpoint = "{ask}"\n'
+        f'[publish]\nendpoint = "{publish}"\n[ask]\nendpoint = "{ask}"\n{keys}'
     )
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
-    with start_daemon(scene, folder / "log") as process, Subscriber(publish) as friend:
+    with (
+        start_daemon(scene, folder / "log") as process,
+        Friend(zmq.SUB, publish, folder) as friend,
+    ):
         made = Hand(process, publish, ask, friend)
         until_s = time.monotonic() + PATIENCE_S
         while friend.take(0.1) is None:
@@ -193,6 +233,23 @@ def endless(_random: random.Random) -> bytes:
     return ENDLESS
 
 
+def endless_with_a_key(plan: Plan) -> Outcome:
+    """Messages of a million frames by somebody who may connect: libzmq sends no unfinished one."""
+    tried = 0
+    frames = [b"x"] * MANY_FRAMES
+    with hand(plan.folder, "curve") as daemon:
+        for _ in plan.rounds():
+            for kind, endpoint in ((zmq.XSUB, daemon.publish), (zmq.DEALER, daemon.ask)):
+                with Friend(kind, endpoint, plan.folder) as hostile:
+                    hostile.socket.send_multipart(frames)
+                    tried += len(frames)
+                    until_s = time.monotonic() + MANY_FRAMES_S
+                    while time.monotonic() < until_s:
+                        daemon.look()
+                        time.sleep(0.002)
+        return daemon.outcome(tried)
+
+
 def subscriptions(numbers: random.Random) -> bytes:
     """Different ones."""
     return b"".join(b"\x00\x21\x01" + numbers.randbytes(32) for _ in range(100))
@@ -234,9 +291,9 @@ def questions(plan: Plan) -> Outcome:
 
 
 def forged(plan: Plan) -> Outcome:
-    """Outcomes of grasps that the controller asked about, told by somebody else, before and after
-    it."""
-    forged_well = told_well = tried = 0
+    """Outcomes told by somebody else, of grasps that the controller asked about, before and after
+    it, and of others; and a word of its own that it takes back."""
+    forged_well = lies = told_well = tried = 0
 
     def tell(who: zmq.Socket[bytes], boot_id: str, grasp: int, outcome: str) -> bool:
         who.send(f"outcome {boot_id} {grasp} {outcome}".encode())
@@ -265,9 +322,11 @@ def forged(plan: Plan) -> Outcome:
                 told_well += tell(controller, *names, "stable")
                 forged_well += tell(liar, *names, "slip")
                 forged_well += tell(controller, *names, "slip")
+                forged_well += tell(liar, answer["boot_id"], answer["grasp"] - 1, "slip")
+                lies += 4
         well = forged_well == 0 and told_well == tried > 0
-        said = f"{forged_well} of {3 * tried} forged, {told_well} of {tried} true ones taken, "
-        return daemon.outcome(4 * tried, well, said)
+        said = f"{forged_well} of {lies} forged, {told_well} of {tried} true ones taken, "
+        return daemon.outcome(lies + tried, well, said)
 
 
 ATTACKS: tuple[Attack, ...] = (
@@ -280,7 +339,14 @@ ATTACKS: tuple[Attack, ...] = (
             "connections",
             partial(connections, scheme),
         )
-        for scheme in ("ipc", "tcp")
+        for scheme in ("ipc", "tcp", "curve")
+    ),
+    Attack(
+        "endless-curve",
+        Aim.FALLS,
+        f"messages of {MANY_FRAMES:,} frames to both sockets, by a peer with an admitted key",
+        "frames",
+        endless_with_a_key,
     ),
     *(
         Attack(
@@ -308,7 +374,7 @@ ATTACKS: tuple[Attack, ...] = (
         "forged-outcomes",
         Aim.WHO_MAY,
         "another peer tells outcomes of grasps that the controller asked about, first and last, "
-        "and the controller itself changes its word",
+        "and of others, and the controller itself changes its word",
         "outcomes",
         forged,
     ),

@@ -48,8 +48,8 @@ NEVER = {
         "lz4",
         "daemon.publish.access",
         "daemon.publish.keys",
-        "zmq.auth",
-        "zmq.utils.monitor",
+        "daemon.publish.curve",
+        "zmq",
     ),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
@@ -100,13 +100,10 @@ STANDARD = 3
 """Descriptors of standard input, output and error."""
 SIGNALS = 2
 """Descriptors of the pipe by which a signal wakes the loop."""
-SOCKET = 8
-"""Descriptors of a ZeroMQ socket at a path: its lock, its listener, its mailbox, the context's own
-mailbox, and a mailbox and an epoll each of I/O thread and reaper (libzmq 4.3)."""
+SOCKET = 3
+"""Descriptors of a socket at a path: its lock, its listener, and what waits for its peers."""
 FILE = 1
 """The recording that plays, or the lock of the kept session."""
-ZMQ_THREADS = 2
-"""Of one ZeroMQ context: I/O and reaper."""
 
 
 @pytest.fixture(scope="module")
@@ -171,10 +168,10 @@ def test_threads_and_descriptors_of_an_example_scene_are_all_accounted_for(
     scene: Path, measured: Measured
 ) -> None:
     found = measured(scene)
-    assert found.whole.threads == 1 + ZMQ_THREADS
+    assert found.whole.threads == 1
     assert found.whole.descriptors == STANDARD + SIGNALS + SOCKET + FILE
     socket = next(part for part in found.parts if part.name == "sockets")
-    assert (socket.threads, socket.descriptors) == (ZMQ_THREADS, SOCKET)
+    assert (socket.threads, socket.descriptors) == (0, SOCKET)
 
 
 def test_the_parts_add_up_to_the_whole(measured: Measured) -> None:
@@ -253,7 +250,8 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     assert HALL | ASK | {"daemon.judge.joint_motion"} <= set(found.modules)
     assert below({"drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
     assert parts["joints"].modules > 0
-    assert parts["sockets"].threads == ZMQ_THREADS  # those of one context, for both
+    assert parts["sockets"].threads == 0
+    assert parts["sockets"].descriptors == 2 * SOCKET
     assert found.timed.judged is not None
 
 
@@ -332,7 +330,7 @@ def test_check_prints_what_each_part_costs_only_when_asked(tmp_path: Path) -> No
         assert f"\n  {part} " in text
     content = json.loads(graspd("check", scene, "--cost", "--json").stdout)
     assert content["left_out"]["gate"].startswith("no tare")
-    assert {"numpy", "onnxruntime", "zmq"} <= set(content["cost"]["packages"])
+    assert {"numpy", "onnxruntime"} <= set(content["cost"]["packages"])
     assert content["cost"]["start"]["cpu_ms"] > 0.0
 
 

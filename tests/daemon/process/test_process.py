@@ -100,9 +100,12 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("allowed", ["512:8192", "8192:8192"])
-def test_there_are_descriptors_for_all_peers_and_not_for_any_number(
-    tmp_path: Path, allowed: str
+@pytest.mark.parametrize(
+    ("allowed", "taken"),
+    [("512:8192", (4096, 8192)), ("5000:8192", (5000, 8192)), ("512:1000", (1000, 1000))],
+)
+def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
+    tmp_path: Path, allowed: str, taken: tuple[int, int]
 ) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(
@@ -113,7 +116,7 @@ def test_there_are_descriptors_for_all_peers_and_not_for_any_number(
         wait_for(tmp_path / "graspd")
         limits = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
         process.terminate()
-    assert limits == (4096, 8192)
+    assert limits == taken
 
 
 @pytest.mark.parametrize("package", ["torch", "rich"])

@@ -24,7 +24,7 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
-from daemon.publish.peers import PlainPeer
+from daemon.publish.peer import PlainPeer
 from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
 from daemon.publish.zmtp import Role
 from daemon.trust.ledger import GraspId, Told
@@ -257,6 +257,26 @@ def test_who_owns_a_grasp_and_has_gone_is_stood_for_by_another_connection_of_its
         assert time.monotonic() < deadline_s
 
 
+def test_who_tells_before_its_former_connection_is_seen_to_go_is_heard(
+    questions: Questions, teller: zmq.Socket[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.publish.questions.GRACE_NS", 5_000_000_000)
+    with zmq.Context() as context, context.socket(zmq.DEALER) as former:
+        former.linger = 0
+        former.connect(questions.endpoint)
+        ask_about(questions, former, 7)
+        teller.send(f"outcome {BOOT} 7 slip".encode())
+        for _ in range(100):
+            questions.take(0, takes_the_seventh)
+            time.sleep(0.001)
+        assert not teller.poll(0)
+    deadline_s = time.monotonic() + 4.0
+    while not teller.poll(1):
+        questions.take(0, takes_the_seventh)
+        assert time.monotonic() < deadline_s
+    assert json.loads(teller.recv()) == {"v": 1, "ok": True}
+
+
 def test_what_was_told_stays_and_may_be_told_again(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
@@ -279,6 +299,20 @@ def test_a_grasp_that_nobody_asked_about_is_told_of_by_anybody_in_one_word(
         assert told(questions, teller, slip)["ok"]
         assert not told(questions, teller, stable)["ok"]
         assert not told(questions, other, stable)["ok"]
+
+
+def test_who_asks_about_grasps_is_not_forestalled_by_who_does_not(
+    questions: Questions, teller: zmq.Socket[bytes]
+) -> None:
+    """A grasp is known to all once it is judged, and may be asked about later."""
+    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
+    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
+        other.linger = 0
+        other.connect(questions.endpoint)
+        ask_about(questions, teller, 6)
+        assert told(questions, other, slip)["why"].startswith("not yours")
+        ask_about(questions, teller, 7)
+        assert told(questions, teller, stable)["ok"]
 
 
 def test_who_stands_for_whom() -> None:

@@ -6,6 +6,8 @@ import contextlib
 import errno
 import select
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,7 +16,8 @@ import pytest
 import zmq
 
 from daemon.publish import peers
-from daemon.publish.peers import PEERS_MAX, SUBSCRIPTIONS_MAX, PlainDoor
+from daemon.publish.peer import SUBSCRIPTIONS_MAX
+from daemon.publish.peers import PEERS_MAX, PlainDoor
 from daemon.publish.publisher import Publisher
 from daemon.publish.questions import Questions
 from tests.daemon.publish.test_publisher import ENDPOINTS, WAIT_MS, Peers, first_message
@@ -135,22 +138,22 @@ def test_an_abstract_name_can_be_heard(tmp_path: Path, friends: Peers) -> None:
 
 def test_a_peer_that_wants_signs_of_life_gets_them(tmp_path: Path, friends: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
-    with Publisher(endpoint) as publisher:
-        with (
-            friends.context.socket(zmq.SUB) as subscriber,
-            subscriber.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor,
-        ):
-            subscriber.linger = 0
-            subscriber.heartbeat_ivl, subscriber.heartbeat_timeout = 20, 100
-            subscriber.subscribe("")
-            subscriber.connect(endpoint)
-            assert hears(publisher, subscriber)
-            for _ in range(100):
-                publisher.take()
-                time.sleep(0.005)
-            assert not monitor.poll(0)
-            assert monitor.poll(2000)  # nobody looks after the publisher any more
-            subscriber.disable_monitor()
+    with (
+        Publisher(endpoint) as publisher,
+        friends.context.socket(zmq.SUB) as subscriber,
+        subscriber.get_monitor_socket(zmq.EVENT_DISCONNECTED) as monitor,
+    ):
+        subscriber.linger = 0
+        subscriber.heartbeat_ivl, subscriber.heartbeat_timeout = 20, 100
+        subscriber.subscribe("")
+        subscriber.connect(endpoint)
+        assert hears(publisher, subscriber)
+        for _ in range(100):
+            publisher.take()
+            time.sleep(0.005)
+        assert not monitor.poll(0)
+        assert monitor.poll(2000)  # nobody looks after the publisher any more
+        subscriber.disable_monitor()
 
 
 def test_a_subscriber_connects_again_after_a_restart(tmp_path: Path, friends: Peers) -> None:
@@ -225,6 +228,37 @@ def test_who_is_there_stays_when_there_is_no_place_for_more(
         assert hears(publisher, subscriber)
         crowd[0].close()
         assert hears(publisher, friends.subscribe(endpoint))
+
+
+CROWD = """
+import socket, sys, time
+held = []
+for _ in range(int(sys.argv[2])):
+    held.append(socket.socket(socket.AF_UNIX))
+    held[-1].connect(sys.argv[1])
+    held[-1].sendall(bytes.fromhex(sys.argv[3]))
+print("there", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_process_that_has_taken_all_places_leaves_some_to_others(
+    tmp_path: Path, friends: Peers
+) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+    says = (GREETING_31 + READY_SUB + SUBSCRIBE_ALL).hex()
+    arguments = [sys.executable, "-c", CROWD, str(tmp_path / "v"), str(PEERS_MAX), says]
+    with (
+        Publisher(endpoint) as publisher,
+        subprocess.Popen(arguments, stdout=subprocess.DEVNULL) as crowd,
+    ):
+        try:
+            until(lambda: publisher.counters["subscriptions"] == PEERS_MAX, publisher.take)
+            subscribers = [friends.subscribe(endpoint) for _ in range(3)]
+            assert all(hears(publisher, subscriber) for subscriber in subscribers)
+            assert publisher.counters["crowded_out"] == 3
+        finally:
+            crowd.kill()
 
 
 def test_who_does_not_say_what_it_is_goes_after_a_while(
