@@ -82,7 +82,7 @@ def test_the_loop_goes_on_until_there_is_what_to_run() -> None:
         for _ in range(100):
             assert not found.take_reload()
         preparing.go.release()
-        readable, _, _ = select.select([found, *found.filenos()], [], [], PATIENCE_S)
+        readable, _, _ = select.select([found.fileno(), *found.filenos()], [], [], PATIENCE_S)
         assert readable == found.filenos()
         assert found.take_reload()
         assert found.take() is PARTS
