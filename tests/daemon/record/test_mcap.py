@@ -250,7 +250,8 @@ def with_chunk(compression: str, content: bytes, said_bytes: int, times: int = 1
     writer.start(profile="", library="graspd")
     writer.add_metadata(METADATA, header("ff", "th", joints=False).texts())
     writer.flush()
-    return stream.getvalue() + builder.end()
+    chunks: bytes = builder.end()
+    return stream.getvalue() + chunks
 
 
 def zstd(content: bytes, *, sized: bool = True) -> bytes:
@@ -320,7 +321,7 @@ def test_what_packs_best_is_far_from_the_limit(tmp_path: Path) -> None:
             seq=number,
             t=number / 100,
             t_mono_ns=number * PERIOD_NS,
-            fingers=list(FINGERS),
+            fingers=["ff", "mf", "rf", "lf", "th"],
             counts=[[0] * 24] * 5,
             faults=[[1] * 24] * 5,
         )
