@@ -3,10 +3,7 @@ which may be slow, grow or fall."""
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
-import resource
-import signal
 import sys
 from collections import deque
 from contextlib import suppress
@@ -70,6 +67,10 @@ def _try(path: Path, content: bytes) -> None:
 
 def main() -> None:
     """Be the process that tries the model on stdin; prints why it is refused."""
+    import ctypes
+    import resource
+    import signal
+
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     with suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))

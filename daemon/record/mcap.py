@@ -9,17 +9,22 @@ import contextlib
 import json
 import os
 import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from io import BytesIO
 from itertools import count
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
+import lz4.frame
 import msgspec
 import zstandard
-from mcap.exceptions import EndOfFile, McapError
-from mcap.records import Channel, Message, Metadata
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError, UnsupportedCompressionError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
@@ -33,6 +38,12 @@ METADATA: Final = "graspd"
 """Name of the metadata record that every file of graspd begins with."""
 RECORD_MAX_BYTES: Final = 64 << 20
 """graspd's chunks have a megabyte; a record whose length is given as far more is damaged."""
+CHUNK_MAX_BYTES: Final = 8 << 20
+"""Of what a chunk unpacks to, at once in memory; graspd's have a megabyte, other tools make four of
+it."""
+RATIO_MAX: Final = 100
+"""How many times as large as packed all chunks may be, beyond the first `CHUNK_MAX_BYTES`. Held
+grasps pack to a twelfth, a sensor that says nothing but zeros to a thirty-sixth."""
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
@@ -129,7 +140,8 @@ class RecordedMessage:
 class McapReader:
     """Reads one file: its header at once, its messages by iterating, which can be done once.
 
-    The iteration ends where the file is damaged, as if it ended there.
+    The iteration ends where the file is damaged, as if it ended there. It raises `RecordingError`
+    for a file that unpacks to more than any recording of graspd.
     """
 
     def __init__(self, path: Path, stream: BinaryIO) -> None:
@@ -137,8 +149,12 @@ class McapReader:
         self._path = path
         self.cut_off = False
         """After iterating: whether the file was cut off or is damaged."""
-        reader = StreamReader(stream, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES)
+        reader = StreamReader(
+            stream, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES
+        )
         self._records = reader.records
+        self._spare_bytes = CHUNK_MAX_BYTES
+        """What may be unpacked still."""
         self._kinds: dict[int, str] = {}
         self.header = self._read_header()
 
@@ -147,7 +163,7 @@ class McapReader:
             for record in self._records:
                 if isinstance(record, Metadata) and record.name == METADATA:
                     return RecordingHeader.of(record.metadata)
-                if isinstance(record, Channel | Message):
+                if isinstance(record, Channel | Message | Chunk):
                     break
         except EndOfFile as error:
             raise RecordingError(self._path, "is empty: nothing was recorded") from error
@@ -160,7 +176,7 @@ class McapReader:
     def __iter__(self) -> Iterator[RecordedMessage]:
         offset_ns = self.header.wall_minus_monotonic_ns
         try:
-            for record in self._records:
+            for record in self._inner_records():
                 if isinstance(record, Channel):
                     self._kinds[record.id] = record.topic.partition(".")[0]
                 elif isinstance(record, Message):
@@ -168,6 +184,66 @@ class McapReader:
                     yield RecordedMessage(kind, record.log_time - offset_ns, record.data)
         except _DAMAGE:
             self.cut_off = True
+
+    def _inner_records(self) -> Iterator[McapRecord]:
+        """All records, those in chunks too."""
+        for record in self._records:
+            if isinstance(record, Chunk):
+                yield from _within(self._unpacked(record))
+            else:
+                yield record
+
+    def _unpacked(self, chunk: Chunk) -> bytes:
+        """What is in a chunk."""
+        self._spare_bytes += RATIO_MAX * len(chunk.data)
+        room = min(self._spare_bytes, CHUNK_MAX_BYTES)
+        content = _unpack(chunk.compression, chunk.data, room + 1)
+        if content is None or len(content) > room or chunk.uncompressed_size > CHUNK_MAX_BYTES:
+            raise RecordingError(
+                self._path,
+                "unpacks to more than any recording of graspd: a chunk of "
+                f"{len(chunk.data)} bytes to more than {room}",
+            )
+        if len(content) != chunk.uncompressed_size:
+            raise McapError("a chunk is not as long as it says")
+        if chunk.uncompressed_crc not in (0, zlib.crc32(content)):
+            raise McapError("a chunk is not what it was")
+        self._spare_bytes -= len(content)
+        return content
+
+
+def _within(chunk: bytes) -> Iterator[McapRecord]:
+    """Channels and messages in what a chunk unpacks to, one after another: all at once take a
+    hundred times its memory."""
+    stream = ReadDataStream(BytesIO(chunk))
+    while stream.count < len(chunk):
+        kind, length = stream.read1(), stream.read8()
+        if kind == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif kind == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        else:
+            stream.read(length)
+
+
+def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
+    """What a chunk holds, cut at `max_bytes`: never more than that is made of it. None for one that
+    takes more than a chunk may have only to begin with it."""
+    unpacked = content
+    if compression == "zstd":
+        if zstandard.get_frame_parameters(content).window_size > CHUNK_MAX_BYTES:
+            return None
+        unpacker = zstandard.ZstdDecompressor(max_window_size=CHUNK_MAX_BYTES)
+        with unpacker.stream_reader(content) as stream:
+            unpacked = stream.read(max_bytes)
+    elif compression == "lz4":
+        try:
+            unpacked = lz4.frame.LZ4FrameDecompressor().decompress(content, max_bytes)
+        except RuntimeError as error:
+            raise McapError(str(error)) from error
+    elif compression:
+        raise UnsupportedCompressionError(compression)
+    return unpacked
 
 
 def header_of(path: Path) -> RecordingHeader:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import logging
+import math
 import re
 import select
 import socket
 import sys
 import threading
+import time
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -35,7 +37,10 @@ PAGES_MAX = 8
 CONNECTIONS_MAX = 16
 """Connections, each of which has a thread; a browser keeps one for the page and asks for others."""
 PATIENCE_S = 5.0
-"""How long a browser may take to ask, or to take what it is sent, s."""
+"""How long a browser may take to ask and to take the page, or to take a snapshot, s."""
+GIVES_WAY_S = 0.25
+"""After so long without being served, s, a connection gives way to a new one when all are taken:
+on this computer, a browser asks and takes the page within milliseconds."""
 SEND_BUFFER_BYTES = 32 * 1024
 """Of a connection: a browser that is slow has a few snapshots before it, and misses the rest."""
 RETRY_MS = 1000
@@ -90,15 +95,20 @@ class Server(ThreadingHTTPServer):
         self.page, self.policy = load_page()
         self.pages = threading.BoundedSemaphore(PAGES_MAX)
         self._places = threading.BoundedSemaphore(CONNECTIONS_MAX)
-        self._open: set[socket.socket] = set()
+        self._open: dict[socket.socket, float] = {}
+        """Connections, and when each is cut off at the latest, monotonic s; oldest first."""
+        self._lock = threading.Lock()
         super().__init__((ADDRESS, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Give a connection a thread, if there is one left for it."""
+        """Give a connection a thread, if there is one left for it or another gives way."""
         if not self._places.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        self._open.add(request)
+            self._cut_off_before(time.monotonic() + PATIENCE_S - GIVES_WAY_S, at_most=1)
+            if not self._places.acquire(timeout=GIVES_WAY_S):
+                self.shutdown_request(request)
+                return
+        with self._lock:
+            self._open[request] = time.monotonic() + PATIENCE_S
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
@@ -106,8 +116,27 @@ class Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._open.discard(request)
+            with self._lock:
+                self._open.pop(request, None)
             self._places.release()
+
+    def service_actions(self) -> None:
+        """Cut off who takes too long; called several times a second."""
+        self._cut_off_before(time.monotonic())
+
+    def keep(self, request: socket.socket) -> None:
+        """Let a connection stay as long as it takes its snapshots."""
+        with self._lock:
+            self._open[request] = math.inf
+
+    def _cut_off_before(self, due_s: float, at_most: int = CONNECTIONS_MAX) -> None:
+        """Cut off connections that are due by then, the oldest first. Their threads end soon."""
+        with self._lock:
+            late = [request for request, end_s in self._open.items() if end_s <= due_s][:at_most]
+            for request in late:
+                self._open[request] = math.inf
+        for request in late:
+            _cut_off(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         """Browsers that go without a word are no news."""
@@ -118,8 +147,7 @@ class Server(ThreadingHTTPServer):
     def server_close(self) -> None:
         """Cut off all browsers and wait for their threads."""
         self.newest.close()
-        for request in tuple(self._open):
-            _cut_off(request)
+        self._cut_off_before(math.inf)
         super().server_close()
 
 
@@ -172,6 +200,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{PAGES_MAX} pages are open")
             return
         try:
+            self.server.keep(self.request)
             number = self.server.newest.number  # the next one is sent first: this may be old
             self._begin("text/event-stream")
             self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())

@@ -97,7 +97,7 @@ def test_one_that_takes_too_long_is_refused(
 def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("onnx", reason="needs the train extra")
     path = files.giant(tmp_path, side=20_000)
-    with pytest.raises(ModelError, match="Failed to allocate|no answer within|takes more than"):
+    with pytest.raises(ModelError, match=r"Failed to allocate|no answer within|takes more than"):
         trial.load(path)
 
 

@@ -60,6 +60,12 @@ def scene(folder: Path, model: str = 'name = "small-session"') -> str:
     return SCENE.format(recording=DEMO_RECORDING, model=model, folder=folder)
 
 
+def _peak_mib(pid: int) -> float:
+    """Most memory that a process has had; 0 of one that has ended."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int((status.partition("VmHWM:")[2].split() or ["0"])[0]) / MIB
+
+
 DOTTED: dict[str, Callable[[int], str]] = {
     "a key of dots": lambda size: ".".join(["a"] * (size // 2)) + " = 1",
     "a header of dots": lambda size: "[" + ".".join(["a"] * (size // 2)) + "]",
@@ -165,10 +171,7 @@ class Running:
 
     def peak_mib(self) -> float:
         """Most memory since `forget_peak`."""
-        if not self.alive:
-            return 0.0
-        status = Path(f"/proc/{self.daemon.pid}/status").read_text()
-        return int(status.partition("VmHWM:")[2].split()[0]) / MIB
+        return _peak_mib(self.daemon.pid) if self.alive else 0.0
 
     def stops_in_s(self) -> float:
         """How long it takes from SIGTERM to its end, s; it is killed after five."""
@@ -313,7 +316,7 @@ def giant(folder: Path, side: int = 5000) -> Path:
 
 
 def _command(folder: Path, *arguments: object) -> tuple[int | None, float, float, str]:
-    """Exit code (None if it had to be killed), seconds, peak MiB of all its processes, stderr."""
+    """Exit code (None if it had to be killed), seconds, peak MiB, stderr."""
     began_s = time.monotonic()
     with (folder / "said").open("w+") as said:
         process = subprocess.Popen(
@@ -323,19 +326,17 @@ def _command(folder: Path, *arguments: object) -> tuple[int | None, float, float
             stdout=subprocess.DEVNULL,
             stderr=said,
         )
-        ended = False
+        ended, peak_mib = False, 0.0
         while not ended and time.monotonic() < began_s + 2 * END_MAX_S:
-            time.sleep(0.05)
-            pid, status, used = os.wait4(process.pid, os.WNOHANG)
-            ended = pid != 0
-        if not ended:
-            process.kill()
-            _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
+            peak_mib = max(peak_mib, _peak_mib(process.pid))
+            time.sleep(0.02)
+            ended = process.poll() is not None
+        process.kill()
+        process.wait()
         said.seek(0)
         text = said.read()
     code = process.returncode if ended else None
-    return code, time.monotonic() - began_s, used.ru_maxrss / MIB, text
+    return code, time.monotonic() - began_s, peak_mib, text
 
 
 def _model(make: Callable[[Path], Path]) -> Callable[[Plan], Outcome]:
@@ -385,8 +386,12 @@ def _mcap(chunks: Iterator[tuple[str, int, bytes]]) -> Iterator[bytes]:
     writer = Writer(stream)
     writer.start(profile="", library="graspd")
     header = RecordingHeader(
-        **{"fingers": ("ff", "mf", "th"), "joints": False, "boot_id": "0" * 32},
-        **{"scene": {"hand": {}}, "model": "cnn1", "model_sha256": "0" * 64},
+        fingers=("ff", "mf", "th"),
+        joints=False,
+        boot_id="0" * 32,
+        scene={"hand": {}},
+        model="cnn1",
+        model_sha256="0" * 64,
     )
     writer.add_metadata(METADATA, header.texts())
     writer.flush()

@@ -5,18 +5,32 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import struct
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk
+from mcap.writer import Writer
 
 from daemon.publish.messages import Tactile, encode
 from daemon.record.header import Known, RecordingHeader
-from daemon.record.mcap import McapReader, McapWriter, RecordedMessage, header_of
+from daemon.record.mcap import (
+    CHUNK_MAX_BYTES,
+    METADATA,
+    RATIO_MAX,
+    McapReader,
+    McapWriter,
+    RecordedMessage,
+    header_of,
+)
 from daemon.record.player import McapReplayDriver
 from daemon.record.topics import Joints
 from drivers.base import FINGERS, JointReading, RecordingError, TactileReading
@@ -220,3 +234,99 @@ def test_messages_that_are_no_readings_are_counted(tmp_path: Path) -> None:
         assert len(driver.read_ready()) == 1
         assert driver.exhausted
     assert driver.counters.malformed == len(wrong) + 1
+
+
+MESSAGES = struct.pack("<BQHIQQ", 5, 24, 1, 0, 0, 0) + b"{}"
+"""The smallest that there is, of a channel that is not known."""
+
+
+def with_chunk(compression: str, content: bytes, said_bytes: int, times: int = 1) -> bytes:
+    """A recording's header and so many times this chunk, whose content is packed already."""
+    builder = RecordBuilder()
+    for _ in range(times):
+        Chunk(compression, content, 0, 0, 0, said_bytes).write(builder)
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start(profile="", library="graspd")
+    writer.add_metadata(METADATA, header("ff", "th", joints=False).texts())
+    writer.flush()
+    chunks: bytes = builder.end()
+    return stream.getvalue() + chunks
+
+
+def zstd(content: bytes, *, sized: bool = True) -> bytes:
+    packed: bytes = zstandard.ZstdCompressor(level=19, write_content_size=sized).compress(content)
+    return packed
+
+
+@pytest.mark.parametrize("compression", ["", "zstd", "lz4"])
+def test_what_other_tools_packed_anew_is_read(compression: str) -> None:
+    content = MESSAGES * 1000
+    pack = {"": bytes, "zstd": zstd, "lz4": lz4.frame.compress}[compression]
+    found = read(with_chunk(compression, pack(content), len(content)))
+    assert [message.payload for message in found] == [b"{}"] * 1000
+
+
+BOMB = MESSAGES * (CHUNK_MAX_BYTES // len(MESSAGES) + 1)
+
+
+@pytest.mark.parametrize("said_bytes", [len(BOMB), 1000, 1 << 60])
+@pytest.mark.parametrize(
+    ("compression", "content"),
+    [
+        ("zstd", zstd(BOMB)),
+        ("zstd", zstd(BOMB, sized=False)),
+        ("zstd", zstd(BOMB * 20)),
+        ("lz4", lz4.frame.compress(BOMB)),
+        ("lz4", lz4.frame.compress(BOMB, store_size=False)),
+        ("", BOMB),
+    ],
+)
+def test_a_chunk_of_more_than_a_recording_has_is_refused(
+    compression: str, content: bytes, said_bytes: int
+) -> None:
+    with pytest.raises(RecordingError, match=r"a\.mcap: unpacks to more than any recording"):
+        read(with_chunk(compression, content, said_bytes))
+
+
+def test_many_small_chunks_are_no_way_around(tmp_path: Path) -> None:
+    content = MESSAGES * 30_000
+    path = tmp_path / "a.mcap"
+    path.write_bytes(with_chunk("zstd", zstd(content), len(content), times=100))
+    assert path.stat().st_size < 40_000
+    with path.open("rb") as stream:
+        found: list[RecordedMessage] = []
+        with pytest.raises(RecordingError, match="unpacks to more than any recording"):
+            found.extend(McapReader(path, stream))
+    assert 0 < len(found) <= (CHUNK_MAX_BYTES + RATIO_MAX * 40_000) // len(MESSAGES)
+
+
+@pytest.mark.parametrize(
+    ("compression", "content"),
+    [("zstd", zstd(b"a" * 99)), ("zstd", b"abc"), ("lz4", b"abcdefgh" * 9), ("brotli", b"a")],
+)
+def test_a_chunk_that_is_not_what_it_says_is_damage(compression: str, content: bytes) -> None:
+    reader = McapReader(Path("a.mcap"), io.BytesIO(with_chunk(compression, content, 100)))
+    assert list(reader) == []
+    assert reader.cut_off
+
+
+def test_what_packs_best_is_far_from_the_limit(tmp_path: Path) -> None:
+    """A sensor that says nothing but zeros."""
+    path = tmp_path / "a.mcap"
+    file = McapWriter(path, header(*FINGERS, joints=False))
+    for number in range(5000):
+        tactile = Tactile(
+            boot_id=BOOT,
+            seq=number,
+            t=number / 100,
+            t_mono_ns=number * PERIOD_NS,
+            fingers=["ff", "mf", "rf", "lf", "th"],
+            counts=[[0] * 24] * 5,
+            faults=[[1] * 24] * 5,
+        )
+        file.write(b"tactile.right", encode(tactile), number * PERIOD_NS)
+    file.close()
+    found = read(path.read_bytes())
+    assert len(found) == 5000
+    assert sum(len(message.payload) for message in found) < RATIO_MAX * path.stat().st_size / 1.5

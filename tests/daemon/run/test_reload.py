@@ -82,7 +82,7 @@ def test_the_loop_goes_on_until_there_is_what_to_run() -> None:
         for _ in range(100):
             assert not found.take_reload()
         preparing.go.release()
-        readable, _, _ = select.select([found, *found.filenos()], [], [], PATIENCE_S)
+        readable, _, _ = select.select([found.fileno(), *found.filenos()], [], [], PATIENCE_S)
         assert readable == found.filenos()
         assert found.take_reload()
         assert found.take() is PARTS
@@ -175,3 +175,30 @@ def test_the_end_cuts_short_what_waits_for_its_turn(monkeypatch: pytest.MonkeyPa
 def test_nothing_is_there_before_it_is_said_to_be() -> None:
     with reloading() as (found, _), pytest.raises(RuntimeError):
         found.take()
+
+
+def test_the_thread_has_not_the_priority_of_the_loop() -> None:
+    scheduled: list[int] = []
+    processors = os.sched_getaffinity(0)
+
+    def look() -> Parts:
+        scheduled.append(os.sched_getscheduler(0))
+        assert os.sched_getaffinity(0) == processors
+        return PARTS
+
+    with reloading() as (found, preparing):
+        preparing.ends = look
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        except PermissionError:
+            pytest.skip("SCHED_FIFO is refused here")
+        try:
+            os.sched_setaffinity(0, {max(processors)})
+            hang_up()
+            preparing.go.release()
+            wait_for(found.take_reload)
+        finally:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            os.sched_setaffinity(0, processors)
+        assert found.take() is PARTS
+    assert scheduled == [os.SCHED_OTHER]

@@ -14,8 +14,11 @@ from pathlib import Path
 import pytest
 import zmq
 
+from daemon.assembly.parts import Parts
 from daemon.judge.reasons import Decision, Reason
+from daemon.process.signals import StopSignal
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
+from daemon.run import runner
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD
 
@@ -244,3 +247,28 @@ def test_a_scene_that_is_wrong_at_the_start_ends_with_2(tmp_path: Path) -> None:
     wrong.write(model="no-such")
     with wrong.started():
         assert wrong.process.wait(PATIENCE_S) == 2
+
+
+def test_what_fails_while_it_takes_over_leaves_the_scene_to_the_former_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    wanted = Running(tmp_path)
+    entered: list[Parts] = []
+
+    def enter(parts: Parts, _stack: object, *, rehearsed: bool) -> None:
+        assert rehearsed == bool(entered)
+        entered.append(parts)
+        if len(entered) == 2:
+            raise MemoryError("no more")
+        if len(entered) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(runner, "enter_realtime", enter)
+    with StopSignal(reloads=True) as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        runner.Runner(wanted.scene, stop).run()
+    first, second, third = entered
+    assert third is first
+    assert second is not first
+    assert "MemoryError: no more" in caplog.text
+    assert "the former scene goes on" in caplog.text

@@ -9,13 +9,21 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 
 import msgspec
 import pytest
 
+from daemon.watch import web
 from daemon.watch.view import View
-from daemon.watch.web import CONNECTIONS_MAX, PAGES_MAX, Newest, Server, load_page
+from daemon.watch.web import (
+    CONNECTIONS_MAX,
+    GIVES_WAY_S,
+    PAGES_MAX,
+    Newest,
+    Server,
+    load_page,
+)
 
 PATIENCE_S = 10.0
 
@@ -213,6 +221,68 @@ def test_connections_are_limited(server: Server) -> None:
         assert has_ended(links[-1])  # one too many: closed at once
         links[0].sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
         assert links[0].recv(12) == b"HTTP/1.0 200"
+
+
+def drip(links: list[socket.socket], sent: bytes, stop: threading.Event) -> None:
+    """Send a byte on each, over and over."""
+    while not stop.wait(0.05):
+        for link in links:
+            with suppress(OSError):
+                link.sendall(sent)
+
+
+@pytest.mark.parametrize("begin", [b"", b"GET / HTTP/1.0\r\nHost: localhost\r\nX: "])
+def test_who_never_ends_the_request_gives_way(server: Server, begin: bytes) -> None:
+    with ExitStack() as stack:
+        viewer = events(opened(server, stack))
+        links = [
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.server_port), 10))
+            for _ in range(CONNECTIONS_MAX - 1)
+        ]
+        for link in links:
+            link.sendall(begin)
+        stop = threading.Event()
+        dripping = threading.Thread(target=drip, args=(links, b"a", stop))
+        dripping.start()
+        try:
+            time.sleep(2 * GIVES_WAY_S)
+            began_s = time.monotonic()
+            for _ in range(3):
+                assert ask(server)[0] == 200
+            assert time.monotonic() - began_s < 3.0
+        finally:
+            stop.set()
+            dripping.join()
+        server.newest.put(b'{"n":1}')
+        assert next(viewer) == {"n": 1}  # whoever is served stays
+
+
+def test_who_asks_and_does_not_read_gives_way(server: Server) -> None:
+    with ExitStack() as stack:
+        for _ in range(CONNECTIONS_MAX):
+            link = stack.enter_context(closing(socket.socket()))
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+            link.connect(("127.0.0.1", server.server_port))
+            link.sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
+        time.sleep(2 * GIVES_WAY_S)
+        assert ask(server)[0] == 200
+
+
+def test_a_whole_request_has_a_limit_however_it_drips(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(web, "PATIENCE_S", 0.5)
+    with socket.create_connection(("127.0.0.1", server.server_port), 10) as link:
+        stop = threading.Event()
+        dripping = threading.Thread(target=drip, args=([link], b"a", stop))
+        dripping.start()
+        began_s = time.monotonic()
+        try:
+            assert has_ended(link)
+        finally:
+            stop.set()
+            dripping.join()
+        assert 0.4 < time.monotonic() - began_s < 5.0
 
 
 def test_closing_ends_pages_that_wait_and_connections_that_say_nothing() -> None:
