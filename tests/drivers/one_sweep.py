@@ -5,6 +5,7 @@ A reading that mixes two sweeps holds two numbers, whatever the driver thinks of
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -52,7 +53,7 @@ class Step:
     """How many frames, packets or samples; of a stall, how long in them."""
 
 
-def plans(sweep: int, steady_sweeps: int = 0) -> st.SearchStrategy[list[Step]]:
+def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
     """Plans for a board of which a sweep takes so many units; at first it sweeps undisturbed.
 
     Losses are often of whole sweeps, or nearly: there places agree again though sweeps do not.
@@ -69,10 +70,20 @@ def plans(sweep: int, steady_sweeps: int = 0) -> st.SearchStrategy[list[Step]]:
         "stall": st.one_of(some, whole),
         "restart": few,
     }
-    steps = [st.builds(Step, st.just(what), units) for what, units in kinds.items()]
-    first = [Step("send", steady_sweeps * sweep)] if steady_sweeps else []
-    plan = st.lists(st.one_of(steps[0], steps[1], *steps), min_size=1, max_size=50)
-    return plan.map(lambda rest: first + rest)
+    steps = {what: st.builds(Step, st.just(what), units) for what, units in kinds.items()}
+    any_step = st.one_of(steps["send"], steps["lose"], *steps.values())
+    # Whole sweeps come and are lost in turns: they look like a board that is slower.
+    sweeps = st.builds(Step, st.just("send"), st.sampled_from([sweep, sweep, 2 * sweep]))
+    lost = st.builds(Step, st.just("lose"), whole)
+    in_turns = st.lists(st.tuples(sweeps, lost), max_size=20).map(lambda both: sum(both, ()))
+    torn = st.lists(st.tuples(steps["send"], lost), max_size=8).map(lambda both: sum(both, ()))
+    first = Step("send", steady_sweeps * sweep)
+    return st.builds(
+        lambda *parts: [first, *itertools.chain(*parts)],
+        in_turns,
+        torn,
+        st.lists(any_step, min_size=5, max_size=50),
+    )
 
 
 @dataclass(frozen=True)
