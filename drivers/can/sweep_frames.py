@@ -1,7 +1,7 @@
 """Per-finger frames -> one `TactileReading` per sweep; what is missing is flagged.
 
-Frames are of one sweep if number and tick agree and if they come within two periods; a board that
-was reset repeats numbers, but neither its ticks nor the past.
+Frames are of one sweep if number and tick agree and if they come within two periods: a board that
+was reset repeats both, but must be silent for so long.
 """
 
 from __future__ import annotations
