@@ -103,6 +103,11 @@ class ReadingMaker:
         if len(self._gaps_ns) >= PERIODS_NEEDED:
             self.period_ns = max(round(statistics.median(self._gaps_ns)), 1)
 
+    def forget_period(self) -> None:
+        """What was learned may be of sweeps of which some were lost."""
+        self._gaps_ns.clear()
+        self.period_ns = None
+
     def miss(self, sweeps: int) -> None:
         """So many sweeps were made and never arrived."""
         self.seq += sweeps

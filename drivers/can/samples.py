@@ -86,6 +86,8 @@ class SampleAssembler:
         self._at_ns = 0
         self._widest_ns = 0
         self._broken = False
+        self._is_steady = False
+        """Whether it has been seen to sweep without a pause."""
         self._origin_ns = 0.0
         self._begin()
 
@@ -125,8 +127,15 @@ class SampleAssembler:
             return ()
         if self._ahead(place, until_ns):
             if self._is_tail_of_previous(place):
-                self._counters.late_frames += 1
-                return ()
+                if not self._previous_had >> place & 1:
+                    self._counters.late_frames += 1
+                    return ()
+                if self._holds(place, words):
+                    self._counters.duplicate_frames += 1
+                    return ()
+                if self._is_early(place, until_ns):
+                    self._counters.late_frames += 1
+                    return ()
             return self._store(place, words, t_ns)
         if self._repeats(place, words, t_ns, until_ns):
             return ()
@@ -146,7 +155,7 @@ class SampleAssembler:
     def interrupt(self) -> None:
         """The link broke: drop the sweep at hand, wait for the beginning of another."""
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
-        self._synchronised = False
+        self._synchronised = self._is_steady = False
         self._previous_had = _ALL
         self._run = 0
         self._begin()
@@ -197,18 +206,28 @@ class SampleAssembler:
         due_ns = self._origin_ns + self._position[place] * period_ns
         return until_ns - due_ns >= self._lateness_ns()
 
+    def _is_early(self, place: int, until_ns: int) -> bool:
+        """Whether a sample came too soon to be of this sweep: it is a late one of before."""
+        period_ns = self._readings.period_ns
+        if period_ns is None:
+            return until_ns - self._t_ns < (place - self._last) * SLOT_MIN_NS
+        due_ns = self._origin_ns + self._position[place] * period_ns
+        return due_ns - until_ns >= self._lateness_ns()
+
     def _lateness_ns(self) -> float:
         """How late a sample must be to be of another sweep, ns."""
         period_ns = self._readings.period_ns or self._samples * SLOT_MIN_NS
         return NEXT_SWEEP_PERIODS * period_ns
 
     def _is_tail_of_previous(self, place: int) -> bool:
-        """Whether one of the last electrodes comes just after the sweep that lacked it."""
-        return (
-            place >= ELECTRODES - REORDER_MAX
-            and 0 <= self._last < REORDER_MAX
-            and not self._previous_had >> place & 1
-        )
+        """Whether one of the last electrodes comes where a sweep has just begun: late, doubled, or
+        after a loss of all between."""
+        return place >= ELECTRODES - REORDER_MAX and 0 <= self._last < REORDER_MAX
+
+    def _holds(self, place: int, words: bytes) -> bool:
+        """Whether these words came last for this place."""
+        start = place * self._width
+        return self._buffer[start : start + self._width] == words
 
     def _repeats(self, place: int, words: bytes, t_ns: int, until_ns: int) -> bool:
         """Deal with a sample that stays in this sweep: a copy or a late one. False: a new sweep."""
@@ -221,8 +240,7 @@ class SampleAssembler:
                 self._counters.reordered_frames += 1
                 self._put(place, words, max(t_ns, self._t_ns))
             return True
-        start = place * self._width
-        if self._buffer[start : start + self._width] != words:
+        if not self._holds(place, words):
             return False
         self._counters.duplicate_frames += 1
         return True
@@ -281,13 +299,17 @@ class SampleAssembler:
 
         Samples without a gap in their order tell of one period even where the time between them
         broke the sweep: else a period that is wrong once, and breaks every sweep, would stay. Not
-        where a whole sweep may be missing in the widest gap between them.
+        where a whole sweep may be missing in the widest gap between them: there only of a board
+        that always pauses between its sweeps.
         """
         known = not self._broken or self._run > ELECTRODES
         if known and self._previous_end_ns is not None:
             gap_ns = end_ns - self._previous_end_ns
-            even = not self._broken or self._widest_ns < EVEN_SHARE * gap_ns
-            if even and 0 < gap_ns <= OUTAGE_NS:
+            is_even = self._widest_ns < EVEN_SHARE * gap_ns
+            if is_even and not self._is_steady:
+                self._is_steady = True
+                self._readings.forget_period()
+            if (is_even or not (self._broken or self._is_steady)) and 0 < gap_ns <= OUTAGE_NS:
                 self._readings.learn(gap_ns)
         self._broken = False
         self._widest_ns = 0

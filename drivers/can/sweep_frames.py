@@ -1,7 +1,7 @@
 """Per-finger frames -> one `TactileReading` per sweep; what is missing is flagged.
 
-Frames are of one sweep if number and tick agree and if they come within two periods; a board that
-was reset repeats numbers, but neither its ticks nor the past.
+Frames are of one sweep if number and tick agree and if they come within two periods: a board that
+was reset repeats both, but must be silent for so long.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ class FrameAssembler:
         self._current: int | None = None
         self._synchronised = False
         self._finished_ns: int | None = None
+        self._follows: int | None = None
+        """Number of the sweep after the one that was finished last, of the same start."""
         self._begin(0, 0)
 
     def _begin(self, tick_us: int, t_ns: int) -> None:
@@ -74,12 +76,19 @@ class FrameAssembler:
             done = self._finish()
             self._advance(sequence, tick_us, t_ns)
         elif tick_us == self._tick_us and self._have >> row & 1:
-            self._counters.duplicate_frames += 1
-            return ()
+            if (self._words[row] == np.frombuffer(words, dtype=">u2")).all():
+                self._counters.duplicate_frames += 1
+                return ()
+            # The board was reset and numbers as before: which frames are of which start is open.
+            self.interrupt()
+            self._counters.restarts += 1
+            self._follows = None
+            self._begin(tick_us, t_ns)
         elif t_ns - self._begun_ns > self._patience_ns():
             self._counters.restarts += 1
             done = self._finish()
             self._readings.miss(1)
+            self._follows = None
             self._begin(tick_us, t_ns)
         elif tick_us != self._tick_us:
             self._counters.contradicting_frames += 1
@@ -102,7 +111,7 @@ class FrameAssembler:
 
     def _patience_ns(self) -> int:
         period_ns = self._readings.period_ns
-        return PATIENCE_NS if period_ns is None else min(PATIENCE_PERIODS * period_ns, OUTAGE_NS)
+        return PATIENCE_NS if period_ns is None else PATIENCE_PERIODS * period_ns
 
     def _is_late(self, sequence: int, tick_us: int, t_ns: int) -> bool:
         """Whether a frame is of one of the sweeps just before: by number, time and tick."""
@@ -119,6 +128,7 @@ class FrameAssembler:
             if jump > SEQUENCE_JUMP_MAX or backwards:
                 self._counters.restarts += 1
                 self._readings.miss(1)
+                self._follows = None
             else:
                 self._readings.miss(jump - 1)
         self._current = sequence
@@ -138,9 +148,12 @@ class FrameAssembler:
             return ()
         self._synchronised = True
         self._counters.lost_frames += self._fingers - here
-        if self._finished_ns is not None and 0 < self._t_ns - self._finished_ns <= OUTAGE_NS:
-            self._readings.learn(self._t_ns - self._finished_ns)
+        if self._finished_ns is not None and self._current == self._follows:
+            gap_ns = self._t_ns - self._finished_ns
+            if 0 < gap_ns <= OUTAGE_NS:
+                self._readings.learn(gap_ns)
         self._finished_ns = self._t_ns
+        self._follows = None if self._current is None else (self._current + 1) % (1 << 16)
         return (self._reading(),)
 
     def _reading(self) -> TactileReading:

@@ -31,7 +31,8 @@ class PalmStream:
     """Makes a `TactileReading` of each round of 14 packets, and a `JointReading` every 10 ms.
 
     Packets must come as the palm makes them, one a millisecond. Of a relay that sends them in
-    batches longer than 10 ms, rounds are flagged or counted as missed that were not.
+    batches longer than 10 ms, rounds are flagged or counted as missed that were not; where it holds
+    packets back for more than 3 ms, the loss of a whole round may not be told.
     """
 
     def __init__(

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daemon.session.file import SessionFile, kept_now
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
 
@@ -72,6 +73,22 @@ def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3
     seeded = graspd("session", "seed", path, bts3_dir / "palm_45.csv")
     assert seeded.returncode == 0, seeded.stderr
     assert re.search(r": \d+ grasps of 2133 readings", seeded.stdout)
+
+
+def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        '[tactile]\ndriver = "spi"\nport = "/nowhere"\n[model]\nname = "small-session"\n'
+        '[session]\nfile = "right.session.json"\n'
+    )
+    fingers = ("ff", "mf", "th")
+    with SessionFile(tmp_path / "right.session.json") as file:
+        file.save(None, fingers, {"ff": "BTSP-1"})
+        file.put_aside(kept_now(None, fingers, {"ff": "BTSP-2", "th": "BTSP-3"}))
+    shown = graspd("session", "show", path)
+    assert "0 grasps of ff BTSP-2, th BTSP-3" in shown.stdout
+    (aside,) = json.loads(graspd("session", "show", path, "--json").stdout)["put_aside"]
+    assert aside["serials"] == {"ff": "BTSP-2", "th": "BTSP-3"}
 
 
 def test_garbage_seeds_no_session(scene: Path, tmp_path: Path) -> None:

@@ -299,3 +299,18 @@ def test_the_frame_period_is_learned() -> None:
     for sweep in range(PERIODS_NEEDED + 1):
         whole(sweeps, sweep, sweep * 10_000_000)
     assert sweeps.period_ns == 10_000_000
+
+
+def test_no_period_is_learned_from_sweeps_that_were_lost_or_of_two_starts() -> None:
+    """Else frames of two starts would be waited for as long as the board takes to begin anew."""
+    sweeps, _ = frame_sweeps()
+    at_ns = 0
+    for _start in range(3):
+        for sweep in (0, 1, 3, 5, 7):
+            at_ns += 10_000_000 if sweep == 1 else 110_000_000
+            whole(sweeps, sweep, at_ns)
+    assert sweeps.period_ns is None  # only three times did one follow the other
+    for sweep in range(8, 11):
+        at_ns += 10_000_000
+        whole(sweeps, sweep, at_ns)
+    assert sweeps.period_ns == 10_000_000

@@ -1,0 +1,128 @@
+"""Sweeps whose counts are their number, and what happens to them between a board and a driver.
+
+A reading that mixes two sweeps holds two numbers, whatever the driver thinks of it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from drivers.base import ELECTRODES, Reading, TactileReading
+
+FIRST, NUMBERS = 50, 4000
+"""The count of sweep 0, and how many sweeps there are before a count comes again."""
+SWEEPS_PER_BOOT = 700
+"""Numbers apart are the sweeps of two starts of a board."""
+
+
+def number_of(sweep: int, boot: int = 0) -> int:
+    """The count that all electrodes have in a sweep, by its place since a start of the board."""
+    return FIRST + (sweep + SWEEPS_PER_BOOT * boot) % NUMBERS
+
+
+def counts_of(number: int, fingers: int = 3) -> NDArray[np.uint16]:
+    """Counts of a sweep, shape (fingers, 24)."""
+    return np.full((fingers, ELECTRODES), number, dtype=np.uint16)
+
+
+def expect_one_sweep(readings: Iterable[Reading]) -> int:
+    """Fail if a reading holds counts of two sweeps without a flag; how many hold any."""
+    sound = 0
+    for reading in readings:
+        assert isinstance(reading, TactileReading)
+        numbers = set(reading.counts[reading.faults == 0].tolist())
+        assert len(numbers) <= 1, f"mixes the sweeps {sorted(numbers)}"
+        sound += bool(numbers)
+    return sound
+
+
+@dataclass(frozen=True)
+class Step:
+    """What happens next."""
+
+    what: str
+    """`send`; `lose`; `again`: the last ones come once more; `late`: they come after the next;
+    `stall`: the board pauses; `restart`: it begins anew, with all its counters."""
+    units: int
+    """How many frames, packets or samples; of a stall, how long in them."""
+
+
+def plans(sweep: int, steady_sweeps: int = 1) -> st.SearchStrategy[list[Step]]:
+    """Plans for a board of which a sweep takes so many units; at first it sweeps undisturbed.
+
+    Losses are often of whole sweeps, or nearly: there places agree again though sweeps do not.
+    """
+    some = st.integers(1, 2 * sweep)
+    whole = st.integers(1, 4).map(lambda sweeps: sweep * sweeps)
+    nearly = st.builds(int.__add__, whole, st.integers(1 - min(sweep, 3), 2))
+    few = st.integers(1, 3)
+    kinds = {
+        "send": st.one_of(some, whole),
+        "lose": st.one_of(some, whole, nearly),
+        "again": few,
+        "late": few,
+        "stall": st.one_of(some, whole),
+        "restart": few,
+    }
+    steps = {what: st.builds(Step, st.just(what), units) for what, units in kinds.items()}
+    any_step = st.one_of(steps["send"], steps["lose"], *steps.values())
+    # Whole sweeps come and are lost in turns: they look like a board that is slower.
+    sweeps = st.builds(Step, st.just("send"), st.sampled_from([sweep, sweep, 2 * sweep]))
+    lost = st.builds(Step, st.just("lose"), whole)
+    in_turns = st.lists(st.tuples(sweeps, lost), max_size=20).map(lambda both: sum(both, ()))
+    torn = st.lists(st.tuples(steps["send"], lost), max_size=8).map(lambda both: sum(both, ()))
+    first = Step("send", steady_sweeps * sweep)
+    return st.builds(
+        lambda *parts: [first, *itertools.chain(*parts)],
+        in_turns,
+        torn,
+        st.lists(any_step, min_size=5, max_size=50),
+    )
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A frame, packet or sample as it comes to the host."""
+
+    at: int
+    """When it comes, in units since the board's first start."""
+    index: int
+    """Which one since the board's last start, lost ones too."""
+    boot: int
+    """Which start that was."""
+
+
+def arrivals(plan: Sequence[Step], silent: int, late_max: int = 3) -> Iterator[Unit]:
+    """Units in the order in which they come.
+
+    A board that begins anew is silent for so many units first; what is late or doubled comes at
+    most `late_max` units after it was sent.
+    """
+    at = index = boot = 0
+    recent: list[Unit] = []
+    held: list[Unit] = []
+    for step in plan:
+        if step.what == "again":
+            again = [each for each in recent[-step.units :] if at - each.at <= late_max]
+            yield from (replace(each, at=at) for each in again)
+        elif step.what == "stall":
+            at += step.units
+        elif step.what == "restart":
+            at, index, boot = at + silent, 0, boot + 1
+        for _ in range(step.units if step.what in ("send", "lose", "late") else 0):
+            unit = Unit(at, index, boot)
+            at, index = at + 1, index + 1
+            held = [each for each in held if unit.at - each.at <= late_max]
+            if step.what == "late":
+                held.append(unit)
+            elif step.what == "send":
+                yield unit
+                recent = [*recent[-late_max:], unit]
+                yield from (replace(each, at=unit.at) for each in held[:1])
+                del held[:1]

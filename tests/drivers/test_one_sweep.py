@@ -1,0 +1,241 @@
+"""No reading of any driver mixes two sweeps, whatever is lost, doubled, late, or begins anew.
+
+What boards must number and how long links may hold frames back, so that this holds, say
+`deploy/bridge/PROTOCOL.md`, `deploy/can/PROTOCOL.md` and the README's part on palms.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.base import JointReading
+from drivers.biotac import SEQUENCES
+from drivers.can.decoders import CanDecoder, make_decoder
+from drivers.can.formats import CanFormat, SweepFrame, encode_sample
+from drivers.can.frames import FD, CanFrame
+from drivers.can.readings import CanCounters
+from drivers.joints.message import JointCounters, JointMessage, JointParser, MessageOrder
+from drivers.palm.stream import PalmStream
+from drivers.recordings.can_log import CanLog, frame_of, line_of
+from drivers.recordings.serial_log import SerialLog, SerialLogParser, encode_records
+from drivers.spi.conversation import Conversation
+from drivers.spi.line import LineEvent
+from drivers.spi.messages import Ping, Sweep, encode
+from drivers.twins.palm import PalmTwin
+from tests.drivers.can.can_words import SLOT_NS, word
+from tests.drivers.one_sweep import (
+    Step,
+    Unit,
+    arrivals,
+    counts_of,
+    expect_one_sweep,
+    number_of,
+    plans,
+)
+from tests.drivers.spi.bridge_bench import hello
+
+FINGERS = ("ff", "mf", "th")
+MS = 1_000_000
+PERIOD_NS = 10 * MS
+BASE_ID = 0x100
+SILENT_NS = 110 * MS
+"""How long a board says nothing after a reset, as deploy/can/PROTOCOL.md asks."""
+WORDS = [word(count) for count in range(4096)]
+ROUND = 14
+PACKETS = [
+    packet.to_bytes()
+    for packet in PalmTwin(counts_of(number_of(at)) for at in range(600)).packets()
+]
+"""More rounds than the longest plan has, and some for other starts."""
+
+
+@settings(max_examples=400)
+@given(plans(ROUND), st.integers(0, 20 * ROUND))
+def test_of_the_palm_a_round_of_fourteen_packets_is_a_sweep(plan: list[Step], first: int) -> None:
+    """A packet may be up to 3 ms late; a relay that was started again goes on in any round."""
+    stream = PalmStream(FINGERS)
+    for unit in arrivals(plan, silent=20):
+        at = first + unit.index + 37 * unit.boot
+        readings = stream.receive(PACKETS[at % len(PACKETS)], unit.at * MS)
+        expect_one_sweep(readings or ())
+
+
+def sweep_frame(unit: Unit, first: int) -> CanFrame:
+    """Frames of three fingers follow each other; number and tick begin anew with the board."""
+    sweep, row = divmod(unit.index, len(FINGERS))
+    finger = (0, 1, 4)[row]
+    words = WORDS[number_of(sweep, unit.boot)] * 24
+    frame = SweepFrame(finger, (first + sweep) % (1 << 16), (sweep + 1) * 10_000, words)
+    return CanFrame(BASE_ID + finger, frame.to_bytes(), FD)
+
+
+@settings(max_examples=400)
+@given(plans(3), st.sampled_from([0, (1 << 16) - 9]))
+def test_of_sweep_frames_number_and_tick_tell_the_sweep(plan: list[Step], first: int) -> None:
+    decoder, unit_ns = sweep_fd_decoder(), PERIOD_NS // 3
+    for unit in arrivals(plan, silent=SILENT_NS // unit_ns + 1, late_max=4):
+        expect_one_sweep(decoder.push(sweep_frame(unit, first), unit.at * unit_ns))
+
+
+@settings(max_examples=50)
+@given(st.integers(1, 3), st.integers(0, 2), st.integers(-2, 2))
+def test_a_counter_that_goes_round_while_frames_are_lost_is_told_by_time(
+    came: int, row: int, off: int
+) -> None:
+    """All 65536 numbers are lost, so the next frame has the number of the sweep at hand."""
+    decoder, unit_ns, seen = sweep_fd_decoder(), PERIOD_NS // 3, 0
+    before = [Unit(at, at, 0) for at in range(30 + came)]
+    lost = 3 * (1 << 16) + 3 * off
+    after = [Unit(at, at, 0) for at in range(lost + 30 + row, lost + 60)]
+    for unit in (*before, *after):
+        seen += expect_one_sweep(decoder.push(sweep_frame(unit, 0), unit.at * unit_ns))
+    assert seen >= 17
+
+
+def sweep_fd_decoder() -> CanDecoder:
+    return make_decoder(
+        CanFormat.SWEEP_FD,
+        FINGERS,
+        counters=CanCounters(),
+        arbitration_id=BASE_ID,
+        sequence="electrodes",
+        data_length=None,
+    )
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+@pytest.mark.parametrize("place", [0, 1])
+def test_frames_that_repeat_number_and_tick_with_other_words_are_of_another_start(
+    order: tuple[int, ...], place: int
+) -> None:
+    """A board that is reset within two periods and numbers as before, heard of one finger."""
+    decoder, seen = sweep_fd_decoder(), 0
+    for boot, rows in ((1, (order[place],)), (2, order), (2, ())):
+        for row in rows:
+            seen += expect_one_sweep(decoder.push(sweep_frame(Unit(0, row, boot), 0), boot * MS))
+    assert seen == (place == 0)
+
+
+def sample(unit: Unit, channels: Sequence[int]) -> CanFrame:
+    """One channel of three sensors, in the order of a sequence."""
+    sweep, slot = divmod(unit.index, len(channels))
+    words = WORDS[number_of(sweep, unit.boot)] * 3
+    return CanFrame(BASE_ID, encode_sample(channels[slot], words))
+
+
+@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
+def test_of_samples_order_and_time_tell_the_sweep(sequence: str) -> None:
+    """For a board without a pause, of which two sweeps in a row have come."""
+    channels = SEQUENCES[sequence]
+
+    @settings(max_examples=150)
+    @given(plans(len(channels), steady_sweeps=3))
+    def holds(plan: list[Step]) -> None:
+        decoder = make_decoder(
+            CanFormat.SYNTOUCH,
+            FINGERS,
+            counters=CanCounters(),
+            arbitration_id=BASE_ID,
+            sequence=sequence,
+            data_length=None,
+        )
+        for unit in arrivals(plan, silent=len(channels)):
+            expect_one_sweep(decoder.push(sample(unit, channels), unit.at * SLOT_NS))
+
+    holds()
+
+
+@settings(max_examples=100)
+@given(st.tuples(plans(3), st.just(True)) | st.tuples(plans(24, steady_sweeps=3), st.just(False)))
+def test_a_log_of_a_bus_is_no_other_than_the_bus(given_: tuple[list[Step], bool]) -> None:
+    plan, numbered = given_
+    channels = SEQUENCES["electrodes"]
+    log = CanLog(
+        FINGERS,
+        format="sweep_fd" if numbered else "syntouch",
+        arbitration_id=BASE_ID,
+        sequence="electrodes",
+    )
+    unit_ns = PERIOD_NS // 3 if numbered else SLOT_NS
+    for unit in arrivals(plan, silent=SILENT_NS // unit_ns + 1):
+        frame = sweep_frame(unit, 0) if numbered else sample(unit, channels)
+        found = frame_of(line_of(frame, unit.at * unit_ns, "can0"))
+        assert found is not None
+        expect_one_sweep(log.feed(*found))
+
+
+def spi_sweep(unit: Unit) -> bytes:
+    words = np.full((24, 3), int.from_bytes(WORDS[number_of(unit.index, unit.boot)]), np.uint16)
+    tick = 1_000_000 + unit.index * 10_000
+    return encode(Sweep(unit.index, tick, tick + 1900, 7, words))
+
+
+damages = st.lists(st.tuples(st.integers(0, 10**6), st.integers(1, 400)), max_size=8)
+"""Where bytes are lost, and how many."""
+
+
+def torn(stream: bytes, damage: Sequence[tuple[int, int]]) -> bytes:
+    """What is left of bytes: two halves of two frames may come to stand side by side."""
+    left = bytearray(stream)
+    for at, number in damage:
+        start = at % max(len(left), 1)
+        del left[start : start + number]
+    return bytes(left)
+
+
+@settings(max_examples=100)
+@given(plans(1), damages, st.integers(1, 500), st.booleans())
+def test_of_a_bridge_a_sweep_is_one_frame_with_a_checksum(
+    plan: list[Step], damage: list[tuple[int, int]], piece: int, logged: bool
+) -> None:
+    """The bytes come in pieces, in part, and through a log or not."""
+    conversation = Conversation("port", FINGERS)
+    log = SerialLog(FINGERS)
+    t_ns, seen = 10**9, 0
+
+    def feed(event: LineEvent, data: bytes) -> None:
+        nonlocal seen
+        if logged:
+            for record in SerialLogParser().feed(encode_records(event, t_ns, data)):
+                seen += expect_one_sweep(log.feed(t_ns, record))
+        elif event is LineEvent.RECEIVED:
+            seen += expect_one_sweep(conversation.receive(data, t_ns, t_ns))
+        else:
+            conversation.sent(data, t_ns)
+
+    conversation.opened(t_ns)
+    for nonce in (1, 2):
+        feed(LineEvent.SENT, encode(Ping(nonce)))
+        feed(LineEvent.RECEIVED, encode(hello(nonce, 1000)))
+    sent = b"".join(spi_sweep(unit) for unit in arrivals(plan, silent=11))
+    stream = torn(sent, damage)
+    for at in range(0, len(stream), piece):
+        t_ns += MS
+        feed(LineEvent.RECEIVED, stream[at : at + piece])
+    assert seen or damage or not any(step.what == "send" for step in plan)
+
+
+@settings(max_examples=200)
+@given(plans(1))
+def test_of_joints_a_message_is_a_reading_and_none_comes_after_a_later_one(
+    plan: list[Step],
+) -> None:
+    counters = JointCounters()
+    parser, order = JointParser(counters), MessageOrder(counters)
+    last: tuple[int, int] = (0, -1)
+    for unit in arrivals(plan, silent=5):
+        angle = 0.001 * (unit.index % 1000) + unit.boot / 2**20
+        message = JointMessage(unit.index, None, ("FFJ3", "MFJ3"), np.full(2, angle))
+        parsed = parser.parse(message.to_bytes())
+        assert parsed is not None
+        if order.admits(parsed):
+            reading = JointReading(unit.at, 0, parsed.names, parsed.position_rad)
+            assert set(reading.position_rad.tolist()) == {angle}
+            assert (unit.boot, unit.index) > last
+            last = unit.boot, unit.index
