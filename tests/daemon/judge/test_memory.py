@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from daemon import scene
 from daemon.assembly import assembly
@@ -34,6 +35,8 @@ SECTIONS: dict[str, Any] = {
 }
 STEP = 23
 """Readings between one judge and the next: some 200 places, of all that happens in a grasp."""
+OLD = 30
+"""So many tactile readings before was an old sweep sent first."""
 
 
 @pytest.fixture(scope="module")
@@ -47,8 +50,8 @@ def readings() -> list[Reading]:
 
 @pytest.fixture(scope="module")
 def troubled(readings: list[Reading]) -> list[Reading]:
-    """The same with electrodes that jump, stand still or are missing, and with outages."""
-    rng = np.random.default_rng(4)
+    """The same with electrodes that jump, stand still or are missing, old sweeps and outages."""
+    rng, sent = np.random.default_rng(4), list[NDArray[np.uint16]]()
     found: list[Reading] = []
     for place, reading in enumerate(readings):
         if place % 1900 > 1700 or (isinstance(reading, JointReading) and 700 < place < 1000):
@@ -60,6 +63,10 @@ def troubled(readings: list[Reading]) -> list[Reading]:
                 faults[2, 7] = ElectrodeFault.MISSING * (rng.random() < 0.5)
             if place % 800 > 400:
                 counts[1, 11] = 2000
+            # Not the first readings after somebody took over: nobody keeps what `motion` was.
+            if place % 700 > 640 and len(found) % STEP > 2:
+                counts[2] = sent[-OLD]  # of before that
+            sent.append(counts[2])
             found.append(dataclasses.replace(reading, counts=counts, faults=faults))
         else:
             found.append(reading)
@@ -117,14 +124,16 @@ def test_whoever_takes_over_anywhere_judges_the_rest_the_same(
     now, gate = [0], {"mode": mode}
     whole, other = judge(now, gate), judge(now, gate)
     model = assembly.load_model(scene.parse(SECTIONS, Path("test")))
-    times = 0
+    times, frozen = 0, 0
     for cut in range(0, len(troubled), STEP):
         part = troubled[cut : cut + STEP]
         expected = judged(whole, now, part)
         other = handed_on(other, judge(now, gate, model))
         assert judged(other, now, part) == expected
         times += sum(each.judged for each, _ in expected)
+        frozen += sum(Reason.FROZEN in each.reasons for each, _ in expected)
     assert times > 5
+    assert frozen > 100
 
 
 def test_what_is_taken_does_not_change_when_the_judge_goes_on(readings: list[Reading]) -> None:
