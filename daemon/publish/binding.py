@@ -45,8 +45,8 @@ class Binding:
 
 def socket_file(endpoint: str, binding: Binding) -> SocketFile | None:
     """The file of an `ipc://` endpoint, taken; None for others. Raises `PublishError`."""
-    if not endpoint.startswith("ipc://") or endpoint.startswith("ipc://@"):
-        return None  # for TCP and abstract sockets the kernel refuses a second bind
+    if not endpoint.startswith("ipc://"):
+        return None  # for TCP the kernel refuses a second bind
     try:
         return SocketFile(Path(endpoint.removeprefix("ipc://")), binding.file_mode, binding.group)
     except (OccupiedError, LookupError) as error:

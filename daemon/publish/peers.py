@@ -244,14 +244,19 @@ class PlainDoor(Door):
         return audience
 
     def _write(self, peer: PlainPeer, data: bytes) -> bool:
-        """Send or queue; False if the queue is full."""
+        """Send or queue; False if the queue is full, so that the oldest message is given up.
+
+        So what slow peers have not read is the same for all of them, and held once. The one that
+        may have been sent in part stays.
+        """
         if peer.socket is None:
             return True
         if peer.queue:
-            if len(peer.queue) >= self._high_water_mark:
-                return False
+            is_full = len(peer.queue) > self._high_water_mark
+            if is_full:
+                del peer.queue[1]
             peer.queue.append(data)
-            return True
+            return not is_full
         try:
             sent = peer.socket.send(data)
         except BlockingIOError:
@@ -323,23 +328,16 @@ class PlainDoor(Door):
 
 
 def _listener(endpoint: str) -> socket.socket:
-    """Bound to TCP or to an abstract name. Raises `OSError`."""
-    scheme, _, address = endpoint.partition("://")
-    if scheme == "ipc":
-        family = socket.AF_UNIX
-        where: str | tuple[str, int] = "\0" + address[1:]
-    else:
-        host, _, port = address.rpartition(":")
-        family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
-        where = (host.strip("[]"), int(port))
+    """Bound to TCP. Raises `OSError`."""
+    host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
+    family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
     with contextlib.ExitStack() as stack:
         listener = stack.enter_context(socket.socket(family, socket.SOCK_STREAM))
         listener.setblocking(False)
-        if scheme == "tcp":
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            # Before it listens: connections inherit it, and the window is made by it.
-            listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        listener.bind(where)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Before it listens: connections inherit it, and the window is made by it.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        listener.bind((host.strip("[]"), int(port)))
         listener.listen(BACKLOG)
         stack.pop_all()
     return listener

@@ -61,8 +61,9 @@ class Publisher(Bound):
 
     @property
     def counters(self) -> Counter[str]:
-        """How often a peer's queue was full (it misses messages until it has read on, as `seq`
-        tells), messages repeated for new peers, subscriptions, and what the door counts."""
+        """How often a peer's queue was full (it misses the oldest message there, with keys the
+        newest, as `seq` tells), messages repeated for new peers, subscriptions, and what the door
+        counts."""
         return self._with_the_doors(self._counted)
 
     def send(self, topic: bytes, payload: bytes) -> None:

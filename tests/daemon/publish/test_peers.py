@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import re
 import select
 import socket
 import subprocess
@@ -130,12 +131,6 @@ def test_another_kind_of_socket_is_cut_off(tmp_path: Path, raw: Raw) -> None:
         assert publisher.counters["cut_off"] == 1
 
 
-def test_an_abstract_name_can_be_heard(tmp_path: Path, friends: Peers) -> None:
-    endpoint = f"ipc://@{tmp_path.name}-{time.monotonic_ns()}"
-    with Publisher(endpoint) as publisher:
-        assert hears(publisher, friends.subscribe(endpoint))
-
-
 def test_a_peer_that_wants_signs_of_life_gets_them(tmp_path: Path, friends: Peers) -> None:
     endpoint = f"ipc://{tmp_path}/v"
     with (
@@ -193,6 +188,25 @@ def test_the_end_waits_for_nobody_for_long(tmp_path: Path, raw: Raw) -> None:
     publisher.close()
     assert 0.4 < time.monotonic() - began_s < 2.0
     assert is_cut_off(deaf)
+
+
+def test_who_reads_too_slowly_misses_the_oldest_messages(tmp_path: Path, raw: Raw) -> None:
+    """Else messages of all times would be held for those who never read."""
+    with Publisher(f"ipc://{tmp_path}/v", high_water_mark=10) as publisher:
+        slow = raw(tmp_path / "v", GREETING_31 + READY_SUB + SUBSCRIBE_ALL)
+        until(lambda: publisher.wanted(b"v"), publisher.take)
+        for number in range(1000):
+            publisher.send(b"verdict.right", b"<%d>" % number + bytes(1000))
+        slow.setblocking(False)
+        heard = b""
+        with contextlib.suppress(BlockingIOError):
+            while b"<999>" not in heard:
+                heard += slow.recv(65536)
+                publisher.take()
+    numbers = [int(number) for number in re.findall(rb"<(\d+)>", heard)]
+    assert numbers[:10] == list(range(10))
+    assert numbers[-10:] == list(range(990, 1000))
+    assert len(numbers) < 500
 
 
 @pytest.mark.parametrize(
