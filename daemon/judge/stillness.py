@@ -33,6 +33,9 @@ SPIKE_COUNTS = 20.0
 """A value that jumps further than this is believed when the next one does too. Spikes last for one
 sweep: of a sensor by 25 counts or more, of a flipped bit by any; noise does so in one value of
 three thousand."""
+SPIKE_SWEEPS_MAX = 3
+"""Where values come more slowly than sweeps and are held, a spike is in two or three of them; what
+stays is none, however constant."""
 SPIKES_MAX = 4
 """Where more electrodes of a finger jump at once, the finger moves: by chance not in a year."""
 BLOCK_STEPS, BLOCKS = 24, 16
@@ -79,8 +82,8 @@ class MotionMemory:
     """The last sweep without spikes."""
     counts: NDArray[np.float32]
     """The last sweep as it came."""
-    jumped: NDArray[np.bool_]
-    """Where it had jumped, and was not believed."""
+    jumped: NDArray[np.uint8]
+    """For how many sweeps it has jumped and was not believed."""
     lost: NDArray[np.uint8]
     """For how many sweeps it has not been usable, up to `LOST_MAX` and one."""
     usable_since_ns: NDArray[np.int64]
@@ -138,7 +141,7 @@ class Motion:
             steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
             clean=np.zeros(shape, dtype=np.float32),
             counts=np.zeros(shape, dtype=np.float32),
-            jumped=np.zeros(shape, dtype=np.bool_),
+            jumped=np.zeros(shape, dtype=np.uint8),
             lost=np.zeros(shape, dtype=np.uint8),
             usable_since_ns=np.zeros(shape, dtype=np.int64),
             all_usable_since_ns=0,
@@ -194,7 +197,7 @@ class Motion:
         if memory.last_ns is None:
             memory.last_ns = memory.all_usable_since_ns = t_ns
             memory.clean = memory.counts = sweep
-            memory.jumped.fill(False)
+            memory.jumped.fill(0)
             memory.lost.fill(LOST_MAX)
             memory.usable_since_ns.fill(t_ns)
         if np.count_nonzero(usable) != usable.size:
@@ -204,7 +207,7 @@ class Motion:
                 # Not in this step, and what comes next has nothing to jump from.
                 memory.all_usable_since_ns = t_ns + STEP_NS
                 memory.usable_since_ns[gone] = t_ns + STEP_NS
-                memory.jumped[gone] = True
+                memory.jumped[gone] = SPIKE_SWEEPS_MAX
             memory.lost += ~usable & ~gone
         self._clean(sweep)
         memory.lost[usable] = 0
@@ -221,16 +224,18 @@ class Motion:
         self._decide()
 
     def _clean(self, counts: NDArray[np.float32]) -> None:
-        """Leave out what has jumped for one sweep alone; held values repeat what was not."""
+        """Leave out what has jumped for one sweep alone, or is held for a few."""
         memory = self.memory
         jumped = np.abs(counts - memory.clean) > SPIKE_COUNTS
-        if jumped.any():
-            jumped[np.count_nonzero(jumped, axis=1) > SPIKES_MAX] = False
-            jumped &= ~memory.jumped | (counts == memory.counts)
-            memory.clean = np.where(jumped, memory.clean, counts)
-        else:
-            memory.clean = counts
-        memory.jumped, memory.counts = jumped, counts
+        memory.counts, before = counts, memory.counts
+        if not jumped.any():
+            memory.clean, memory.jumped = counts, jumped.view(np.uint8)
+            return
+        jumped[np.count_nonzero(jumped, axis=1) > SPIKES_MAX] = False
+        held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
+        jumped &= (memory.jumped == 0) | held
+        memory.clean = np.where(jumped, memory.clean, counts)
+        memory.jumped = np.where(jumped, memory.jumped + 1, 0).astype(np.uint8)
 
     def _remember(self, t_ns: int) -> None:
         memory = self.memory

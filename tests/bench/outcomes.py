@@ -75,22 +75,28 @@ class Reference:
     """Learns from what was published and acknowledged, without a file and without kills."""
 
     def __init__(self, wanted: scene.Scene) -> None:
-        model = assembly.load_model(wanted)
-        self._pipeline = assembly.build_pipeline(wanted, model, learns=False)
+        self._scene, self._model = wanted, assembly.load_model(wanted)
         kept = load(wanted.session_path)
-        if kept is None or kept.statistics is None or self._pipeline.session is None:
+        if kept is None or kept.statistics is None:
             raise LostError("no session to begin with")
-        self._pipeline.session.restore(kept.statistics)
-        trust = assembly.build_pipeline(wanted, model).trust
+        self._statistics = kept.statistics
+        trust = assembly.build_pipeline(wanted, self._model).trust
         if trust is None:
             raise LostError("nothing learns")
         self.trust: Trust = trust
 
     def note(self, grasp: GraspId, counts: NDArray[np.uint16], *, stable: bool) -> None:
-        """Judge a published reading as the daemon did."""
+        """Judge a published reading as the daemon did.
+
+        With a judge of its own: to the one before it a row that it has had is an old one.
+        """
+        pipeline = assembly.build_pipeline(self._scene, self._model, learns=False)
+        if pipeline.session is None:
+            raise LostError("the model keeps no session")
+        pipeline.session.restore(self._statistics)
         faults = np.zeros(counts.shape, dtype=np.uint8)
-        self._pipeline.judge(TactileReading(time.monotonic_ns(), 0, counts, faults))
-        assessment = self._pipeline.memory.opinion.assessment
+        pipeline.judge(TactileReading(time.monotonic_ns(), 0, counts, faults))
+        assessment = pipeline.memory.opinion.assessment
         if assessment is not None:
             self.trust.ledger.note(grasp, assessment.features, stable=stable)
 

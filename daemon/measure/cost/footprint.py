@@ -212,9 +212,12 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     meter.take("sockets")
     from daemon.process.signals import StopSignal
     from daemon.run.loop import Loop, Timing
+    from daemon.run.reload import Reload
 
-    stop = stack.enter_context(StopSignal())
+    stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
+    stack.callback(stop.close)
     timing = Timing(parts.scene.max_age_ns)
+    stack.enter_context(timing.selector())
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")
     return outbox

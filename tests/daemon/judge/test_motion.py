@@ -196,6 +196,14 @@ def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     assert (motion.motion > 5.0).all()
 
 
+def test_an_electrode_that_jumps_and_stays_has_moved_however_constant_it_is() -> None:
+    motion, counts = Motion(1, 0.05, early=True), wavering(2.5, 100.0, 3.5, 11)
+    counts[-8:, 0, 0] = counts[-9, 0, 0] - 1000.0
+    fed(motion, counts, 100.0)
+    assert not motion.early
+    assert not motion.sure
+
+
 def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_passed() -> None:
     motion = Motion(1, 0.05, early=True)
     counts = np.rint(wavering(3.0, 100.0, 3.5, 12)).astype(np.uint16)
