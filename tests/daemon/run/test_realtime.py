@@ -252,14 +252,14 @@ class Twin:
             self.judged = self._seq + 1 - self._silences
 
 
-def thrice(former: Status, later: Status) -> bool:
-    """Whether, between two statuses, three times as many readings came as were judged."""
+def twice(former: Status, later: Status) -> bool:
+    """Whether, between two statuses, twice as many readings came as were judged."""
     came = later.drivers["spi"]["readings"] - former.drivers["spi"]["readings"]
     skipped = later.skipped_readings - former.skipped_readings
     return came >= OVERLOAD * (came - skipped) > 0
 
 
-OVERLOAD = 3
+OVERLOAD = 2
 RATES_HZ = (2000, 4000, 8000, 16_000, 32_000)
 RTTIME_US = 1_000_000
 """As `LimitRTTIME` of the unit, but a fifth: so long may it compute without sleeping."""
@@ -291,7 +291,7 @@ print("lives on")
 
 
 @pytest.mark.parametrize("realtime", [False, True])
-def test_a_daemon_at_three_times_its_capacity_lives_on_and_accounts_for_all(
+def test_a_daemon_at_twice_its_capacity_lives_on_and_accounts_for_all(
     tmp_path: Path, realtime: bool
 ) -> None:
     if realtime and not fifo_may_be_had():
@@ -312,6 +312,7 @@ def test_a_daemon_at_three_times_its_capacity_lives_on_and_accounts_for_all(
         for topic in ("status.", "verdict."):
             listener.subscribe(topic)
         listener.connect(f"ipc://{tmp_path}/graspd")
+        burden.rcvhwm = 1  # it never reads
         burden.subscribe("tactile.")  # so each reading takes long enough to be too many
         burden.connect(f"ipc://{tmp_path}/graspd")
         twin = Twin(tmp_path, listener)
@@ -323,9 +324,9 @@ def test_a_daemon_at_three_times_its_capacity_lives_on_and_accounts_for_all(
             twin.hear(8.0, lambda status: status.overloaded)
             former = twin.statuses[-1]
             twin.hear(3.2, lambda status: False)
-            if former.overloaded and thrice(former, twin.statuses[-1]):
+            if former.overloaded and twice(former, twin.statuses[-1]):
                 break
-        assert thrice(former, twin.statuses[-1])
+        assert twice(former, twin.statuses[-1])
         assert all(status.overloaded for status in twin.statuses if status.seq > former.seq)
         twin.sweep(20)
         assert twin.hear(20.0, lambda status: not status.overloaded)
