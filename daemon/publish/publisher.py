@@ -71,6 +71,7 @@ class Publisher(Bound):
         self._take()
         if topic.startswith(REPEATED):
             self._last[topic] = (payload, self._clock())
+            self._owed.pop(topic, None)  # this one is newer
         self._counted["queues_full"] += not self.door.publish(topic, payload)
 
     def take(self) -> None:

@@ -190,6 +190,24 @@ def test_the_end_waits_for_nobody_for_long(tmp_path: Path, raw: Raw) -> None:
     assert is_cut_off(deaf)
 
 
+def test_who_comes_between_two_messages_hears_none_twice(tmp_path: Path, raw: Raw) -> None:
+    with Publisher(f"ipc://{tmp_path}/v") as publisher:
+        publisher.send(b"verdict.right", b"<1>")
+        newcomer = raw(tmp_path / "v", GREETING_31 + READY_SUB + SUBSCRIBE_ALL)
+        for number in range(2, 12):
+            publisher.send(b"verdict.right", b"<%d>" % number)
+        publisher.take()
+        heard = b""
+        while b"<11>" not in heard:
+            heard += newcomer.recv(65536)
+        publisher.take()
+        newcomer.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            heard += newcomer.recv(65536)
+    numbers = [int(number) for number in re.findall(rb"<(\d+)>", heard)]
+    assert numbers == sorted(set(numbers))
+
+
 def test_who_reads_too_slowly_misses_the_oldest_messages(tmp_path: Path, raw: Raw) -> None:
     """Else messages of all times would be held for those who never read."""
     with Publisher(f"ipc://{tmp_path}/v", high_water_mark=10) as publisher:
