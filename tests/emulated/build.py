@@ -82,17 +82,24 @@ def image(
             "BRIDGE_SYS_CLOCK_MHZ": str(clock_mhz),
             "BRIDGE_SEQUENCE": f"BIOTAC_{sequence.upper()}",
         }
-        folder = FOLDER / f"{clock_mhz}-{sensors}-{sequence}"
-        made = folder / f"{TARGETS[port]}.bin"
-        stamp = folder / f"{TARGETS[port]}.stamp"
-        digest = _digest(sdk, options)
-        if not (made.is_file() and stamp.is_file() and stamp.read_text() == digest):
-            stamp.unlink(missing_ok=True)
-            settings = [f"-D{name}={value}" for name, value in options.items()]
-            _run("cmake", "-G", "Ninja", "-S", BRIDGE / "pico", "-B", folder, *settings)
-            _run("ninja", "-C", folder, TARGETS[port])
-            stamp.write_text(digest)
+        kind = f"{port}-{sensors}-{clock_mhz}-{sequence}"
+        made = FOLDER / "images" / f"{kind}-{_digest(sdk, options)}.bin"
+        if not made.is_file():
+            made.parent.mkdir(exist_ok=True)
+            for old in made.parent.glob(f"{kind}-*"):
+                old.unlink()
+            _build(FOLDER / str(clock_mhz), TARGETS[port], options, made)
     return made
+
+
+def _build(folder: Path, target: str, options: dict[str, str], made: Path) -> None:
+    """Compile one image; what it has in common with the last one in this folder stays there."""
+    settings = [f"-D{name}={value}" for name, value in options.items()]
+    _run("cmake", "-G", "Ninja", "-S", BRIDGE / "pico", "-B", folder, *settings)
+    _run("ninja", "-C", folder, target)
+    shutil.copy(folder / f"{target}.elf", made.with_suffix(".elf"))
+    shutil.copy(folder / f"{target}.bin", made.with_suffix(".part"))
+    made.with_suffix(".part").rename(made)
 
 
 def check_tools() -> None:
@@ -144,8 +151,9 @@ def _digest(sdk: Path, options: dict[str, str]) -> str:
     digest = hashlib.sha256(version + repr(options).encode())
     digest.update((sdk / "pico_sdk_version.cmake").read_bytes())
     for file in sorted(file for folder in SOURCES for file in folder.rglob("*") if file.is_file()):
-        digest.update(f"{file.relative_to(ROOT)}\0".encode() + file.read_bytes())
-    return digest.hexdigest()
+        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        digest.update(f"{file.relative_to(ROOT)} {content}\n".encode())
+    return digest.hexdigest()[:16]
 
 
 @contextmanager
