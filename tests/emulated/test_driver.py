@@ -69,7 +69,9 @@ def read_from_a_twin(path: Path, rows: Sequence[Counts]) -> list[TactileReading]
             said.clear()
             readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
             while driver.counters.bytes < sum(sent):
-                assert select.select([driver.fileno()], [], [], PATIENCE_S)[0]
+                descriptor = driver.fileno()
+                assert descriptor is not None
+                assert select.select([descriptor], [], [], PATIENCE_S)[0]
                 readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
             if not said:
                 due_ns = [due for due in (twin.due_ns(), driver.due_ns()) if due is not None]
