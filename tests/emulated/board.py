@@ -87,11 +87,11 @@ class Board:
         self._process.stdout.close()
         self._process.wait(10)
 
-    def do(self, what: str, **arguments: object) -> dict[str, Any]:
+    def do(self, name: str, /, **arguments: object) -> dict[str, Any]:
         """One command of `emulator/main.cjs` and its answer."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps({"do": what, **arguments}) + "\n")
+        self._process.stdin.write(json.dumps({"do": name, **arguments}) + "\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         assert line, f"the emulator ended: {self._process.wait(10)}"
