@@ -29,8 +29,8 @@ class Chip {
     this.bitten = this.stuck = false;
     const watchdog = mcu.peripherals[WATCHDOG];
     watchdog.onWatchdogTrigger = () => {
-      watchdog.alarm.enable = false; // or it goes off again at once, for ever
       this.bitten = true;
+      watchdog.timer.enable = false; // or it would bite again at once, for ever
       this.stop(this.now());
     };
     if (before) {
