@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import zmq
 
 from deploy.clients.python.graspd_client import Graspd, Outcome, OutcomeAnswer, Verdict
 from tests.clients.messages import ADDED, TOPIC, verdict
+from tests.threads import at_work
 
 PERIOD_MS = 5
 TAKEN_FRAMES = [b'{"v":1,"ok":true}']
@@ -41,22 +43,12 @@ def false_daemon(
     folder: Path, answer: Answer, outcome: str = "stable", **more: object
 ) -> Iterator[None]:
     """Publishes that verdict all the time, with what is `more`, and answers so."""
-    stop = threading.Event()
-    thread = threading.Thread(target=_serve, args=(folder, answer, outcome, stop, more))
-    thread.start()
-    try:
+    with at_work(partial(_serve, folder, answer, outcome, more)):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def _serve(
-    folder: Path,
-    answer: Answer,
-    outcome: str,
-    stop: threading.Event,
-    more: dict[str, Any],
+    folder: Path, answer: Answer, outcome: str, more: dict[str, Any], stop: threading.Event
 ) -> None:
     with (
         zmq.Context() as context,
@@ -273,12 +265,11 @@ LIFTED_ON = Verdict("stable", grasp=42, boot_id=BOOT)
 def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
     """What is told to a daemon that answers so, or not at all."""
     found: list[bytes] = []
-    stop = threading.Event()
     with zmq.Context() as context, context.socket(zmq.ROUTER) as asked:
         asked.linger = 0
         asked.bind(f"ipc://{folder}/ask")
 
-        def listen() -> None:
+        def listen(stop: threading.Event) -> None:
             while not stop.is_set():
                 if asked.poll(PERIOD_MS):
                     who, *words = asked.recv_multipart()
@@ -286,13 +277,8 @@ def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
                     if frames:
                         asked.send_multipart([who, *frames])
 
-        thread = threading.Thread(target=listen)
-        thread.start()
-        try:
+        with at_work(listen):
             yield found
-        finally:
-            stop.set()
-            thread.join()
 
 
 def told_in_python(folder: Path, name: str | None) -> OutcomeAnswer:

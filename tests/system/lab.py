@@ -19,6 +19,7 @@ from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.spi import SpiTwin
 from tests.system.machine import COMMAND_TIMEOUT_S, Machine
 from tests.system.messages import Message
+from tests.threads import at_work
 
 PAYLOAD: Final = "/payload"
 PYTHON: Final = "/opt/graspd/venv/bin/python"
@@ -197,15 +198,8 @@ class Bridge:
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
         """Serve in a thread of its own."""
-        stop = threading.Event()
-        with self._twin:
-            thread = threading.Thread(target=self._serve, args=(stop,))
-            thread.start()
-            try:
-                yield
-            finally:
-                stop.set()
-                thread.join()
+        with self._twin, at_work(self._serve):
+            yield
 
     @contextlib.contextmanager
     def hung(self) -> Iterator[None]:

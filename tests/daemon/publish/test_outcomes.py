@@ -9,6 +9,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -147,11 +148,18 @@ def takes_the_seventh(boot_id: str, grasp: int, *_told: object) -> str | None:
     return None if (boot_id, grasp) == (BOOT, 7) else "no such"
 
 
-@pytest.fixture
-def teller(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
+@contextmanager
+def peer(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
+    """Who asks and tells over a connection of its own."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.linger = 0
         socket.connect(questions.endpoint)
+        yield socket
+
+
+@pytest.fixture
+def teller(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
+    with peer(questions) as socket:
         yield socket
 
 
@@ -232,9 +240,7 @@ def test_a_grasp_that_somebody_asked_about_is_told_of_by_nobody_else(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
     slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
-        other.linger = 0
-        other.connect(questions.endpoint)
+    with peer(questions) as other:
         ask_about(questions, teller, 7)
         ask_about(questions, other, 7)  # who comes second owns nothing
         refused = told(questions, other, slip)
@@ -248,9 +254,7 @@ def test_a_grasp_that_somebody_asked_about_is_told_of_by_nobody_else(
 def test_who_owns_a_grasp_and_has_gone_is_stood_for_by_another_connection_of_its(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
-    with zmq.Context() as context, context.socket(zmq.DEALER) as former:
-        former.linger = 0
-        former.connect(questions.endpoint)
+    with peer(questions) as former:
         ask_about(questions, former, 7)
     deadline_s = time.monotonic() + 10.0
     while not told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"]:
@@ -261,9 +265,7 @@ def test_who_tells_before_its_former_connection_is_seen_to_go_is_heard(
     questions: Questions, teller: zmq.Socket[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("daemon.publish.questions.GRACE_NS", 5_000_000_000)
-    with zmq.Context() as context, context.socket(zmq.DEALER) as former:
-        former.linger = 0
-        former.connect(questions.endpoint)
+    with peer(questions) as former:
         ask_about(questions, former, 7)
         teller.send(f"outcome {BOOT} 7 slip".encode())
         for _ in range(100):
@@ -292,9 +294,7 @@ def test_a_grasp_that_nobody_asked_about_is_told_of_by_anybody_in_one_word(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
     slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
-        other.linger = 0
-        other.connect(questions.endpoint)
+    with peer(questions) as other:
         assert told(questions, other, slip)["ok"]
         assert told(questions, teller, slip)["ok"]
         assert not told(questions, teller, stable)["ok"]
@@ -306,9 +306,7 @@ def test_who_asks_about_grasps_is_not_forestalled_by_who_does_not(
 ) -> None:
     """A grasp is known to all once it is judged, and may be asked about later."""
     slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    with zmq.Context() as context, context.socket(zmq.DEALER) as other:
-        other.linger = 0
-        other.connect(questions.endpoint)
+    with peer(questions) as other:
         ask_about(questions, teller, 6)
         assert told(questions, other, slip)["why"].startswith("not yours")
         ask_about(questions, teller, 7)
@@ -406,11 +404,8 @@ def test_whatever_follows_the_word_nothing_breaks(texts: list[bytes]) -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         Questions(f"ipc://{folder}/ask", 10**9) as taker,
-        zmq.Context() as context,
-        context.socket(zmq.DEALER) as socket,
+        peer(taker) as socket,
     ):
-        socket.linger = 0
-        socket.connect(taker.endpoint)
         for text in texts:
             answer = told(taker, socket, b"outcome " + text, outcome=lambda *_told: None)
             assert answer["v"] == 1

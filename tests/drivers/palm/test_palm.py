@@ -6,9 +6,9 @@ import dataclasses
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,7 @@ from tests.drivers.palm.palm_stream import (
     tactile,
 )
 from tests.drivers.twins.signals import GeneratedContact
+from tests.threads import at_work
 
 LOOPBACK = "udp://127.0.0.1:0"
 EXAMPLE = ROOT / "deploy" / "calibration" / "example_hand.toml"
@@ -319,20 +320,15 @@ def test_the_loop_is_not_woken_in_the_middle_of_a_round(driver: PalmDriver, cloc
 def test_a_twin_at_full_pace_is_found_again_after_its_link_broke() -> None:
     faults = LinkFaults(disconnect_every_frames=300)
     twin = PalmTwin(GeneratedContact(), faults=faults)
-    stop = threading.Event()
-    with PalmDriver(LOOPBACK) as driver:
-        target = f"udp://127.0.0.1:{driver.port}"
-        thread = threading.Thread(target=twin.serve, args=(target, stop))
-        thread.start()
-        try:
-            listen(driver, lambda _: driver.counters.link_losses == 1)
-            assert state(driver) is LinkState.GREETING
-            listen(driver, lambda _: state(driver) is LinkState.UP)
-            back_ns = time.monotonic_ns()
-            readings = listen(driver, lambda readings: len(tactile(readings)) >= 3)
-        finally:
-            stop.set()
-            thread.join()
+    with (
+        PalmDriver(LOOPBACK) as driver,
+        at_work(partial(twin.serve, f"udp://127.0.0.1:{driver.port}")),
+    ):
+        listen(driver, lambda _: driver.counters.link_losses == 1)
+        assert state(driver) is LinkState.GREETING
+        listen(driver, lambda _: state(driver) is LinkState.UP)
+        back_ns = time.monotonic_ns()
+        readings = listen(driver, lambda readings: len(tactile(readings)) >= 3)
     first = tactile(readings)[0]
     assert not first.faults.any()
     assert first.t_ns - back_ns < 100 * MS  # two rounds, on a machine that has other work too
