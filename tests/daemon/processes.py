@@ -26,13 +26,13 @@ with zmq.Context() as context, context.socket(zmq.SUB) as socket:
 """Plain pyzmq: prints the verdicts that come at an endpoint, so many at most."""
 
 
-def graspd(*arguments: object) -> subprocess.CompletedProcess[str]:
+def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.CompletedProcess[str]:
     """Run a command to its end."""
     return subprocess.run(
         [*GRASPD, *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=TIMEOUT_S,
+        timeout=timeout_s,
         check=False,
     )
 
