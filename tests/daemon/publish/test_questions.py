@@ -52,7 +52,7 @@ def connect() -> Iterator[Connect]:
 
 
 def take_until(questions: Questions, wanted: int) -> int:
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     taken = 0
     while taken < wanted and time.monotonic() < deadline_s:
         taken += questions.take(0)
@@ -68,7 +68,7 @@ def test_a_question_gets_one_answer(
     assert take_until(questions, 1) == 1
     assert questions.due_ns() == PATIENCE_NS
     questions.answer(b"{}")
-    assert asker.poll(5000)
+    assert asker.poll(100_000)
     assert asker.recv_multipart() == [b"{}"]
     assert questions.waiting == 0
     assert questions.due_ns() is None
@@ -98,7 +98,7 @@ def test_what_is_no_question_is_counted_and_not_answered(
     asker.send(b"judge")
     assert take_until(questions, 1) == 1
     questions.answer(b"{}")
-    assert asker.poll(5000)
+    assert asker.poll(100_000)
     assert asker.recv() == b"{}"
     assert not asker.poll(50)
     assert questions.counters["malformed"] == 1
@@ -112,7 +112,7 @@ def test_a_peer_that_sends_too_much_is_cut_off_and_others_are_not(
     polite.send(b"judge")
     assert take_until(questions, 1) == 1
     questions.answer(b"{}")
-    assert polite.poll(5000)
+    assert polite.poll(100_000)
 
 
 def test_a_flood_of_questions_is_bounded_and_each_peers_newest_is_answered(
@@ -141,7 +141,7 @@ def test_whoever_asks_and_goes_again_and_again_pushes_nobody_out(
         asker.close(linger=0)
     assert questions.waiting == WAITING_MAX
     questions.answer(b"{}")
-    assert patient.poll(5000)
+    assert patient.poll(100_000)
 
 
 @pytest.mark.parametrize("flooders", [8])
@@ -174,7 +174,7 @@ def test_a_message_without_an_end_is_not_collected_and_its_peer_alone_is_cut_off
 ) -> None:
     loud, polite = connect(endpoint), connect(endpoint)
     loud.send_multipart([b""] * 5000)
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     while not questions.counters["cut_off"] and time.monotonic() < deadline_s:
         questions.take(0)
     assert questions.counters["cut_off"] >= 1
@@ -189,17 +189,17 @@ def test_when_time_is_up_only_those_are_answered_who_have_waited_that_long(
     first.send(b"judge")
     assert take_until(questions, 1) == 1
     second.send(b"judge")
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     while not questions.take(500) and time.monotonic() < deadline_s:
         pass
     questions.answer(b"early", PATIENCE_NS - 1)
     assert questions.waiting == 2
     questions.answer(b"late", PATIENCE_NS)
-    assert first.poll(5000)
+    assert first.poll(100_000)
     assert first.recv() == b"late"
     assert questions.waiting == 1
     questions.answer(b"judged")
-    assert second.poll(5000)
+    assert second.poll(100_000)
     assert second.recv() == b"judged"
 
 
@@ -235,7 +235,7 @@ def ask(asker: zmq.Socket[bytes]) -> tuple[Verdict, float]:
     """One answer, and how long it took, s."""
     asked_s = time.monotonic()
     asker.send(b"judge")
-    assert asker.poll(5000)
+    assert asker.poll(100_000)
     return decode_verdict(asker.recv()), time.monotonic() - asked_s
 
 
@@ -246,7 +246,7 @@ def test_a_controller_that_asks_gets_what_was_judged_for_it_or_unknown_in_time(
         wait_for(tmp_path / "ask")
         asker = connect(f"ipc://{tmp_path}/ask", zmq.REQ)
         answers: list[Verdict] = []
-        deadline_s = time.monotonic() + 25.0
+        deadline_s = time.monotonic() + 100.0
         while time.monotonic() < deadline_s and len([a for a in answers if a.valid]) < 2:
             answer, took_s = ask(asker)
             answers.append(answer)
@@ -270,7 +270,7 @@ def test_nothing_is_judged_in_request_mode_unless_somebody_asks(
         listener.subscribe("verdict.")
         verdicts = []
         for _ in range(450):  # two grasps
-            assert listener.poll(5000)
+            assert listener.poll(100_000)
             verdicts.append(decode_verdict(listener.recv_multipart()[1]))
         daemon.terminate()
         daemon.communicate(timeout=TIMEOUT_S)

@@ -149,7 +149,7 @@ def wait_like_the_service(driver: PalmDriver | JointStreamDriver, most_s: float)
 def listen(
     driver: PalmDriver | JointStreamDriver,
     until: Callable[[list[Reading]], bool],
-    most_s: float = 10.0,
+    most_s: float = 100.0,
 ) -> list[Reading]:
     """Readings until a condition holds; fails after `most_s`."""
     readings: list[Reading] = []
