@@ -170,7 +170,7 @@ def told(
     outcome: TakeOutcome | None = takes_the_seventh,
 ) -> dict[str, Any]:
     teller.send_multipart(frames)
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     while not teller.poll(1):
         assert questions.take(0, outcome) == 0  # it is no question: nobody is judged for it
         assert time.monotonic() < deadline_s
@@ -194,7 +194,7 @@ def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(
     questions: Questions, teller: zmq.Socket[bytes]
 ) -> None:
     waiting: list[Answer] = []
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     for grasp in (7, 8, 7):
         teller.send(f"outcome {BOOT} {grasp} slip".encode())
     while len(waiting) < 2:
@@ -222,14 +222,14 @@ def test_answers_are_on_their_way_before_the_socket_closes(tmp_path: Path) -> No
             while not waiting:
                 taker.take(0, takes_the_seventh, waiting.append)
             waiting[0](None)
-        assert teller.poll(5000)
+        assert teller.poll(100_000)
         assert json.loads(teller.recv()) == {"v": 1, "ok": True}
 
 
 def ask_about(questions: Questions, asker: zmq.Socket[bytes], grasp: int) -> None:
     """Ask, and be answered about a grasp."""
     asker.send(b"judge")
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     while not questions.take(0):
         assert time.monotonic() < deadline_s
     questions.answer(b"{}", grasp=GraspId(BOOT, grasp))
@@ -256,7 +256,7 @@ def test_who_owns_a_grasp_and_has_gone_is_stood_for_by_another_connection_of_its
 ) -> None:
     with peer(questions) as former:
         ask_about(questions, former, 7)
-    deadline_s = time.monotonic() + 10.0
+    deadline_s = time.monotonic() + 100.0
     while not told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"]:
         assert time.monotonic() < deadline_s
 
@@ -272,7 +272,7 @@ def test_who_tells_before_its_former_connection_is_seen_to_go_is_heard(
             questions.take(0, takes_the_seventh)
             time.sleep(0.001)
         assert not teller.poll(0)
-    deadline_s = time.monotonic() + 4.0
+    deadline_s = time.monotonic() + 100.0
     while not teller.poll(1):
         questions.take(0, takes_the_seventh)
         assert time.monotonic() < deadline_s
