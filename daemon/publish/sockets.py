@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-import msgspec
-
 from daemon.publish.binding import Binding, OwnKeys, PublishError
 from daemon.publish.companion import Companion, Requests
 from daemon.publish.messages import Status, Verdict
@@ -27,16 +25,6 @@ if TYPE_CHECKING:
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
-
-
-class _Judged(msgspec.Struct):
-    """Which grasp a verdict is about."""
-
-    boot_id: str
-    grasp: int
-
-
-_decode = msgspec.json.Decoder(_Judged).decode
 
 
 class Sockets(Companion):
@@ -152,11 +140,11 @@ class Sockets(Companion):
         if self._guard is not None:
             self._guard.look(self._clock())
 
-    def on_answer(self, payload: bytes) -> None:
+    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
         """Answer all who have asked."""
         if self.questions is not None and self.questions.waiting:
-            judged = _decode(payload)
-            self.questions.answer(payload, grasp=GraspId(judged.boot_id, judged.grasp))
+            grasp = GraspId(verdict.boot_id, verdict.grasp)
+            self.questions.answer(payload, grasp=grasp)
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Answer those who have waited too long for a better answer."""

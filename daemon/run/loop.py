@@ -193,9 +193,9 @@ class Loop:
 
     def _wake(self) -> Ended:
         """Say that nothing is known, also to who waits for an answer."""
-        payload = self._tell_silence(self._clock())
+        verdict, payload = self._tell_silence(self._clock())
         for on_answer in self._on_answer:
-            on_answer(payload)
+            on_answer(verdict, payload)
         return Ended.SLEPT
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
@@ -302,7 +302,7 @@ class Loop:
         """Tell companions a verdict, and whether it is what those who ask wait for."""
         if verdict.judged or not self._pipeline.on_request:
             for on_answer in self._on_answer:
-                on_answer(payload)
+                on_answer(verdict, payload)
         for on_verdict in self._on_verdict:
             on_verdict(verdict, payload, reading)
 
@@ -311,14 +311,14 @@ class Loop:
         if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
             self._tell_silence(now_ns)
 
-    def _tell_silence(self, now_ns: int) -> bytes:
+    def _tell_silence(self, now_ns: int) -> tuple[Verdict, bytes]:
         self._state = State.SILENT
         self._silence_due_ns = now_ns + self._silence_ns()
         verdict, payload = self._outbox.verdict(
             self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
         )
         self._tell(verdict, payload, None)
-        return payload
+        return verdict, payload
 
     def _silence_ns(self) -> int:
         """How long nothing may come before it is said, ns."""
