@@ -96,6 +96,8 @@ class Conversation:
         """When the PINGs that wait for an answer were sent, by their nonce."""
         self._pings_sent = 0
         self._ping_due_ns = self._silent_at_ns = 0
+        self._silence_ns = SILENCE_MIN_NS
+        """How long no sweep may come, ns."""
 
     @property
     def counters(self) -> BridgeCounters:
@@ -171,7 +173,7 @@ class Conversation:
         said = [encode(Start())] if self._starts else []
         self._starts = False
         if self._sweeps is not None and now_ns >= self._silent_at_ns:
-            self.lost(f"no sweep for {self._silence_ns() / 1e6:.0f} ms", now_ns)
+            self.lost(f"no sweep for {self._silence_ns / 1e6:.0f} ms", now_ns)
         elif now_ns < self._ping_due_ns:
             return said
         elif self._sweeps is not None:
@@ -229,9 +231,6 @@ class Conversation:
     def _next_ping(self) -> bytes:
         self._nonce = (self._nonce + 1) % NONCES or 1  # 0 is that of a reset
         return encode(Ping(self._nonce))
-
-    def _silence_ns(self) -> int:
-        return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
 
     def _speaks_our_language(self, payload: bytes, now_ns: int) -> bool:
         """Whether a HELLO is of our version and layout; if not the link is given up for now."""
@@ -311,7 +310,8 @@ class Conversation:
             self._starts = True
             self._pings_sent = 1
             self._ping_due_ns = now_ns + PING_FIRST_NS
-            self._silent_at_ns = now_ns + self._silence_ns()
+            self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
+            self._silent_at_ns = now_ns + self._silence_ns
             self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
@@ -322,7 +322,7 @@ class Conversation:
         if reading is None:
             return None
         self._next_seq = self._sweeps.next_seq
-        self._silent_at_ns = arrival_ns + self._silence_ns()
+        self._silent_at_ns = arrival_ns + self._silence_ns
         if self.link.state is LinkState.GREETING:
             self.link.up(", ".join(_about(self._sweeps.hello).values()), arrival_ns)
         return reading
