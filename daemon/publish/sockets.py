@@ -46,6 +46,7 @@ class Sockets(Companion):
         self._guard: Guard | None = None
         self.publisher: Publisher
         self.questions: Questions | None = None
+        self._filenos: list[int] = []
         try:
             self._open(wanted)
         except BaseException:
@@ -93,10 +94,12 @@ class Sockets(Companion):
             log.error("%s; no key there may connect", why)
 
     def _watch(self) -> None:
+        self._filenos = [each.fileno() for each in self._bound() if each.is_open]
         if self.authenticator is not None:
             for door in self._with_keys():
                 if door.is_open:
                     self.authenticator.watch(door.socket)
+            self._filenos += self.authenticator.filenos()
 
     def _with_keys(self) -> list[CurveDoor]:
         if self._curve is None:
@@ -119,9 +122,7 @@ class Sockets(Companion):
 
     def filenos(self) -> list[int]:
         """Become readable when a peer may want something, as long as `before_wait` is called."""
-        asked = [each for each in (self.publisher, self.questions) if each is not None]
-        found = [each.fileno() for each in asked if each.is_open]
-        return found if self.authenticator is None else found + self.authenticator.filenos()
+        return self._filenos
 
     def before_wait(self, requests: Requests) -> None:
         """See to peers that come; pass on what they ask and tell."""
@@ -133,8 +134,7 @@ class Sockets(Companion):
 
     def take(self) -> None:
         """See to peers that come; questions are taken by `before_wait`."""
-        if self.publisher.is_open:
-            self.publisher.take()
+        self.publisher.take()
         if self.authenticator is not None:
             self.authenticator.take()
         if self._guard is not None:

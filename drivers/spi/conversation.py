@@ -77,6 +77,8 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
+        self.serials: dict[str, str] = {}
+        """By finger, from that HELLO; without the sensors that did not answer."""
         self._believed: tuple[str, ...] = ()
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
         self._doubted: tuple[str, ...] | None = None
@@ -117,13 +119,6 @@ class Conversation:
     def clock(self) -> DeviceClock | None:
         """The bridge's clock: drift, round trip, trust. None while not greeted."""
         return None if self._sweeps is None else self._sweeps.clock
-
-    @property
-    def serials(self) -> dict[str, str]:
-        """By finger, from the last HELLO; without the sensors that did not answer."""
-        found = () if self.hello is None else self.hello.serials
-        known = zip(self._fingers, self._sensors, strict=True)
-        return {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
     @property
     def due_ns(self) -> int:
@@ -274,7 +269,7 @@ class Conversation:
             # Misread or exchanged: at STOP it reads them again.
             self.lost("the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
-            self.hello = hello
+            self._take(hello)
             self._sweeps.round_trip(hello, sent_ns, arrival_ns)
 
     def _believes(self, told: tuple[str, ...]) -> bool:
@@ -306,13 +301,18 @@ class Conversation:
             if self._pings_sent <= GREETING_TRIES:
                 self._ping_due_ns = now_ns
         else:
-            self.hello = hello
+            self._take(hello)
             self._starts = True
             self._pings_sent = 1
             self._ping_due_ns = now_ns + PING_FIRST_NS
             self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
             self._silent_at_ns = now_ns + self._silence_ns
             self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
+
+    def _take(self, hello: Hello) -> None:
+        self.hello, found = hello, hello.serials
+        known = zip(self._fingers, self._sensors, strict=True)
+        self.serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:
