@@ -10,6 +10,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -171,7 +172,11 @@ def sweeps() -> list[TactileReading]:
             for reading in driver.read_ready():
                 if isinstance(reading, TactileReading):
                     t_ns = START_NS + reading.made_ns
-                    found.append(replace(reading, t_ns=t_ns, recorded_ns=None, annotation=None))
+                    found.append(
+                        msgspec.structs.replace(
+                            reading, t_ns=t_ns, recorded_ns=None, annotation=None
+                        )
+                    )
     return found
 
 
