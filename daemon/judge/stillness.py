@@ -14,7 +14,7 @@ from operator import le, truediv
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number
+from daemon.judge.findings import Number, all_of
 from daemon.judge.windows import (
     APART,
     LONG_NS,
@@ -64,7 +64,7 @@ def mean_distance(
     """
     distance = one - other
     np.abs(distance, out=distance)
-    if np.count_nonzero(usable) == usable.size:
+    if all_of(usable):
         return (distance @ ONES).astype(np.float64) / ELECTRODES
     distance *= usable
     mean: NDArray[np.float64] = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
@@ -213,7 +213,7 @@ class Motion:
             memory.jumped.fill(0)
             memory.lost.fill(LOST_MAX)
             memory.usable_since_ns.fill(t_ns)
-        if np.count_nonzero(usable) != usable.size:
+        if not all_of(usable):
             sweep = np.where(usable, sweep, memory.clean)
             gone = ~usable & (memory.lost >= LOST_MAX)
             if gone.any():
