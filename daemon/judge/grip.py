@@ -219,12 +219,13 @@ class Grip:
         """How each finger moves in the window that shows more of it, and what it may there."""
         found, limits = dict[Finger, float | None](), dict[Finger, float]()
         windows = self._gate.motion
-        fast, slow = windows.motion.tolist()
-        fast_limits, slow_limits = windows.limits.tolist()
-        for place, finger in enumerate(self._fingers):
-            moves, limit = fast[place], fast_limits[place]
-            if slow[place] < math.inf and slow[place] * limit > moves * slow_limits[place]:
-                moves, limit = slow[place], slow_limits[place]
+        fast = zip(windows.fast, windows.fast_limits, strict=True)
+        slow = zip(windows.slow, windows.slow_limits, strict=True)
+        for finger, (moves, limit), (slides, slides_limit) in zip(
+            self._fingers, fast, slow, strict=True
+        ):
+            if slides < math.inf and slides * limit > moves * slides_limit:
+                moves, limit = slides, slides_limit
             found[finger] = round(moves, 2) if moves < math.inf else None
             limits[finger] = round(limit, 2)
         return found, limits
