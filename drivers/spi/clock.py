@@ -10,6 +10,7 @@ neither batches of a USB adapter nor a host that stalls disturb it.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -92,6 +93,18 @@ class DeviceClock:
         """How much the device's clock is fast, parts per million; None while it is not known."""
         drift = self._drift
         return None if drift.slack == SLACK_MAX else (1.0 / (1.0 + drift.slope) - 1.0) * 1e6
+
+    @property
+    def rate_limits_ppm(self) -> tuple[float, float] | None:
+        """Least and most that the clock is fast, as the PINGs remembered prove, ppm."""
+        least, most = -math.inf, math.inf
+        for first, last in itertools.combinations(self._bounds, 2):
+            if last.sent_ns > first.received_ns:
+                ticks = last.tick - first.tick
+                shortest = (ticks - 1) * self._ns_per_tick / (last.received_ns - first.sent_ns)
+                longest = (ticks + 1) * self._ns_per_tick / (last.sent_ns - first.received_ns)
+                least, most = max(least, shortest), min(most, longest)
+        return None if most == math.inf else (1e6 * (least - 1.0), 1e6 * (most - 1.0))
 
     @property
     def round_trip_ns(self) -> int | None:

@@ -10,10 +10,10 @@ from typing import Final
 
 from drivers.base import Reading, TactileReading, sensor_rows
 from drivers.link import Link, LinkState
-from drivers.spi.clock import DeviceClock
 from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
     DIGEST,
+    FIRMWARE,
     VERSION,
     Hello,
     HelloHead,
@@ -116,11 +116,6 @@ class Conversation:
         return None if self.hello is None else self.hello.period_ns
 
     @property
-    def clock(self) -> DeviceClock | None:
-        """The bridge's clock: drift, round trip, trust. None while not greeted."""
-        return None if self._sweeps is None else self._sweeps.clock
-
-    @property
     def due_ns(self) -> int:
         """When to call `say`, though nothing has come."""
         if self._sweeps is None:
@@ -134,12 +129,12 @@ class Conversation:
             known["why"] = self.link.reason
         if self.hello is not None:
             known.update(_about(self.hello))
-        if self.clock is not None:
-            known["clock"] = "trusted" if self.clock.trusted else "not trusted"
-            if self.clock.round_trip_ns is not None:
-                known["round trip"] = f"{self.clock.round_trip_ns / 1e6:.2f} ms"
-            if self.clock.drift_ppm is not None:
-                known["clock drift"] = f"{self.clock.drift_ppm:+.1f} ppm"
+            if self.hello.firmware < FIRMWARE:
+                known["newer firmware"] = _version(FIRMWARE)
+        if self._sweeps is not None:
+            known.update(_about_time(self._sweeps))
+        if self.status is not None:
+            known["spi errors"] = ", ".join(map(str, self.status.spi_errors))
         return known
 
     def opened(self, now_ns: int) -> None:
@@ -332,7 +327,27 @@ def _about(hello: Hello) -> dict[str, str]:
     """What a bridge says of itself, for people."""
     return {
         "board": hello.board or "unnamed",
-        "firmware": f"{hello.firmware >> 8}.{hello.firmware & 0xFF}",
+        "firmware": _version(hello.firmware),
         "sequence": f"{hello.slots} samples at {hello.tick_hz / hello.period_ticks:.1f} Hz",
         "sensors": ", ".join(serial or "none" for serial in hello.serials),
     }
+
+
+def _about_time(sweeps: SweepDecoder) -> dict[str, str]:
+    """What is known of a bridge's clock and of how long its sweeps take, for people."""
+    clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
+    known = {"clock": "trusted" if clock.trusted else "not trusted", "clock rate": f"{tick_hz} Hz"}
+    if clock.drift_ppm is not None:
+        known["clock drift"] = f"{clock.drift_ppm:+.1f} ppm"
+    elif clock.rate_limits_ppm is not None:
+        known["clock drift"] = "{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm)
+    if clock.round_trip_ns is not None:
+        known["round trip"] = f"{clock.round_trip_ns / 1e6:.2f} ms"
+    if sweeps.longest_ticks:
+        longest_ms, period_ms = 1e3 * sweeps.longest_ticks / tick_hz, sweeps.hello.period_ns / 1e6
+        known["sweep"] = f"{longest_ms:.2f} ms at most, of {period_ms:.2f} ms"
+    return known
+
+
+def _version(firmware: int) -> str:
+    return f"{firmware >> 8}.{firmware & 0xFF}"

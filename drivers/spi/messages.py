@@ -18,6 +18,8 @@ from drivers.biotac import FORBIDDEN_COMMAND
 from drivers.spi.framing import FrameParser, encode_frame
 
 VERSION = 1
+FIRMWARE = 0x0001
+"""Firmware in `deploy/bridge` of this graspd, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
 SCHEMA = """\
 graspd bridge 1
 01 HELLO   u8 version; u32 digest; u32 nonce; u64 tick; u32 tick_hz; u16 firmware; char board[16]; \

@@ -80,6 +80,8 @@ class SweepDecoder:
         self.next_seq = next_seq
         self.hello = hello
         """What the bridge said of itself at the start."""
+        self.longest_ticks = 0
+        """Longest time that a sweep took, ticks."""
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None
@@ -122,6 +124,7 @@ class SweepDecoder:
             return None
         if not self._is_next(sweep):
             return None
+        self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
         faults, fallbacks = self.clock.faults, self.clock.fallbacks
         t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
         self._counters.clock_faults += self.clock.faults - faults
