@@ -71,7 +71,7 @@ DEVICE_TROUBLES = (
         "two chip selects lead to one sensor, or touch",
     ),
     ("sensors", r"\bnone\b", Level.WARNING, "they stand in the order of the chip selects"),
-    ("spi errors", "[1-9]", Level.WARNING, "by chip select, since its reset: of one, its wires"),
+    ("spi errors", "[1-9]", Level.WARNING, "by chip select, since its reset; of one: its wires"),
     ("clock", "not trusted", Level.WARNING, f"it stands, was reset, or is wrong: {FLASH}"),
 )
 """What a device says of itself that is not fine: key, pattern of the value, how bad, advice."""
@@ -137,7 +137,7 @@ class ElectrodeStatistics:
         missing = self.faulty[finger] > FAULTY_FRACTION * self.readings
         why = _faults_in_words(int(np.bitwise_or.reduce(self.fault_bits[finger])))
         if missing.all():
-            advice = "check the finger's plug, its chip select and its supply (3.3 to 5 V)"
+            advice = "check the finger's plug, its chip select and its supply"
             return [Finding(Level.ERROR, f"{name}: no electrode can be read ({why})", advice)]
         unreliable = (self.faulty[finger] > 0) & ~missing
         mean, deviation = self.mean[finger], self.deviation[finger]
