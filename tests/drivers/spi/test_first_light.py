@@ -130,10 +130,16 @@ def test_programs_are_told_the_same(tmp_path: Path, start_bridge: StartBridge) -
     assert float(device["sweep"].partition(" ")[0]) >= 1.91  # 24 slots of 64 bits and 65 us
 
 
-def test_the_picture_shows_the_pins_of_the_firmware() -> None:
+@pytest.mark.parametrize(
+    ("source", "pins"),
+    [
+        ("pico/config.h", r"PIN_SELECT ([\d, ]+) "),
+        ("rp2040/graspd_bridge/graspd_bridge.ino", r"PIN_SELECT\[\w+\] = {([\d, ]+)}"),
+    ],
+)
+def test_the_picture_shows_the_pins_of_the_firmware(source: str, pins: str) -> None:
     picture = (BRIDGE / "wiring.svg").read_text()
-    sketch = (BRIDGE / "rp2040" / "graspd_bridge" / "graspd_bridge.ino").read_text()
-    (numbers,) = re.findall(r"PIN_SELECT\[\w+\] = {([\d, ]+)}", sketch)
+    (numbers,) = re.findall(pins, (BRIDGE / source).read_text())
     selects = numbers.split(", ")
     for number, pin in enumerate(selects[:3], start=1):
         assert re.search(rf"CS {number}: pin \d+, GP{pin}<", picture), number
