@@ -51,6 +51,8 @@ LINK_ADVICE = {
     "has . sensors|sweeps once": f"let the scene and the settings of the bridge agree: {FLASH}",
     "no answer": f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}",
     "other sensors": "serial numbers are misread: see supply, ground, MISO and its pull-up",
+    "no sweep": "it began and stopped: see its supply and cable, and how busy this computer is",
+    "went away|was reset": "plug, cable, hub and supply: it was unplugged, or lost power",
     "^greeting$": "it has not answered yet: listen longer, --listen 10",
     "": "is it powered, connected, and the one that the scene names?",
 }
@@ -71,7 +73,8 @@ DEVICE_TROUBLES = (
         "two chip selects lead to one sensor, or touch",
     ),
     ("sensors", r"\bnone\b", Level.WARNING, "they stand in the order of the chip selects"),
-    ("spi errors", "[1-9]", Level.WARNING, "by chip select, since its reset: of one, its wires"),
+    ("spi errors", "[1-9]", Level.WARNING, "by chip select, since its reset; of one: its wires"),
+    ("sweep", "too long", Level.WARNING, "set a longer period or a shorter sequence, and flash it"),
     ("clock", "not trusted", Level.WARNING, f"it stands, was reset, or is wrong: {FLASH}"),
 )
 """What a device says of itself that is not fine: key, pattern of the value, how bad, advice."""
@@ -137,7 +140,7 @@ class ElectrodeStatistics:
         missing = self.faulty[finger] > FAULTY_FRACTION * self.readings
         why = _faults_in_words(int(np.bitwise_or.reduce(self.fault_bits[finger])))
         if missing.all():
-            advice = "check the finger's plug, its chip select and its supply (3.3 to 5 V)"
+            advice = "check the finger's plug, its chip select and its supply"
             return [Finding(Level.ERROR, f"{name}: no electrode can be read ({why})", advice)]
         unreliable = (self.faulty[finger] > 0) & ~missing
         mean, deviation = self.mean[finger], self.deviation[finger]

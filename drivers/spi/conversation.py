@@ -345,7 +345,8 @@ def _about_time(sweeps: SweepDecoder) -> dict[str, str]:
         known["round trip"] = f"{clock.round_trip_ns / 1e6:.2f} ms"
     if sweeps.longest_ticks:
         longest_ms, period_ms = 1e3 * sweeps.longest_ticks / tick_hz, sweeps.hello.period_ns / 1e6
-        known["sweep"] = f"{longest_ms:.2f} ms at most, of {period_ms:.2f} ms"
+        fits = "at most, of" if longest_ms < period_ms else "is too long for"
+        known["sweep"] = f"{longest_ms:.2f} ms {fits} {period_ms:.2f} ms"
     return known
 
 

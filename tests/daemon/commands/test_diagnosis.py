@@ -167,6 +167,8 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
         ("sensors", "BTSP1, none, BTSP1", Level.ERROR, "two chip selects"),
         ("spi errors", "0, 0, 0", Level.OK, ""),
         ("spi errors", "0, 10, 0", Level.WARNING, "by chip select"),
+        ("sweep", "1.91 ms at most, of 10.00 ms", Level.OK, ""),
+        ("sweep", "10.42 ms is too long for 10.00 ms", Level.WARNING, "longer period"),
         ("clock", "trusted", Level.OK, ""),
         ("clock", "not trusted", Level.WARNING, "flash"),
         ("last error", "no buffer space", Level.WARNING, ""),

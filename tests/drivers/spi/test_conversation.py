@@ -174,10 +174,13 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
     for seq, took in enumerate((1910, 2209, 1900)):
         made = Sweep(seq, 1_000_200 + 3000 * seq, 1_000_200 + 3000 * seq + took, 7, words())
         assert hear(conversation, made, T0 + S + 20 * MS) == 1
+    late = Sweep(3, 1_020_000, 1_520_000, 7, words())
+    assert conversation.describe()["sweep"] == "2.21 ms at most, of 500.00 ms"
+    hear(conversation, late, T0 + S + 540 * MS)
+    assert conversation.describe()["sweep"] == "500.00 ms is too long for 500.00 ms"
     hear(conversation, Status(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
     told = conversation.describe()
     assert told["clock rate"] == "1000000 Hz"
-    assert told["sweep"] == "2.21 ms at most, of 500.00 ms"
     assert told["spi errors"] == "0, 7, 24"
     # 1000100 +- 1 us by its clock are between 1000 and 1001 ms by ours.
     assert told["clock drift"] == "-900 to +101 ppm"
