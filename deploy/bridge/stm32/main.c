@@ -60,7 +60,7 @@ static void clock_start(void)
 
 /* ---- time ------------------------------------------------------------------------------------ */
 
-/* Cycles since reset. To be asked for at least every 0.1 s: the timer has 24 bits and counts down. */
+/* Cycles since reset. To be asked for at least every 0.1 s: the timer has 24 bits, counts down. */
 static uint64_t cycles(void)
 {
     static uint32_t last;

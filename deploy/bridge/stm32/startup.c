@@ -40,7 +40,7 @@ struct vectors {
     void (*handler[EXCEPTIONS - 1 + INTERRUPTS])(void);
 };
 
-/* Initial stack pointer, reset, the faults of the core; of the interrupts only USART1 is enabled. */
+/* Initial stack pointer, reset, the core's faults; of the interrupts only USART1 is enabled. */
 const struct vectors vectors __attribute__((section(".vectors"), used)) = {
     stack_top,
     {reset, stay, stay, stay, stay, stay, [EXCEPTIONS - 1 + USART1_INTERRUPT] = usart1_interrupt},
