@@ -22,8 +22,15 @@
 #include <hardware/timer.h>
 #include <pico/unique_id.h>
 
-static const uint8_t SENSORS = 3;
-static const enum biotac_sequence SEQUENCE = BIOTAC_ELECTRODES;
+#ifndef BRIDGE_SENSORS
+#define BRIDGE_SENSORS 3
+#endif
+#ifndef BRIDGE_SEQUENCE
+#define BRIDGE_SEQUENCE BIOTAC_ELECTRODES
+#endif
+
+static const uint8_t SENSORS = BRIDGE_SENSORS;
+static const enum biotac_sequence SEQUENCE = BRIDGE_SEQUENCE;
 static const uint32_t PERIOD_US = 10000;
 static const uint32_t SPI_HZ = 4400000; /* the chip takes the next lower that it can make */
 
@@ -39,9 +46,11 @@ extern "C" uint64_t hal_ticks_us(void)
     return time_us_64() - reset_us;
 }
 
+/* busy_wait_us_32 counts edges of the microsecond: n of them may take no more than n - 1
+ * microseconds. */
 extern "C" void hal_delay_us(uint32_t us)
 {
-    busy_wait_us_32(us);
+    busy_wait_us_32(us + 1);
 }
 
 extern "C" void hal_select(uint8_t sensors)

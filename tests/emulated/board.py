@@ -1,0 +1,179 @@
+"""The bridge's board on an emulated chip, in lock-step: its time moves as far as it is told."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.drivers.spi.bridge_c import HELLO, PING, START, STATUS, STOP, frame, unframe
+from tests.emulated.tools import EMULATOR, boot_rom, emulator_folder
+
+MS = 1_000_000
+BOARD_ID = "E66118604B2C3A17"
+"""The number of the emulated flash."""
+BOOT_MS = 40
+"""Reset, enumeration and the first look for the sensors take 13 ms."""
+
+EVENT = np.dtype(
+    [("t_ns", "<f8"), ("hz", "<u4"), ("kind", "u1"), ("value", "u1"), ("miso", "u1"), ("", "u1")]
+)
+"""What happened on the bus of the sensors: `kind` SELECT has the mask of those whose chip select is
+low from then on as `value`, `kind` BYTE begins a byte of MOSI and has its clock, Hz."""
+SELECT, BYTE = 0, 1
+Events = NDArray[np.void]
+
+
+@dataclass(frozen=True)
+class Frame:
+    t_ns: float
+    """Emulated time at which its last byte reached the host."""
+    kind: int
+    payload: bytes
+
+
+@dataclass
+class Status:
+    """Counters of a STATUS frame."""
+
+    tick: int
+    sweeps: int
+    overruns: int
+    tx_dropped: int
+    rx_errors: int
+    spi_errors: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, payload: bytes) -> Self:
+        tick, sweeps, overruns, dropped, errors, sensors = struct.unpack_from("<QIIIIB", payload)
+        spi_errors = struct.unpack_from(f"<{sensors}I", payload, 25)
+        return cls(tick, sweeps, overruns, dropped, errors, list(spi_errors))
+
+
+class Board:
+    """One board: a process of node. Everything happens at the emulated time `now_ns`.
+
+    The host's side takes frames as they come into `frames`, and fails on a damaged one.
+    """
+
+    def __init__(self) -> None:
+        self.now_ns = 0.0
+        self.frames: list[Frame] = []
+        self._held = b""
+        command = ["node", str(EMULATOR / "main.cjs"), str(emulator_folder()), str(boot_rom())]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_details: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait(10)
+
+    def do(self, what: str, **arguments: object) -> dict[str, Any]:
+        """One command of `emulator/main.cjs` and its answer."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps({"do": what, **arguments}) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        assert line, f"the emulator ended: {self._process.wait(10)}"
+        answer: dict[str, Any] = json.loads(line)
+        assert "error" not in answer, answer["error"]
+        self.now_ns = answer["now"]
+        return answer
+
+    # ---- power and cable ----
+
+    def power(self, image: Path, counts: Path | None = None) -> Self:
+        """Power comes, with an image in the flash; the port is opened as soon as it is there."""
+        self.do("power", file=str(image), counts=None if counts is None else str(counts))
+        self.do("open")
+        self.run(BOOT_MS)
+        return self
+
+    # ---- the line ----
+
+    def run_until(self, t_ns: float, *, hand_over: bool = False) -> bytes:
+        """Let time pass and give the bytes that the host got; `hand_over`: no further than that."""
+        packets = self.do("run", until=t_ns, hand_over=hand_over)["packets"]
+        for at_ns, packet in packets:
+            *whole, self._held = (self._held + bytes.fromhex(packet)).split(b"\0")
+            for encoded in filter(None, whole):
+                found = unframe(encoded)
+                assert found is not None, encoded.hex()
+                self.frames.append(Frame(at_ns, *found))
+        return b"".join(bytes.fromhex(packet) for _, packet in packets)
+
+    def run(self, ms: float) -> bytes:
+        return self.run_until(self.now_ns + ms * MS)
+
+    def send(self, *data: bytes) -> None:
+        self.do("send", bytes=b"".join(data).hex())
+
+    def hello(self, nonce: int = 99) -> bytes:
+        """Greet the bridge as PROTOCOL.md says."""
+        self.send(b"\0", frame(STOP), frame(PING, struct.pack("<I", nonce)))
+        self.run(20)
+        hellos = [one for one in self.take(HELLO) if struct.unpack_from("<I", one, 5)[0] == nonce]
+        assert len(hellos) == 1, f"{len(hellos)} answers to a PING"
+        return hellos[0]
+
+    def start(self) -> None:
+        """Begin sweeping with what stands in row 0 of the counts."""
+        self.do("rewind")
+        self.send(frame(START))
+
+    def take(self, kind: int) -> list[bytes]:
+        """Payloads of a type that have come since `take` was last called for it."""
+        found = [one.payload for one in self.frames if one.kind == kind]
+        self.frames = [one for one in self.frames if one.kind != kind]
+        return found
+
+    def until(self, kind: int, count: int, within_ms: float) -> list[bytes]:
+        """The first payloads of a type, which must come within an emulated time."""
+        end_ns = self.now_ns + within_ms * MS
+        while sum(one.kind == kind for one in self.frames) < count:
+            assert self.now_ns < end_ns, f"{len(self.frames)} frames in {within_ms} ms"
+            self.run_until(end_ns, hand_over=True)
+        return self.take(kind)[:count]
+
+    def status(self) -> Status:
+        """The next STATUS."""
+        self.take(STATUS)
+        return Status.of(self.until(STATUS, 1, 1100.0)[0])
+
+    # ---- the bus of the sensors ----
+
+    def recorded(self, folder: Path, ms: float) -> Events:
+        """What happens on the bus in some emulated time, in order, as `EVENT`."""
+        self.do("record")
+        self.run(ms)
+        file = folder / "events"
+        self.do("recorded", file=str(file))
+        return np.fromfile(file, EVENT)
+
+    def sensor(self, sensor: int, what: str, *values: float) -> None:
+        """`unplug` 0 or 1, `settle` ns, `dead` mask, `force` electrode word; sensors from 0."""
+        self.do("sensor", sensor=sensor, what=what, values=values)
+
+
+def serials(hello: bytes) -> Iterator[bytes]:
+    """Serial numbers of a HELLO's sensors, without padding."""
+    for start in range(45, 45 + 16 * hello[43], 16):
+        yield hello[start : start + 16].rstrip(b"\0")

@@ -1,0 +1,188 @@
+"""Builds the firmware of the bridge for a Raspberry Pi Pico: the C port and the Arduino sketch.
+
+`python -m tests.emulated.build` builds both at each system clock and tells their sizes.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final, Literal
+
+from tests.conftest import ROOT, data_dir
+
+Port = Literal["pico", "sketch"]
+Sequence = Literal["electrodes", "all", "interleaved"]
+
+BRIDGE: Final = ROOT / "deploy" / "bridge"
+SKETCH: Final = Path(__file__).parent / "firmware" / "sketch.cmake"
+SOURCES: Final = (BRIDGE / "src", BRIDGE / "pico", BRIDGE / "rp2040", SKETCH.parent)
+FOLDER: Final = ROOT / "build" / "pico"
+"""Everything made here, outside of the sources and of git."""
+TARGETS: Final[dict[Port, str]] = {"pico": "bridge", "sketch": "sketch"}
+CLOCKS_MHZ: Final = (125, 133, 200)
+COMPILER: Final = "arm-none-eabi-gcc"
+NEEDED: Final = {
+    COMPILER: "gcc-arm-none-eabi",
+    "arm-none-eabi-size": "binutils-arm-none-eabi",
+    "cmake": "cmake",
+    "ninja": "ninja-build",
+}
+"""Programs that a build calls, and the Debian packages that have them."""
+SUBSET: Final = "pico-sdk-*-subset.tar.xz"
+RAM: Final = range(0x20000000, 0x20042000)
+"""Addresses of the RP2040's RAM (datasheet section 2.6.2)."""
+
+
+class MissingError(Exception):
+    """Something that a build needs is not there; says what."""
+
+
+class BuildError(Exception):
+    """The firmware does not compile; says how."""
+
+
+def shared_dir() -> Path | None:
+    """Folder of the pico-sdk's subset and of the boot ROM, or None where there is none."""
+    data = data_dir()
+    beside = ROOT.parent / "shared"
+    candidates = [*([data.parent] if data else []), beside]
+    found = (folder / "pico" for folder in candidates if any((folder / "pico").glob(SUBSET)))
+    return next(found, None)
+
+
+def image(
+    port: Port = "pico",
+    sensors: int = 3,
+    clock_mhz: int = 125,
+    sequence: Sequence = "electrodes",
+) -> Path:
+    """Build an image, or find the one that was built of the same sources.
+
+    `port` is the C port or the Arduino sketch, `clock_mhz` the chip's system clock (125, 133, 200).
+    Gives the `.bin` as it lies in flash from 0x10000000; the `.elf` with symbols is beside it.
+    Raises `MissingError` where a tool or the pico-sdk is missing, `BuildError` where the compiler
+    objects.
+    """
+    check_tools()
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    with _alone(FOLDER / "lock"):
+        sdk = _sdk()
+        options = {
+            "PICO_SDK_PATH": str(sdk),
+            "CMAKE_PROJECT_graspd_bridge_INCLUDE": str(SKETCH),
+            "BRIDGE_SENSORS": str(sensors),
+            "BRIDGE_SYS_CLOCK_MHZ": str(clock_mhz),
+            "BRIDGE_SEQUENCE": f"BIOTAC_{sequence.upper()}",
+        }
+        kind = f"{port}-{sensors}-{clock_mhz}-{sequence}"
+        made = FOLDER / "images" / f"{kind}-{_digest(sdk, options)}.bin"
+        if not made.is_file():
+            made.parent.mkdir(exist_ok=True)
+            for old in made.parent.glob(f"{kind}-*"):
+                old.unlink()
+            _build(FOLDER / str(clock_mhz), TARGETS[port], options, made)
+    return made
+
+
+def _build(folder: Path, target: str, options: dict[str, str], made: Path) -> None:
+    """Compile one image; what it has in common with the last one in this folder stays there."""
+    settings = [f"-D{name}={value}" for name, value in options.items()]
+    _run("cmake", "-G", "Ninja", "-S", BRIDGE / "pico", "-B", folder, *settings)
+    _run("ninja", "-C", folder, target)
+    shutil.copy(folder / f"{target}.elf", made.with_suffix(".elf"))
+    shutil.copy(folder / f"{target}.bin", made.with_suffix(".part"))
+    made.with_suffix(".part").rename(made)
+
+
+def check_tools() -> None:
+    """Raise `MissingError` if the compiler, its C library, CMake or Ninja is missing."""
+    for program, package in NEEDED.items():
+        if shutil.which(program) is None:
+            raise MissingError(f"no {program}: install {package}")
+    asked = [COMPILER, "-print-file-name=nosys.specs"]
+    found = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.strip()
+    if not Path(found).is_absolute():
+        raise MissingError("no C library for ARM: install libnewlib-arm-none-eabi")
+
+
+def flash_and_ram(image: Path) -> tuple[int, int]:
+    """Bytes that an image takes of the flash, and of the RAM while it runs, without its stacks."""
+    elf = str(image.with_suffix(".elf"))
+    asked = ["arm-none-eabi-size", "-A", "-d", elf]
+    told = subprocess.run(asked, capture_output=True, text=True, check=True).stdout
+    rows = [row for line in told.splitlines() if len(row := line.split()) == 3 and row[2].isdigit()]
+    held = (int(size) for name, size, at in rows if int(at) in RAM and "stack" not in name)
+    return image.stat().st_size, sum(held)
+
+
+def _sdk() -> Path:
+    """The pico-sdk that `PICO_SDK_PATH` names, or the subset, unpacked."""
+    named = os.environ.get("PICO_SDK_PATH")
+    if named is not None:
+        if not (Path(named) / "pico_sdk_init.cmake").is_file():
+            raise MissingError(f"no pico-sdk at PICO_SDK_PATH {named!r}")
+        return Path(named)
+    shared = shared_dir()
+    if shared is None:
+        raise MissingError("no pico-sdk: set PICO_SDK_PATH")
+    packed = max(shared.glob(SUBSET))
+    sdk = FOLDER / packed.name.removesuffix(".tar.xz")
+    if not sdk.is_dir():
+        fresh = sdk.with_suffix(".new")
+        shutil.rmtree(fresh, ignore_errors=True)
+        shutil.unpack_archive(packed, fresh, filter="data")
+        (top,) = fresh.iterdir()
+        top.rename(sdk)
+        fresh.rmdir()
+    return sdk
+
+
+def _digest(sdk: Path, options: dict[str, str]) -> str:
+    """What an image is made of: sources, version of the SDK, compiler, options."""
+    version = subprocess.run([COMPILER, "--version"], capture_output=True, check=True).stdout
+    digest = hashlib.sha256(version + repr(options).encode())
+    digest.update((sdk / "pico_sdk_version.cmake").read_bytes())
+    for file in sorted(file for folder in SOURCES for file in folder.rglob("*") if file.is_file()):
+        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        digest.update(f"{file.relative_to(ROOT)} {content}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Let one process build at a time."""
+    with path.open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
+def _run(*command: str | Path) -> None:
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise BuildError(f"{command[0]}:\n{done.stdout}{done.stderr}")
+
+
+def main() -> int:
+    """Build both ports at each clock and write their sizes to standard output, as Markdown."""
+    sys.stdout.write("| image | system clock | flash | RAM |\n|---|---|---|---|\n")
+    try:
+        for port in TARGETS:
+            for clock_mhz in CLOCKS_MHZ:
+                flash, ram = flash_and_ram(image(port, clock_mhz=clock_mhz))
+                sys.stdout.write(f"| {port} | {clock_mhz} MHz | {flash} B | {ram} B |\n")
+    except (MissingError, BuildError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
