@@ -29,7 +29,6 @@ from tests.drivers.spi.bridge_c import (
     PING,
     START,
     STATUS,
-    SWEEP,
     Host,
     StartBridge,
     counts_of,
@@ -115,8 +114,7 @@ def board_of(image: Path) -> str:
 def said(host: Host, sweeps: int) -> tuple[list[bytes], list[bytes]]:
     """The HELLOs of reset and greeting, and the first sweeps."""
     hellos = [*host.next_of(HELLO), host.hello(nonce=0x12345678)]
-    host.send(frame(START))
-    return hellos, host.next_of(SWEEP, sweeps)
+    return hellos, host.first_sweeps(sweeps)
 
 
 def without_ticks(hellos: list[bytes], sweeps: list[bytes]) -> list[bytes]:
