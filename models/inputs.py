@@ -102,9 +102,8 @@ class VectorBuilder(_FlatBuilder):
         self.shape = (fingers * ELECTRODES,)
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        z, spread = np.empty_like(counts), np.empty(counts.shape[:-1])
-        _z_scores(counts, z, np.empty_like(spread), spread)
-        return _flat(z), spread
+        features, spread = _features(counts)
+        return features[..., : -2 * spread.shape[-1]], spread
 
 
 class CountsBuilder(_FlatBuilder):
@@ -116,7 +115,7 @@ class CountsBuilder(_FlatBuilder):
         self.shape = (fingers * ELECTRODES,)
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        return _flat(counts), _z_scores(counts)[2]
+        return _flat(counts), _features(counts)[1]
 
 
 class SessionBuilder(_FlatBuilder):

@@ -7,6 +7,7 @@ session models, so that a network trained on other days sees what it knows.
 from __future__ import annotations
 
 import itertools
+from operator import getitem
 from typing import Annotated
 
 import msgspec
@@ -189,9 +190,9 @@ def is_odd(
     # Of each finger of the session from each of the training.
     deviations = (mean[:, np.newaxis] - training_mean) / training_spread
     away = np.add.reduce(np.square(deviations), axis=2) / mean.shape[1]
+    rows: list[list[float]] = away.tolist()
     own, *others = (
-        sum(row[finger] for row, finger in zip(away.tolist(), order, strict=True))
-        for order in itertools.permutations(range(len(away)))
+        sum(map(getitem, rows, order)) for order in itertools.permutations(range(len(rows)))
     )
     if enough and not all(least <= each <= most for each in ratios):
         return True
