@@ -176,13 +176,14 @@ class Health:
         np.copyto(memory.changed, memory.number, where=differs)
         if memory.has_jumped:
             memory.jumps *= JUMPS_FADE
-            memory.jumps[memory.jumps < JUMPS_FORGOTTEN] = 0.0
-            memory.has_jumped = bool(np.count_nonzero(memory.jumps))
+            remembered = memory.jumps >= JUMPS_FORGOTTEN
+            memory.jumps *= remembered
+            memory.has_jumped = any_of(remembered)
         if any_of(far):
             near = counts - previous + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still
                 jumps = far & (near.sum(axis=1, keepdims=True) >= STILL)
-                memory.has_jumped |= bool(np.count_nonzero(jumps))
+                memory.has_jumped |= any_of(jumps)
                 memory.jumps += jumps
         memory.previous = counts
         return railed, differs
@@ -190,8 +191,8 @@ class Health:
     def _all_live(self) -> bool:
         """Whether no electrode is broken by what it did in the last readings."""
         memory = self.memory
-        if memory.has_jumped:
-            return not any_of(self._worn_out())
+        if memory.has_jumped and any_of(memory.jumps > JUMPS_MAX):
+            return False
         if memory.number >= self._live_until:
             self._live_until = int(memory.changed.min()) + UNCHANGED_MAX
         return memory.number < self._live_until

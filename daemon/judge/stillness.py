@@ -54,6 +54,8 @@ SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
 
+Times = NDArray[np.float64]
+
 
 def mean_distance(
     one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_]
@@ -225,10 +227,7 @@ class Motion:
         self._clean(sweep)
         if memory.lost.tobytes() != self._nothing:
             memory.lost[usable] = 0
-        if memory.sweeps:
-            memory.total += memory.clean
-        else:
-            np.copyto(memory.total, memory.clean)
+        memory.total = memory.total + memory.clean if memory.sweeps else memory.clean
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
         if memory.number and t_ns - memory.last_ns < STEP_NS:
@@ -280,7 +279,14 @@ class Motion:
             return
         last = memory.first + memory.number - 1
         differences = memory.steps[last] - memory.steps[last - APART : last][::-1]
-        memory.block += self._mean(np.square(differences, out=differences), last - APART)
+        squares, usable = np.square(differences, out=differences), self._usable_since(last - APART)
+        if usable is None:
+            means = (squares @ ONES).astype(np.float64)
+            means /= ELECTRODES
+        else:
+            numbers = np.maximum(np.count_nonzero(usable, axis=1), 1)
+            means = ((squares * usable) @ ONES).astype(np.float64) / numbers
+        memory.block += means
         memory.block_steps += 1
         if memory.block_steps >= BLOCK_STEPS:
             memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
@@ -288,19 +294,24 @@ class Motion:
             memory.block_steps = 0
             memory.block.fill(0.0)
 
-    def _mean(
-        self, values: NDArray[np.float32], begin: int, too_few: float | None = None
-    ) -> NDArray[np.float64]:
-        """Over electrodes usable from a step on, (..., fingers); `too_few` where they are that."""
+    def _usable_since(self, begin: int) -> NDArray[np.bool_] | None:
+        """Electrodes usable from a step on, shape (fingers, 24); None where all were."""
         memory, since_ns = self.memory, self.memory.times_ns.item(begin)
         if memory.all_usable_since_ns <= since_ns:
-            mean = (values @ ONES).astype(np.float64)
-            mean /= ELECTRODES
-            return mean
-        known = memory.usable_since_ns <= since_ns
-        numbers = np.count_nonzero(known, axis=1)
-        mean = ((values * known) @ ONES).astype(np.float64) / np.maximum(numbers, 1)
-        return mean if too_few is None else np.where(numbers < SOUND_MIN, too_few, mean)
+            return None
+        return np.asarray(memory.usable_since_ns <= since_ns)
+
+    def _mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
+        """Of each finger over its electrodes usable from a step on; infinite if too few are."""
+        usable = self._usable_since(begin)
+        if usable is None:
+            return [total / ELECTRODES for total in (values @ ONES).tolist()]
+        totals = ((values * usable) @ ONES).tolist()
+        numbers = np.count_nonzero(usable, axis=1).tolist()
+        return [
+            total / number if number >= SOUND_MIN else math.inf
+            for total, number in zip(totals, numbers, strict=True)
+        ]
 
     def _known_noise(self) -> Noise:
         memory = self.memory
@@ -328,28 +339,29 @@ class Motion:
         windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
         short, long = (min(begin, number - STEPS_MIN) for begin in windows.tolist())
         noise = self._known_noise()
-        beside = self._follow_fast(memory.first + short, end, noise)
+        times_s = (times_ns[long:] - now_ns) / 1e9
+        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
         self.early = all(map(le, self.fast, self.fast_limits))
         if age_ns >= LONG_NS:
-            self._follow_slow(memory.first + long, end, noise)
+            self._follow_slow(memory.first + long, end, times_s, noise)
             slow = all(map(le, self.slow, self.slow_limits))
             self.sure = slow and all(map(le, self.fast, beside))
 
-    def _follow_fast(self, begin: int, end: int, noise: Noise) -> list[float]:
+    def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
         """How steps have moved, and its limit where it decides alone; the limit where not."""
         memory, number, tails = self.memory, end - begin, self._tails
-        times_s = centred(memory.times_ns[begin:end])
-        extent = times_s.dot(times_s).item()
+        times_s = centred(times_s)
+        extent = float(times_s.dot(times_s))
         times_s /= extent
         slopes = times_s.astype(np.float32) @ memory.steps[begin:end].reshape(number, -1)
         slopes = np.abs(slopes, out=slopes).reshape(memory.clean.shape)
         root = math.sqrt(extent)
         by_noise = [each / root for each in noise.slope[number].tolist()]
-        self.fast = list(map(truediv, self._mean(slopes, begin, math.inf).tolist(), by_noise))
+        self.fast = list(map(truediv, self._mean(slopes, begin), by_noise))
         self.fast_limits = fast_limit(tails.alone, by_noise)
         return self.fast_limits if tails.fast == tails.alone else fast_limit(tails.fast, by_noise)
 
-    def _follow_slow(self, begin: int, end: int, noise: Noise) -> None:
+    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> None:
         """How far steps have spread, and the limit of it."""
         memory, number = self.memory, end - begin
         steps = memory.steps[begin:end]
@@ -358,10 +370,9 @@ class Motion:
         deviations = steps - middle
         squares = np.add.reduce(np.square(deviations, out=deviations), axis=0)
         by_noise = [each * (number - 1) for each in noise.variance[number].tolist()]
-        mean = self._mean(squares, begin, math.inf).tolist()
-        self.slow = [math.sqrt(each / usual) for each, usual in zip(mean, by_noise, strict=True)]
-        times_s = centred(memory.times_ns[begin:end])
-        extent = times_s.dot(times_s).item()
+        self.slow = list(map(math.sqrt, map(truediv, self._mean(squares, begin), by_noise)))
+        times_s = centred(times_s)
+        extent = float(times_s.dot(times_s))
         extents = [extent / each for each in by_noise]
         self.slow_limits = slow_limit(self._tails.slow, extents, noise.spread[number].tolist())
 

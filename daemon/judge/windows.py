@@ -157,7 +157,7 @@ def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, Oper
 
 
 def _extent(number: int, step_ns: int) -> float:
-    times_s = centred(np.arange(number) * step_ns)
+    times_s = centred(np.arange(number) * step_ns / 1e9)
     return float(times_s @ times_s)
 
 
@@ -166,11 +166,9 @@ def creep(tail: float) -> float:
     return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
 
 
-def centred(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """In seconds, with a mean of 0."""
-    times_s = (times_ns - times_ns[0]) / 1e9
-    times_s -= np.add.reduce(times_s) / len(times_s)
-    return np.asarray(times_s)
+def centred(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """With a mean of 0."""
+    return np.asarray(times_s - np.add.reduce(times_s) / len(times_s))
 
 
 def upper_tail(share: float) -> float:

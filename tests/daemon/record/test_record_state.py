@@ -192,7 +192,8 @@ def again(*paths: Path) -> list[Judgement]:
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)
-                found.append(replace(pipeline.judge(reading), t_ns=reading.made_ns))
+                judgement = pipeline.judge(reading)
+                found.append(msgspec.structs.replace(judgement, t_ns=reading.made_ns))
                 pipeline.learn()
     return found
 
