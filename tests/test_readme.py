@@ -42,7 +42,7 @@ def verdict_lines(command: list[str], endpoint: str) -> list[str]:
             [*replay, "--publish", endpoint, "--wait", "20"],
             check=True,
             capture_output=True,
-            timeout=1000,
+            timeout=200,
         )
         return subscriber.communicate(timeout=100)[0].splitlines()
 

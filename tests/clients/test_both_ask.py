@@ -106,7 +106,7 @@ def test_in_cpp_only_an_answer_that_fits_allows_a_lift(
     places = [f"ipc://{tmp_path}/out", str(deadline_s), f"ipc://{tmp_path}/ask"]
     with false_daemon(tmp_path, answer):
         result = subprocess.run(
-            [lift_gate, *places], capture_output=True, text=True, timeout=2000, check=False
+            [lift_gate, *places], capture_output=True, text=True, timeout=200, check=False
         )
     assert result.stdout.split()[0] == expected
     assert (result.returncode == 0) == (expected == "stable")
@@ -140,7 +140,7 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
             [lift_gate, "--supervised", *places],
             capture_output=True,
             text=True,
-            timeout=2000,
+            timeout=200,
             check=False,
         )
         assert (result.returncode, "\nlift supervised after" in result.stdout) == (not may, may)
@@ -154,7 +154,7 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
 def cpp_lifts(lift_gate: Path, *words: str) -> bool:
     """Whether the example says so."""
     result = subprocess.run(
-        [lift_gate, *words], capture_output=True, text=True, timeout=2000, check=False
+        [lift_gate, *words], capture_output=True, text=True, timeout=200, check=False
     )
     assert result.returncode in (0, 1), result.stderr
     assert ("\nlift after" in result.stdout) is (result.returncode == 0)
@@ -225,7 +225,7 @@ def test_a_supervised_lift_must_have_been_still_as_any(lift_gate: Path, tmp_path
         asked = [str(lift_gate), "--supervised", "--still"]
         for still_ms, code in (("100", 0), ("240", 1)):
             result = subprocess.run(
-                [*asked, still_ms, out, "1.0"], capture_output=True, timeout=2000, check=False
+                [*asked, still_ms, out, "1.0"], capture_output=True, timeout=200, check=False
             )
             assert result.returncode == code
 
@@ -293,7 +293,7 @@ def told_in_cpp(lift_gate: Path, folder: Path, *words: str) -> tuple[int, str]:
         [lift_gate, "--tell", *places, *words],
         capture_output=True,
         text=True,
-        timeout=2000,
+        timeout=200,
         check=False,
     )
     return result.returncode, (result.stdout + result.stderr).splitlines()[0]

@@ -34,7 +34,7 @@ GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(
 sweeps) and to settle."""
 CAN_GRASPS: Final = Durations(first_rest_s=(13.0, 13.0), settle_s=(4.0, 4.0), rest_s=(13.0, 13.0))
 """The same at half that rate."""
-PATIENCE_S: Final = 120.0
+PATIENCE_S: Final = 300.0
 """For what takes a second on a computer that is not emulated."""
 LOOK_S: Final = 0.5
 

@@ -160,9 +160,7 @@ def test_who_floods_does_not_keep_others_from_their_answers(
                 with contextlib.suppress(zmq.Again):
                     for _ in range(100):
                         each.send(b"judge", zmq.NOBLOCK)
-            began_s = (
-                time.thread_time()
-            )  # neither waits: what others compute meanwhile is none of it
+            began_s = time.thread_time()  # neither waits
             questions.take(0)
             questions.answer(b"%d" % number)
             slowest_s = max(slowest_s, time.thread_time() - began_s)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import can
@@ -89,7 +89,9 @@ def test_a_recording_arrives_over_udp_multicast(frame_format: str) -> None:
 
 
 def over_multicast(
-    counts: Sequence[Counts], frame_format: str, **clocks: Callable[[], int]
+    counts: Sequence[Counts],
+    frame_format: str,
+    **clocks: Any,  # noqa: ANN401
 ) -> list[TactileReading]:
     """At least as many readings as counts, each sent when the one before has come."""
     options: dict[str, Any] = {"format": frame_format, "arbitration_id": SAMPLE_ID}
