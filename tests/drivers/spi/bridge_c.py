@@ -6,6 +6,7 @@ Frames are computed with `zlib`, `cobs` and `struct` alone, so that they owe not
 from __future__ import annotations
 
 import os
+import random
 import select
 import struct
 import subprocess
@@ -103,6 +104,29 @@ def judged(stream: bytes) -> tuple[list[str], int]:
         else:
             found.append(f"{one[0]:02x} {int.from_bytes(one[1], 'little')}")
     return found, errors
+
+
+def damaged(rng: random.Random) -> bytes:
+    """A frame of a host that something happened to, with its zero."""
+    kind = rng.choice((PING, START, STOP, rng.randrange(256)))
+    size = HOST_PAYLOADS.get(kind, rng.randrange(8))
+    whole = bytearray(frame(kind, rng.randbytes(size), rng.choice((DIGEST, DIGEST, 0))))
+    match rng.randrange(7):
+        case 0:
+            whole[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        case 1:
+            del whole[rng.randrange(len(whole))]
+        case 2:
+            whole.insert(rng.randrange(len(whole)), rng.randrange(256))
+        case 3:
+            del whole[rng.randrange(len(whole)) : -1]
+        case 4:
+            whole[:] = rng.randbytes(rng.randrange(1, 40)) + b"\0"
+        case 5:
+            whole[:] = bytes(rng.randrange(1, 256) for _ in range(rng.choice((32, 33, 1025))))
+        case _:
+            whole[:] = frame(kind, rng.randbytes(size + rng.choice((-1, 1, 30)) % 40))
+    return bytes(whole)
 
 
 @dataclass

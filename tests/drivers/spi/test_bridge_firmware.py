@@ -21,18 +21,16 @@ from tests.drivers.spi.bridge_c import (
     DIGEST,
     ELECTRODE_COMMANDS,
     HELLO,
-    HOST_PAYLOADS,
     PAC,
     PDC,
     PING,
-    START,
     STATUS,
-    STOP,
     SWEEP,
     TAC,
     TDC,
     ask,
     build_program,
+    damaged,
     frame,
     hexed,
     judged,
@@ -240,29 +238,6 @@ def test_a_sweep_takes_the_documented_bytes(
     assert 23 + len(words) == payload
     answer = ask(bridge_probe, [f"sweep 1 2 3 1 {sensors} {slots} {words.hex()}"])[0]
     assert len(bytes.fromhex(answer)) == line
-
-
-def damaged(rng: random.Random) -> bytes:
-    """A frame of a host that something happened to, with its zero."""
-    kind = rng.choice((PING, START, STOP, rng.randrange(256)))
-    size = HOST_PAYLOADS.get(kind, rng.randrange(8))
-    whole = bytearray(frame(kind, rng.randbytes(size), rng.choice((DIGEST, DIGEST, 0))))
-    match rng.randrange(7):
-        case 0:
-            whole[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
-        case 1:
-            del whole[rng.randrange(len(whole))]
-        case 2:
-            whole.insert(rng.randrange(len(whole)), rng.randrange(256))
-        case 3:
-            del whole[rng.randrange(len(whole)) : -1]
-        case 4:
-            whole[:] = rng.randbytes(rng.randrange(1, 40)) + b"\0"
-        case 5:
-            whole[:] = bytes(rng.randrange(1, 256) for _ in range(rng.choice((32, 33, 1025))))
-        case _:
-            whole[:] = frame(kind, rng.randbytes(size + rng.choice((-1, 1, 30)) % 40))
-    return bytes(whole)
 
 
 def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(

@@ -29,6 +29,7 @@ class Chip {
     this.bitten = this.stuck = false;
     const watchdog = mcu.peripherals[WATCHDOG];
     watchdog.onWatchdogTrigger = () => {
+      watchdog.alarm.enable = false; // or it goes off again at once, for ever
       this.bitten = true;
       this.stop(this.now());
     };
