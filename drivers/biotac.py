@@ -96,7 +96,8 @@ def decode_words(
 
     A word with a fault has the count 0. Words are the 16 bits as sent, first byte high.
     """
-    return _COUNTS[words], _FAULTS[words]
+    at = words.astype(np.intp)  # once for both tables
+    return _COUNTS.take(at), _FAULTS.take(at)
 
 
 def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -160,13 +161,15 @@ class Board:
 
     # ---- the bus of the sensors ----
 
-    def recorded(self, folder: Path, ms: float) -> Events:
-        """What happens on the bus in some emulated time, in order, as `EVENT`."""
+    @contextmanager
+    def recording(self, folder: Path) -> Iterator[Callable[[], Events]]:
+        """What happens on the bus meanwhile, in order, as `EVENT`; called afterwards."""
         self.do("record")
-        self.run(ms)
+        events: list[Events] = []
+        yield lambda: events[0]
         file = folder / "events"
         self.do("recorded", file=str(file))
-        return np.fromfile(file, EVENT)
+        events.append(np.fromfile(file, EVENT))
 
     def sensor(self, sensor: int, what: str, *values: float) -> None:
         """`unplug` 0 or 1, `settle` ns, `dead` mask, `force` electrode word; sensors from 0."""

@@ -11,7 +11,9 @@
 #include "pico/unique_id.h"
 #include "tusb.h"
 
-static const uint8_t pin_select[PROTOCOL_SENSORS_MAX] = {BRIDGE_PIN_SELECT};
+static const uint8_t pin_select[] = {BRIDGE_PIN_SELECT};
+
+_Static_assert(sizeof pin_select >= BRIDGE_SENSORS, "a chip select for each sensor");
 
 /* Chip selects of the sensors whose bits are set. */
 static uint32_t select_pins(uint8_t sensors)

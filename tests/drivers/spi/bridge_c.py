@@ -47,7 +47,7 @@ def build_program(folder: Path, name: str, *sources: str) -> Path:
     files = [str(file) for source in sources for file in sorted(BRIDGE.glob(source))]
     includes = [f"-I{BRIDGE}/src", f"-I{BRIDGE}/host"]
     command = ["cc", *WARNINGS, *SANITIZERS, POSIX, *includes, *files, "-o", str(program)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, done.stderr
     return program
 
@@ -120,7 +120,7 @@ class Host:
             os.close(self.descriptor)
             self.descriptor = -1
             self.process.terminate()
-            assert self.process.wait(10) == 0
+            assert self.process.wait(100) == 0
 
     def send(self, *data: bytes) -> None:
         os.write(self.descriptor, b"".join(data))

@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: MIT */
 /* The graspd bridge on a Raspberry Pi Pico (RP2040), Arduino core of Earle Philhower.
  *
- * NOT YET RUN ON HARDWARE: it compiles against stand-ins for the core's headers, no more.
+ * NOT YET RUN ON HARDWARE, only on an emulated RP2040, and there on a stand-in for the Arduino core.
  *
  *   Pico    BioTac SP
  *   GP18    SCK      all sensors

@@ -1,0 +1,54 @@
+"""How the firmware's images are built, and what is said where they cannot be."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.emulated import build
+from tests.emulated.conftest import Image
+
+
+def test_an_image_is_built_once(image: Image, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = image("pico")
+    monkeypatch.setattr(build, "_build", lambda *_: pytest.fail("built again"))
+    assert image("pico") == made
+
+
+def test_each_setting_makes_another_image(image: Image) -> None:
+    made = [
+        image(),
+        image("sketch"),
+        image(sensors=5),
+        image(clock_mhz=200),
+        image(sequence="interleaved"),
+    ]
+    assert len({path.read_bytes() for path in made}) == len(made)
+
+
+@pytest.mark.parametrize("port", ["pico", "sketch"])
+def test_an_image_leaves_most_of_the_chip_free(port: str, image: Image) -> None:
+    flash, ram = build.flash_and_ram(image(port))
+    assert 10_000 < flash < 64 * 1024, "of 2 MB"
+    assert 4_000 < ram < 64 * 1024, "of 264 kB"
+
+
+@pytest.mark.parametrize("program", build.NEEDED)
+def test_a_missing_program_is_named_with_its_package(
+    program: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "which", lambda name: None if name == program else f"/{name}")
+    with pytest.raises(
+        build.MissingError, match=f"^no {program}: install {build.NEEDED[program]}$"
+    ):
+        build.image()
+
+
+def test_a_folder_that_is_no_sdk_is_named(
+    image: Image, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PICO_SDK_PATH", str(tmp_path))
+    with pytest.raises(build.MissingError, match=f"^no pico-sdk at PICO_SDK_PATH '{tmp_path}'$"):
+        image()

@@ -1,0 +1,195 @@
+"""Times on the sensors' bus, from its edges: what the manual asks for holds at every clock."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from drivers.biotac import ERROR_WORDS
+from tests.drivers.spi.bridge_c import (
+    ELECTRODE_COMMANDS,
+    PAC,
+    PDC,
+    SWEEP,
+    TAC,
+    TDC,
+    counts_of,
+    pattern,
+    seq_of,
+    words_of,
+)
+from tests.emulated.board import Board, serials
+from tests.emulated.bus import Timing, Transaction, sweeps, timing, transactions
+from tests.emulated.conftest import Image
+
+PERIOD_MS = 10.0
+SWEEPS = 20
+COMMANDS = {
+    "electrodes": ELECTRODE_COMMANDS,
+    "all": bytes([PAC, PDC, TAC, TDC]) + ELECTRODE_COMMANDS,
+    "interleaved": b"".join(bytes([one, PAC]) for one in (*ELECTRODE_COMMANDS, PDC, TAC, TDC)),
+}
+"""By sequence (manual table 12)."""
+SETTLE_US, GAP_US = 50.0, 5.0
+"""Least times between a command and an answer, and after an answer (manual figure 14)."""
+SPI_HZ_MIN, SPI_HZ_ASKED = 500_000, 4_400_000
+"""Slowest clock that a sensor takes (manual section 8.2), and the one that is asked for."""
+LATE_US = 20.0
+"""A turn of the firmware's loop, with USB served in it: the most that a sweep may begin late."""
+OWN_TIME = 1.25
+"""A sweep takes no longer than this times its bits and waits."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    port: str
+    clock_mhz: int = 125
+    sensors: int = 3
+    sequence: str = "electrodes"
+
+    def __str__(self) -> str:
+        return f"{self.port}-{self.clock_mhz}MHz-{self.sensors}-{self.sequence}"
+
+
+SETTINGS = (
+    Setting("pico"),
+    Setting("pico", 133),
+    Setting("pico", 200),
+    Setting("pico", 133, 1, "all"),
+    Setting("pico", 200, 5, "interleaved"),
+    Setting("sketch"),
+    Setting("sketch", 200),
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a board with this setting did: the greeting, then some sweeps."""
+
+    setting: Setting
+    state: dict[str, object]
+    hello: bytes
+    greeting: list[Transaction]
+    """On the bus while sensors were looked for."""
+    said: list[bytes]
+    """SWEEPs."""
+    swept: list[list[Transaction]]
+    """The same on the bus."""
+
+    @property
+    def timing(self) -> Timing:
+        return timing(self.swept, PERIOD_MS * 1000.0)
+
+
+@pytest.fixture(scope="module", params=SETTINGS, ids=str)
+def run(
+    request: pytest.FixtureRequest, image: Image, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Run]:
+    setting: Setting = request.param
+    folder = tmp_path_factory.mktemp("events")
+    with Board() as board:
+        board.power(image(setting.port, setting.sensors, setting.clock_mhz, setting.sequence))
+        with board.recording(folder) as greeting:
+            hello = board.hello()
+        board.start()
+        with board.recording(folder) as swept:
+            board.run(PERIOD_MS * SWEEPS)
+        commands = COMMANDS[setting.sequence]
+        yield Run(
+            setting,
+            board.do("state"),
+            hello,
+            transactions(greeting()),
+            board.take(SWEEP),
+            sweeps(transactions(swept()), len(commands), setting.sensors),
+        )
+
+
+def test_the_chip_runs_at_the_clock_it_was_built_for(run: Run) -> None:
+    assert run.state["sys_hz"] == run.setting.clock_mhz * 1_000_000
+    assert (run.state["spi_mode"], run.state["spi_bits"]) == (0, 8)
+    assert run.state["resets"] == 0
+
+
+def test_hello_names_every_sensor_and_the_sequence(run: Run) -> None:
+    sensors = run.setting.sensors
+    assert list(serials(run.hello)) == [b"BTSP%012d" % (at + 1) for at in range(sensors)]
+    assert struct.unpack_from("<IBB", run.hello, 39) == (
+        10_000,
+        sensors,
+        len(COMMANDS[run.setting.sequence]),
+    )
+    assert run.hello[45 + 16 * sensors :] == COMMANDS[run.setting.sequence]
+
+
+def test_sweeps_carry_what_the_sensors_feel(run: Run) -> None:
+    assert [seq_of(sweep) for sweep in run.said] == list(range(len(run.said)))
+    assert len(run.said) in (SWEEPS, SWEEPS - 1)  # the last may be under way
+    at = [COMMANDS[run.setting.sequence].index(command) for command in ELECTRODE_COMMANDS]
+    for row, sweep in enumerate(run.said):
+        words = words_of(sweep)
+        counts = counts_of(sweep)[:, at]
+        assert (counts == pattern(row, run.setting.sensors)).all()
+        assert not set(words.ravel().tolist()) & {*ERROR_WORDS, 0x0000, 0xFFFF}
+
+
+def test_a_sensor_has_50_us_between_command_and_answer_and_5_us_after_it(run: Run) -> None:
+    assert run.timing.settle_us >= SETTLE_US
+    assert run.timing.gap_us >= GAP_US
+
+
+def test_a_property_has_50_us_and_5_us_as_well(run: Run) -> None:
+    reads = [one for one in run.greeting if not one.is_command]
+    assert len(reads) == 2 * 3 * run.setting.sensors  # firmware version twice, serial number
+    for ask, answer in zip(reads[::2], reads[1::2], strict=True):
+        assert ask.mosi[0] == 0x61
+        assert answer.low_ns - ask.high_ns >= SETTLE_US * 1e3
+    for answer, ask in zip(reads[1::2], reads[2::2], strict=False):
+        assert ask.low_ns - answer.high_ns >= GAP_US * 1e3
+
+
+def test_the_clock_of_spi_is_one_that_a_sensor_takes(run: Run) -> None:
+    clocks = {hz for sweep in run.swept for one in sweep for hz in one.hz}
+    assert len(clocks) == 1
+    assert SPI_HZ_MIN <= min(clocks) <= SPI_HZ_ASKED
+    assert max(clocks) > 0.9 * SPI_HZ_ASKED
+
+
+def test_chip_selects_change_between_bytes_and_never_within_one(run: Run) -> None:
+    everyone = (1 << run.setting.sensors) - 1
+    slot = [everyone, *(1 << sensor for sensor in range(run.setting.sensors))]
+    assert len(run.swept) >= SWEEPS - 1
+    for sweep in run.swept:
+        assert [one.sensors for one in sweep] == slot * len(COMMANDS[run.setting.sequence])
+        for one in sweep:
+            byte_ns = 8e9 / one.hz[0]
+            first, second = one.byte_ns
+            assert one.low_ns <= first
+            assert first + byte_ns <= second
+            assert second + byte_ns <= one.high_ns
+
+
+def test_commands_are_sent_to_all_and_answers_read_from_each(run: Run) -> None:
+    for sweep in run.swept:
+        told = [one.mosi for one in sweep if one.is_command]
+        assert told == [bytes([command, 0]) for command in COMMANDS[run.setting.sequence]]
+        assert {one.mosi for one in sweep if not one.is_command} == {b"\x01\x00"}
+
+
+def test_a_sweep_takes_its_bits_and_waits_and_little_more(run: Run) -> None:
+    sensors, slots = run.setting.sensors, len(COMMANDS[run.setting.sequence])
+    bits_us = 16e6 * (1 + sensors) / run.timing.spi_hz
+    least_us = slots * (bits_us + SETTLE_US + GAP_US * sensors)
+    shortest_us, longest_us = run.timing.duration_us
+    assert least_us - GAP_US <= shortest_us <= longest_us <= OWN_TIME * least_us
+    for sweep, on_the_bus in zip(run.said, run.swept, strict=False):
+        start, end = struct.unpack_from("<QQ", sweep, 4)
+        seen_us = (on_the_bus[-1].high_ns - on_the_bus[0].low_ns) / 1e3
+        assert 0.0 <= end - start - seen_us < 20.0
+
+
+def test_sweeps_begin_on_the_grid(run: Run) -> None:
+    assert run.timing.late_us < LATE_US
