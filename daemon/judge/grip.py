@@ -218,7 +218,8 @@ class Grip:
 
     def _motion(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
         """How each finger moves in the window that shows more of it, and what it may there."""
-        found, limits = dict[Finger, float | None](), dict[Finger, float]()
+        found: dict[Finger, float | None] = {}
+        limits: dict[Finger, float] = {}
         now = self._gate.motion
         windows = now.fast, now.fast_limits, now.slow, now.slow_limits
         for finger, moves, limit, slides, its_limit in zip(self._fingers, *windows, strict=True):

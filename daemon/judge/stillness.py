@@ -14,7 +14,7 @@ from operator import le, truediv
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number, all_of
+from daemon.judge.findings import Number, all_of, any_of
 from daemon.judge.windows import (
     APART,
     LONG_NS,
@@ -111,12 +111,16 @@ class MotionMemory:
     """Time of the last sweep that ended a step."""
     block_steps: Number = 0
     """Steps of the block at hand."""
+    pending: Number = 0
+    """The last of these, which are still to be taken into it."""
     block_number: Number = 0
     """Blocks so far."""
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for what no such memory can be."""
-        if self.number > STEPS or self.first + self.number > len(self.steps):
+        end = self.first + self.number
+        pending_max = max(self.number - APART, 0)
+        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
             raise ValueError("more steps than are remembered")
 
 
@@ -192,7 +196,7 @@ class Motion:
         """Forget the motion: what comes next does not continue what came before."""
         memory = self.memory
         memory.number = memory.sweeps = memory.block_steps = memory.total_ns = 0
-        memory.first = 0
+        memory.first = memory.pending = 0
         memory.last_ns = None
         memory.block.fill(0.0)
         self._say_unknown()
@@ -218,7 +222,11 @@ class Motion:
         if not all_of(usable):
             sweep = np.where(usable, sweep, memory.clean)
             gone = ~usable & (memory.lost >= LOST_MAX)
-            if gone.any():
+            if any_of(gone):
+                end = memory.first + memory.number
+                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[end - 1 - APART]
+                if memory.pending and any_of(was_usable):
+                    self._fill_block()
                 # Not in this step, and what comes next has nothing to jump from.
                 memory.all_usable_since_ns = t_ns + STEP_NS
                 memory.usable_since_ns[gone] = t_ns + STEP_NS
@@ -252,12 +260,14 @@ class Motion:
         for finger in range(len(jumped)):
             if where.count(1, finger * ELECTRODES, (finger + 1) * ELECTRODES) > SPIKES_MAX:
                 jumped[finger] = False
-        if memory.jumped.tobytes() != self._nothing:
+        if memory.jumped.tobytes() == self._nothing:
+            memory.jumped = jumped.view(np.uint8)
+        else:
             held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
             jumped &= (memory.jumped == 0) | held
+            memory.jumped += 1
+            memory.jumped *= jumped
         memory.clean = np.where(jumped, memory.clean, counts)
-        memory.jumped += 1
-        memory.jumped *= jumped
 
     def _remember(self, t_ns: int) -> None:
         memory = self.memory
@@ -277,35 +287,34 @@ class Motion:
         memory = self.memory
         if memory.number <= APART:
             return
-        last = memory.first + memory.number - 1
-        differences = memory.steps[last] - memory.steps[last - APART : last][::-1]
-        squares, usable = np.square(differences, out=differences), self._usable_since(last - APART)
-        if usable is None:
-            means = (squares @ ONES).astype(np.float64)
-            means /= ELECTRODES
-        else:
-            numbers = np.maximum(np.count_nonzero(usable, axis=1), 1)
-            means = ((squares * usable) @ ONES).astype(np.float64) / numbers
-        memory.block += means
+        memory.pending += 1
         memory.block_steps += 1
         if memory.block_steps >= BLOCK_STEPS:
+            self._fill_block()
             memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
             memory.block_number += 1
             memory.block_steps = 0
             memory.block.fill(0.0)
 
-    def _usable_since(self, begin: int) -> NDArray[np.bool_] | None:
-        """Electrodes usable from a step on, shape (fingers, 24); None where all were."""
-        memory, since_ns = self.memory, self.memory.times_ns.item(begin)
-        if memory.all_usable_since_ns <= since_ns:
-            return None
-        return np.asarray(memory.usable_since_ns <= since_ns)
+    def _fill_block(self) -> None:
+        """Take the pending steps into the block, by the electrodes that are usable until now."""
+        memory = self.memory
+        end = memory.first + memory.number
+        begin, memory.pending = end - memory.pending, 0
+        since_ns = memory.times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
+        usable = memory.usable_since_ns <= since_ns
+        numbers = np.maximum(np.count_nonzero(usable, axis=2), 1)
+        for apart, sums in enumerate(memory.block, start=1):
+            differences = memory.steps[begin:end] - memory.steps[begin - apart : end - apart]
+            means = (np.square(differences) * usable) @ ONES / numbers
+            np.add.reduce((sums, *means), axis=0, out=sums)
 
     def _mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
         """Of each finger over its electrodes usable from a step on; infinite if too few are."""
-        usable = self._usable_since(begin)
-        if usable is None:
+        memory, since_ns = self.memory, self.memory.times_ns.item(begin)
+        if memory.all_usable_since_ns <= since_ns:
             return [total / ELECTRODES for total in (values @ ONES).tolist()]
+        usable = memory.usable_since_ns <= since_ns
         totals = ((values * usable) @ ONES).tolist()
         numbers = np.count_nonzero(usable, axis=1).tolist()
         return [
