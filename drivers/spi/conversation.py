@@ -77,8 +77,7 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
-        self.serials: dict[str, str] = {}
-        """By finger, from that HELLO; without the sensors that did not answer."""
+        self._serials: dict[str, str] = {}
         self._believed: tuple[str, ...] = ()
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
         self._doubted: tuple[str, ...] | None = None
@@ -114,6 +113,11 @@ class Conversation:
     def period_ns(self) -> int | None:
         """Nominal time between sweeps by the last HELLO, ns; None before the first."""
         return None if self.hello is None else self.hello.period_ns
+
+    @property
+    def serials(self) -> dict[str, str]:
+        """By finger, from the last HELLO; without the sensors that did not answer."""
+        return self._serials
 
     @property
     def due_ns(self) -> int:
@@ -307,7 +311,7 @@ class Conversation:
     def _take(self, hello: Hello) -> None:
         self.hello, found = hello, hello.serials
         known = zip(self._fingers, self._sensors, strict=True)
-        self.serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
+        self._serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:

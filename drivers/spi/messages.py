@@ -11,6 +11,7 @@ import zlib
 from dataclasses import dataclass
 from typing import ClassVar, Final, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -168,8 +169,7 @@ class Hello:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
+class Sweep(msgspec.Struct, frozen=True, eq=False):
     """The response words of one sweep over all slots and sensors, as they were read."""
 
     TYPE: ClassVar[int] = 0x02

@@ -65,6 +65,23 @@ def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 
+COLLECTIONS = """
+import atexit, gc
+before = sum(each["collections"] for each in gc.get_stats())
+def tell():
+    done = sum(each["collections"] for each in gc.get_stats()) - before
+    print(done, gc.isenabled(), gc.get_freeze_count() > 10_000)
+atexit.register(tell)
+"""
+
+
+def test_loading_collects_no_garbage_and_what_is_loaded_is_never_looked_through() -> None:
+    result = python(COLLECTIONS, "check", DEMO_SCENE)
+    done, enabled, frozen = result.stdout.splitlines()[-1].split()
+    assert (enabled, frozen) == ("True", "True")
+    assert int(done) < 60  # it takes some 110 while loading alone
+
+
 WHILE_LEAVING = """
 import os, signal
 from daemon.process.signals import StopSignal
