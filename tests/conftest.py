@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
 import signal
@@ -64,8 +65,7 @@ def nothing_is_left_behind() -> Iterator[None]:
 def _open_descriptors() -> set[str]:
     links = set()
     for entry in os.scandir("/proc/self/fd"):
-        try:
-            links.add(f"{entry.name} -> {os.readlink(entry.path)}")
-        except FileNotFoundError:
-            continue  # the descriptor of this very listing
-    return links
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            links.add((entry.name, os.readlink(entry.path)))
+    listing = f"/proc/{os.getpid()}/fd"
+    return {f"{name} -> {path}" for name, path in links if path != listing}

@@ -215,6 +215,7 @@ def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     disk = StalledDisk(monkeypatch)
+    monkeypatch.setattr(recorder_module, "CLOSE_S", 100.0)
     recorder = make()
     assert disk.asked.wait(100)
     for number in range(QUEUE_MAX + 500):

@@ -149,7 +149,7 @@ class Host:
     def send(self, *data: bytes) -> None:
         os.write(self.descriptor, b"".join(data))
 
-    def frames(self, timeout_s: float = 10.0) -> Iterator[tuple[int, bytes]]:
+    def frames(self, timeout_s: float = 100.0) -> Iterator[tuple[int, bytes]]:
         """Frames as they come; the test fails on a damaged one and after `timeout_s`."""
         end_s = time.monotonic() + timeout_s
         while (left_s := end_s - time.monotonic()) > 0:
