@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -39,6 +40,50 @@ class Level(StrEnum):
     OK = "ok"
     WARNING = "warning"
     ERROR = "error"
+
+
+FLASH = "flash the firmware of this graspd: deploy/bridge/BUILD.md"
+LINK_ADVICE = {
+    "no such file": "plug it in; ls /dev/serial/by-id; a Pico that is a drive has no firmware yet",
+    "another program": "fuser -v and the port names it; a daemon: systemctl stop 'graspd@*'",
+    "permission denied": "join the group of the port: ls -lL and the port names it",
+    "speaks version|has layout": FLASH,
+    "has . sensors|sweeps once": f"let the scene and the settings of the bridge agree: {FLASH}",
+    "no answer": f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}",
+    "other sensors": "serial numbers are misread: see supply, ground, MISO and its pull-up",
+    "no sweep": "it began and stopped: see its supply and cable, and how busy this computer is",
+    "went away|was reset": "plug, cable, hub and supply: it was unplugged, or lost power",
+    "^greeting$": "it has not answered yet: listen longer, --listen 10",
+    "": "is it powered, connected, and the one that the scene names?",
+}
+"""What to do about a link that is not up, by the first pattern that is found in why it is not."""
+DEVICE_TROUBLES = (
+    ("last error", "", Level.WARNING, ""),
+    ("newer firmware", "", Level.WARNING, FLASH),
+    (
+        "sensors",
+        "^none(, none)*$",
+        Level.ERROR,
+        "see what all share: 3.3 V, ground, SCK, MOSI, MISO and its pull-up",
+    ),
+    (
+        "sensors",
+        r"(^|, )(?!none)([^,]+),(.*,)? \2(,|$)",
+        Level.ERROR,
+        "two chip selects lead to one sensor, or touch",
+    ),
+    ("sensors", r"\bnone\b", Level.WARNING, "they stand in the order of the chip selects"),
+    ("spi errors", "[1-9]", Level.WARNING, "by chip select, since its reset; of one: its wires"),
+    ("sweep", "too long", Level.WARNING, "set a longer period or a shorter sequence, and flash it"),
+    ("clock", "not trusted", Level.WARNING, f"it stands, was reset, or is wrong: {FLASH}"),
+)
+"""What a device says of itself that is not fine: key, pattern of the value, how bad, advice."""
+COUNTER_ADVICE = {
+    "bad_": "damaged or foreign bytes: cable, hub, baud; is it the firmware of a bridge?",
+    "too_long": "foreign bytes: is it the firmware of a bridge?",
+    "bridge_": "since its reset: what grows from one look to the next is trouble",
+}
+"""What to do about a counter, by how its name begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +140,7 @@ class ElectrodeStatistics:
         missing = self.faulty[finger] > FAULTY_FRACTION * self.readings
         why = _faults_in_words(int(np.bitwise_or.reduce(self.fault_bits[finger])))
         if missing.all():
-            advice = "check the finger's plug, its chip select and its supply (3.3 to 5 V)"
+            advice = "check the finger's plug, its chip select and its supply"
             return [Finding(Level.ERROR, f"{name}: no electrode can be read ({why})", advice)]
         unreliable = (self.faulty[finger] > 0) & ~missing
         mean, deviation = self.mean[finger], self.deviation[finger]
@@ -113,7 +158,12 @@ class ElectrodeStatistics:
             ),
             (still, Level.ERROR, "frozen", "power-cycle the sensor; check who repeats old data"),
             (unreliable, Level.WARNING, f"now and then faulty ({why})", "check wiring and clock"),
-            (moving, Level.WARNING, "restless", "leave the hand untouched while the doctor looks"),
+            (
+                moving,
+                Level.WARNING,
+                "restless",
+                "leave the hand untouched while the doctor looks; if touched: is it this finger?",
+            ),
         ]
         return [
             Finding(level, f"{_names(name, which)} {what}", advice)
@@ -122,10 +172,38 @@ class ElectrodeStatistics:
         ]
 
 
+def device_findings(driver: str, device: Mapping[str, str]) -> list[Finding]:
+    """A finding for all that a driver says of its device, by key; a link's with why it is down."""
+    told = dict(device)
+    found = []
+    link, why = told.pop("link", "up"), told.pop("why", None)
+    if link != "up":
+        link = link if why is None else f"{link}: {why}"
+        advice = next(advice for part, advice in LINK_ADVICE.items() if re.search(part, link))
+        found.append(Finding(Level.ERROR, f"{driver}: link {link}", advice))
+    elif "link" in device:
+        found.append(Finding(Level.OK, f"{driver}: link up"))
+    for key, value in told.items():
+        level, advice = next(
+            (
+                (level, advice)
+                for which, part, level, advice in DEVICE_TROUBLES
+                if which == key and re.search(part, value)
+            ),
+            (Level.OK, ""),
+        )
+        found.append(Finding(level, f"{driver}: {key} {value}", advice))
+    return found
+
+
 def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
     """A warning for every counter of a driver that is about something going wrong."""
     return [
-        Finding(Level.WARNING, f"{driver}: {number} {name.replace('_', ' ')}")
+        Finding(
+            Level.WARNING,
+            f"{driver}: {number} {name.replace('_', ' ')}",
+            next((advice for word, advice in COUNTER_ADVICE.items() if name.startswith(word)), ""),
+        )
         for name, number in counters.items()
         if number > JOINING_MAX * name.startswith(JOINING) and name not in USUAL_COUNTERS
     ]

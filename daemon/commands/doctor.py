@@ -23,6 +23,7 @@ from daemon.commands.diagnosis import (
     Finding,
     Level,
     counter_findings,
+    device_findings,
     rate_finding,
 )
 from daemon.process.text import complain, printable
@@ -41,8 +42,6 @@ BRIDGE_NAME = "graspd"
 BRIDGE_VENDOR = 0x2E8A
 """Raspberry Pi, whose Pico the bridge's sketch is for. Only ports of this vendor, or with the name
 above in their description, are greeted unasked: other devices may not like it."""
-DESCRIBED = {("clock", "not trusted"): Level.WARNING}
-"""What a driver says of its device that is not fine."""
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
 
 
@@ -158,10 +157,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
     for driver in drivers:
         device = described[driver.name]
         report[driver.name] = {"device": device, "counters": driver.counters.as_dict()}
-        findings += [
-            Finding(DESCRIBED.get((key, value), Level.OK), f"{driver.name}: {key} {value}")
-            for key, value in device.items()
-        ]
+        findings += device_findings(driver.name, device)
     tactile = drivers[0]
     findings.append(rate_finding(tactile.name, statistics.readings, seconds, tactile.period_ns))
     for driver in drivers:

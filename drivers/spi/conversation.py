@@ -10,10 +10,10 @@ from typing import Final
 
 from drivers.base import Reading, TactileReading, sensor_rows
 from drivers.link import Link, LinkState
-from drivers.spi.clock import DeviceClock
 from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
     DIGEST,
+    FIRMWARE,
     VERSION,
     Hello,
     HelloHead,
@@ -77,6 +77,7 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
+        self._serials: dict[str, str] = {}
         self._believed: tuple[str, ...] = ()
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
         self._doubted: tuple[str, ...] | None = None
@@ -96,6 +97,8 @@ class Conversation:
         """When the PINGs that wait for an answer were sent, by their nonce."""
         self._pings_sent = 0
         self._ping_due_ns = self._silent_at_ns = 0
+        self._silence_ns = SILENCE_MIN_NS
+        """How long no sweep may come, ns."""
 
     @property
     def counters(self) -> BridgeCounters:
@@ -112,16 +115,9 @@ class Conversation:
         return None if self.hello is None else self.hello.period_ns
 
     @property
-    def clock(self) -> DeviceClock | None:
-        """The bridge's clock: drift, round trip, trust. None while not greeted."""
-        return None if self._sweeps is None else self._sweeps.clock
-
-    @property
     def serials(self) -> dict[str, str]:
         """By finger, from the last HELLO; without the sensors that did not answer."""
-        found = () if self.hello is None else self.hello.serials
-        known = zip(self._fingers, self._sensors, strict=True)
-        return {finger: found[at] for finger, at in known if at < len(found) and found[at]}
+        return self._serials
 
     @property
     def due_ns(self) -> int:
@@ -137,12 +133,12 @@ class Conversation:
             known["why"] = self.link.reason
         if self.hello is not None:
             known.update(_about(self.hello))
-        if self.clock is not None:
-            known["clock"] = "trusted" if self.clock.trusted else "not trusted"
-            if self.clock.round_trip_ns is not None:
-                known["round trip"] = f"{self.clock.round_trip_ns / 1e6:.2f} ms"
-            if self.clock.drift_ppm is not None:
-                known["clock drift"] = f"{self.clock.drift_ppm:+.1f} ppm"
+            if self.hello.firmware < FIRMWARE:
+                known["newer firmware"] = _version(FIRMWARE)
+        if self._sweeps is not None:
+            known.update(_about_time(self._sweeps))
+        if self.status is not None:
+            known["spi errors"] = ", ".join(map(str, self.status.spi_errors))
         return known
 
     def opened(self, now_ns: int) -> None:
@@ -171,7 +167,7 @@ class Conversation:
         said = [encode(Start())] if self._starts else []
         self._starts = False
         if self._sweeps is not None and now_ns >= self._silent_at_ns:
-            self.lost(f"no sweep for {self._silence_ns() / 1e6:.0f} ms", now_ns)
+            self.lost(f"no sweep for {self._silence_ns / 1e6:.0f} ms", now_ns)
         elif now_ns < self._ping_due_ns:
             return said
         elif self._sweeps is not None:
@@ -230,9 +226,6 @@ class Conversation:
         self._nonce = (self._nonce + 1) % NONCES or 1  # 0 is that of a reset
         return encode(Ping(self._nonce))
 
-    def _silence_ns(self) -> int:
-        return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
-
     def _speaks_our_language(self, payload: bytes, now_ns: int) -> bool:
         """Whether a HELLO is of our version and layout; if not the link is given up for now."""
         head = HelloHead.from_bytes(payload)
@@ -275,7 +268,7 @@ class Conversation:
             # Misread or exchanged: at STOP it reads them again.
             self.lost("the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
-            self.hello = hello
+            self._take(hello)
             self._sweeps.round_trip(hello, sent_ns, arrival_ns)
 
     def _believes(self, told: tuple[str, ...]) -> bool:
@@ -307,12 +300,18 @@ class Conversation:
             if self._pings_sent <= GREETING_TRIES:
                 self._ping_due_ns = now_ns
         else:
-            self.hello = hello
+            self._take(hello)
             self._starts = True
             self._pings_sent = 1
             self._ping_due_ns = now_ns + PING_FIRST_NS
-            self._silent_at_ns = now_ns + self._silence_ns()
+            self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
+            self._silent_at_ns = now_ns + self._silence_ns
             self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
+
+    def _take(self, hello: Hello) -> None:
+        self.hello, found = hello, hello.serials
+        known = zip(self._fingers, self._sensors, strict=True)
+        self._serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:
@@ -322,7 +321,7 @@ class Conversation:
         if reading is None:
             return None
         self._next_seq = self._sweeps.next_seq
-        self._silent_at_ns = arrival_ns + self._silence_ns()
+        self._silent_at_ns = arrival_ns + self._silence_ns
         if self.link.state is LinkState.GREETING:
             self.link.up(", ".join(_about(self._sweeps.hello).values()), arrival_ns)
         return reading
@@ -332,7 +331,28 @@ def _about(hello: Hello) -> dict[str, str]:
     """What a bridge says of itself, for people."""
     return {
         "board": hello.board or "unnamed",
-        "firmware": f"{hello.firmware >> 8}.{hello.firmware & 0xFF}",
+        "firmware": _version(hello.firmware),
         "sequence": f"{hello.slots} samples at {hello.tick_hz / hello.period_ticks:.1f} Hz",
         "sensors": ", ".join(serial or "none" for serial in hello.serials),
     }
+
+
+def _about_time(sweeps: SweepDecoder) -> dict[str, str]:
+    """What is known of a bridge's clock and of how long its sweeps take, for people."""
+    clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
+    known = {"clock": "trusted" if clock.trusted else "not trusted", "clock rate": f"{tick_hz} Hz"}
+    if clock.drift_ppm is not None:
+        known["clock drift"] = f"{clock.drift_ppm:+.1f} ppm"
+    elif clock.rate_limits_ppm is not None:
+        known["clock drift"] = "{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm)
+    if clock.round_trip_ns is not None:
+        known["round trip"] = f"{clock.round_trip_ns / 1e6:.2f} ms"
+    if sweeps.longest_ticks:
+        longest_ms, period_ms = 1e3 * sweeps.longest_ticks / tick_hz, sweeps.hello.period_ns / 1e6
+        fits = "at most, of" if longest_ms < period_ms else "is too long for"
+        known["sweep"] = f"{longest_ms:.2f} ms {fits} {period_ms:.2f} ms"
+    return known
+
+
+def _version(firmware: int) -> str:
+    return f"{firmware >> 8}.{firmware & 0xFF}"

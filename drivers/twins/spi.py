@@ -20,6 +20,7 @@ from drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_com
 from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
     DIGEST,
+    FIRMWARE,
     TEXT_BYTES,
     VERSION,
     Hello,
@@ -302,6 +303,7 @@ class SpiTwin(Opened):
                 for i in range(self._sensors)
             ),
             commands=self._commands,
+            firmware=FIRMWARE,
             board="twin",
             version=VERSION + self._faults.wrong_version,
             digest=self._digest,

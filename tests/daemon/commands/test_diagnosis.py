@@ -13,10 +13,12 @@ from daemon.commands.diagnosis import (
     ElectrodeStatistics,
     Level,
     counter_findings,
+    device_findings,
     rate_finding,
 )
 from daemon.commands.doctor import can_interfaces
 from drivers.base import ElectrodeFault, TactileReading
+from drivers.link import LinkState
 
 FINGERS = ("ff", "mf", "th")
 Counts = NDArray[np.float64]
@@ -148,3 +150,50 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
     assert up.what == "CAN interface can0 is up"
     assert (down.level, down.what) == (Level.WARNING, "CAN interface can1 is down")
     assert "ip link set can1 up" in down.advice
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "level", "advice"),
+    [
+        ("firmware", "0.1", Level.OK, ""),
+        ("newer firmware", "0.2", Level.WARNING, "flash"),
+        ("sensors", "BTSP1, BTSP2, BTSP10", Level.OK, ""),
+        ("sensors", "BTSP-TWIN-1, BTSP-TWIN-2, BTSP-TWIN-10", Level.OK, ""),
+        ("sensors", "BTSP-1, BTSP-2, BTSP-2", Level.ERROR, "two chip selects"),
+        ("sensors", "BTSP-1, BTSP-1", Level.ERROR, "two chip selects"),
+        ("sensors", "none, BTSP2, none", Level.WARNING, "order of the chip selects"),
+        ("sensors", "none", Level.ERROR, "MISO"),
+        ("sensors", "none, none", Level.ERROR, "MISO"),
+        ("sensors", "BTSP1, none, BTSP1", Level.ERROR, "two chip selects"),
+        ("spi errors", "0, 0, 0", Level.OK, ""),
+        ("spi errors", "0, 10, 0", Level.WARNING, "by chip select"),
+        ("sweep", "1.91 ms at most, of 10.00 ms", Level.OK, ""),
+        ("sweep", "10.42 ms is too long for 10.00 ms", Level.WARNING, "longer period"),
+        ("clock", "trusted", Level.OK, ""),
+        ("clock", "not trusted", Level.WARNING, "flash"),
+        ("last error", "no buffer space", Level.WARNING, ""),
+    ],
+)
+def test_what_a_device_says_is_judged(key: str, value: str, level: Level, advice: str) -> None:
+    up, finding = device_findings("spi", {"link": "up", key: value})
+    assert (up.level, up.what) == (Level.OK, "spi: link up")
+    assert (finding.level, finding.what) == (level, f"spi: {key} {value}")
+    assert advice in finding.advice
+    assert bool(advice) == bool(finding.advice)
+
+
+@pytest.mark.parametrize("state", sorted({*LinkState} - {LinkState.UP}))
+@pytest.mark.parametrize("why", [None, "no answer from /dev/x", "something new"])
+def test_a_link_that_is_not_up_is_an_error_with_cause_and_advice(
+    state: LinkState, why: str | None
+) -> None:
+    device = {"link": str(state)} | ({} if why is None else {"why": why})
+    (finding,) = device_findings("palm", device)
+    assert finding.level is Level.ERROR
+    assert finding.what == f"palm: link {state}" + (f": {why}" if why else "")
+    assert finding.advice
+
+
+def test_a_recording_has_no_link() -> None:
+    (finding,) = device_findings("replay", {"recordings": "a.csv"})
+    assert finding.level is Level.OK

@@ -15,6 +15,7 @@ import pytest
 from cobs import cobs
 
 from drivers.biotac import ERROR_WORDS
+from drivers.spi.messages import FIRMWARE
 from tests.drivers.spi.bridge_c import (
     BRIDGE,
     DIGEST,
@@ -54,6 +55,12 @@ def test_the_digest_is_that_of_the_documented_schema() -> None:
     assert zlib.crc32(schema.encode("ascii")) == DIGEST
     header = (BRIDGE / "src" / "protocol.h").read_text()
     assert re.findall(r"PROTOCOL_DIGEST 0x(\w+)u", header) == [f"{DIGEST:08X}"]
+
+
+def test_graspd_knows_the_firmware_that_it_ships() -> None:
+    header = (BRIDGE / "src" / "bridge.h").read_text()
+    (made,) = re.findall(r"BRIDGE_FIRMWARE = 0x(\w+),", header)
+    assert int(made, 16) == FIRMWARE
 
 
 def test_the_core_needs_no_heap_and_no_floating_point() -> None:

@@ -60,10 +60,25 @@ def test_the_drift_is_found() -> None:
     assert clock.round_trip_ns < 16 * MS
 
 
+@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 80.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_rate_is_within_its_limits_which_close_in(drift_ppm: float, seed: int) -> None:
+    widths = []
+    for duration_s in (3.0, 30.0):
+        clock = DeviceClock(TICK_HZ)
+        errors_ms(Way(0.1, 0.0, drift_ppm, seed), duration_s, clock)
+        assert clock.rate_limits_ppm is not None
+        least, most = clock.rate_limits_ppm
+        assert least <= drift_ppm <= most
+        widths.append(most - least)
+    assert widths[1] < widths[0] < 1000.0
+
+
 def test_one_answered_ping_is_enough() -> None:
     clock, now_ns = synchronised(pings=1)
     assert clock.trusted
     assert clock.drift_ppm is None
+    assert clock.rate_limits_ppm is None
     made_ns = now_ns + 10 * MS
     mapped_ns = clock.host_ns(tick_of(made_ns, Way()), made_ns + 3 * MS, now_ns)
     assert made_ns - MS <= mapped_ns <= made_ns

@@ -8,8 +8,19 @@ import pytest
 
 from drivers.link import LinkState
 from drivers.spi.conversation import Conversation
-from drivers.spi.messages import Message, Ping, Start, Status, Stop, decode, encode, frame_parser
-from tests.drivers.spi.bridge_bench import FINGERS, MS, hello, sweep
+from drivers.spi.messages import (
+    FIRMWARE,
+    Message,
+    Ping,
+    Start,
+    Status,
+    Stop,
+    Sweep,
+    decode,
+    encode,
+    frame_parser,
+)
+from tests.drivers.spi.bridge_bench import FINGERS, MS, hello, sweep, words
 
 T0 = 5_000_000 * MS
 S = 1000 * MS
@@ -142,6 +153,7 @@ def test_people_are_told_what_is_known() -> None:
         "why": "unplugged",
         **about,
         "clock": "trusted",
+        "clock rate": "1000000 Hz",
         "round trip": "2.00 ms",
     }
     assert conversation.serials == {"ff": "BTSP-1", "th": "BTSP-3"}
@@ -152,6 +164,38 @@ def test_people_are_told_what_is_known() -> None:
         "why": "unplugged",
         **about,
     }
+
+
+def test_people_are_told_how_the_bridge_keeps_time() -> None:
+    conversation = greeted(period_ms=500)
+    said(conversation, T0 + S)  # a PING, answered after 1 ms by a clock that is 100 ppm fast
+    answer = dataclasses.replace(hello(43, 1_000_100), period_ticks=500_000)
+    hear(conversation, answer, T0 + S + MS)
+    for seq, took in enumerate((1910, 2209, 1900)):
+        made = Sweep(seq, 1_000_200 + 3000 * seq, 1_000_200 + 3000 * seq + took, 7, words())
+        assert hear(conversation, made, T0 + S + 20 * MS) == 1
+    late = Sweep(3, 1_020_000, 1_520_000, 7, words())
+    assert conversation.describe()["sweep"] == "2.21 ms at most, of 500.00 ms"
+    hear(conversation, late, T0 + S + 540 * MS)
+    assert conversation.describe()["sweep"] == "500.00 ms is too long for 500.00 ms"
+    hear(conversation, Status(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
+    told = conversation.describe()
+    assert told["clock rate"] == "1000000 Hz"
+    assert told["spi errors"] == "0, 7, 24"
+    # 1000100 +- 1 us by its clock are between 1000 and 1001 ms by ours.
+    assert told["clock drift"] == "-900 to +101 ppm"
+
+
+@pytest.mark.parametrize(
+    ("firmware", "newer"),
+    [(FIRMWARE - 1, "0.1"), (FIRMWARE, None), (FIRMWARE + 1, None), (0x0200, None)],
+)
+def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None) -> None:
+    conversation = opened()
+    for nonce in (42, 43):
+        said(conversation, T0)
+        hear(conversation, dataclasses.replace(hello(nonce), firmware=firmware), T0)
+    assert conversation.describe().get("newer firmware") == newer
 
 
 def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words() -> None:
