@@ -16,6 +16,7 @@ from cobs import cobs
 
 from drivers.biotac import ERROR_WORDS
 from drivers.spi.messages import FIRMWARE
+from tests.conftest import ROOT
 from tests.drivers.spi.bridge_c import (
     BRIDGE,
     DIGEST,
@@ -69,34 +70,8 @@ def test_the_core_needs_no_heap_and_no_floating_point() -> None:
         assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|float|double)\b", code), source
 
 
+ARDUINO = ROOT / "tests" / "emulated" / "firmware" / "arduino"
 STAND_INS = {
-    "Arduino.h": """
-        #include <stddef.h>
-        #include <stdint.h>
-        enum { LOW, HIGH };
-        enum { INPUT, OUTPUT };
-        void pinMode(uint8_t pin, int mode);
-        void digitalWrite(uint8_t pin, int value);
-        struct Port {
-            void begin(unsigned long baud);
-            int available(), read(), availableForWrite();
-            size_t write(const uint8_t *data, size_t size);
-        };
-        extern Port Serial;
-        """,
-    "SPI.h": """
-        #include <stdint.h>
-        enum { LSBFIRST, MSBFIRST };
-        enum { SPI_MODE0 };
-        struct SPISettings { SPISettings(uint32_t hz, int order, int mode); };
-        struct Spi {
-            bool setRX(uint8_t pin), setTX(uint8_t pin), setSCK(uint8_t pin);
-            void begin(bool hardware_select);
-            void beginTransaction(SPISettings settings);
-            uint8_t transfer(uint8_t data);
-        };
-        extern Spi SPI;
-        """,
     "hardware/gpio.h": """
         #include <stdint.h>
         void gpio_pull_up(unsigned pin);
@@ -113,7 +88,7 @@ STAND_INS = {
         void pico_get_unique_board_id(pico_unique_board_id_t *id);
         """,
 }
-"""As much of the headers of the RP2040's Arduino core as the sketch uses."""
+"""As much of the pico-sdk's headers as the sketch uses; those of the Arduino core are ARDUINO's."""
 
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler (c++)")
@@ -123,7 +98,7 @@ def test_the_sketch_compiles_against_stand_ins(tmp_path: Path) -> None:
         (tmp_path / name).write_text("#pragma once\n" + text)
     sketch = BRIDGE / "rp2040" / "graspd_bridge" / "graspd_bridge.ino"
     flags = ["-std=gnu++17", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c++"]
-    includes = [f"-I{BRIDGE}/src", f"-I{tmp_path}", "-include", "Arduino.h"]
+    includes = [f"-I{BRIDGE}/src", f"-I{ARDUINO}", f"-I{tmp_path}", "-include", "Arduino.h"]
     done = subprocess.run(
         ["c++", *flags, *includes, str(sketch)], capture_output=True, text=True, check=False
     )
