@@ -32,8 +32,8 @@ PORT = "/dev/serial/by-id/usb-Raspberry_Pi_Pico_E6614103E7452D2F-if00"
 BOARD = ("--board", "E6614103E7452D2F")
 PERIOD_US = 100_000
 """Slow, so that a computer that stalls loses no sweep; the page's numbers are of 10 ms."""
-LISTEN_S = 1.6
-GIVEN_UP_S = 2.2
+LISTEN_S = 2.0
+GIVEN_UP_S = 2.6
 """A bridge that does not answer is asked four times, half a second apart."""
 ABSENT = {sensor: ("--unplug", sensor) for sensor in range(3)}
 STEPS: dict[str, Sequence[object] | None] = {
@@ -45,7 +45,7 @@ STEPS: dict[str, Sequence[object] | None] = {
     "The wrong finger moves": (),
 }
 """Steps by how the page calls them, and what the PC port is told; without any, there is none."""
-VARIES = re.compile(r"bridge overruns|^...(model|realtime priority|you are not in)")
+VARIES = re.compile(r"bridge overruns|readings/s|^...(model|realtime priority|you are not in)")
 """Findings on the computer, its user and its load, not on the bridge."""
 
 
