@@ -82,7 +82,8 @@ class Timing:
 
 def timing(whole: Sequence[Sequence[Transaction]], period_us: float) -> Timing:
     """Figures of sweeps in a row."""
-    settles, gaps = [], []
+    settles: list[float] = []
+    gaps: list[float] = []
     for sweep in whole:
         for before, after in pairwise(sweep):
             (settles if before.is_command else gaps).append(after.low_ns - before.high_ns)

@@ -47,28 +47,33 @@ class LockStep:
     def now_ns(self) -> int:
         return EPOCH_NS + round(self.board.now_ns)
 
-    def close(self) -> None:
-        """Hang up as the daemon does; may be called more than once."""
-        if self.driver.link_state is not LinkState.CLOSED:
-            self._send_all(self.driver.close)
-        self._vanish()
-
     def open(self) -> None:
         """Plug the board's serial port in and open the driver."""
         self._look()
         self._send_all(self.driver.open)
+
+    def hang_up(self) -> None:
+        """Close the driver as the daemon does."""
+        self._send_all(self.driver.close)
+
+    def close(self) -> None:
+        """Close the driver and take the port away; may be called more than once."""
+        self.driver.close()
+        self._vanish()
 
     def serve(self, ms: float, enough: Callable[[], bool] = lambda: False) -> None:
         """Serve the driver as the daemon does, for an emulated time or until it is enough."""
         end_ns = self.board.now_ns + ms * MS
         while self.board.now_ns < end_ns and not enough():
             self._look()
+            if self._is_open and self._master < 0:
+                self._send_all(self._take)  # its device went away
             due_ns = self.driver.due_ns()
             wait_ns = end_ns if due_ns is None else max(due_ns - EPOCH_NS, self.board.now_ns)
             there = self.board.run_until(
                 min(end_ns, wait_ns, self.board.now_ns + LOOK_MS * MS), hand_over=True
             )
-            if there and self._is_open:
+            if there and self._is_open and self._master >= 0:
                 self._to_driver += os.write(self._master, there)
             if there or (due_ns is not None and self.now_ns() >= due_ns):
                 self._send_all(self._read)

@@ -1,0 +1,97 @@
+"""`graspd doctor` and `graspd run` as they are, in real time, on the emulated board's port."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.publish.messages import Tactile, decode_tactile
+from tests.bench.live import Subscriber
+from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.emulated.board import BOARD_ID
+from tests.emulated.conftest import Image
+from tests.emulated.test_driver import grasps, write_counts
+
+READINGS = 500
+READY_S = 200.0
+"""Real time for the board to be there, on a computer with other things to do."""
+ON_TIME_MS = 50.0
+"""Half the silence after which the driver gives a link up: an emulation that was further behind is
+a board that was silent, and the driver is right to say so."""
+
+
+@dataclass
+class Live:
+    process: subprocess.Popen[str]
+    scene: Path
+
+    def behind_ms(self) -> float:
+        """End the board and ask how far it was behind its time at worst."""
+        self.process.send_signal(signal.SIGTERM)
+        output, _ = self.process.communicate(timeout=TIMEOUT_S)
+        assert self.process.returncode == 0
+        return float(output.split()[0])
+
+
+@pytest.fixture
+def live(image: Image, tmp_path: Path) -> Iterator[Live]:
+    image()
+    link, scene = tmp_path / "port", tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "spi"\nport = "{link}"\n[model]\nname = "cnn1"\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+    )
+    counts = write_counts(tmp_path / "counts", grasps())
+    command = [sys.executable, "-m", "tests.emulated.live", "--link", link, "--counts", counts]
+    with subprocess.Popen(
+        [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        end_s = time.monotonic() + READY_S
+        while not link.is_symlink():
+            assert process.poll() is None
+            assert time.monotonic() < end_s
+            time.sleep(0.05)
+        yield Live(process, scene)
+        process.terminate()
+
+
+def readings(endpoint: str) -> list[Tactile]:
+    found: list[Tactile] = []
+    with Subscriber(endpoint, topics=("tactile.",)) as subscriber:
+        while len(found) < READINGS and (message := subscriber.take(20.0)) is not None:
+            found.append(decode_tactile(message[1]))
+    return found
+
+
+def test_the_doctor_and_the_daemon_take_it_for_a_board(live: Live, tmp_path: Path) -> None:
+    report = json.loads(graspd("doctor", live.scene, "--listen", 3, "--json").stdout)
+    said = [finding["what"] for finding in report["findings"]]
+    assert f"spi: board {BOARD_ID}" in said
+    assert "spi: sensors BTSP000000000001, BTSP000000000002, BTSP000000000003" in said
+
+    with start("run", live.scene) as daemon:
+        wait_for(tmp_path / "graspd")
+        found = readings(f"ipc://{tmp_path}/graspd")
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(TIMEOUT_S) == 0
+    behind_ms = live.behind_ms()
+    assert len(found) == READINGS
+    rows = {row.tobytes(): at for at, row in enumerate(grasps())}
+    at = [rows[np.array(reading.counts, dtype=np.uint16).tobytes()] for reading in found]
+    steps = np.diff(at)
+    assert not any(any(map(any, reading.faults)) for reading in found)
+    times_ns = [reading.t_mono_ns for reading in found]
+    if behind_ms < ON_TIME_MS:
+        assert times_ns == sorted(times_ns)
+        assert (steps == 1).all()
+        assert report["readings"] > 250
+        assert float(np.median(np.diff(times_ns))) == pytest.approx(10e6, rel=0.01)
