@@ -290,15 +290,16 @@ class Contact:
     def _settle(self, fingers: list[int], t_ns: int) -> None:
         """Take over what the window says of fingers, of those that were at rest."""
         memory = self.memory
-        usable = np.logical_and.reduce(memory.usable[:, fingers], axis=0)
+        usable = np.logical_and.reduce(memory.usable, axis=0)
         oldest = memory.sweeps % WINDOW
-        window = np.concatenate((memory.window[oldest:, fingers], memory.window[:oldest, fingers]))
+        window = np.concatenate((memory.window[oldest:], memory.window[:oldest]))
         baselines = _median(window)
         # Twice as large they are whole numbers, which are sorted in a fifth of the time.
         twice = np.abs(2 * window.astype(np.int32) - (2.0 * baselines).astype(np.int32))
         sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
         halves = _median(window[WINDOW // 2 :]) - _median(window[: WINDOW // 2])
-        for finger, *found in zip(fingers, baselines, sigmas, halves, usable, strict=True):
+        for finger in fingers:
+            found = baselines[finger], sigmas[finger], halves[finger], usable[finger]
             self._settle_finger(finger, t_ns, *found)
 
     def _settle_finger(

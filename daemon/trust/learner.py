@@ -87,8 +87,8 @@ class Learner:
         """
         if inputs.shape != (self._width - 2,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
-        largest = float(np.maximum.reduce(np.abs(inputs), initial=0.0))  # NaN if one is
-        if not (math.isfinite(margin) and largest <= INPUT_MAX):
+        within = (np.abs(inputs) <= INPUT_MAX).tobytes()  # false for NaN
+        if 0 in within or not math.isfinite(margin):
             raise ValueError("margin or inputs are not finite, or too large")
         values = np.empty(self._width)
         values[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE
