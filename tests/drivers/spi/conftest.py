@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.daemon.processes import put_first
 from tests.drivers.spi.bridge_c import SANITIZERS, Host, StartBridge, build_program
 
 
@@ -53,6 +54,7 @@ def start_bridge(bridge_program: Path) -> Iterator[StartBridge]:
         process = subprocess.Popen(
             [bridge_program, *map(str, options)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
+        put_first(process.pid)
         assert process.stdin is not None
         assert process.stdout is not None
         if stdin is not None:
