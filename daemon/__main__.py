@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -28,9 +29,14 @@ def main() -> int:
 
 
 def _run(heeded: bool) -> int:
+    # Modules leave next to no garbage: to look for it takes a tenth of a start, and to look through
+    # what is loaded, ever again, 30 ms in which no reading is judged.
+    gc.disable()
     from daemon.cli import parse
 
     command = parse()
+    gc.freeze()
+    gc.enable()
     if heeded:
         signal.signal(signal.SIGINT, _interrupt_once)
     return command()

@@ -10,6 +10,7 @@ from enum import IntFlag
 from pathlib import Path
 from typing import Protocol, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,8 +73,7 @@ class Annotation:
     """How the lift ended: True slip, False stable, None not recorded."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TactileReading:
+class TactileReading(msgspec.Struct, frozen=True, eq=False):
     """One sweep over all electrodes of all fingers of a hand."""
 
     t_ns: int
@@ -102,8 +102,7 @@ class TactileReading:
             raise ValueError(f"faults {self.faults.shape} do not fit counts {self.counts.shape}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JointReading:
+class JointReading(msgspec.Struct, frozen=True, eq=False):
     """Joint angles of a hand at one time."""
 
     t_ns: int

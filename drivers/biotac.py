@@ -96,7 +96,8 @@ def decode_words(
 
     A word with a fault has the count 0. Words are the 16 bits as sent, first byte high.
     """
-    return _COUNTS[words], _FAULTS[words]
+    at = words.astype(np.intp)  # once for both tables
+    return _COUNTS.take(at), _FAULTS.take(at)
 
 
 def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:
@@ -107,14 +108,19 @@ def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Count and fault of all 65536 words, so that a sweep is decoded by two look-ups."""
-    words = np.arange(1 << 16, dtype=np.uint32)
-    odd = np.array([byte.bit_count() % 2 == 1 for byte in range(256)])
-    sound = odd[words >> 8] & odd[words & 0xFF] & (words & 0x06 == 0)
-    faults = np.where(sound, 0, int(ElectrodeFault.PARITY)).astype(np.uint8)
-    faults[list(ERROR_WORDS)] = int(ElectrodeFault.ERROR_WORD)
-    faults[list(UNPLUGGED_WORDS)] = int(ElectrodeFault.MISSING)
-    counts = np.where(faults == 0, (words >> 9) << 5 | (words & 0xFF) >> 3, 0)
-    return counts.astype(np.uint16), faults
+    count = np.arange(COUNT_MAX + 1)
+    high, low = count >> 5 << 1, (count & 0x1F) << 3
+    parity = np.array([(byte.bit_count() + 1) % 2 for byte in range(256)])
+    words = (high | parity[high]) << 8 | low | parity[low]  # as `encode_word` makes them
+    counts = np.zeros(1 << 16, dtype=np.uint16)
+    faults = np.full(1 << 16, int(ElectrodeFault.PARITY), dtype=np.uint8)
+    counts[words], faults[words] = count, 0
+    for told, fault in (
+        (list(ERROR_WORDS), ElectrodeFault.ERROR_WORD),
+        (list(UNPLUGGED_WORDS), ElectrodeFault.MISSING),
+    ):
+        counts[told], faults[told] = 0, int(fault)
+    return counts, faults
 
 
 _COUNTS, _FAULTS = _tables()

@@ -102,8 +102,8 @@ class VectorBuilder(_FlatBuilder):
         self.shape = (fingers * ELECTRODES,)
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        z, _, spread = _z_scores(counts)
-        return _flat(z), spread
+        features, spread = _features(counts)
+        return features[..., : -2 * spread.shape[-1]], spread
 
 
 class CountsBuilder(_FlatBuilder):
@@ -115,7 +115,7 @@ class CountsBuilder(_FlatBuilder):
         self.shape = (fingers * ELECTRODES,)
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
-        return _flat(counts), _z_scores(counts)[2]
+        return _flat(counts), _features(counts)[1]
 
 
 class SessionBuilder(_FlatBuilder):
@@ -130,17 +130,22 @@ class SessionBuilder(_FlatBuilder):
     def __init__(self, fingers: int, clip: float) -> None:
         self.shape = (fingers * FEATURES_PER_FINGER,)
         self._clip = clip
-        self._mean = np.zeros(self.shape)
+        self._mean, self._spread = np.zeros(self.shape), np.ones(self.shape)
         self._scale = np.ones(self.shape)
 
     def use(self, mean: Floats, spread: Floats) -> None:
-        """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero."""
-        self._mean = mean
-        self._scale = 1.0 / spread
+        """Standardise by these from now on, each of shape (fingers * 26,), spreads above zero.
+
+        They must not change any more.
+        """
+        if spread is not self._spread:
+            self._scale = 1.0 / spread
+        self._mean, self._spread = mean, spread
 
     def _values(self, counts: Floats) -> tuple[Floats, Floats]:
         features, spread = _features(counts)
-        standard: Floats = (features - self._mean) * self._scale
+        standard: Floats = features - self._mean
+        standard *= self._scale
         # What `np.clip` does, in half its time.
         np.maximum(standard, -self._clip, out=standard)
         return np.minimum(standard, self._clip, out=standard), spread
@@ -152,8 +157,15 @@ def raw_features(counts: NDArray[np.generic]) -> Floats:
 
 
 def _features(counts: Floats) -> tuple[Floats, Floats]:
-    z, mean, spread = _z_scores(counts)
-    return np.concatenate((_flat(z), mean, spread), axis=-1), spread
+    fingers = counts.shape[-2]
+    features = np.empty((*counts.shape[:-2], fingers * FEATURES_PER_FINGER))
+    z, mean, spread = (
+        features[..., : -2 * fingers],
+        features[..., -2 * fingers : -fingers],
+        features[..., -fingers:],
+    )
+    _z_scores(counts, z.reshape(counts.shape), mean, spread)
+    return features, spread
 
 
 def _flat(values: Floats) -> Floats:
@@ -161,16 +173,16 @@ def _flat(values: Floats) -> Floats:
     return values.reshape(*values.shape[:-2], -1)
 
 
-def _z_scores(
-    counts: Floats,
-) -> tuple[Floats, Floats, Floats]:
-    """Z-values, means and (population) spreads of each finger; all zero where it is flat.
+def _z_scores(counts: Floats, z: Floats, mean: Floats, spread: Floats) -> None:
+    """Z-values, means and (population) spreads of each finger; z-values are zero where it is flat.
 
     In two passes, so that large counts that hardly differ cancel before they are squared: for
     counts of 12 bits the error is below 1e-9 of the largest magnitude, 6e-8 once it is float32.
     """
-    mean = np.add.reduce(counts, axis=-1) / ELECTRODES
-    centred = counts - mean[..., np.newaxis]
-    spread: Floats = np.sqrt(np.add.reduce(centred**2, axis=-1) / ELECTRODES)
-    centred *= scale_of(spread)[..., np.newaxis]
-    return centred, mean, spread
+    np.add.reduce(counts, axis=-1, out=mean)
+    mean /= ELECTRODES
+    np.subtract(counts, mean[..., np.newaxis], out=z)
+    np.add.reduce(np.square(z), axis=-1, out=spread)
+    spread /= ELECTRODES
+    np.sqrt(spread, out=spread)
+    z *= scale_of(spread)[..., np.newaxis]

@@ -7,6 +7,7 @@ session models, so that a network trained on other days sees what it knows.
 from __future__ import annotations
 
 import itertools
+from operator import getitem
 from typing import Annotated
 
 import msgspec
@@ -78,6 +79,7 @@ class SessionStatistics:
             raise ValueError("prior spreads and weight must be above zero")
         self._prior_mean = prior_mean
         self._prior_spread = prior_spread
+        self._prior_variance = prior_spread**2
         self._prior_grasps = prior_grasps
         self.reset()
 
@@ -97,7 +99,7 @@ class SessionStatistics:
         `slip` is how it was judged, None if it was not. Among many slips each weighs the less: a
         session's mean that moved to what slips would make the next slip look stable.
         """
-        if not np.isfinite(values).all() or self._is_held(values):
+        if 0 in np.isfinite(values).tobytes() or self._is_held(values):
             return False
         self._last = values.copy()
         weight = self._balance(slip)
@@ -155,7 +157,7 @@ class SessionStatistics:
             return False
         step = values - self._last
         kinds = (self.spread, REPEAT_DISTANCE), (self._prior_spread, REPEAT_IN_PRIOR)
-        return any(float(np.mean((step / spread) ** 2)) < distance**2 for spread, distance in kinds)
+        return any(_mean_square(step / spread) < distance**2 for spread, distance in kinds)
 
     def _settle(self) -> None:
         """Blend session and prior, as if the prior were `prior_grasps` grasps around its mean."""
@@ -163,7 +165,7 @@ class SessionStatistics:
         share = self._prior_grasps / total
         self.mean: NDArray[np.float64] = share * self._prior_mean + (1.0 - share) * self._mean
         self.spread: NDArray[np.float64] = np.sqrt(
-            share * self._prior_spread**2 + self._squares / total
+            share * self._prior_variance + self._squares / total
         )
 
 
@@ -181,16 +183,22 @@ def is_odd(
     sees noise alone. Of mean and spread of each electrode in the session, and in the training,
     counts, shape (fingers, 24).
     """
-    ratio = np.median(spread / training_spread, axis=1)
+    ratio = np.sort(spread / training_spread, axis=1)
+    middle = ratio.shape[1] // 2
+    ratios = ((ratio[:, (ratio.shape[1] - 1) // 2] + ratio[:, middle]) / 2.0).tolist()  # the median
     least, most = SPREAD_RATIOS
     # Of each finger of the session from each of the training.
     deviations = (mean[:, np.newaxis] - training_mean) / training_spread
-    away = np.mean(deviations**2, axis=2)
+    away = np.add.reduce(np.square(deviations), axis=2) / mean.shape[1]
+    rows: list[list[float]] = away.tolist()
     own, *others = (
-        sum(row[finger] for row, finger in zip(away.tolist(), order, strict=True))
-        for order in itertools.permutations(range(len(away)))
+        sum(map(getitem, rows, order)) for order in itertools.permutations(range(len(rows)))
     )
-    if enough and not bool(((ratio >= least) & (ratio <= most)).all()):
+    if enough and not all(least <= each <= most for each in ratios):
         return True
     exchanged = own > ORDER_RATIO**2 * min(others, default=own) and own > len(away) * AWAY_MIN**2
     return exchanged or not own <= len(away) * AWAY_MAX**2
+
+
+def _mean_square(values: NDArray[np.float64]) -> float:
+    return float(values.dot(values)) / len(values)

@@ -76,7 +76,7 @@ def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Writes NaN into `spread` where it is infinite: it overflowed, so it is no number to judge by.
     """
-    if np.count_nonzero((spread >= SPREAD_FLOOR_COUNTS) & (spread < np.inf)) == spread.size:
+    if 0 not in ((spread >= SPREAD_FLOOR_COUNTS) & (spread < np.inf)).tobytes():
         return 1.0 / spread
     spread[np.isinf(spread)] = np.nan
     judgeable = spread >= SPREAD_FLOOR_COUNTS

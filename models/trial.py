@@ -1,9 +1,8 @@
-"""Loads a model as a daemon may: one that is not of the zoo is first tried in a process of its own,
-which may be slow, grow or fall."""
+"""Loads a model as a daemon may: one that is not of the zoo, by its card's digest, is first tried
+in a process of its own, which may be slow, grow or fall. That is a second start, 0.2 s."""
 
 from __future__ import annotations
 
-import hashlib
 import sys
 from collections import deque
 from contextlib import suppress
@@ -11,7 +10,7 @@ from pathlib import Path
 
 from models import zoo
 from models.contract import ModelError
-from models.runtime import TactileModel, check_operators, read
+from models.runtime import ModelFile, TactileModel, check_operators, read
 
 TRIAL_S = 10.0
 """For loading and the first runs, s; a model of 12 MB takes 0.3. So long a daemon's start or a
@@ -29,12 +28,11 @@ passed: deque[str] = deque(maxlen=8)
 
 def load(path: Path) -> TactileModel:
     """The model at `path`, warm. Raises `ModelError`, for one that is too slow or large too."""
-    content = read(path)
-    digest = hashlib.sha256(content).hexdigest()
-    if digest not in passed and not zoo.ships(path, digest):
-        _try(path, content)
-        passed.append(digest)
-    return TactileModel(path, content)
+    file = read(path)
+    if file.sha256 not in passed and not zoo.ships(path, file.sha256):
+        _try(path, file.data)
+        passed.append(file.sha256)
+    return TactileModel(path, file)
 
 
 def _try(path: Path, content: bytes) -> None:
@@ -75,10 +73,10 @@ def main() -> None:
     with suppress(OSError, ValueError):
         resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_MAX_BYTES, MEMORY_MAX_BYTES))
         resource.setrlimit(resource.RLIMIT_CPU, (round(TRIAL_S), round(TRIAL_S) + 1))
-    path, content = Path(sys.argv[1]), sys.stdin.buffer.read()
+    path, file = Path(sys.argv[1]), ModelFile(sys.stdin.buffer.read())
     try:
-        check_operators(path, content)
-        TactileModel(path, content)
+        check_operators(path, file.data)
+        TactileModel(path, file)
     except ModelError as error:
         sys.stdout.write(str(error))
         sys.exit(REFUSED)

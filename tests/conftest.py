@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
+import signal
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +13,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+# A shell's background jobs ignore it, and so would all that the tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before anybody imports onnxruntime: its telemetry opens descriptors whenever it likes.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 # Tests run side by side; threads of OpenMP that wait for each other would take the cores.
@@ -22,29 +26,6 @@ settings.register_profile(
 settings.load_profile("side by side")
 
 ROOT = Path(__file__).parents[1]
-
-IN_REAL_TIME = {
-    *("test_against_daemon", "test_both_ask", "test_bridge_process", "test_can_bridge"),
-    *("test_can_link", "test_can_slcan", "test_can_socket", "test_can_twin"),
-    *("test_commands", "test_cpp_against_daemon", "test_export", "test_fewer_fingers"),
-    *("test_hardware_commands", "test_joints", "test_keys", "test_lift", "test_logs"),
-    *("test_systemd", "test_outages", "test_outcomes", "test_palm", "test_process"),
-    *("test_publisher", "test_questions", "test_link_log", "test_readme"),
-    *("test_realtime", "test_record_and_replay", "test_recorder", "test_runner"),
-    *(
-        "test_curve",
-        "test_peers",
-        "test_soak",
-        "test_sockets",
-        "test_spi_bridge",
-        "test_spi_twin",
-        "test_subscribers",
-    ),
-    *("test_run_jobs", "test_watch_browser", "test_watch_command", "test_watch_web"),
-}
-"""Files whose tests work with processes, links and clocks as they are. A shared computer stalls now
-and then, so they are tried three times; what is wrong fails each time, and what fails once is
-listed."""
 
 
 def data_dir() -> Path | None:
@@ -61,13 +42,6 @@ def bts3_dir() -> Path:
     if folder is None:
         pytest.skip("no real recordings: get them with `graspd data`, or set $GRASPD_DATA")
     return folder / "bts3"
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let tests in real time be tried again."""
-    for item in items:
-        if item.path.stem in IN_REAL_TIME:
-            item.add_marker(pytest.mark.flaky(reruns=2))
 
 
 def pytest_collection_finish() -> None:
@@ -91,8 +65,7 @@ def nothing_is_left_behind() -> Iterator[None]:
 def _open_descriptors() -> set[str]:
     links = set()
     for entry in os.scandir("/proc/self/fd"):
-        try:
-            links.add(f"{entry.name} -> {os.readlink(entry.path)}")
-        except FileNotFoundError:
-            continue  # the descriptor of this very listing
-    return links
+        with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+            links.add((entry.name, os.readlink(entry.path)))
+    listing = f"/proc/{os.getpid()}/fd"
+    return {f"{name} -> {path}" for name, path in links if path != listing}

@@ -42,9 +42,9 @@ def verdict_lines(command: list[str], endpoint: str) -> list[str]:
             [*replay, "--publish", endpoint, "--wait", "20"],
             check=True,
             capture_output=True,
-            timeout=50,
+            timeout=200,
         )
-        return subscriber.communicate(timeout=20)[0].splitlines()
+        return subscriber.communicate(timeout=100)[0].splitlines()
 
 
 def test_the_python_subscriber_prints_verdicts(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, get_args
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.process.text import complain, printable
+from daemon.process.text import complain, printable, progress
 from daemon.scene import drivers as scene_drivers
 from drivers.base import DriverError
 from drivers.udp.receiver import SCHEME, Endpoint
@@ -88,10 +88,13 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         from daemon.measure.cost.tables import CostError, measure
 
         try:
+            progress(f"measuring what {path} costs, some seconds")
             cost = measure(path)
         except CostError as error:
             complain(error)
             return _Checked(FAILED)
+        finally:
+            progress("")
     parts = {
         "in": _what_is_in(wanted, model, limits, period_ns),
         "left_out": _what_is_left_out(wanted, model, limits),

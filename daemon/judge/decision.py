@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+
+import msgspec
+from msgspec.structs import replace
 
 from daemon.judge.reasons import Decision, Reason
 
@@ -23,8 +26,7 @@ class Limits:
     some twenty. So nothing flickers at a threshold, and who asks on gets no lucky draw."""
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
+class Case(msgspec.Struct, frozen=True, gc=False):
     """All that a verdict depends on."""
 
     p_slip: float | None
@@ -45,8 +47,7 @@ class Case:
     """What it was judged to be within `steady_ns`, if that was not `stable`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
+class Doubt(msgspec.Struct, frozen=True, gc=False):
     """The latest judging by which a grasp was not `stable`."""
 
     grasp: int

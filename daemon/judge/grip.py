@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
-from daemon.judge.findings import Felt, Watched
+from daemon.judge.findings import Felt, Watched, all_of
 from daemon.judge.gate import Gate
 from daemon.judge.limits import MEDIAN_SWEEPS, GripLimits
 from daemon.judge.median import FreshMedian
@@ -217,22 +218,21 @@ class Grip:
 
     def _motion(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
         """How each finger moves in the window that shows more of it, and what it may there."""
-        found, limits = dict[Finger, float | None](), dict[Finger, float]()
-        windows = self._gate.motion
-        fast, slow = windows.motion.tolist()
-        fast_limits, slow_limits = windows.limits.tolist()
-        for place, finger in enumerate(self._fingers):
-            moves, limit = fast[place], fast_limits[place]
-            if slow[place] < math.inf and slow[place] * limit > moves * slow_limits[place]:
-                moves, limit = slow[place], slow_limits[place]
+        found: dict[Finger, float | None] = {}
+        limits: dict[Finger, float] = {}
+        now = self._gate.motion
+        windows = now.fast, now.fast_limits, now.slow, now.slow_limits
+        for finger, moves, limit, slides, its_limit in zip(self._fingers, *windows, strict=True):
+            if slides < math.inf and slides * limit > moves * its_limit:
+                moves, limit = slides, its_limit
             found[finger] = round(moves, 2) if moves < math.inf else None
             limits[finger] = round(limit, 2)
         return found, limits
 
     def _against(self, t_ns: int) -> tuple[Reason, ...]:
         against: list[Reason] = []
-        tared = self._contact.tared.tolist()
-        if not all(tared[finger] for finger in self._required):
+        tared = self._contact.tared
+        if not all_of(tared) and not all_of(tared[self._required]):
             against.append(Reason.NOT_TARED)
         joints = None if self._joints is None else self._joints.against(t_ns)
         if joints is not None:
@@ -240,5 +240,4 @@ class Grip:
         return tuple(against)
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
-        chosen = zip(self._fingers, which.tolist(), strict=True)
-        return tuple(finger for finger, is_chosen in chosen if is_chosen)
+        return tuple(compress(self._fingers, which.tolist()))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number, Watched
+from daemon.judge.findings import Number, Watched, any_of
 from daemon.judge.reasons import Reason
 from daemon.judge.recurrence import NO_COUNT, PastSweeps
 from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
@@ -51,6 +51,10 @@ JUMPS_MAX = 2.0
 JUMPS_FADE = 0.9
 JUMPS_FORGOTTEN = 1e-9
 """Of a jump, after 200 readings: as good as none."""
+# At a rail, far from the last count, not the same: so is a count that, less 1 or less the last one
+# and so much more, is above a limit. Modulo 2**16, so that steps down are small numbers, too.
+MORE = np.array([JUMP_COUNTS, 0], dtype=np.uint16)[:, np.newaxis, np.newaxis]
+LIMITS = np.array([COUNT_MAX - 2, 2 * JUMP_COUNTS, 0], dtype=np.uint16)[:, np.newaxis, np.newaxis]
 
 
 @dataclass(slots=True, eq=False)
@@ -95,6 +99,9 @@ class Health:
         nothing = np.zeros(shape, dtype=np.bool_)
         nothing.flags.writeable = False  # one for all sound readings
         self._sound = Watched((), nothing)
+        self._less = np.ones((len(LIMITS), *shape), dtype=np.uint16)
+        self._live_until = 0
+        """Number of the reading before which no electrode can have kept its count for too long."""
 
     def watch(self, reading: TactileReading) -> Watched:
         """What is wrong with a reading and its electrodes, by it and by those before it."""
@@ -102,19 +109,16 @@ class Health:
         if counts.shape != self._shape:
             return Watched((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
         self.memory.faults = reading.faults
-        # Nearly all readings are sound, and that is seen with a few cheap operations: comparing
-        # bytes and counting take a tenth of the time of a reduction such as `any`.
+        # Nearly all readings are sound, and that is seen with a few cheap operations.
         if reading.faults.tobytes() != self._no_faults:
             return self._watch_flagged(counts, reading.faults)
-        differs = self._compare(counts)
-        railed = _railed(counts)
-        broken = railed | self._worn_out()
-        changes = np.count_nonzero(differs)
-        repeats = bool(changes <= differs.size - ELECTRODES and not differs.any(axis=1).all())
-        repeats |= self.memory.sweeps.recurs(counts)
-        if not repeats and not np.count_nonzero(broken):
+        railed, differs = self._compare(counts)
+        repeats = self.memory.sweeps.recurs(counts)
+        if differs.tobytes().count(0) >= ELECTRODES:
+            repeats |= not differs.any(axis=1).all()
+        if not repeats and self._all_live() and not any_of(railed):
             return self._sound
-        return self._found(0, railed, broken, repeats=repeats)
+        return self._found(0, railed, railed | self._worn_out(), repeats=repeats)
 
     def _watch_flagged(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> Watched:
         """The same for a reading in which the driver has flagged electrodes.
@@ -122,9 +126,9 @@ class Health:
         What is flagged was not read: it neither repeats anything nor hides that others do.
         """
         sound = flags == 0
-        differs = self._compare(counts)
+        railed, differs = self._compare(counts)
         self.memory.changed[~sound] = self.memory.number
-        railed = _railed(counts) & sound
+        railed &= sound
         broken = ~sound | railed | self._worn_out()
         faults = int(np.bitwise_or.reduce(flags, axis=None))
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
@@ -161,28 +165,37 @@ class Health:
             found[finger, electrode] = _fault_reasons(int(memory.faults[finger, electrode]))[0]
         return found
 
-    def _compare(self, counts: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        """Take in how the counts have changed; which differ from before, (fingers, 24)."""
-        memory = self.memory
+    def _compare(self, counts: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Take in how the counts have changed; which are at a rail and which differ from before,
+        each of shape (fingers, 24)."""
+        memory, less = self.memory, self._less
         previous = memory.previous
         memory.number += 1
-        differs: NDArray[np.bool_] = counts != previous
+        np.subtract(previous, MORE, out=less[1:])
+        railed, far, differs = counts - less > LIMITS
         np.copyto(memory.changed, memory.number, where=differs)
         if memory.has_jumped:
             memory.jumps *= JUMPS_FADE
-            memory.jumps[memory.jumps < JUMPS_FORGOTTEN] = 0.0
-            memory.has_jumped = bool(np.count_nonzero(memory.jumps))
-        # Modulo 2**16: what is added makes steps down as far as that small numbers, too.
-        steps = counts - previous
-        far = steps + JUMP_COUNTS > 2 * JUMP_COUNTS
-        if np.count_nonzero(far):
-            near = steps + STILL_COUNTS <= 2 * STILL_COUNTS
+            remembered = memory.jumps >= JUMPS_FORGOTTEN
+            memory.jumps *= remembered
+            memory.has_jumped = any_of(remembered)
+        if any_of(far):
+            near = counts - previous + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still
                 jumps = far & (near.sum(axis=1, keepdims=True) >= STILL)
-                memory.has_jumped |= bool(np.count_nonzero(jumps))
+                memory.has_jumped |= any_of(jumps)
                 memory.jumps += jumps
         memory.previous = counts
-        return differs
+        return railed, differs
+
+    def _all_live(self) -> bool:
+        """Whether no electrode is broken by what it did in the last readings."""
+        memory = self.memory
+        if memory.has_jumped and any_of(memory.jumps > JUMPS_MAX):
+            return False
+        if memory.number >= self._live_until:
+            self._live_until = int(memory.changed.min()) + UNCHANGED_MAX
+        return memory.number < self._live_until
 
     def _worn_out(self) -> NDArray[np.bool_]:
         """Electrodes that are broken by what they did in the last readings, (fingers, 24)."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.findings import all_of
 from daemon.judge.recurrence import NO_COUNT
 
 VALUES = 3
@@ -52,6 +53,8 @@ class FreshMedian:
             all_full=False,
             counts=counts,
         )
+        self._same, self._fresh = np.zeros((2, *shape), dtype=np.bool_)
+        self._low, self._high = np.zeros((2, *shape), dtype=np.uint16)
 
     @property
     def counts(self) -> NDArray[np.uint16]:
@@ -61,7 +64,7 @@ class FreshMedian:
     def reset(self) -> None:
         """Forget everything: what comes next does not continue what came before."""
         memory = self.memory
-        memory.last.fill(NO_COUNT)
+        memory.last = np.full_like(memory.last, NO_COUNT)
         memory.held.fill(False)
         memory.number.fill(0)
         memory.all_full = False
@@ -75,9 +78,10 @@ class FreshMedian:
         """
         memory = self.memory
         oldest, middle, newest = memory.oldest, memory.middle, memory.newest
-        memory.held = (counts == memory.last) & ~memory.held
-        fresh = ~memory.held
-        all_usable = np.count_nonzero(usable) == usable.size
+        same = np.equal(counts, memory.last, out=self._same)
+        held = np.greater(same, memory.held, out=memory.held)  # same, and not held before
+        fresh = np.logical_not(held, out=self._fresh)
+        all_usable = all_of(usable)
         if not all_usable:
             fresh &= usable
         np.copyto(oldest, middle, where=fresh)
@@ -85,11 +89,11 @@ class FreshMedian:
         np.copyto(newest, counts, where=fresh)
         if not (all_usable and memory.all_full):
             self._fill(counts, usable, fresh)
-        np.copyto(memory.last, counts, where=usable)
+        memory.last = counts if all_usable else np.where(usable, counts, memory.last)
+        low = np.minimum(oldest, middle, out=self._low)
+        high = np.maximum(oldest, middle, out=self._high)
         # A new array each time: what was handed out stays.
-        low = np.minimum(oldest, middle)
-        high = np.maximum(oldest, middle)
-        memory.counts = np.maximum(low, np.minimum(high, newest))
+        memory.counts = np.maximum(low, np.minimum(high, newest, out=high))
 
     def _fill(
         self, counts: NDArray[np.uint16], usable: NDArray[np.bool_], fresh: NDArray[np.bool_]
@@ -101,7 +105,7 @@ class FreshMedian:
         np.copyto(memory.oldest, counts, where=first)
         np.copyto(memory.middle, counts, where=first)
         memory.number += fresh & (memory.number < VALUES)
-        memory.all_full = bool((memory.number == VALUES).all())
+        memory.all_full = all_of(memory.number == VALUES)
 
     def is_full(self, usable: NDArray[np.bool_]) -> bool:
         """Whether each `usable` electrode, shape (fingers, 24), has three fresh values."""

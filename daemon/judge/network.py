@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Examined, Opinion
+from daemon.judge.findings import Examined, Opinion, all_of
 from daemon.judge.reasons import Reason
 from models.contract import ModelError
 from models.inputs import SessionBuilder
@@ -61,7 +61,7 @@ class Network:
         if session is not None and isinstance(model.inputs, SessionBuilder):
             model.inputs.use(session.features_mean, session.features_spread)
         spread = model.inputs.build(counts, model.input)
-        if np.count_nonzero(spread >= SPREAD_FLOOR_COUNTS) < len(spread):
+        if not all_of(spread >= SPREAD_FLOOR_COUNTS):
             return Reason.FLAT
         try:
             p_stable, p_slip = model.run()

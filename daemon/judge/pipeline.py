@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,8 +42,7 @@ NOT_HELD: Final = {GateState.IDLE, GateState.RELEASED}
 """Where a grasp is over."""
 
 
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW1641 (holds dicts)
     """What was found about one reading, or about the lack of one."""
 
     t_ns: int
@@ -82,9 +82,14 @@ class Judgement:
     """Whether its lift, watched, would teach what is not known: ask for it."""
     risk: RiskReport | None = None
     """What lifts of `stable` verdicts came to; None where nothing learns and no risk is set."""
-    judged_counts: NDArray[np.uint16] | None = field(default=None, compare=False, repr=False)
+    judged_counts: NDArray[np.uint16] | None = None
     """Shape (fingers, 24): what the network judged, before any repair; None if it did not judge
-    this very reading, or if electrodes of it are broken."""
+    this very reading, or if electrodes of it are broken. Not compared."""
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Judgement):
+            return NotImplemented
+        return msgspec.structs.astuple(self)[:-1] == msgspec.structs.astuple(other)[:-1]
 
 
 @dataclass(slots=True, eq=False)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Examined, electrode_name
+from daemon.judge.findings import Examined, any_of, electrode_name
 from daemon.judge.health import too_many
 from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger, SeenCounts
-from models.electrodes import Electrodes
+from models.electrodes import ROUNDING, Electrodes
 from models.novelty import CONTRADICTING_MAX, NoveltyCheck
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ class Plausibility:
         """
         if _is_flat(counts, broken):
             return Examined((Reason.FLAT,), counts)
+        if session is not None and not any_of(broken) and self._is_plain(counts, session):
+            return Examined((), counts, (), counts)
         values = counts.astype(np.float64) if session is None else session.to_training(counts)
         grasp, values = self._repair(counts, values, broken, session)
         known = int(np.count_nonzero(broken))
@@ -71,6 +73,18 @@ class Plausibility:
             return Examined((Reason.NEVER_SEEN,), counts, (), grasp if learned else None)
         return Examined((), repaired, self._names(found) if number else (), grasp)
 
+    def _is_plain(self, counts: NDArray[np.uint16], session: Calibration) -> bool:
+        """Whether nothing at all is found: each limit is kept by more than rounding can be.
+
+        In a fifth of the time of the examination, which would say the same.
+        """
+        deviations = counts - session.counts_mean
+        deviations *= session.scale
+        square = None if session.odd else self._electrodes.plain_square(deviations)
+        return square is not None and all(
+            self._novelty.is_near(square * share) for share in (1.0 - ROUNDING, 1.0 + ROUNDING)
+        )
+
     def _repair(
         self,
         counts: NDArray[np.uint16],
@@ -79,7 +93,7 @@ class Plausibility:
         session: Calibration | None,
     ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Counts, and their values with the training's sensors, with the broken ones repaired."""
-        if not np.count_nonzero(broken):
+        if not any_of(broken):
             return counts, values
         values = self._electrodes.repaired(values, broken)
         expected = values if session is None else session.from_training(values)
@@ -94,11 +108,11 @@ class Plausibility:
 def _is_flat(counts: NDArray[np.uint16], broken: NDArray[np.bool_]) -> bool:
     """Whether the sound electrodes of a finger read about the same."""
     values, numbers = counts.astype(np.float64), [ELECTRODES] * len(counts)
-    if np.count_nonzero(broken):
+    if any_of(broken):
         values[broken] = 0.0
         numbers = (~broken).sum(axis=1).tolist()
-    sums = (values @ ONES).tolist()
-    squares = (values**2 @ ONES).tolist()
+    sums = values.dot(ONES).tolist()
+    squares = np.square(values).dot(ONES).tolist()
     # Sums of whole numbers are exact, so nothing is lost when they cancel.
     return any(
         number * square - total * total < (number * FLAT_SPREAD_COUNTS) ** 2

@@ -45,10 +45,9 @@ class PastSweeps:
 
         `sound` tells which of the counts were read; None: all. What was not read may be anything.
         """
-        sweeps = counts.tobytes()
         if sound is not None or any(self.lacking):
             return self._recurs_in_part(counts, sound)
-        found = False
+        sweeps, found = counts.tobytes(), False
         for finger, past in enumerate(self.past):
             found |= _known(past, sweeps[finger * SWEEP_BYTES : (finger + 1) * SWEEP_BYTES])
         return found

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import le, truediv
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number
+from daemon.judge.findings import Number, all_of, any_of
 from daemon.judge.windows import (
     APART,
     LONG_NS,
@@ -53,6 +54,8 @@ SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
 
+Times = NDArray[np.float64]
+
 
 def mean_distance(
     one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_]
@@ -63,7 +66,7 @@ def mean_distance(
     """
     distance = one - other
     np.abs(distance, out=distance)
-    if np.count_nonzero(usable) == usable.size:
+    if all_of(usable):
         return (distance @ ONES).astype(np.float64) / ELECTRODES
     distance *= usable
     mean: NDArray[np.float64] = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
@@ -108,12 +111,16 @@ class MotionMemory:
     """Time of the last sweep that ended a step."""
     block_steps: Number = 0
     """Steps of the block at hand."""
+    pending: Number = 0
+    """The last of these, which are still to be taken into it."""
     block_number: Number = 0
     """Blocks so far."""
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for what no such memory can be."""
-        if self.number > STEPS or self.first + self.number > len(self.steps):
+        end = self.first + self.number
+        pending_max = max(self.number - APART, 0)
+        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
             raise ValueError("more steps than are remembered")
 
 
@@ -149,12 +156,13 @@ class Motion:
             block=np.zeros((APART, fingers)),
             blocks=np.zeros((BLOCKS, APART, fingers)),
         )
-        self._unknown = np.full((2, fingers), np.inf)
-        self._no_limits = np.ones((2, fingers))
-        self.motion = self._unknown
-        """Over the short and the long window, shape (2, fingers), in units of the finger's noise;
-        infinite where it is not known."""
-        self.limits = self._no_limits
+        self._nothing = self.memory.lost.tobytes()
+        self._jumps = np.zeros(shape, dtype=np.float32)
+        self._unknown, self._no_limits = [math.inf] * fingers, [1.0] * fingers
+        self.fast = self.slow = self._unknown
+        """How each finger moves over the short and over the long window, in units of its noise;
+        infinite where that is not known."""
+        self.fast_limits = self.slow_limits = self._no_limits
         """What it may be at most for a finger that is still, in the same units."""
         self.early = False
         """Whether fast motion is excluded."""
@@ -164,21 +172,32 @@ class Motion:
     @property
     def known(self) -> bool:
         """Whether it is known of all fingers how they moved in the short window."""
-        return bool(max(self.motion[0].tolist()) < math.inf)
+        return max(self.fast) < math.inf
 
     @property
     def slides(self) -> bool:
         """Whether it is known that a finger moves slowly, or has moved within the long window."""
-        motion = np.where(np.isfinite(self.motion), self.motion, 0.0)[1]
-        return bool((motion > self.limits[1]).any())
+        return any(
+            limit < moves < math.inf
+            for moves, limit in zip(self.slow, self.slow_limits, strict=True)
+        )
+
+    @property
+    def motion(self) -> NDArray[np.float64]:
+        """`fast` and `slow`, shape (2, fingers)."""
+        return np.array((self.fast, self.slow))
+
+    @property
+    def limits(self) -> NDArray[np.float64]:
+        """Their limits, shape (2, fingers)."""
+        return np.array((self.fast_limits, self.slow_limits))
 
     def reset(self) -> None:
         """Forget the motion: what comes next does not continue what came before."""
         memory = self.memory
         memory.number = memory.sweeps = memory.block_steps = memory.total_ns = 0
-        memory.first = 0
+        memory.first = memory.pending = 0
         memory.last_ns = None
-        memory.total.fill(0.0)
         memory.block.fill(0.0)
         self._say_unknown()
 
@@ -200,24 +219,28 @@ class Motion:
             memory.jumped.fill(0)
             memory.lost.fill(LOST_MAX)
             memory.usable_since_ns.fill(t_ns)
-        if np.count_nonzero(usable) != usable.size:
+        if not all_of(usable):
             sweep = np.where(usable, sweep, memory.clean)
             gone = ~usable & (memory.lost >= LOST_MAX)
-            if gone.any():
+            if any_of(gone):
+                end = memory.first + memory.number
+                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[end - 1 - APART]
+                if memory.pending and any_of(was_usable):
+                    self._fill_block()
                 # Not in this step, and what comes next has nothing to jump from.
                 memory.all_usable_since_ns = t_ns + STEP_NS
                 memory.usable_since_ns[gone] = t_ns + STEP_NS
                 memory.jumped[gone] = SPIKE_SWEEPS_MAX
             memory.lost += ~usable & ~gone
         self._clean(sweep)
-        memory.lost[usable] = 0
-        memory.total += memory.clean
+        if memory.lost.tobytes() != self._nothing:
+            memory.lost[usable] = 0
+        memory.total = memory.total + memory.clean if memory.sweeps else memory.clean
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
         if memory.number and t_ns - memory.last_ns < STEP_NS:
             return
         self._remember(memory.last_ns + memory.total_ns // memory.sweeps)
-        memory.total.fill(0.0)
         memory.sweeps = memory.total_ns = 0
         memory.last_ns = t_ns
         self._learn_noise()
@@ -225,17 +248,26 @@ class Motion:
 
     def _clean(self, counts: NDArray[np.float32]) -> None:
         """Leave out what has jumped for one sweep alone, or is held for a few."""
-        memory = self.memory
-        jumped = np.abs(counts - memory.clean) > SPIKE_COUNTS
+        memory, jumps = self.memory, self._jumps
+        np.abs(np.subtract(counts, memory.clean, out=jumps), out=jumps)
         memory.counts, before = counts, memory.counts
-        if not jumped.any():
-            memory.clean, memory.jumped = counts, jumped.view(np.uint8)
+        if jumps.item(jumps.argmax()) <= SPIKE_COUNTS:
+            memory.clean = counts
+            memory.jumped.fill(0)
             return
-        jumped[np.count_nonzero(jumped, axis=1) > SPIKES_MAX] = False
-        held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
-        jumped &= (memory.jumped == 0) | held
+        jumped = jumps > SPIKE_COUNTS
+        where = jumped.tobytes()
+        for finger in range(len(jumped)):
+            if where.count(1, finger * ELECTRODES, (finger + 1) * ELECTRODES) > SPIKES_MAX:
+                jumped[finger] = False
+        if memory.jumped.tobytes() == self._nothing:
+            memory.jumped = jumped.view(np.uint8)
+        else:
+            held = (counts == before) & (memory.jumped < SPIKE_SWEEPS_MAX)
+            jumped &= (memory.jumped == 0) | held
+            memory.jumped += 1
+            memory.jumped *= jumped
         memory.clean = np.where(jumped, memory.clean, counts)
-        memory.jumped = np.where(jumped, memory.jumped + 1, 0).astype(np.uint8)
 
     def _remember(self, t_ns: int) -> None:
         memory = self.memory
@@ -255,30 +287,40 @@ class Motion:
         memory = self.memory
         if memory.number <= APART:
             return
-        last = memory.first + memory.number - 1
-        differences = memory.steps[last] - memory.steps[last - APART : last][::-1]
-        memory.block += self._mean(np.square(differences, out=differences), last - APART)[0]
+        memory.pending += 1
         memory.block_steps += 1
         if memory.block_steps >= BLOCK_STEPS:
+            self._fill_block()
             memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
             memory.block_number += 1
             memory.block_steps = 0
             memory.block.fill(0.0)
 
-    def _mean(
-        self, values: NDArray[np.float32], begin: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
-        """Over electrodes usable from a step on, (..., fingers); where there are too few of them.
+    def _fill_block(self) -> None:
+        """Take the pending steps into the block, by the electrodes that are usable until now."""
+        memory = self.memory
+        end = memory.first + memory.number
+        begin, memory.pending = end - memory.pending, 0
+        since_ns = memory.times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
+        usable = memory.usable_since_ns <= since_ns
+        numbers = np.maximum(np.count_nonzero(usable, axis=2), 1)
+        for apart, sums in enumerate(memory.block, start=1):
+            differences = memory.steps[begin:end] - memory.steps[begin - apart : end - apart]
+            means = (np.square(differences) * usable) @ ONES / numbers
+            np.add.reduce((sums, *means), axis=0, out=sums)
 
-        None where all are usable.
-        """
-        memory, since_ns = self.memory, self.memory.times_ns[begin]
+    def _mean(self, values: NDArray[np.float32], begin: int) -> list[float]:
+        """Of each finger over its electrodes usable from a step on; infinite if too few are."""
+        memory, since_ns = self.memory, self.memory.times_ns.item(begin)
         if memory.all_usable_since_ns <= since_ns:
-            return (values @ ONES).astype(np.float64) / ELECTRODES, None
-        known = memory.usable_since_ns <= since_ns
-        numbers = np.count_nonzero(known, axis=1)
-        mean = ((values * known) @ ONES).astype(np.float64) / np.maximum(numbers, 1)
-        return mean, numbers < SOUND_MIN
+            return [total / ELECTRODES for total in (values @ ONES).tolist()]
+        usable = memory.usable_since_ns <= since_ns
+        totals = ((values * usable) @ ONES).tolist()
+        numbers = np.count_nonzero(usable, axis=1).tolist()
+        return [
+            total / number if number >= SOUND_MIN else math.inf
+            for total, number in zip(totals, numbers, strict=True)
+        ]
 
     def _known_noise(self) -> Noise:
         memory = self.memory
@@ -299,49 +341,51 @@ class Motion:
         if memory.block_number < BLOCKS_MIN or number <= STEPS_MIN:
             return
         times_ns = memory.times_ns[memory.first : end]
-        now_ns = int(times_ns[-1])
-        age_ns = now_ns - int(times_ns[0])
+        now_ns = times_ns.item(-1)
+        age_ns = now_ns - times_ns.item(0)
         if age_ns < SHORT_NS:
             return
-        self.motion, self.limits = self._unknown.copy(), self._no_limits.copy()
-        begins = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
-        short, long = np.minimum(begins, number - STEPS_MIN).tolist()
-        beside = self._follow_fast(memory.first + short, end)
-        self.early = bool((self.motion[0] <= self.limits[0]).all())
+        windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
+        short, long = (min(begin, number - STEPS_MIN) for begin in windows.tolist())
+        noise = self._known_noise()
+        times_s = (times_ns[long:] - now_ns) / 1e9
+        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
+        self.early = all(map(le, self.fast, self.fast_limits))
         if age_ns >= LONG_NS:
-            self._follow_slow(memory.first + long, end)
-            slow = bool((self.motion[1] <= self.limits[1]).all())
-            self.sure = slow and bool((self.motion[0] <= beside).all())
+            self._follow_slow(memory.first + long, end, times_s, noise)
+            slow = all(map(le, self.slow, self.slow_limits))
+            self.sure = slow and all(map(le, self.fast, beside))
 
-    def _follow_fast(self, begin: int, end: int) -> NDArray[np.float64]:
+    def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
         """How steps have moved, and its limit where it decides alone; the limit where not."""
-        memory, number, noise = self.memory, end - begin, self._known_noise()
-        times_s = centred(memory.times_ns[begin:end])
-        extent = float(times_s @ times_s)
-        weights = (times_s / extent).astype(np.float32)
-        slopes = (weights @ memory.steps[begin:end].reshape(number, -1)).reshape(memory.clean.shape)
-        mean, too_few = self._mean(np.abs(slopes, out=slopes), begin)
-        by_noise = noise.slope[number] / math.sqrt(extent)
-        self.motion[0] = mean / by_noise
-        if too_few is not None:
-            self.motion[0, too_few] = np.inf
-        self.limits[0] = fast_limit(self._tails.alone, by_noise)
-        return fast_limit(self._tails.fast, by_noise)
+        memory, number, tails = self.memory, end - begin, self._tails
+        times_s = centred(times_s)
+        extent = float(times_s.dot(times_s))
+        times_s /= extent
+        slopes = times_s.astype(np.float32) @ memory.steps[begin:end].reshape(number, -1)
+        slopes = np.abs(slopes, out=slopes).reshape(memory.clean.shape)
+        root = math.sqrt(extent)
+        by_noise = [each / root for each in noise.slope[number].tolist()]
+        self.fast = list(map(truediv, self._mean(slopes, begin), by_noise))
+        self.fast_limits = fast_limit(tails.alone, by_noise)
+        return self.fast_limits if tails.fast == tails.alone else fast_limit(tails.fast, by_noise)
 
-    def _follow_slow(self, begin: int, end: int) -> None:
+    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> None:
         """How far steps have spread, and the limit of it."""
-        memory, number, noise = self.memory, end - begin, self._known_noise()
-        deviations = memory.steps[begin:end] - memory.steps[begin:end].mean(axis=0)
-        squares = np.einsum("sfe,sfe->fe", deviations, deviations)
-        mean, too_few = self._mean(squares, begin)
-        by_noise = noise.variance[number] * (number - 1)
-        self.motion[1] = np.sqrt(mean / by_noise)
-        if too_few is not None:
-            self.motion[1, too_few] = np.inf
-        times_s = centred(memory.times_ns[begin:end])
-        extent = float(times_s @ times_s) / by_noise
-        self.limits[1] = slow_limit(self._tails.slow, extent, noise.spread[number])
+        memory, number = self.memory, end - begin
+        steps = memory.steps[begin:end]
+        middle = np.add.reduce(steps, axis=0)
+        middle /= number
+        deviations = steps - middle
+        squares = np.add.reduce(np.square(deviations, out=deviations), axis=0)
+        by_noise = [each * (number - 1) for each in noise.variance[number].tolist()]
+        self.slow = list(map(math.sqrt, map(truediv, self._mean(squares, begin), by_noise)))
+        times_s = centred(times_s)
+        extent = float(times_s.dot(times_s))
+        extents = [extent / each for each in by_noise]
+        self.slow_limits = slow_limit(self._tails.slow, extents, noise.spread[number].tolist())
 
     def _say_unknown(self) -> None:
-        self.motion, self.limits = self._unknown, self._no_limits
+        self.fast = self.slow = self._unknown
+        self.fast_limits = self.slow_limits = self._no_limits
         self.early = self.sure = False

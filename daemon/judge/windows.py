@@ -6,6 +6,7 @@ The short one shows fast motion soon; the long one slow slides, which no short o
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -100,24 +101,25 @@ class Tails(NamedTuple):
         return cls(slow, fast, slow if early else fast)
 
 
-def fast_limit(tail: float, by_noise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Of the mean absolute slope over what noise makes of it, counts/s, shape (fingers,)."""
-    limit = np.hypot(math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail) / by_noise)
-    return np.asarray(limit)
+def fast_limit(tail: float, by_noise: Sequence[float]) -> list[float]:
+    """Of each finger's mean absolute slope over what noise makes of it, counts/s."""
+    usual, creeps = math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
+    return [math.hypot(usual, creeps / each) for each in by_noise]
 
 
-def slow_limit(
-    tail: float, extent: NDArray[np.float64], spread: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Of the root mean square deviation over that of noise, shape (fingers,).
+def slow_limit(tail: float, extents: Sequence[float], spreads: Sequence[float]) -> list[float]:
+    """Of each finger's root mean square deviation over that of noise.
 
-    `extent` is the sum of the squares of the times around their mean over the sum of the squares of
-    the noise, (s/counts)**2, and `spread` is that of `Noise`.
+    `extents` are the sum of the squares of the times around their mean over the sum of the squares
+    of the noise, (s/counts)**2, and `spreads` are those of `Noise`.
     """
-    usual, most = creep(0.0) ** 2 * extent, creep(tail) ** 2 * extent
-    # Noise and creep know nothing of each other: their deviations add up as squares do.
-    above = np.hypot(tail * spread * (1.0 + usual), most - usual)
-    return np.asarray(np.sqrt(1.0 + usual + above))
+    middle, tails, limits = creep(0.0) ** 2, creep(tail) ** 2, []
+    for extent, spread in zip(extents, spreads, strict=True):
+        usual, most = middle * extent, tails * extent
+        # Noise and creep know nothing of each other: their deviations add up as squares do.
+        above = math.hypot(tail * spread * (1.0 + usual), most - usual)
+        limits.append(math.sqrt(1.0 + usual + above))
+    return limits
 
 
 class OperatingPoint(NamedTuple):
@@ -142,19 +144,20 @@ def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, Oper
     variance, correlations = np.full(1, TYPICAL_COUNTS**2 / sweeps), np.array(TYPICAL_CORRELATIONS)
     noise = Noise.of(variance, correlations[:, np.newaxis])
     # The squares of noise and motion add up: how much motion brings the sum to the limit?
-    by_noise = noise.slope[short] / math.sqrt(_extent(short, step_ns))
-    fast = by_noise * np.sqrt(np.square(fast_limit(tails.alone, by_noise)) - 1.0)
-    extent = _extent(long, step_ns) / (noise.variance[long] * (long - 1))
-    limit = slow_limit(tails.slow, extent, noise.spread[long])
-    slow = MEAN_ABS * np.sqrt((np.square(limit) - 1.0) / extent)
+    by_noise = noise.slope[short].item() / math.sqrt(_extent(short, step_ns))
+    (limit,) = fast_limit(tails.alone, [by_noise])
+    fast = by_noise * math.sqrt(limit**2 - 1.0)
+    extent = _extent(long, step_ns) / (noise.variance[long].item() * (long - 1))
+    (limit,) = slow_limit(tails.slow, [extent], noise.spread[long].tolist())
+    slow = MEAN_ABS * math.sqrt((limit**2 - 1.0) / extent)
     return (
-        OperatingPoint(max(SHORT_NS, short * step_ns), float(fast[0])),
-        OperatingPoint(max(LONG_NS, long * step_ns), float(slow[0])),
+        OperatingPoint(max(SHORT_NS, short * step_ns), fast),
+        OperatingPoint(max(LONG_NS, long * step_ns), slow),
     )
 
 
 def _extent(number: int, step_ns: int) -> float:
-    times_s = centred(np.arange(number) * step_ns)
+    times_s = centred(np.arange(number) * step_ns / 1e9)
     return float(times_s @ times_s)
 
 
@@ -163,10 +166,9 @@ def creep(tail: float) -> float:
     return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
 
 
-def centred(times_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """In seconds, with a mean of 0."""
-    times_s = (times_ns - times_ns[0]) / 1e9
-    return np.asarray(times_s - times_s.sum() / len(times_s))
+def centred(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """With a mean of 0."""
+    return np.asarray(times_s - np.add.reduce(times_s) / len(times_s))
 
 
 def upper_tail(share: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 SLEPT_NS = 50_000_000
 """By which the clocks must move apart, ns: a sleep takes seconds, the scheduler a moment between
@@ -14,9 +15,8 @@ LOOKS = 3
 """At the start, so that one of them is not interrupted."""
 
 
-def boottime_ns() -> int:
-    """ns since the computer was started, those that it slept included (clock_gettime(2))."""
-    return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
+"""ns since the computer was started, those that it slept included (clock_gettime(2))."""
 
 
 class Sleep:
@@ -30,12 +30,9 @@ class Sleep:
         """Both give ns; only `boot_clock` goes on in a sleep."""
         self._clock = clock
         self._boot_clock = boot_clock
-        self._apart_ns = max(self._look() for _ in range(LOOKS))
+        # In this order a look that the scheduler interrupts takes no sleep for granted.
+        self._apart_ns = max(boot_clock() - clock() for _ in range(LOOKS))
 
     def has_slept(self) -> bool:
         """True once the computer has slept. Takes a microsecond."""
-        return self._look() - self._apart_ns > SLEPT_NS
-
-    def _look(self) -> int:
-        # In this order a look that the scheduler interrupts takes no sleep for granted.
-        return self._boot_clock() - self._clock()
+        return self._boot_clock() - self._clock() - self._apart_ns > SLEPT_NS

@@ -8,6 +8,9 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from daemon.process.logs import JOURNAL_ERROR, is_journal
 
+PROGRESS_MAX = 78
+"""Characters: one that wraps could not be taken back."""
+
 
 def printable(text: str, length_max: int | None = None) -> str:
     """The text with everything escaped that moves a cursor or hides; cut at `length_max`."""
@@ -30,6 +33,16 @@ def complain(problem: object) -> None:
         sys.stderr.writelines(f"{JOURNAL_ERROR}{line}\n" for line in lines)
     else:
         sys.stderr.write("graspd: " + "\n".join(lines) + "\n")
+
+
+def progress(doing: str) -> None:
+    """Show on a terminal what is being done, in the place of what was shown before; "": nothing.
+
+    Writes to stderr, and only if that is a terminal.
+    """
+    if sys.stderr.isatty():
+        sys.stderr.write(f"\r\x1b[K{printable(doing, PROGRESS_MAX)}")
+        sys.stderr.flush()
 
 
 def markdown_table(

@@ -76,7 +76,7 @@ class Companion:
     def keep(self, answer: Answer) -> None:
         """Call `answer` once what was told until now is on the disk, or is known not to be."""
 
-    def on_answer(self, payload: bytes) -> None:
+    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
         """A verdict is about to be told that answers who has asked; `payload` is it, encoded."""
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:

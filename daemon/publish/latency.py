@@ -24,10 +24,11 @@ class LatencyHistogram:
         """Count one duration, us."""
         index = 0
         if duration_us > FLOOR_US:
-            index = min(int(math.log(duration_us / FLOOR_US) / _LOG_STEP), BUCKETS - 1)
-        self.buckets[index] += 1
+            index = int(math.log(duration_us / FLOOR_US) / _LOG_STEP)
+        self.buckets[index if index < BUCKETS else -1] += 1
         self.count += 1
-        self.max_us = max(self.max_us, duration_us)
+        if duration_us > self.max_us:
+            self.max_us = duration_us
 
     def quantile_us(self, fraction: float) -> float:
         """Duration, us, that `fraction` of all stay at or below, to 2 %; 0 if there is none."""

@@ -146,8 +146,10 @@ class Outbox:
         self._verdict_seq += 1
         self.latency.add(latency_us)
         self.decisions[judgement.decision] += 1
-        self.reasons.update(judgement.reasons)
-        self._repaired.update(judgement.repaired)
+        if judgement.reasons:
+            self.reasons.update(judgement.reasons)
+        if judgement.repaired:
+            self._repaired.update(judgement.repaired)
         if judgement.judged:
             self._remember(judgement.grasp)
         return message, payload

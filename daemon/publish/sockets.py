@@ -10,8 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-import msgspec
-
 from daemon.publish.binding import Binding, OwnKeys, PublishError
 from daemon.publish.companion import Companion, Requests
 from daemon.publish.messages import Status, Verdict
@@ -27,16 +25,6 @@ if TYPE_CHECKING:
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
-
-
-class _Judged(msgspec.Struct):
-    """Which grasp a verdict is about."""
-
-    boot_id: str
-    grasp: int
-
-
-_decode = msgspec.json.Decoder(_Judged).decode
 
 
 class Sockets(Companion):
@@ -58,6 +46,7 @@ class Sockets(Companion):
         self._guard: Guard | None = None
         self.publisher: Publisher
         self.questions: Questions | None = None
+        self._filenos: list[int] = []
         try:
             self._open(wanted)
         except BaseException:
@@ -105,10 +94,12 @@ class Sockets(Companion):
             log.error("%s; no key there may connect", why)
 
     def _watch(self) -> None:
+        self._filenos = [each.fileno() for each in self._bound() if each.is_open]
         if self.authenticator is not None:
             for door in self._with_keys():
                 if door.is_open:
                     self.authenticator.watch(door.socket)
+            self._filenos += self.authenticator.filenos()
 
     def _with_keys(self) -> list[CurveDoor]:
         if self._curve is None:
@@ -131,9 +122,7 @@ class Sockets(Companion):
 
     def filenos(self) -> list[int]:
         """Become readable when a peer may want something, as long as `before_wait` is called."""
-        asked = [each for each in (self.publisher, self.questions) if each is not None]
-        found = [each.fileno() for each in asked if each.is_open]
-        return found if self.authenticator is None else found + self.authenticator.filenos()
+        return self._filenos
 
     def before_wait(self, requests: Requests) -> None:
         """See to peers that come; pass on what they ask and tell."""
@@ -145,18 +134,17 @@ class Sockets(Companion):
 
     def take(self) -> None:
         """See to peers that come; questions are taken by `before_wait`."""
-        if self.publisher.is_open:
-            self.publisher.take()
+        self.publisher.take()
         if self.authenticator is not None:
             self.authenticator.take()
         if self._guard is not None:
             self._guard.look(self._clock())
 
-    def on_answer(self, payload: bytes) -> None:
+    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
         """Answer all who have asked."""
         if self.questions is not None and self.questions.waiting:
-            judged = _decode(payload)
-            self.questions.answer(payload, grasp=GraspId(judged.boot_id, judged.grasp))
+            grasp = GraspId(verdict.boot_id, verdict.grasp)
+            self.questions.answer(payload, grasp=grasp)
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Answer those who have waited too long for a better answer."""

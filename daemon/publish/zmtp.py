@@ -3,6 +3,7 @@ messages and back, without a socket."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from enum import Enum
 from typing import Final
@@ -28,6 +29,8 @@ PING_CONTEXT_MAX_BYTES = 16
 SUBSCRIBE, CANCEL = b"\x01", b"\x00"
 """How a message begins that subscribes to a topic, or does so no more (ZMTP 3.0)."""
 
+_LONG_HEAD = struct.Struct(">BQ")
+
 Message = list[bytes]
 
 
@@ -44,9 +47,10 @@ class ZmtpError(Exception):
 
 def frame(body: bytes, flags: int = 0) -> bytes:
     """One frame."""
-    if len(body) > 255:
-        return bytes((flags | LONG,)) + len(body).to_bytes(8, "big") + body
-    return bytes((flags, len(body))) + body
+    size = len(body)
+    if size > 255:
+        return _LONG_HEAD.pack(flags | LONG, size) + body
+    return bytes((flags, size)) + body
 
 
 def command(name: bytes, body: bytes = b"") -> bytes:
@@ -56,7 +60,11 @@ def command(name: bytes, body: bytes = b"") -> bytes:
 
 def message(frames: Sequence[bytes]) -> bytes:
     """A message of some frames."""
-    return b"".join(frame(body, MORE) for body in frames[:-1]) + frame(frames[-1])
+    *begun, last = frames
+    whole = b""
+    for body in begun:
+        whole += frame(body, MORE)
+    return whole + frame(last)
 
 
 def ready(role: Role) -> bytes:

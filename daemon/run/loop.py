@@ -108,7 +108,7 @@ class Loop:
 
         self._deadlines = Deadlines()
         self._joints: JointReading | None = None
-        self._watched: set[int] = set()
+        self._watched: list[int] = []
         """Descriptors of drivers and companions that the selector has."""
         self._state = State.RUNNING
         now_ns = self._clock()
@@ -124,7 +124,7 @@ class Loop:
 
         Raises `DriverError` if a driver gives up. Call `close` when it is not to go on.
         """
-        self._watched = set()
+        self._watched = []
         with self._new_selector() as selector:
             selector.register(self._stop, selectors.EVENT_READ)
             while self._stop.received is None:
@@ -193,20 +193,20 @@ class Loop:
 
     def _wake(self) -> Ended:
         """Say that nothing is known, also to who waits for an answer."""
-        payload = self._tell_silence(self._clock())
+        verdict, payload = self._tell_silence(self._clock())
         for on_answer in self._on_answer:
-            on_answer(payload)
+            on_answer(verdict, payload)
         return Ended.SLEPT
 
     def _wait(self, selector: selectors.BaseSelector) -> None:
         """Sleep until a driver, a timer, a companion or a signal wants attention."""
-        wanted = {fd for driver in self._drivers if (fd := driver.fileno()) is not None}
+        wanted = [fd for driver in self._drivers if (fd := driver.fileno()) is not None]
         for filenos in self._filenos:
-            wanted.update(filenos())
+            wanted += filenos()
         if wanted != self._watched:
-            for former in self._watched - wanted:
+            for former in set(self._watched).difference(wanted):
                 selector.unregister(former)
-            for descriptor in wanted - self._watched:
+            for descriptor in set(wanted).difference(self._watched):
                 selector.register(descriptor, selectors.EVENT_READ)
             self._watched = wanted
         due_ns = min(self._silence_due_ns, self._status_due_ns)
@@ -219,7 +219,10 @@ class Loop:
         if began_ns < due_ns:
             selector.select((due_ns - began_ns) / 1e9)
             now_ns = self._clock()
-        if now_ns - began_ns - (time.thread_time_ns() - worked_ns) >= BLOCKED_NS:
+        idle_ns = now_ns - began_ns
+        if idle_ns >= BLOCKED_NS:  # else it is not asked for, which takes a system call
+            idle_ns -= time.thread_time_ns() - worked_ns
+        if idle_ns >= BLOCKED_NS:
             self._overload.waited(now_ns)
         else:  # there was work already
             self._overload.rest(now_ns)
@@ -258,7 +261,9 @@ class Loop:
 
     def _read(self) -> tuple[list[Reading], int]:
         """What the drivers have, and how many are tactile; if that is too much, to the newest."""
-        readings = [reading for driver in self._drivers for reading in driver.read_ready()]
+        readings: list[Reading] = []
+        for driver in self._drivers:
+            readings += driver.read_ready()
         waiting = _tactile(readings)
         for _ in range(DRAINS_MAX if self._is_too_much(waiting) else 0):
             more = self._tactile.read_ready()
@@ -269,7 +274,9 @@ class Loop:
         return readings, waiting
 
     def _is_too_much(self, waiting: int, elapsed_ns: int = 0) -> bool:
-        return self._overload.is_too_much(waiting, elapsed_ns, self._tactile.period_ns)
+        return waiting > 1 and self._overload.is_too_much(
+            waiting, elapsed_ns, self._tactile.period_ns
+        )
 
     def _after(self, skipped: Sequence[TactileReading], newest: TactileReading) -> TactileReading:
         """The newest reading, as it is to be judged after those that were left out."""
@@ -302,7 +309,7 @@ class Loop:
         """Tell companions a verdict, and whether it is what those who ask wait for."""
         if verdict.judged or not self._pipeline.on_request:
             for on_answer in self._on_answer:
-                on_answer(payload)
+                on_answer(verdict, payload)
         for on_verdict in self._on_verdict:
             on_verdict(verdict, payload, reading)
 
@@ -311,14 +318,14 @@ class Loop:
         if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
             self._tell_silence(now_ns)
 
-    def _tell_silence(self, now_ns: int) -> bytes:
+    def _tell_silence(self, now_ns: int) -> tuple[Verdict, bytes]:
         self._state = State.SILENT
         self._silence_due_ns = now_ns + self._silence_ns()
         verdict, payload = self._outbox.verdict(
             self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
         )
         self._tell(verdict, payload, None)
-        return payload
+        return verdict, payload
 
     def _silence_ns(self) -> int:
         """How long nothing may come before it is said, ns."""
@@ -350,4 +357,4 @@ class Loop:
 
 def _tactile(readings: Sequence[Reading]) -> int:
     """How many of them are tactile."""
-    return sum(isinstance(reading, TactileReading) for reading in readings)
+    return [type(reading) for reading in readings].count(TactileReading)

@@ -7,13 +7,13 @@ it (RLIMIT_RTTIME).
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from drivers.base import ElectrodeFault, TactileReading
@@ -114,4 +114,4 @@ def after(skipped: TactileReading, newest: TactileReading) -> TactileReading:
     if not held.any():
         return newest
     faults = newest.faults | np.uint8(ElectrodeFault.HELD) * (sound & held[:, np.newaxis])
-    return dataclasses.replace(newest, faults=faults)
+    return msgspec.structs.replace(newest, faults=faults)

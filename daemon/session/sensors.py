@@ -24,6 +24,8 @@ class SensorWatch(Companion):
     def before_readings(self) -> None:
         """Compare the sensors with those before."""
         serials = self._tactile.serials
+        if serials == self._serials:
+            return
         changed = exchanged(self._serials, serials)
         if changed:
             self._exchange(changed, serials)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Generic, TypeVar
+
+import msgspec
 
 from drivers.base import Opened, Reading, RecordingError
 
@@ -96,7 +97,7 @@ class Timeline(Generic[Item]):
         """
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
-        return dataclasses.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
+        return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
 
     def _read_ahead(self, items: Generator[tuple[int, Item], None, None]) -> None:
         self._next, self._failure = None, None

@@ -91,8 +91,8 @@ class DeviceClock:
     @property
     def drift_ppm(self) -> float | None:
         """How much the device's clock is fast, parts per million; None while it is not known."""
-        slope, slack = self._drift.slope_and_slack()
-        return None if slack == SLACK_MAX else (1.0 / (1.0 + slope) - 1.0) * 1e6
+        drift = self._drift
+        return None if drift.slack == SLACK_MAX else (1.0 / (1.0 + drift.slope) - 1.0) * 1e6
 
     @property
     def rate_limits_ppm(self) -> tuple[float, float] | None:
@@ -154,9 +154,9 @@ class DeviceClock:
 
     def _earliest_ns(self, bound: _Bound, tick: int) -> int:
         """A time before which `tick` cannot have been, by this bound."""
-        slope, slack = self._drift.slope_and_slack()
-        passed_ns = (tick - bound.tick) * self._ns_per_tick * (1.0 + slope)
-        return bound.sent_ns + round(passed_ns - slack * abs(passed_ns) - self._ns_per_tick)
+        drift = self._drift
+        passed_ns = (tick - bound.tick) * self._ns_per_tick * (1.0 + drift.slope)
+        return bound.sent_ns + round(passed_ns - drift.slack * abs(passed_ns) - self._ns_per_tick)
 
     def _fits(self, earlier: _Bound, later: _Bound) -> bool:
         """Whether the ticks between two PINGs took as long as the host's clock allows."""
@@ -183,6 +183,8 @@ class _Drift:
 
     def __init__(self) -> None:
         self._origin: tuple[float, int] | None = None
+        self.slope, self.slack = 0.0, SLACK_MAX
+        """Host ns per device ns, less one, and how wrong that may be."""
         self._restart(0.0, 0.0)
 
     def _restart(self, x: float, y: float) -> None:
@@ -190,15 +192,15 @@ class _Drift:
         self._x_variance = self._covariance = 0.0
         self._noise_variance = NOISE_FIRST_NS**2
         self._outliers = 0
+        self._conclude()
 
-    def slope_and_slack(self) -> tuple[float, float]:
-        """Host ns per device ns, less one, and how wrong that may be; (0, `SLACK_MAX`) at first."""
+    def _conclude(self) -> None:
+        self.slope, self.slack = 0.0, SLACK_MAX
         if self._x_variance > 0.0:
             error = math.sqrt(self._noise_variance * DECAY / (2.0 * self._x_variance))
             slope, slack = self._covariance / self._x_variance, SLACK_SIGMAS * error
             if slack < SLACK_MAX and abs(slope) <= RATE_TOLERANCE:
-                return slope, max(slack, SLACK_MIN)
-        return 0.0, SLACK_MAX
+                self.slope, self.slack = slope, max(slack, SLACK_MIN)
 
     def add(self, device_ns: float, sent_ns: int) -> None:
         """Take in a PING: the device's time at the nominal rate, and when it was sent, host ns."""
@@ -207,8 +209,7 @@ class _Drift:
         # Differences from the first PING keep the numbers small enough for their precision.
         x = device_ns - self._origin[0]
         y = (sent_ns - self._origin[1]) - x
-        slope, _ = self.slope_and_slack()
-        residual = y - self._y_mean - slope * (x - self._x_mean)
+        residual = y - self._y_mean - self.slope * (x - self._x_mean)
         limit = max(OUTLIER_SIGMAS * math.sqrt(self._noise_variance), OUTLIER_MIN_NS)
         if residual > limit or self._outliers >= OUTLIERS_MAX:
             self._restart(x, y)  # nothing arrives too early: the line was made of late ones
@@ -223,3 +224,4 @@ class _Drift:
         self._x_variance = (1.0 - DECAY) * (self._x_variance + DECAY * dx * dx)
         self._covariance = (1.0 - DECAY) * (self._covariance + DECAY * dx * dy)
         self._noise_variance = (1.0 - DECAY) * (self._noise_variance + DECAY * residual**2)
+        self._conclude()

@@ -77,6 +77,7 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
+        self._serials: dict[str, str] = {}
         self._believed: tuple[str, ...] = ()
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
         self._doubted: tuple[str, ...] | None = None
@@ -96,6 +97,8 @@ class Conversation:
         """When the PINGs that wait for an answer were sent, by their nonce."""
         self._pings_sent = 0
         self._ping_due_ns = self._silent_at_ns = 0
+        self._silence_ns = SILENCE_MIN_NS
+        """How long no sweep may come, ns."""
 
     @property
     def counters(self) -> BridgeCounters:
@@ -114,9 +117,7 @@ class Conversation:
     @property
     def serials(self) -> dict[str, str]:
         """By finger, from the last HELLO; without the sensors that did not answer."""
-        found = () if self.hello is None else self.hello.serials
-        known = zip(self._fingers, self._sensors, strict=True)
-        return {finger: found[at] for finger, at in known if at < len(found) and found[at]}
+        return self._serials
 
     @property
     def due_ns(self) -> int:
@@ -166,7 +167,7 @@ class Conversation:
         said = [encode(Start())] if self._starts else []
         self._starts = False
         if self._sweeps is not None and now_ns >= self._silent_at_ns:
-            self.lost(f"no sweep for {self._silence_ns() / 1e6:.0f} ms", now_ns)
+            self.lost(f"no sweep for {self._silence_ns / 1e6:.0f} ms", now_ns)
         elif now_ns < self._ping_due_ns:
             return said
         elif self._sweeps is not None:
@@ -225,9 +226,6 @@ class Conversation:
         self._nonce = (self._nonce + 1) % NONCES or 1  # 0 is that of a reset
         return encode(Ping(self._nonce))
 
-    def _silence_ns(self) -> int:
-        return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
-
     def _speaks_our_language(self, payload: bytes, now_ns: int) -> bool:
         """Whether a HELLO is of our version and layout; if not the link is given up for now."""
         head = HelloHead.from_bytes(payload)
@@ -270,7 +268,7 @@ class Conversation:
             # Misread or exchanged: at STOP it reads them again.
             self.lost("the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
-            self.hello = hello
+            self._take(hello)
             self._sweeps.round_trip(hello, sent_ns, arrival_ns)
 
     def _believes(self, told: tuple[str, ...]) -> bool:
@@ -302,12 +300,18 @@ class Conversation:
             if self._pings_sent <= GREETING_TRIES:
                 self._ping_due_ns = now_ns
         else:
-            self.hello = hello
+            self._take(hello)
             self._starts = True
             self._pings_sent = 1
             self._ping_due_ns = now_ns + PING_FIRST_NS
-            self._silent_at_ns = now_ns + self._silence_ns()
+            self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
+            self._silent_at_ns = now_ns + self._silence_ns
             self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
+
+    def _take(self, hello: Hello) -> None:
+        self.hello, found = hello, hello.serials
+        known = zip(self._fingers, self._sensors, strict=True)
+        self._serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:
@@ -317,7 +321,7 @@ class Conversation:
         if reading is None:
             return None
         self._next_seq = self._sweeps.next_seq
-        self._silent_at_ns = arrival_ns + self._silence_ns()
+        self._silent_at_ns = arrival_ns + self._silence_ns
         if self.link.state is LinkState.GREETING:
             self.link.up(", ".join(_about(self._sweeps.hello).values()), arrival_ns)
         return reading

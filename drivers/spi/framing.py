@@ -89,12 +89,11 @@ class FrameParser:
         frames = []
         for piece in ended:
             self._hold(piece)
-            if not self._overlong:
-                frame = self._decode(self._held)
-                if frame is not None:
-                    frames.append(frame)
-            self.reset()
-        self._hold(rest)
+            if not self._overlong and (frame := self._decode(self._held)) is not None:
+                frames.append(frame)
+            self._held, self._overlong = b"", False
+        if rest:
+            self._hold(rest)
         return frames
 
     def _hold(self, piece: bytes) -> None:

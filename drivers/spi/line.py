@@ -17,6 +17,8 @@ from drivers.base import DriverError, LinkError
 
 READ_BYTES = 4096
 """A terminal hands over no more than this at once."""
+SHORT_BYTES = READ_BYTES // 2
+"""A terminal that hands over less has no more: while more waits behind it, it is kept full."""
 READS_MAX = 32
 """Reads in one go: more than a kernel buffers (64 KiB), so that a flood cannot hold the loop."""
 DRAIN_TRIES, DRAIN_TRY_S = 10, 0.002
@@ -53,6 +55,7 @@ class SerialLine:
         self._baud = baud
         self._serial: serial.Serial | None = None
         self._fileno: int | None = None
+        self._is_terminal = False
 
     def open(self) -> None:
         """Take the port for this process alone. Raises `LinkError`, or `DriverError` for ever."""
@@ -70,6 +73,7 @@ class SerialLine:
         except ValueError as error:
             raise DriverError(f"{self.port}: {error}") from error
         self._fileno = self._descriptor()
+        self._is_terminal = type(self._serial) is serial.Serial
         self._lower_latency()
         if self.tap is not None:
             self.tap(LineEvent.OPENED, b"")
@@ -110,9 +114,16 @@ class SerialLine:
         self.drained = False
         try:
             while len(chunks) < READS_MAX and not self.drained:
-                chunk = port.read(READ_BYTES)
+                chunk = b""
+                if self._is_terminal and self._fileno is not None:
+                    chunk = os.read(self._fileno, READ_BYTES)
+                    self.drained = 0 < len(chunk) < SHORT_BYTES
+                if not chunk:  # of a terminal pyserial tells whether it is still there
+                    chunk = port.read(READ_BYTES)
+                    self.drained = not chunk
                 chunks.append(chunk)
-                self.drained = not chunk
+        except BlockingIOError:
+            self.drained = True
         except (OSError, termios.error) as error:
             if not chunks:  # else the next call says so, after these bytes
                 raise LinkError(f"{self.port}: {_loss(error)}") from error

@@ -11,6 +11,7 @@ import zlib
 from dataclasses import dataclass
 from typing import ClassVar, Final, Self
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,6 +51,7 @@ _HELLO = struct.Struct(f"<BIIQIH{TEXT_BYTES}sIBB")
 _SWEEP = struct.Struct("<IQQBBB")
 _STATUS = struct.Struct("<QIIIIB")
 _PING = struct.Struct("<I")
+_WORD = np.dtype(">u2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +169,7 @@ class Hello:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
+class Sweep(msgspec.Struct, frozen=True, eq=False):
     """The response words of one sweep over all slots and sensors, as they were read."""
 
     TYPE: ClassVar[int] = 0x02
@@ -195,7 +196,7 @@ class Sweep:
         _check_range("slots", slots, 1, SLOTS_MAX)
         _check_range("present", self.present, 0, (1 << sensors) - 1)
         head = _SWEEP.pack(self.seq, self.tick_start, self.tick_end, self.present, sensors, slots)
-        return head + self.words.astype(">u2").tobytes()
+        return head + self.words.astype(_WORD).tobytes()
 
     @classmethod
     def from_bytes(cls, payload: bytes) -> Sweep | None:
@@ -212,7 +213,7 @@ class Sweep:
         )
         if not sound:
             return None
-        words = np.frombuffer(payload, dtype=">u2", offset=_SWEEP.size).astype(np.uint16)
+        words = np.frombuffer(payload, _WORD, -1, _SWEEP.size).astype(np.uint16)
         return cls(seq, tick_start, tick_end, present, words.reshape(slots, sensors))
 
 

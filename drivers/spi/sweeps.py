@@ -95,6 +95,8 @@ class SweepDecoder:
             self._source[row, columns[:, 1]] = columns[:, 0] * hello.sensors + sensor
         self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.uint16)
         self._is_sampled = self._source < samples
+        self._shape = (hello.slots, hello.sensors)
+        self._all_present = sum(1 << sensor for sensor in set(sensors))
 
     def fits(self, hello: Hello) -> bool:
         """Whether a later HELLO describes the same sampling."""
@@ -117,7 +119,7 @@ class SweepDecoder:
 
         `idle_ns` is when nothing was waiting to be read for the last time before its arrival.
         """
-        if sweep.words.shape != (self.hello.slots, self.hello.sensors):
+        if sweep.words.shape != self._shape:
             self._counters.bad_frames += 1
             return None
         if not self._is_next(sweep):
@@ -152,10 +154,10 @@ class SweepDecoder:
         """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
         self._words[:-1] = sweep.words.ravel()
         counts, faults = decode_words(self._words[self._source])
-        absent = [
-            row for row, sensor in enumerate(self._sensors) if not sweep.present >> sensor & 1
-        ]
-        if absent:
+        absent: list[int] = []
+        if sweep.present & self._all_present != self._all_present:
+            present = [sweep.present >> sensor & 1 for sensor in self._sensors]
+            absent = [row for row, is_there in enumerate(present) if not is_there]
             counts[absent] = 0
             faults[absent] = int(ElectrodeFault.MISSING)
         self._count(faults, absent)
@@ -165,7 +167,7 @@ class SweepDecoder:
         counters = self._counters
         counters.readings += 1
         counters.absent_sensors += len(absent)
-        if not faults.any():
+        if not np.count_nonzero(faults):
             return
         counters.faulty_readings += 1
         read = self._is_sampled.copy()

@@ -57,6 +57,8 @@ TESTS_S = 60.0
 """Tests that a mutant gets, by the time that they take without it, s."""
 SLACK, SLACK_S = 5.0, 10.0
 """A test that takes longer than this many times its usual time, and this, s, hangs."""
+RUN_S = 60.0
+"""Pytest starts in that time, s, on whatever machine: what is over it hangs outside of a test."""
 WARM = ("can", "msgspec", "numpy", "onnxruntime", "pydantic", "serial", "zmq")
 """Imported once for all mutants."""
 UNCHECKED: Final = (1).to_bytes(4, "little")
@@ -330,19 +332,25 @@ class Workshop:
         return found
 
     def notices(self, mutant: Mutant, seconds: Mapping[str, float], known: Collection[str]) -> bool:
-        """Whether one of the tests fails, or hangs."""
+        """Whether one of the tests fails, or hangs.
+
+        A run that is cut off outside of a test shows nothing: it counts as unnoticed, and is said.
+        """
         module = self._folder / mutant.file
         compiled = Path(importlib.util.cache_from_source(str(module)))
         compiled.parent.mkdir(exist_ok=True)
         content = importlib.util.MAGIC_NUMBER + UNCHECKED + bytes(8) + marshal.dumps(mutant.code())
         compiled.write_bytes(content)
         files = sorted({test.partition("::")[0] for test in seconds})
-        limit_s = SLACK * sum(seconds.values()) + 2.0 * SLACK_S
+        limit_s = SLACK * sum(seconds.values()) + SLACK_S + RUN_S
         try:
             plugins = [Chosen(seconds, known), SameExamples()]
-            return _forked(lambda: self._pytest([*files, "-x"], plugins), limit_s, self._log) != 0
+            status = _forked(lambda: self._pytest([*files, "-x"], plugins), limit_s, self._log)
         finally:
             compiled.unlink()
+        if status is None:
+            _say(f"cut off after {limit_s:.0f} s, outside of a test: {mutant}")
+        return status not in (0, None)
 
     def _measure(self, report: Path) -> int:
         measure = coverage.Coverage(

@@ -28,6 +28,7 @@ from tests.bench.live import (
     PATIENCE_S,
     Child,
     Subscriber,
+    free_port,
     held_grasp,
     start_daemon,
     tactile_section,
@@ -60,9 +61,7 @@ class Bench:
             stack.enter_context(self._subscriber)
             stack.enter_context(self.twin)
             joint_socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-                probe.bind(("127.0.0.1", 0))
-                port = probe.getsockname()[1]
+            port = free_port()
             joint_socket.connect(("127.0.0.1", port))
             threads = [
                 threading.Thread(target=self.twin.serve, args=(self._ends,)),

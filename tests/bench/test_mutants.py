@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import marshal
+import re
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,16 @@ CHANGES = [
     "8: 250.0 becomes 300.0",
     "8: 250.0 becomes 200.0",
 ]
+LIMIT = """LIMIT = 5
+
+def is_fast(speed):
+    return speed > LIMIT
+
+def first_beyond(n):
+    while n <= 5:
+        n += 1
+    return n
+"""
 TESTS = """
 import pytest
 from speeds.limit import first_beyond, is_fast
@@ -87,7 +98,7 @@ def test_a_mutant_has_its_one_mistake_and_no_other() -> None:
             "4, 6",
             [
                 "speeds/limit.py:1: 5 becomes 4 in `LIMIT = 5`",
-                "speeds/limit.py:5: Gt becomes GtE in `return speed > LIMIT`",
+                "speeds/limit.py:4: Gt becomes GtE in `return speed > LIMIT`",
             ],
         ),
     ],
@@ -95,22 +106,43 @@ def test_a_mutant_has_its_one_mistake_and_no_other() -> None:
 def test_what_no_test_tells_apart_is_found(
     speeds: str, unnoticed: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, "SLACK_S", 0.5)  # one of the mutants never ends
+    monkeypatch.setattr(bench, "SLACK_S", 3.0)  # two of the mutants never end
+    picked, survivors = run(tmp_path, LIMIT, TESTS.replace("{speeds}", speeds))
+    assert len(picked) == 11
+    assert [str(each) for each in survivors] == unnoticed
+    assert "LIMIT = 5" in (tmp_path / "speeds/limit.py").read_text()
+
+
+def test_a_run_that_is_cut_off_is_not_taken_for_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(bench, "RUN_S", 1.0)
+    monkeypatch.setattr(bench, "SLACK_S", 0.0)
+    hangs = "speeds/limit.py:2: Gt becomes Lt in `while LIMIT > 9:`"
+    _, survivors = run(
+        tmp_path,
+        "LIMIT = 5\nwhile LIMIT > 9:\n    pass\n",
+        "from speeds.limit import LIMIT\n\ndef test_the_limit():\n    assert LIMIT\n",
+        only="limit.py:2",
+    )
+    assert hangs in [str(each) for each in survivors]
+    assert re.search(f"^cut off after .*{re.escape(hangs)}$", capsys.readouterr().out, re.M)
+
+
+def run(
+    tree: Path, module: str, tests: str, only: str = "limit.py"
+) -> tuple[list[bench.Mutant], list[bench.Mutant]]:
+    """All mutants of `module`, and those that `tests` do not notice."""
     for file, content in {
-        "speeds/limit.py": "LIMIT = 5\n\n\n"
-        "def is_fast(speed):\n    return speed > LIMIT\n\n\n"
-        "def first_beyond(n):\n    while n <= 5:\n        n += 1\n    return n\n",
+        "speeds/limit.py": module,
         "speeds/__init__.py": "",
-        "tests/speeds/test_limit.py": TESTS.replace("{speeds}", speeds),
+        "tests/speeds/test_limit.py": tests,
         "pyproject.toml": "[tool.pytest.ini_options]\naddopts = '--import-mode=importlib'\n",
     }.items():
-        path = tmp_path / "tree" / file
+        path = tree / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(content)
     options = argparse.Namespace(
-        package="speeds", only=[], number=99, seed=1, tests=["tests/speeds"], timeout=9.0
+        package="speeds", only=[only], number=99, seed=1, tests=["tests/speeds"], timeout=9.0
     )
-    picked, survivors = bench.run(tmp_path / "tree", options)
-    assert len(picked) == 11
-    assert [str(each) for each in survivors] == unnoticed
-    assert "LIMIT = 5" in (tmp_path / "tree/speeds/limit.py").read_text()
+    return bench.run(tree, options)

@@ -14,7 +14,7 @@ from daemon.publish.keys import make
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 
-PATIENCE_S = 45.0
+PATIENCE_S = 100.0
 REST, GRASP = slice(0, 160), slice(1484, 1770)
 """Rows of the demo recording: the open hand, and a whole grasp that is stable."""
 RATE_HZ = 100

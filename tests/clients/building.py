@@ -34,7 +34,7 @@ def compiled(name: str, folder: Path) -> Path:
     subprocess.run(
         ["make", "-s", "-C", CPP, f"BUILD={folder}", "CXXFLAGS=-O0", f"{folder}/{name}"],
         check=True,
-        timeout=55,
+        timeout=200,
     )
     return folder / name
 
@@ -47,7 +47,7 @@ def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     subprocess.run(
         ["gcc", "-shared", "-fPIC", "-Wall", "-Werror", source, "-o", library],
         check=True,
-        timeout=55,
+        timeout=200,
     )
     slept = folder / "slept"
     monkeypatch.setenv("SLEPT", str(slept))
@@ -76,6 +76,6 @@ def compiled_probe(folder: Path) -> Path:
             "-lzmq",
         ],
         check=True,
-        timeout=55,
+        timeout=200,
     )
     return binary

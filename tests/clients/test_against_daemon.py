@@ -76,11 +76,11 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
         assert graspd.outcome(lifted_on, slipped=True, object_name="mug", wait_s=10.0)
         grasp = [str(lifted_on.boot_id), str(lifted_on.grasp)]
         tell = [str(lift_gate), "--tell", daemon.endpoint, daemon.ask_endpoint, *grasp]
-        assert subprocess.run([*tell, "stable"], check=False, timeout=40).returncode == 1
-        subprocess.run([*tell, "slip"], check=True, timeout=40)
+        assert subprocess.run([*tell, "stable"], check=False, timeout=200).returncode == 1
+        subprocess.run([*tell, "slip"], check=True, timeout=200)
         heard = []
         for _ in range(2):
-            assert listener.poll(5000)
+            assert listener.poll(100_000)
             heard.append(decode_outcome(listener.recv_multipart()[1]))
         never = replace(lifted_on, grasp=10**9)
         assert graspd.outcome(never, slipped=True, wait_s=10.0).why.startswith("unknown grasp")

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import zmq
 
 from deploy.clients.python.graspd_client import Graspd, Outcome, OutcomeAnswer, Verdict
 from tests.clients.messages import ADDED, TOPIC, verdict
+from tests.threads import at_work
 
 PERIOD_MS = 5
 TAKEN_FRAMES = [b'{"v":1,"ok":true}']
@@ -41,22 +43,12 @@ def false_daemon(
     folder: Path, answer: Answer, outcome: str = "stable", **more: object
 ) -> Iterator[None]:
     """Publishes that verdict all the time, with what is `more`, and answers so."""
-    stop = threading.Event()
-    thread = threading.Thread(target=_serve, args=(folder, answer, outcome, stop, more))
-    thread.start()
-    try:
+    with at_work(partial(_serve, folder, answer, outcome, more)):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def _serve(
-    folder: Path,
-    answer: Answer,
-    outcome: str,
-    stop: threading.Event,
-    more: dict[str, Any],
+    folder: Path, answer: Answer, outcome: str, more: dict[str, Any], stop: threading.Event
 ) -> None:
     with (
         zmq.Context() as context,
@@ -102,7 +94,7 @@ def test_only_an_answer_that_fits_allows_a_lift(
         false_daemon(tmp_path, answer),
         Graspd(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask") as graspd,
     ):
-        said = graspd.may_i_lift(30.0 if expected != "unknown" else DEADLINE_S)
+        said = graspd.may_i_lift(100.0 if expected != "unknown" else DEADLINE_S)
     assert (bool(said), said.verdict.verdict) == (expected == "stable", expected)
 
 
@@ -110,11 +102,11 @@ def test_only_an_answer_that_fits_allows_a_lift(
 def test_in_cpp_only_an_answer_that_fits_allows_a_lift(
     lift_gate: Path, tmp_path: Path, answer: Answer, expected: str
 ) -> None:
-    deadline_s = 30.0 if expected != "unknown" else DEADLINE_S
+    deadline_s = 100.0 if expected != "unknown" else DEADLINE_S
     places = [f"ipc://{tmp_path}/out", str(deadline_s), f"ipc://{tmp_path}/ask"]
     with false_daemon(tmp_path, answer):
         result = subprocess.run(
-            [lift_gate, *places], capture_output=True, text=True, timeout=40, check=False
+            [lift_gate, *places], capture_output=True, text=True, timeout=200, check=False
         )
     assert result.stdout.split()[0] == expected
     assert (result.returncode == 0) == (expected == "stable")
@@ -148,7 +140,7 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
             [lift_gate, "--supervised", *places],
             capture_output=True,
             text=True,
-            timeout=40,
+            timeout=200,
             check=False,
         )
         assert (result.returncode, "\nlift supervised after" in result.stdout) == (not may, may)
@@ -162,7 +154,7 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
 def cpp_lifts(lift_gate: Path, *words: str) -> bool:
     """Whether the example says so."""
     result = subprocess.run(
-        [lift_gate, *words], capture_output=True, text=True, timeout=40, check=False
+        [lift_gate, *words], capture_output=True, text=True, timeout=200, check=False
     )
     assert result.returncode in (0, 1), result.stderr
     assert ("\nlift after" in result.stdout) is (result.returncode == 0)
@@ -197,7 +189,7 @@ def test_who_wants_the_hand_to_have_been_still_lifts_only_when_the_daemon_says_s
     out = f"ipc://{tmp_path}/out"
     with false_daemon(tmp_path, told(), **says), Graspd(out) as graspd:
         for still_ms, allowed in ((240.0, may), (None, may_at_once)):
-            deadline_s = 30.0 if allowed else DEADLINE_S
+            deadline_s = 100.0 if allowed else DEADLINE_S
             answer = graspd.may_i_lift(deadline_s, still_ms=still_ms)
             assert bool(answer) is allowed
             if may_at_once and not allowed:
@@ -213,7 +205,7 @@ def test_both_answer_and_newest_message_must_have_been_still(
 ) -> None:
     places = [f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/ask"]
     may = newest_ms == answer_ms == 250.0
-    deadline_s = 30.0 if may else DEADLINE_S
+    deadline_s = 100.0 if may else DEADLINE_S
     with (
         false_daemon(tmp_path, told(still_ms=answer_ms), still_ms=newest_ms),
         Graspd(places[0], ask_endpoint=places[1]) as graspd,
@@ -228,12 +220,12 @@ def test_a_supervised_lift_must_have_been_still_as_any(lift_gate: Path, tmp_path
     more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
     with false_daemon(tmp_path, told(), "unknown", **more | {"still_ms": 130.0}):
         with Graspd(out) as graspd:
-            assert graspd.may_i_lift(30.0, supervised=True, still_ms=100)
+            assert graspd.may_i_lift(100.0, supervised=True, still_ms=100)
             assert not graspd.may_i_lift(DEADLINE_S, supervised=True, still_ms=240)
         asked = [str(lift_gate), "--supervised", "--still"]
         for still_ms, code in (("100", 0), ("240", 1)):
             result = subprocess.run(
-                [*asked, still_ms, out, "1.0"], capture_output=True, timeout=40, check=False
+                [*asked, still_ms, out, "1.0"], capture_output=True, timeout=200, check=False
             )
             assert result.returncode == code
 
@@ -273,12 +265,11 @@ LIFTED_ON = Verdict("stable", grasp=42, boot_id=BOOT)
 def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
     """What is told to a daemon that answers so, or not at all."""
     found: list[bytes] = []
-    stop = threading.Event()
     with zmq.Context() as context, context.socket(zmq.ROUTER) as asked:
         asked.linger = 0
         asked.bind(f"ipc://{folder}/ask")
 
-        def listen() -> None:
+        def listen(stop: threading.Event) -> None:
             while not stop.is_set():
                 if asked.poll(PERIOD_MS):
                     who, *words = asked.recv_multipart()
@@ -286,13 +277,8 @@ def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
                     if frames:
                         asked.send_multipart([who, *frames])
 
-        thread = threading.Thread(target=listen)
-        thread.start()
-        try:
+        with at_work(listen):
             yield found
-        finally:
-            stop.set()
-            thread.join()
 
 
 def told_in_python(folder: Path, name: str | None) -> OutcomeAnswer:
@@ -307,7 +293,7 @@ def told_in_cpp(lift_gate: Path, folder: Path, *words: str) -> tuple[int, str]:
         [lift_gate, "--tell", *places, *words],
         capture_output=True,
         text=True,
-        timeout=40,
+        timeout=200,
         check=False,
     )
     return result.returncode, (result.stdout + result.stderr).splitlines()[0]
@@ -423,7 +409,7 @@ def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(
             assert int(unreported) == before.count(False)
             grasps[grasp] = grasps.get(grasp, False) or tell
             assert not tell or probe.stdout.readline() == "told\n"
-        probe.communicate(timeout=20)
+        probe.communicate(timeout=200)
         assert probe.returncode == 0, "the sanitizers found something"
     assert warned == ["1", "11"]
 

@@ -24,7 +24,7 @@ MAY, MAY_NOT, WRONG = 0, 1, 2
 def asked(lift_gate: Path, *words: object) -> tuple[int, str]:
     """Exit code and output of one question."""
     result = subprocess.run(
-        [lift_gate, *map(str, words)], capture_output=True, text=True, timeout=50, check=False
+        [lift_gate, *map(str, words)], capture_output=True, text=True, timeout=200, check=False
     )
     return result.returncode, result.stdout + result.stderr
 

@@ -41,7 +41,7 @@ class Probe:
 
     def close(self) -> int:
         """End it; its exit code."""
-        self._process.communicate(timeout=10)
+        self._process.communicate(timeout=100)
         return self._process.returncode
 
 

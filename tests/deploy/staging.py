@@ -10,7 +10,7 @@ from pathlib import Path
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 INSTALLER = DEPLOY / "install.sh"
-TIMEOUT_S = 50
+TIMEOUT_S = 200
 
 
 def wheelhouse(folder: Path, version: str, *, starts: bool = True) -> Path:

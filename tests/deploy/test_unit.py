@@ -35,7 +35,7 @@ def tool(name: str, package: str) -> str:
 
 def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
     words = [str(word) for word in command]
-    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=50)
+    return subprocess.run(words, check=False, capture_output=True, text=True, timeout=200)
 
 
 def test_systemd_understands_the_unit(tmp_path: Path) -> None:

@@ -67,6 +67,7 @@ class Board:
     def __init__(self) -> None:
         self.now_ns = 0.0
         self.frames: list[Frame] = []
+        self._torn = False
         self._held = b""
         command = ["node", str(EMULATOR / "main.cjs"), str(emulator_folder()), str(boot_rom())]
         self._process = subprocess.Popen(
@@ -86,11 +87,11 @@ class Board:
         self._process.stdout.close()
         self._process.wait(10)
 
-    def do(self, what: str, **arguments: object) -> dict[str, Any]:
+    def do(self, name: str, /, **arguments: object) -> dict[str, Any]:
         """One command of `emulator/main.cjs` and its answer."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps({"do": what, **arguments}) + "\n")
+        self._process.stdin.write(json.dumps({"do": name, **arguments}) + "\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         assert line, f"the emulator ended: {self._process.wait(10)}"
@@ -108,6 +109,11 @@ class Board:
         self.run(BOOT_MS)
         return self
 
+    def cut(self, what: str) -> None:
+        """Do `unplug`, `detach` or `stick`, after which one frame may be torn."""
+        self._torn = True
+        self.do(what)
+
     # ---- the line ----
 
     def run_until(self, t_ns: float, *, hand_over: bool = False) -> bytes:
@@ -117,6 +123,9 @@ class Board:
             *whole, self._held = (self._held + bytes.fromhex(packet)).split(b"\0")
             for encoded in filter(None, whole):
                 found = unframe(encoded)
+                if found is None and self._torn:
+                    self._torn = False
+                    continue
                 assert found is not None, encoded.hex()
                 self.frames.append(Frame(at_ns, *found))
         return b"".join(bytes.fromhex(packet) for _, packet in packets)

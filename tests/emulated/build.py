@@ -88,7 +88,8 @@ def image(
             made.parent.mkdir(exist_ok=True)
             for old in made.parent.glob(f"{kind}-*"):
                 old.unlink()
-            _build(FOLDER / str(clock_mhz), TARGETS[port], options, made)
+            place = hashlib.sha256(f"{ROOT} {sdk}".encode()).hexdigest()[:8]
+            _build(FOLDER / f"{clock_mhz}-{place}", TARGETS[port], options, made)
     return made
 
 
@@ -167,7 +168,8 @@ def _alone(path: Path) -> Iterator[None]:
 def _run(*command: str | Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise BuildError(f"{command[0]}:\n{done.stdout}{done.stderr}")
+        told = (done.stdout + done.stderr).splitlines()[-40:]
+        raise BuildError("\n".join([f"{command[0]}:", *(line[:300] for line in told)]))
 
 
 def main() -> int:

@@ -19,7 +19,7 @@ from tests.system import steps_faults, steps_install, steps_verdicts
 from tests.system.image import ImageError, image
 from tests.system.lab import Bridge, Lab, Outcome
 from tests.system.machine import Machine, MachineError
-from tests.system.payload import PROJECT, make_payload
+from tests.system.payload import make_payload
 from tests.system.table import Table
 
 Step = Callable[[Lab], Outcome]
@@ -56,7 +56,13 @@ NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_i
 def main(arguments: list[str] | None = None) -> int:
     """Run all steps; 0 if all is as it must be, 1 if something is not, 2 if it cannot be tried."""
     parser = argparse.ArgumentParser(prog="python -m tests.system", description=__doc__)
-    parser.add_argument("--cache", type=Path, default=PROJECT / ".cache" / "system", metavar="DIR")
+    parser.add_argument(
+        "--cache",
+        type=Path,
+        default=Path.home() / ".cache" / "graspd-system",
+        metavar="DIR",
+        help="image and wheels by their recipes, for all working copies; default %(default)s",
+    )
     parser.add_argument(
         "--rebuild", action="store_true", help="build the image even if it is there"
     )

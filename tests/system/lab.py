@@ -19,6 +19,7 @@ from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.spi import SpiTwin
 from tests.system.machine import COMMAND_TIMEOUT_S, Machine
 from tests.system.messages import Message
+from tests.threads import at_work
 
 PAYLOAD: Final = "/payload"
 PYTHON: Final = "/opt/graspd/venv/bin/python"
@@ -33,7 +34,7 @@ GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(
 sweeps) and to settle."""
 CAN_GRASPS: Final = Durations(first_rest_s=(13.0, 13.0), settle_s=(4.0, 4.0), rest_s=(13.0, 13.0))
 """The same at half that rate."""
-PATIENCE_S: Final = 120.0
+PATIENCE_S: Final = 300.0
 """For what takes a second on a computer that is not emulated."""
 LOOK_S: Final = 0.5
 
@@ -197,15 +198,8 @@ class Bridge:
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
         """Serve in a thread of its own."""
-        stop = threading.Event()
-        with self._twin:
-            thread = threading.Thread(target=self._serve, args=(stop,))
-            thread.start()
-            try:
-                yield
-            finally:
-                stop.set()
-                thread.join()
+        with self._twin, at_work(self._serve):
+            yield
 
     @contextlib.contextmanager
     def hung(self) -> Iterator[None]:

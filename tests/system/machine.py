@@ -20,10 +20,10 @@ from tests.system.messages import Messages
 MEMORY_MIB: Final = 1536
 CPUS: Final = 2
 START_TIMEOUT_S: Final = 10.0
-BOOT_TIMEOUT_S: Final = 180.0
-ANSWER_TIMEOUT_S: Final = 30.0
+BOOT_TIMEOUT_S: Final = 600.0
+ANSWER_TIMEOUT_S: Final = 100.0
 """For a guest agent that is busy, under emulation."""
-COMMAND_TIMEOUT_S: Final = 60.0
+COMMAND_TIMEOUT_S: Final = 200.0
 SYNCHRONISE_S: Final = 5.0
 """After this long the agent is asked again: while it starts it loses what it was asked."""
 BOOT_ID: Final = "cat /proc/sys/kernel/random/boot_id"

@@ -9,8 +9,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
+
+from tests.threads import at_work
 
 RECEIVE_BYTES: Final = 65536
 LOOK_S: Final = 0.2
@@ -47,17 +50,11 @@ class Messages:
     @contextlib.contextmanager
     def listening(self, path: Path) -> Iterator[None]:
         """Listen on the Unix socket where the machine's port ends."""
-        stop = threading.Event()
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as port:
             port.connect(str(path))
             port.settimeout(LOOK_S)
-            thread = threading.Thread(target=self._listen, args=(port, stop))
-            thread.start()
-            try:
+            with at_work(partial(self._listen, port)):
                 yield
-            finally:
-                stop.set()
-                thread.join()
 
     def forget(self) -> None:
         """All messages so far: the machine's clock has started anew."""

@@ -11,7 +11,7 @@ from tests.system.payload import EXTRA
 INSTALL: Final = f"sh {PAYLOAD}/deploy/install.sh"
 OFFLINE: Final = f"{INSTALL} --wheelhouse {PAYLOAD}/wheels --extras {EXTRA}"
 INSTALL_TIMEOUT_S: Final = 900.0
-CHECK_TIMEOUT_S: Final = 180.0
+CHECK_TIMEOUT_S: Final = 400.0
 EXPOSURE_MAX: Final = 2.5
 EACCES: Final = 13
 

@@ -60,8 +60,11 @@ def can_verdicts(lab: Lab) -> Outcome:
 
 
 def serial_verdicts(lab: Lab) -> Outcome:
-    """Whole grasps over the serial port: each is judged once, when it has settled."""
-    began_s = after_s = lab.now_s()
+    """Whole grasps over the serial port: each is judged once, when it has settled.
+
+    From the start on: they are made all the time.
+    """
+    began_s = after_s = 0.0
     lab.await_message("serial", began_s, "rest learned", _tared)
     for _ in range(GRASPS):
         judged = lab.await_message("serial", after_s, "a judged grasp", judgement)

@@ -91,12 +91,16 @@ def main(arguments: list[str]) -> int:
     """
     path, folder, started_ns = arguments
     meter = Meter(int(started_ns))
+    import gc
     import importlib
 
+    gc.disable()  # as `daemon.__main__` does
     for name, modules in CORE:
         for module in modules:
             importlib.import_module(module)
         meter.take(name)
+    gc.freeze()
+    gc.enable()
     import json
     from contextlib import ExitStack
     from pathlib import Path

@@ -1,28 +1,28 @@
-"""The report as figures, table, picture and one page that needs nothing else."""
+"""The report as figures, tables, and one page that needs nothing else."""
 
 from __future__ import annotations
 
 import html
-import io
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
-import numpy as np
-from matplotlib.figure import Figure
-
+from daemon.measure.error_vs_time.picture import (
+    DEFAULT,
+    PANELS,
+    Found,
+    Row,
+    draw,
+    error_of,
+    front,
+    points,
+)
 from daemon.process.text import markdown_table
 
-Found = dict[str, Any]
-Row = dict[str, Any]
-
 PROTOCOL = "cv"
-COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
-FEWER_FINGERS = "#9a8f2f"
-"""Colour of models for hands with fewer sensors: no alternative to those of the whole hand."""
-MARKERS = {"model": "o", "peer": "s"}
+SUMMARY_MAX = 7
+"""Rows of the short table beside the picture."""
+SUMMARY_ALWAYS = (DEFAULT, "cnn1", "cnn1-session", "published: loops, Keras predict")
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 90rem; margin: 2rem auto; padding: 0 1rem;
   color: #222; background: #fff }
@@ -56,13 +56,16 @@ def _by_fingers(rows: Sequence[Row]) -> list[list[Row]]:
 
 
 def table(found: Found) -> str:
-    """All rows as Markdown, the most exact first, with the advice."""
-    lines = list(markdown_table(COLUMNS, [_cells(row) for row in _sorted(found["rows"])]))
-    lines += ["", *_stages(found), "", *(f"- {text}" for text in advice(found["rows"]))]
+    """As Markdown: the short table, advice, stages, and all rows, the most exact first."""
+    lines = list(markdown_table(SUMMARY_COLUMNS, _summary(found["rows"])))
+    lines += ["", *(f"- {text}" for text in advice(found["rows"])), "", *_stages(found), ""]
+    lines += markdown_table(COLUMNS, [_cells(row) for row in _sorted(found["rows"])])
     lines += ["", _made(found)]
     return "\n".join(lines)
 
 
+ASKED = tuple(asked for _, asked in PANELS)
+SUMMARY_COLUMNS = ("model, F1 in %", *ASKED, "paced p50 / p99, us", "CPU at 100 Hz")
 COLUMNS = (
     "model",
     "fingers",
@@ -84,21 +87,59 @@ COLUMNS = (
 STAGE_COLUMNS = ("stage", "p50, us", "p99, us")
 
 
+def _summary(rows: Sequence[Row]) -> list[list[str]]:
+    """Default, published network and way, and the fronts; seven rows at most, the fastest first."""
+    chosen = list(SUMMARY_ALWAYS)
+    for protocols, _ in PANELS:
+        chosen += [point.name for point in front(list(points(rows, protocols)))]
+    names = list(dict.fromkeys(chosen))[:SUMMARY_MAX]
+    shown = [row for row in rows if row["name"] in names]
+    shown.sort(key=lambda row: float(row["time"]["paced_p50_us"]))
+    return [
+        [
+            _named(row),
+            *(_percent(error_of(row, protocols)) for protocols, _ in PANELS),
+            *_paced(row),
+        ]
+        for row in shown
+    ]
+
+
+def _named(row: Row) -> str:
+    name = f"`{row['name']}`" if row["kind"] == "model" else row["name"]
+    return f"{name}, the default" if row["name"] == DEFAULT else name
+
+
+def _percents(row: Row) -> Iterator[str]:
+    return (_percent(error_of(row, protocols)) for protocols, _ in PANELS)
+
+
+def _percent(error: Row) -> str:
+    return f"{100 * error['f1']:.1f}" if error else "-"
+
+
+def _paced(row: Row) -> tuple[str, str]:
+    took = row["time"]
+    return (
+        f"{took['paced_p50_us']:.0f} / {took['paced_p99_us']:.0f}",
+        f"{took['cpu_percent_at_100_hz']:.1f} %",
+    )
+
+
 def _cells(row: Row) -> list[str]:
     error = row["error"].get(PROTOCOL, {})
-    other = row["error"].get("objects") or row["error"].get("objects-whole")
+    other = error_of(row, PANELS[1][0])
     exact, took = row["numerical"], row["time"]
     return [
-        f"`{row['name']}`" if row["kind"] == "model" else row["name"],
+        _named(row),
         " ".join(row["fingers"]) or "-",
         _interval(error),
-        "-" if not other else f"{100 * other['f1']:.1f}",
+        _percent(other),
         "-" if not error else f"{error['brier']:.3f}",
         "-" if not error else f"{error['ece']:.3f}",
         f"{exact['largest']:.0e}, {exact['flipped']}" if "largest" in exact else "-",
         f"{took['hot_p50_us']:.0f} / {took['hot_p99_us']:.0f} / {took['hot_p99.9_us']:.0f}",
-        f"{took['paced_p50_us']:.0f} / {took['paced_p99_us']:.0f}",
-        f"{took['cpu_percent_at_100_hz']:.1f} %",
+        *_paced(row),
         "-" if row["bytes"] is None else f"{row['bytes'] / 1e6:.2f}",
         "-" if row["floor_us"] is None else f"{row['floor_us']:.1f}",
         "-" if row["start_ms"] is None else f"{row['start_ms']:.0f}",
@@ -165,72 +206,14 @@ def advice(rows: Sequence[Row]) -> Iterator[str]:
     )
 
 
-def draw(found: Found) -> str:
-    """Error against run time as SVG: points are numbered, the list beside them names them."""
-    mpl.rcParams["svg.hashsalt"] = "graspd"
-    figure = Figure(figsize=(11.0, 5.6), layout="constrained")
-    axes, names = figure.subplots(1, 2, width_ratios=(3, 1))
-    shown = [row for row in _sorted(found["rows"]) if PROTOCOL in row["error"]]
-    whole, *fewer = _by_fingers(shown)
-    colours = {row["name"]: COLOURS[row["kind"]] for row in shown}
-    colours |= {row["name"]: FEWER_FINGERS for alike in fewer for row in alike}
-    for number, row in enumerate(shown, start=1):
-        _draw_row(axes, row, number, colours[row["name"]])
-        names.text(
-            0.0,
-            1.0 - (number - 1) / max(len(shown), 24),
-            f"{number:2d}  {row['name']}",
-            fontsize=8,
-            va="top",
-            color=colours[row["name"]],
-            transform=names.transAxes,
-        )
-    _draw_front(axes, whole)
-    for row in found["rows"]:
-        if row["kind"] == "floor":
-            x = row["time"]["paced_p50_us"]
-            axes.axvline(x, color="#888", ls=":", lw=1)
-            axes.text(
-                x, 0.99, f" {row['name']}", fontsize=8, va="top", color="#666",
-                transform=axes.get_xaxis_transform(),
-            )  # fmt: skip
-    names.axis("off")
-    axes.set_xscale("log")
-    axes.set_xlabel("time per reading, paced at 100 Hz: input and network, p50, us")
-    axes.set_ylabel("1 - F1 on known objects, % (bars: 95 %)")
-    axes.grid(alpha=0.25)
-    text = io.StringIO()
-    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
-    return text.getvalue()
-
-
-def _draw_row(axes: Any, row: Row, number: int, colour: str) -> None:  # noqa: ANN401 - matplotlib's
-    error = row["error"][PROTOCOL]
-    x, y = row["time"]["paced_p50_us"], 100 * (1 - error["f1"])
-    reach = [[100 * (error["high"] - error["f1"])], [100 * (error["f1"] - error["low"])]]
-    axes.errorbar(x, y, yerr=reach, fmt="none", ecolor=colour, alpha=0.25, lw=0.8)
-    axes.plot(x, y, MARKERS[row["kind"]], color=colour, markersize=13, alpha=0.85)
-    axes.text(x, y, str(number), color="white", fontsize=7, ha="center", va="center", zorder=5)
-
-
-def _draw_front(axes: Any, rows: Sequence[Row]) -> None:  # noqa: ANN401 - matplotlib's own
-    """Models that none is both faster and more exact than."""
-    front, best = [], np.inf
-    for row in sorted(rows, key=lambda row: float(row["time"]["paced_p50_us"])):
-        error = 100 * (1 - row["error"][PROTOCOL]["f1"])
-        if error < best:
-            best = error
-            front.append((row["time"]["paced_p50_us"], error))
-    axes.plot(*zip(*front, strict=True), color="#1f6f8b", lw=1.2, alpha=0.6, zorder=0)
-
-
 def _made(found: Found) -> str:
     machine = ", ".join(
         value if name == "processor" else f"{name} {value}"
         for name, value in found["machine"].items()
     )
     return (
-        f"{machine}; {found['readings']['hot']} readings hot, {found['readings']['paced']} paced, "
+        f"{machine}; {found['readings']['hot']} readings hot, {found['readings']['paced']} paced"
+        f"{' (--quick: rough)' if found['quick'] else ''}, "
         f"memory {found['bandwidth_bytes_per_s'] / 1e9:.1f} GB/s; `graspd report error-vs-time`"
     )
 
@@ -242,7 +225,9 @@ def _page(found: Found, picture: str) -> str:
     return (
         "<!doctype html><html lang=en><meta charset=utf-8><title>graspd: error against run time"
         f"</title><style>{STYLE}</style><h1>Error against run time</h1><ul>{items}</ul>"
-        f"{picture[picture.index('<svg') :]}{_html_table(COLUMNS, cells)}"
+        f"{picture[picture.index('<svg') :]}"
+        f"{_html_table(SUMMARY_COLUMNS, _summary(found['rows']))}"
+        f"<h2>All of them</h2>{_html_table(COLUMNS, cells)}"
         f"<h2>Stages of a reading</h2>{_html_table(STAGE_COLUMNS, stages)}"
         f"<p>{_marked(_made(found))}</p></html>\n"
     )

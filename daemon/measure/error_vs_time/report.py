@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from daemon.measure.error_vs_time import page, stages
+from daemon.measure.error_vs_time.picture import DEFAULT
 from daemon.measure.error_vs_time.timing import Step, bandwidth_bytes_per_s, measure
 from daemon.measure.reference.reference import Reference
-from daemon.process.text import complain
+from daemon.process.text import complain, progress
 from models import zoo
 from models.bts3 import FINGERS
 from models.contract import Finger, ModelError
@@ -129,20 +130,26 @@ def report(grasps: Grasps, folders: Sequence[Path], *, quick: bool = False) -> d
     paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
     models = {path.stem: TactileModel(path) for path in paths}
     counts = {name: _counts(model, grasps) for name, model in models.items()}
-    rows = {name: _model_row(model, counts[name]) for name, model in models.items()}
+    rows = {}
+    for done, (name, model) in enumerate(models.items(), 1):
+        progress(f"how exact is {name}, {done} of {len(models)}")
+        rows[name] = _model_row(model, counts[name])
+    progress("fitting the peers")
     steps: dict[str, Step] = {name: _step(model, counts[name]) for name, model in models.items()}
     _add_peers(rows, steps, grasps)
     readings, paced = (QUICK_READINGS, QUICK_PACED) if quick else (READINGS, PACED)
     times = measure(steps, readings, paced)
+    progress("")
     bandwidth = bandwidth_bytes_per_s()
     for name, row in rows.items():
         row.time = times[name].quantiles()
         if row.bytes is not None:
             row.floor_us = row.bytes / bandwidth * 1e6
-    default = "small-session" if "small-session" in models else next(iter(models))
+    default = DEFAULT if DEFAULT in models else next(iter(models))
     return {
         "machine": {"processor": _processor(), "python": platform.python_version()}
         | {package: version(package) for package in ("numpy", "onnxruntime")},
+        "quick": quick,
         "readings": {"hot": readings, "paced": paced},
         "bandwidth_bytes_per_s": bandwidth,
         "stages": {

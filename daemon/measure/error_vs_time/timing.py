@@ -11,11 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.process.text import progress
+
 WARM_UP = 20
 ROUNDS = 10
 """Of the hot loop: a machine that is busy for a second spoils a round of all, not all of one."""
 PERIOD_S = 0.01
 """Of the paced readings: 100 Hz."""
+PROGRESS_EVERY = 10
+"""Paced readings between two words of how far it is."""
 BANDWIDTH_BYTES = 64 << 20
 BANDWIDTH_ROUNDS = 15
 
@@ -51,8 +55,9 @@ def measure(steps: Mapping[str, Step], readings: int, paced: int) -> dict[str, T
             step(index)
     hot: dict[str, list[float]] = {name: [] for name in steps}
     with _no_collection():
-        for _ in range(ROUNDS):
+        for done in range(ROUNDS):
             for name, step in steps.items():
+                progress(f"one reading after the other, round {done + 1} of {ROUNDS}: {name}")
                 hot[name] += _timed(step, readings // ROUNDS)
         cold, cpu = _paced(steps, paced)
     return {
@@ -75,6 +80,8 @@ def _paced(
     cpu: dict[str, list[float]] = {name: [] for name in steps}
     due_s = time.perf_counter()
     for index in range(readings):
+        if index % PROGRESS_EVERY == 0:
+            progress(f"paced at 100 Hz: {index} of {readings} readings each")
         for name, step in steps.items():
             due_s += PERIOD_S
             time.sleep(max(due_s - time.perf_counter(), 0.0))

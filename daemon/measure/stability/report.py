@@ -27,7 +27,7 @@ from daemon.measure.stability.steps import StepRow
 from daemon.measure.stability.time import clock_rows, wrap_rows
 from daemon.measure.stability.trust import trust_rows
 from daemon.process.extras import needs
-from daemon.process.text import complain, markdown_table, printable
+from daemon.process.text import complain, markdown_table, printable, progress
 from drivers.base import RecordingError
 from models import zoo
 from models.contract import ModelError
@@ -140,12 +140,14 @@ def measured(
 
     report = StabilityReport(bounds)
     quantised = []
-    for model in models:
+    for done, model in enumerate(models, 1):
+        progress(f"{model.path.stem}, model {done} of {len(models)}")
         reference = Reference(model.path)
         rows = list(_measure(model, reference, folder, bounds))
         report.cases.extend(rows)
         if reference.is_quantised:
             quantised += rows
+    progress("steps that are no model's")
     report.steps.extend(repair_row(model.path.stem, model.contract.seen) for model in models)
     for several in (session_rows, joint_rows, calibration_rows, gate_rows, clock_rows, wrap_rows):
         report.steps.extend(several())
@@ -154,6 +156,7 @@ def measured(
     worst = max((row.network_error for row in quantised), default=0.0)
     of_these = list(dict.fromkeys(row.model for row in quantised))
     report.steps.append(quantised_row(of_these, worst, bounds.p_slip))
+    progress("")
     return report
 
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from daemon.measure.worth.lives import live
 from daemon.measure.worth.streams import RANDOM, Plan, Stream, streams
-from daemon.process.text import complain, markdown_table
+from daemon.process.text import complain, markdown_table, progress
 from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import DatasetError, read_all
 
@@ -80,7 +80,9 @@ def run(args: argparse.Namespace) -> int:
             chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))
             grasps = grasps.rows(chosen.astype(np.int64))
         args.out.mkdir(parents=True, exist_ok=True)
-        curves = measured([one for one in streams(grasps, plan) if one.order == RANDOM])
+        several = [one for one in streams(grasps, plan) if one.order == RANDOM]
+        progress("")
+        curves = measured(several)
         text = "\n".join(table(curves)) + "\n"
         (args.out / "worth.md").write_text(text)
         (args.out / "worth.svg").write_text(draw(curves))

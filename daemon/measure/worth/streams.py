@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.process.text import progress
 from models.inputs import SessionBuilder, builder, raw_features
 from models.training.data.datasets import Grasps
 from models.training.data.folds import fold_seed, object_folds
@@ -77,6 +78,9 @@ def streams(grasps: Grasps, plan: Plan) -> Iterator[Stream]:
     for seed, fold in itertools.product(range(plan.seeds), range(plan.folds)):
         fold_of = object_folds(grasps.objects, DAYS_FOLDS, seed)
         for protocol, training, tables in DAYS:
+            progress(
+                f"seed {seed + 1} of {plan.seeds}, fold {fold + 1} of {plan.folds}, {protocol}"
+            )
             seen = grasps.rows(np.flatnonzero(np.isin(names, training) & (fold_of != fold)))
             random = np.random.default_rng([seed, fold])
             kinds, rows = [], []

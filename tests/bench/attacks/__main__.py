@@ -13,6 +13,7 @@ import pkgutil
 import random
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -80,8 +81,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not wanted:
         parser.error("no such attack")
     attacked = []
-    for attack in wanted:
-        outcome = tried(attack, given.minutes * 60.0 / len(wanted), given.seed)
+    end_s = time.monotonic() + given.minutes * 60.0
+    for number, attack in enumerate(wanted):
+        left_s = max(0.0, end_s - time.monotonic())  # some take longer: the others have less
+        outcome = tried(attack, left_s / (len(wanted) - number), given.seed)
         log.info("%s: %s %s: %s", attack.name, outcome.tried, attack.unit, outcome.happened)
         attacked.append((attack, outcome))
     print(report(attacked))  # noqa: T201

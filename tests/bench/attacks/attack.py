@@ -37,6 +37,13 @@ class Plan:
             yield tried
             tried += 1
 
+    def folders(self) -> Iterator[Path]:
+        """A new folder for each round."""
+        for number in self.rounds():
+            folder = self.folder / str(number)
+            folder.mkdir()
+            yield folder
+
 
 @dataclass(frozen=True, slots=True)
 class Outcome:

@@ -22,6 +22,7 @@ from daemon.publish.keys import load_pair, make
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import PATIENCE_S, Child, start_daemon
+from tests.threads import at_work
 
 MEMORY_MAX_MIB = 32.0
 """So far from rest the daemon's memory may go."""
@@ -264,29 +265,26 @@ def questions(plan: Plan) -> Outcome:
     """A controller among flooders."""
     answered = asked = 0
     with hand(plan.folder, "ipc") as daemon:
-        ended = threading.Event()
 
-        def flood() -> None:
-            while not ended.is_set():
+        def flood(stop: threading.Event) -> None:
+            while not stop.is_set():
                 _flood(daemon, daemon.doors[1], AS_REQ, lambda: QUESTION * 500)
 
-        flooding = threading.Thread(target=flood)
-        flooding.start()
-        try:
-            with zmq.Context() as context, context.socket(zmq.DEALER) as controller:
-                controller.linger = 0
-                controller.connect(daemon.ask)
-                time.sleep(0.3)
-                for _ in plan.rounds():
-                    for _ in range(QUESTIONS):
-                        controller.send(b"judge")
-                        asked += 1
-                        if controller.poll(PATIENCE_MS + 200):
-                            controller.recv()
-                            answered += 1
-        finally:
-            ended.set()
-            flooding.join()
+        with (
+            at_work(flood),
+            zmq.Context() as context,
+            context.socket(zmq.DEALER) as controller,
+        ):
+            controller.linger = 0
+            controller.connect(daemon.ask)
+            time.sleep(0.3)
+            for _ in plan.rounds():
+                for _ in range(QUESTIONS):
+                    controller.send(b"judge")
+                    asked += 1
+                    if controller.poll(PATIENCE_MS + 200):
+                        controller.recv()
+                        answered += 1
         return daemon.outcome(asked, answered == asked, f"{answered} of {asked} answers, ")
 
 

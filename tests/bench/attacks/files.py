@@ -24,6 +24,7 @@ from drivers.recordings.csv_player import DEMO_RECORDING
 from models import zoo
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon, usage
+from tests.threads import at_work
 
 MIB = 1024
 """KiB."""
@@ -211,22 +212,16 @@ def _storm(plan: Plan) -> Outcome:
     with Running(plan.folder) as running:
         running.hear(3.0)  # all that it needs it has by then
         rest_mib = running.rss_mib()
-        stop = threading.Event()
 
-        def hang_up() -> None:
+        def hang_up(stop: threading.Event) -> None:
             nonlocal sent
             while not stop.wait(0.0005):
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(running.daemon.pid, signal.SIGHUP)
                 sent += 1
 
-        sender = threading.Thread(target=hang_up)
-        sender.start()
-        try:
+        with at_work(hang_up):
             gap_s = running.hear(max(plan.seconds, 8.0))
-        finally:
-            stop.set()
-            sender.join()
         growth_mib = running.rss_mib() - rest_mib
         running.hear(2.0)  # the last one was late
         other = running.reload(scene(plan.folder, 'name = "mlp"'))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import operator
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -32,11 +30,13 @@ from tests.bench.live import (
     SEED,
     Subscriber,
     can_id,
+    free_port,
     judged_counts,
     start_daemon,
     tactile_section,
     where_of,
 )
+from tests.threads import at_work
 
 PALM_HZ = 1000.0 / 14.0
 SILENCE_S = 0.16
@@ -87,33 +87,16 @@ def grasped() -> Iterator[Counts]:
     )
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
-
-
-@contextmanager
-def sending(counts: Iterator[Counts], port: int) -> Iterator[None]:
+def sending(counts: Iterator[Counts], port: int) -> AbstractContextManager[object]:
     """A palm's relay, on a socket of its own, for as long as the block."""
-    stop = threading.Event()
-    twin = PalmTwin(counts)
-    thread = threading.Thread(target=twin.serve, args=(f"udp://127.0.0.1:{port}", stop))
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
+    return at_work(partial(PalmTwin(counts).serve, f"udp://127.0.0.1:{port}"))
 
 
 def second_palm(plan: Plan) -> Outcome:
     """The first hand is judged and falls silent; another one, which holds, sends instead of it."""
-    known, told, stable, rounds = 0, 0, 0, 0
-    for rounds in plan.rounds():
-        folder = plan.folder / str(rounds)
-        folder.mkdir()
+    known, told, stable, tried = 0, 0, 0, 0
+    for folder in plan.folders():
+        tried += 1
         port = free_port()
         tactile = f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{port}"\n'
         with daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n") as subscriber:
@@ -127,7 +110,7 @@ def second_palm(plan: Plan) -> Outcome:
             told += len(second.verdicts)
             stable += sum(verdict.valid for verdict in second.verdicts)
     happened = f"{stable} of {told} verdicts on the second hand by the first one's tare"
-    return Outcome(rounds + 1, happened, stable == 0 and told > 50 and known == rounds + 1)
+    return Outcome(tried, happened, stable == 0 and told > 50 and known == tried)
 
 
 class MisreadTwin(SpiTwin):
@@ -150,15 +133,8 @@ class MisreadTwin(SpiTwin):
 @contextmanager
 def bridge(twin: SpiTwin) -> Iterator[None]:
     """A twin at work in a thread."""
-    stop = threading.Event()
-    with twin:
-        thread = threading.Thread(target=twin.serve, args=(stop.is_set,))
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
+    with twin, at_work(lambda stop: twin.serve(stop.is_set)):
+        yield
 
 
 def keep_grasps(folder: Path, text: str) -> SessionFile:
@@ -186,10 +162,9 @@ def kept_grasps(file: SessionFile) -> int:
 
 def misread_serial(plan: Plan) -> Outcome:
     """One HELLO of the first eight is wrong."""
-    wiped, rounds = 0, 0
-    for rounds in plan.rounds():
-        folder = plan.folder / str(rounds)
-        folder.mkdir()
+    wiped, tried = 0, 0
+    for folder in plan.folders():
+        tried += 1
         tactile = tactile_section("spi", str(folder / "bridge"))
         session = f'[session]\nfile = "{folder}/session.json"\n'
         file = keep_grasps(folder, tactile + session)
@@ -200,16 +175,14 @@ def misread_serial(plan: Plan) -> Outcome:
         ):
             heard = hear(subscriber, lambda heard: len(heard.verdicts) >= SPI_VERDICTS, UP_S)
         wiped += kept_grasps(file) < KEPT_GRASPS or len(heard.verdicts) < SPI_VERDICTS
-    happened = f"{wiped} of {rounds + 1} kept sessions of {KEPT_GRASPS} grasps wiped"
-    return Outcome(rounds + 1, happened, wiped == 0)
+    happened = f"{wiped} of {tried} kept sessions of {KEPT_GRASPS} grasps wiped"
+    return Outcome(tried, happened, wiped == 0)
 
 
 def exchanged_sensor(plan: Plan) -> Outcome:
     """A sensor is exchanged for another while the bridge is unplugged, and later put back."""
     kept: list[tuple[int, int]] = []
-    for rounds in plan.rounds():
-        folder = plan.folder / str(rounds)
-        folder.mkdir()
+    for folder in plan.folders():
         tactile = tactile_section("spi", str(folder / "bridge"))
         session = f'[session]\nfile = "{folder}/session.json"\n'
         file = keep_grasps(folder, tactile + session)
@@ -242,22 +215,20 @@ def mixed(payload: bytes) -> bool:
 def torn(plan: Plan, link: str) -> Outcome:
     """Frames are lost, doubled, swapped and held back, and the board is unplugged and reset."""
     readings = torn_ones = flagged = 0
-    for rounds in plan.rounds():
-        folder = plan.folder / str(rounds)
-        folder.mkdir()
+    for tried, folder in enumerate(plan.folders()):
         faults = LinkFaults(
             drop_probability=0.02,
             duplicate_probability=0.02,
             reorder_probability=0.02,
             bit_flip_probability=0.02 if link == "spi" else 0.0,  # CAN has a checksum of its own
-            burst_frames=1 + rounds % 3,
+            burst_frames=1 + tried % 3,
             disconnect_every_frames={"spi": 150, "sweep_fd": 451, "syntouch": 3611}[link],
             seed=plan.random.randrange(1 << 30),
         )
-        tactile, at_work = torn_twin(folder, link, faults)
+        tactile, twin = torn_twin(folder, link, faults)
         endpoint = f"ipc://{folder}/verdicts"
         with (
-            at_work,
+            twin,
             daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n"),
             Subscriber(endpoint, topics=("tactile.",)) as subscriber,
         ):
@@ -294,15 +265,8 @@ def torn_twin(
 @contextmanager
 def board(twin: CanTwin) -> Iterator[None]:
     """A twin on a bus at work in a thread."""
-    stop = threading.Event()
-    with twin:
-        thread = threading.Thread(target=twin.serve, args=(stop,))
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            thread.join()
+    with twin, at_work(twin.serve):
+        yield
 
 
 def any_valid(heard: Heard) -> bool:

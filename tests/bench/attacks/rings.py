@@ -40,10 +40,12 @@ from tests.bench.live import (
     SEED,
     Subscriber,
     can_id,
+    free_port,
     start_daemon,
     tactile_section,
     where_of,
 )
+from tests.threads import at_work
 
 RING_MIN, RING_MAX = 2, 64
 """Sweeps that are repeated."""
@@ -59,8 +61,10 @@ JOINTS_MAY_STAND_S = 1.5
 """How long joint angles may be equal to the bit before no verdict may be `stable`, s."""
 
 RATES_HZ = (PALM_RATE_HZ, RATE_HZ)
-Serve = Callable[[Path, Iterator[Counts], float, threading.Event], tuple[str, Callable[[], None]]]
-"""The scene's `[tactile]`, and what sends the counts, so many a second, until told to stop."""
+Send = Callable[[threading.Event], None]
+"""Sends until it is told to stop."""
+Link = Callable[[Path, Iterator[Counts], float], tuple[str, Send]]
+"""The scene's `[tactile]`, and what sends the counts, so many a second."""
 
 
 class Ring:
@@ -99,12 +103,10 @@ def ringed(old: Counts, fresh: Counts, finger: int | None) -> Counts:
     return counts
 
 
-def over_spi(
-    folder: Path, counts: Iterator[Counts], rate_hz: float, stop: threading.Event
-) -> tuple[str, Callable[[], None]]:
+def over_spi(folder: Path, counts: Iterator[Counts], rate_hz: float) -> tuple[str, Send]:
     twin = SpiTwin(folder / "bridge", counts, rate_hz=rate_hz)
 
-    def serve() -> None:
+    def serve(stop: threading.Event) -> None:
         with twin:
             twin.serve(stop.is_set)
 
@@ -112,15 +114,15 @@ def over_spi(
 
 
 def over_can(
-    format_: str, folder: Path, counts: Iterator[Counts], rate_hz: float, stop: threading.Event
-) -> tuple[str, Callable[[], None]]:
+    format_: str, folder: Path, counts: Iterator[Counts], rate_hz: float
+) -> tuple[str, Send]:
     where = where_of("can", folder)
     identifier = can_id(where)
     twin = CanTwin(
         "udp_multicast", where, counts, format=format_, arbitration_id=identifier, rate_hz=rate_hz
     )
 
-    def serve() -> None:
+    def serve(stop: threading.Event) -> None:
         with twin:
             twin.serve(stop)
 
@@ -130,34 +132,10 @@ def over_can(
     ), serve
 
 
-def over_palm(
-    _folder: Path, counts: Iterator[Counts], _rate_hz: float, stop: threading.Event
-) -> tuple[str, Callable[[], None]]:
+def over_palm(_folder: Path, counts: Iterator[Counts], _rate_hz: float) -> tuple[str, Send]:
     target = f"udp://127.0.0.1:{free_port()}"
-    serve = partial(PalmTwin(counts).serve, target, stop)
+    serve = partial(PalmTwin(counts).serve, target)
     return f'[tactile]\ndriver = "palm"\nsource = "{target}"\n', serve
-
-
-def free_port() -> int:
-    """A UDP port of this computer that nobody has."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
-
-
-@contextlib.contextmanager
-def serving(*serve: Callable[[], None], stop: threading.Event) -> Iterator[None]:
-    """Each in a thread, until the block is left."""
-    threads = [threading.Thread(target=one) for one in serve]
-    for thread in threads:
-        thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        for thread in threads:
-            thread.join()
 
 
 def scene_in(folder: Path, sections: str) -> Path:
@@ -180,8 +158,7 @@ def wait_for(subscriber: Subscriber, wanted: Callable[[Verdict], bool]) -> None:
 def under_attack(
     folder: Path,
     sections: str,
-    serve: Sequence[Callable[[], None]],
-    stop: threading.Event,
+    serve: Sequence[Send],
     begin: threading.Event,
     since_ns: Callable[[], int | None],
 ) -> tuple[int, int]:
@@ -197,7 +174,7 @@ def under_attack(
         contextlib.ExitStack() as within,
     ):
         wait_for(subscriber, lambda _: True)  # it is there, and sees the hand at rest
-        within.enter_context(serving(*serve, stop=stop))
+        within.enter_context(at_work(*serve))
         wait_for(
             subscriber,
             lambda verdict: verdict.verdict is Decision.STABLE and next(stable) >= STABLE_FIRST,
@@ -216,12 +193,12 @@ def under_attack(
     return len(late), late.count(Decision.STABLE)
 
 
-def rounds(plan: Plan) -> Iterator[tuple[int, int | None]]:
-    """Length of each ring, and the finger that it is of; None: all."""
-    for _ in plan.rounds():
+def rings(plan: Plan) -> Iterator[tuple[Path, int, int | None]]:
+    """A folder for each ring, its length, and the finger that it is of; None: all."""
+    for folder in plan.folders():
         finger = None if plan.random.random() < 0.5 else plan.random.randrange(3)
         # Short rings more often than long ones: what is looked for is the same in all.
-        yield round(RING_MIN * (RING_MAX / RING_MIN) ** plan.random.random()), finger
+        yield folder, round(RING_MIN * (RING_MAX / RING_MIN) ** plan.random.random()), finger
 
 
 def tallied(verdicts: Iterable[tuple[int, int]]) -> Outcome:
@@ -234,18 +211,16 @@ def tallied(verdicts: Iterable[tuple[int, int]]) -> Outcome:
     return Outcome(tried, f"{stable} of {said:,} verdicts `stable`", said > 0 and stable == 0)
 
 
-def ring_over(over: Serve, rates_hz: Sequence[float], plan: Plan) -> Outcome:
+def ring_over(over: Link, rates_hz: Sequence[float], plan: Plan) -> Outcome:
     """A ring over a link, at one of these rates."""
 
-    def one(number: int, sweeps: int, finger: int | None) -> tuple[int, int]:
-        folder = plan.folder / str(number)
-        folder.mkdir()
+    def one(folder: Path, sweeps: int, finger: int | None) -> tuple[int, int]:
         rate_hz = plan.random.choice(rates_hz)
-        ring, stop = Ring(sweeps, finger, rate_hz), threading.Event()
-        section, serve = over(folder, ring.counts(), rate_hz, stop)
-        return under_attack(folder, section, [serve], stop, ring.begin, lambda: ring.turned_ns)
+        ring = Ring(sweeps, finger, rate_hz)
+        section, serve = over(folder, ring.counts(), rate_hz)
+        return under_attack(folder, section, [serve], ring.begin, lambda: ring.turned_ns)
 
-    return tallied(one(number, *each) for number, each in enumerate(rounds(plan)))
+    return tallied(one(*each) for each in rings(plan))
 
 
 def recorded(
@@ -266,9 +241,7 @@ def recorded(
 def ring_replayed(plan: Plan) -> Outcome:
     """A ring in a recording that is played."""
 
-    def one(number: int, ring: int, finger: int | None) -> tuple[int, int]:
-        folder = plan.folder / str(number)
-        folder.mkdir()
+    def one(folder: Path, ring: int, finger: int | None) -> tuple[int, int]:
         rate_hz = plan.random.choice(RATES_HZ)
         moments, late_from = recorded(ring, finger, rate_hz, HOLD_S + plan.random.random())
         with (folder / "rows.csv").open("w") as file:
@@ -290,23 +263,21 @@ def ring_replayed(plan: Plan) -> Outcome:
             raise RuntimeError("the recorded grasp was not judged before the ring began")
         return len(late), list(late.values()).count(Decision.STABLE)
 
-    return tallied(one(number, *each) for number, each in enumerate(rounds(plan)))
+    return tallied(one(*each) for each in rings(plan))
 
 
 def joints_frozen(plan: Plan) -> Outcome:
     """Joint angles that stand still to the bit beside sweeps that go on."""
 
-    def one(number: int) -> tuple[int, int]:
-        folder = plan.folder / str(number)
-        folder.mkdir()
-        port, stop, begin = free_port(), threading.Event(), threading.Event()
+    def one(folder: Path) -> tuple[int, int]:
+        port, begin = free_port(), threading.Event()
         frozen_ns: list[int] = []
         counts = Ring(1, None, RATE_HZ).counts()
-        section, serve = over_spi(folder, counts, RATE_HZ, stop)
+        section, serve = over_spi(folder, counts, RATE_HZ)
         section += f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{port}"\n'
         rng = np.random.default_rng(plan.random.randrange(1 << 32))
 
-        def send_joints() -> None:
+        def send_joints(stop: threading.Event) -> None:
             angles = np.full(len(JOINT_NAMES), 0.8)
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
                 for seq in itertools.count():
@@ -322,9 +293,9 @@ def joints_frozen(plan: Plan) -> Outcome:
         def since_ns() -> int | None:
             return frozen_ns[0] + round(JOINTS_MAY_STAND_S * 1e9) if frozen_ns else None
 
-        return under_attack(folder, section, [serve, send_joints], stop, begin, since_ns)
+        return under_attack(folder, section, [serve, send_joints], begin, since_ns)
 
-    return tallied(one(number) for number in plan.rounds())
+    return tallied(one(folder) for folder in plan.folders())
 
 
 def _ring(door: str, run: Callable[[Plan], Outcome]) -> Attack:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from models import zoo
 from models.runtime import TactileModel
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import HELD, PATIENCE_S, Subscriber, start_daemon, tactile_section
+from tests.threads import at_work
 
 MODEL = "cnn1"
 """What it says of counts depends on nothing else."""
@@ -153,9 +153,7 @@ def scene_text(folder: Path, gate: str) -> str:
 def drifts(plan: Plan, gate: str) -> Outcome:
     """Ask all the while that a held grasp drifts to what the network calls slip."""
     told = Told()
-    for number in plan.rounds():
-        folder = plan.folder / str(number)
-        folder.mkdir()
+    for folder in plan.folders():
         _drift_once(folder, gate, told)
     happened = (
         f"{told.false:,} of {told.valid:,} verdicts `stable` after 100 ms of slip, {told.slips:,} "
@@ -167,7 +165,7 @@ def drifts(plan: Plan, gate: str) -> Outcome:
 
 
 def _drift_once(folder: Path, gate: str, told: Told) -> None:
-    scene, over = folder / "scene.toml", threading.Event()
+    scene = folder / "scene.toml"
     scene.write_text(scene_text(folder, gate))
     sweeps = drifting()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -177,16 +175,11 @@ def _drift_once(folder: Path, gate: str, told: Told) -> None:
         context,
         context.socket(zmq.DEALER) as asker,
         SpiTwin(folder / "bridge", sweeps) as twin,
+        at_work(lambda stop: twin.serve(stop.is_set)),
     ):
         asker.linger = 0
         asker.connect(f"ipc://{folder}/ask")
-        serving = threading.Thread(target=partial(twin.serve, over.is_set))
-        serving.start()
-        try:
-            _hear(subscriber, asker, twin, told)
-        finally:
-            over.set()
-            serving.join()
+        _hear(subscriber, asker, twin, told)
 
 
 def _hear(subscriber: Subscriber, asker: zmq.Socket[bytes], twin: SpiTwin, told: Told) -> None:
@@ -216,9 +209,7 @@ def _hear(subscriber: Subscriber, asker: zmq.Socket[bytes], twin: SpiTwin, told:
 def open_hand(plan: Plan) -> Outcome:
     """Have each reading of an open hand judged as a grasp."""
     verdicts = stable = refused = tried = 0
-    for number in plan.rounds():
-        folder = plan.folder / str(number)
-        folder.mkdir()
+    for folder in plan.folders():
         scene = folder / "scene.toml"
         scene.write_text(scene_text(folder, 'mode = "every"'))
         command = [sys.executable, "-m", "daemon", "check", str(scene)]
@@ -233,26 +224,21 @@ def open_hand(plan: Plan) -> Outcome:
 
 
 def _open_once(folder: Path, scene: Path) -> list[Verdict]:
-    over, heard = threading.Event(), list[Verdict]()
+    heard: list[Verdict] = []
     with (
         start_daemon(scene, folder / "log") as daemon,
         Subscriber(f"ipc://{folder}/v") as subscriber,
         SpiTwin(folder / "bridge", at_rest()) as twin,
+        at_work(lambda stop: twin.serve(stop.is_set)),
     ):
-        serving = threading.Thread(target=partial(twin.serve, over.is_set))
-        serving.start()
-        try:
-            ends_s = time.monotonic() + PATIENCE_S
-            while not heard and daemon.process.poll() is None and time.monotonic() < ends_s:
-                if (message := subscriber.take(0.1)) is not None:
-                    heard.append(decode_verdict(message[1]))
-                    ends_s = time.monotonic() + OPEN_S
-            while heard and time.monotonic() < ends_s:
-                if (message := subscriber.take(0.1)) is not None:
-                    heard.append(decode_verdict(message[1]))
-        finally:
-            over.set()
-            serving.join()
+        ends_s = time.monotonic() + PATIENCE_S
+        while not heard and daemon.process.poll() is None and time.monotonic() < ends_s:
+            if (message := subscriber.take(0.1)) is not None:
+                heard.append(decode_verdict(message[1]))
+                ends_s = time.monotonic() + OPEN_S
+        while heard and time.monotonic() < ends_s:
+            if (message := subscriber.take(0.1)) is not None:
+                heard.append(decode_verdict(message[1]))
     return heard
 
 

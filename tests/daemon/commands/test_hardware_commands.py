@@ -130,7 +130,7 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
         wait_for(tmp_path / "graspd")
         for _ in range(2):
             with twin("spi", tmp_path) as hardware:
-                deadline_s = time.monotonic() + 20
+                deadline_s = time.monotonic() + TIMEOUT_S
                 while not any(verdict.valid for verdict in published(tmp_path, 10)):
                     assert time.monotonic() < deadline_s
                 end(hardware)

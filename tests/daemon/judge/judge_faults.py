@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,7 +40,7 @@ def replayed(**faults: int | float | tuple[int, ...] | tuple[str, ...]) -> Fault
             injector.observe(number, counts, flags)
             if number and injector.makes(number) and not injector.loses():
                 injector.spoil(counts, flags)
-                reading = dataclasses.replace(reading, counts=counts, faults=flags)
+                reading = msgspec.structs.replace(reading, counts=counts, faults=flags)
             elif number:
                 reading = None
             now_ns = step.now_ns + round(wanted.delayed_s * 1e9)
@@ -75,7 +76,7 @@ def flagged(fault: ElectrodeFault, where: Electrodes) -> Fault:
     def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
         counts, faults = reading.counts.copy(), reading.faults.copy()
         counts[where], faults[where] = 0, fault
-        return dataclasses.replace(reading, counts=counts, faults=faults)
+        return msgspec.structs.replace(reading, counts=counts, faults=faults)
 
     return in_tactile(change)
 
@@ -86,7 +87,7 @@ def reading_only(count: int, where: Electrodes) -> Fault:
     def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
         counts = reading.counts.copy()
         counts[where] = count
-        return dataclasses.replace(reading, counts=counts)
+        return msgspec.structs.replace(reading, counts=counts)
 
     return in_tactile(change)
 
@@ -95,14 +96,14 @@ def shifted(time_ms: int) -> Fault:
     """Readings whose time jumps by so much, once."""
 
     def change(reading: TactileReading, _before: TactileReading) -> TactileReading:
-        return dataclasses.replace(reading, t_ns=reading.t_ns + time_ms * MS)
+        return msgspec.structs.replace(reading, t_ns=reading.t_ns + time_ms * MS)
 
     return in_tactile(change)
 
 
 def standing_still(reading: TactileReading, before: TactileReading) -> TactileReading:
     """A reading whose time is that of the last sound one."""
-    return dataclasses.replace(reading, t_ns=before.t_ns)
+    return msgspec.structs.replace(reading, t_ns=before.t_ns)
 
 
 def ring(sweeps: int, fingers: tuple[int, ...] = (0, 1, 2)) -> Fault:
@@ -115,7 +116,7 @@ def ring(sweeps: int, fingers: tuple[int, ...] = (0, 1, 2)) -> Fault:
             if step.tactile is not None and old is not None:
                 counts = step.tactile.counts.copy()
                 counts[fingers, :] = old.counts[fingers, :]
-                tactile = dataclasses.replace(step.tactile, counts=counts)
+                tactile = msgspec.structs.replace(step.tactile, counts=counts)
                 step = dataclasses.replace(step, tactile=tactile)
             steps.append(step)
         return steps
@@ -133,7 +134,7 @@ def in_joints(change: Callable[[NDArray[np.float64], float], NDArray[np.float64]
             if joints is not None:
                 since_s = (step.now_ns - sound[0].now_ns) / 1e9
                 angles = change(joints.position_rad, since_s)
-                joints = dataclasses.replace(joints, position_rad=angles)
+                joints = msgspec.structs.replace(joints, position_rad=angles)
             steps.append(dataclasses.replace(step, joints=joints))
         return steps
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -67,7 +66,7 @@ def troubled(readings: list[Reading]) -> list[Reading]:
             if place % 700 > 640 and len(found) % STEP > 2:
                 counts[2] = sent[-OLD]  # of before that
             sent.append(counts[2])
-            found.append(dataclasses.replace(reading, counts=counts, faults=faults))
+            found.append(msgspec.structs.replace(reading, counts=counts, faults=faults))
         else:
             found.append(reading)
     return found

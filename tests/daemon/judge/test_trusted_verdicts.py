@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -46,7 +46,7 @@ def test_without_an_outcome_nothing_changes(p_slip: float) -> None:
     assert trusted.p_slip == plain.p_slip == trusted.p_slip_model
     assert trusted.risk is not None
     assert (trusted.risk.target, trusted.risk.bound, trusted.supervised) == (None, None, False)
-    assert dataclasses.replace(trusted, risk=None) == plain
+    assert msgspec.structs.replace(trusted, risk=None) == plain
 
 
 def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:

@@ -54,8 +54,8 @@ def test_the_limit_of_slopes_is_what_19_of_20_real_touches_kept_to(
     variance = np.array([SIGMA_COUNTS**2 / (1.0 - CORRELATION)])
     noise = Noise.of(variance, np.array([[CORRELATION], [0.03]]))
     by_noise = noise.slope[sweeps] / np.sqrt((times_s**2).sum())
-    limit = fast_limit(Tails.of(1, 0.05, early=True).alone, by_noise)
-    assert (limit * by_noise)[0] == pytest.approx(counts_per_s, rel=0.1)
+    (limit,) = fast_limit(Tails.of(1, 0.05, early=True).alone, by_noise.tolist())
+    assert limit * by_noise[0] == pytest.approx(counts_per_s, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -13,7 +14,10 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
-from daemon.measure.error_vs_time import page
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from daemon.measure.error_vs_time import page, picture
 from daemon.measure.error_vs_time.peers import loop_image
 from daemon.measure.error_vs_time.report import _counts, _errors
 from daemon.measure.error_vs_time.timing import measure
@@ -25,11 +29,26 @@ from tests.daemon.fakes import FakeModel, contract
 from tests.daemon.processes import graspd
 from tests.models.training.evaluation_samples import sessions
 
+WHOLE_S = 300.0
+"""A quick report takes a quarter of a minute, and many on a busy machine."""
+pytestmark = pytest.mark.timeout(WHOLE_S)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def fonts() -> None:
+    """Matplotlib opens its fonts once, and keeps them open."""
+    figure = Figure()
+    figure.subplots().set_xscale("log")
+    for style, weight in (("normal", "bold"), ("italic", "normal")):
+        figure.text(0.0, 0.0, "a", fontstyle=style, fontweight=weight)
+    figure.draw_without_rendering()
+
 
 @pytest.fixture(scope="module")
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report")
-    result = graspd("report", "error-vs-time", "--data", bts3_dir, "--out", out, "--quick")
+    command = ("report", "error-vs-time", "--data", bts3_dir, "--out", out, "--quick")
+    result = graspd(*command, timeout_s=WHOLE_S)
     assert result.returncode == 0, result.stderr
     assert result.stdout == (out / "error-vs-time.md").read_text()
     return out
@@ -72,8 +91,61 @@ def test_the_page_needs_nothing_from_elsewhere(folder: Path, found: dict[str, An
     assert "<script" not in text
     for row in found["rows"]:
         assert row["name"].split(",")[0] in text
-    picture = (folder / "error-vs-time.svg").read_text()
-    assert all(re.search(rf"<!-- +[0-9]+ +{name} -->", picture) for name in zoo.names())
+
+
+def test_each_point_is_named_in_the_panels_that_it_is_in(
+    folder: Path, found: dict[str, Any]
+) -> None:
+    drawn = (folder / "error-vs-time.svg").read_text()
+    whole = [row for row in found["rows"] if len(row["fingers"]) == 3]
+    for row in whole:
+        label = row["name"] + " (default)" * (row["name"] == "small-session")
+        protocols = set(row["error"]) & {"cv", "objects", "objects-whole", "session"}
+        assert drawn.count(f"<!-- {label} -->") == len(protocols) == 3
+    assert not any(f"<!-- {row['name']} -->" in drawn for row in found["rows"] if row not in whole)
+    assert all(f"<!-- {asked}" in drawn for asked in page.ASKED)
+
+
+def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[str, Any]) -> None:
+    for suffix in ("svg", "md", "html"):
+        text = (folder / f"error-vs-time.{suffix}").read_text()
+        assert "-quick" in text  # an XML comment has no "--"
+        assert found["machine"]["processor"].split("(")[0] in text
+    drawn = picture.draw({**found, "quick": False})
+    assert "-quick" not in drawn
+    assert "Error against run time" in drawn
+
+
+def test_the_short_table_has_seven_rows_at_most_and_the_default_is_marked(folder: Path) -> None:
+    first, _ruler, *rows = (folder / "error-vs-time.md").read_text().split("\n\n")[0].split("\n")
+    assert first.count("|") == 7
+    assert 3 <= len(rows) <= 7
+    assert next(row for row in rows if "the default" in row).startswith("| `small-session`")
+
+
+def test_no_name_covers_a_point_or_another_name() -> None:
+    several = [
+        picture.Point(f"model-{number}", "model", 100.0 + number, 5.0 + number / 50, (1, 1), False)
+        for number in range(12)
+    ]
+    figure = Figure(figsize=(9, 3), dpi=72)
+    axes = figure.subplots()
+    axes.set(xscale="log", xlim=(50, 500), ylim=(4, 7))
+    picture.name_points(axes, several)
+    figure.draw_without_rendering()
+    boxes = [Text.get_window_extent(text) for text in axes.texts]  # without their lines
+    points = [axes.transData.transform((point.us, point.error)) for point in several]
+    assert len(boxes) == len(several)
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+    assert not any(box.contains(*point) for box in boxes for point in points)
+
+
+def test_the_front_is_what_none_is_both_faster_and_more_exact_than() -> None:
+    # By hand: c is slower and worse than b; the peer is no model of graspd's.
+    given = [("a", "model", 9.0, 8.0), ("b", "model", 20.0, 5.0), ("c", "model", 30.0, 6.0)]
+    given += [("d", "model", 40.0, 4.0), ("e", "peer", 8.0, 1.0)]
+    several = [picture.Point(*each, (0.0, 0.0), False) for each in given]
+    assert [point.name for point in picture.front(several)] == ["a", "b", "d"]
 
 
 def test_an_interval_is_nadeaus_and_bengios() -> None:

@@ -53,7 +53,7 @@ def test_a_complaint_in_the_journal_is_an_error(tmp_path: Path) -> None:
             stderr=stream,
             env={**os.environ, "JOURNAL_STREAM": f"{there.st_dev}:{there.st_ino}"},
             check=False,
-            timeout=50,
+            timeout=200,
         ).returncode
     assert code == 2
     assert log.read_text().startswith("<3>")

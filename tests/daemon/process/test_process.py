@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import resource
 import signal
@@ -11,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.process.text import printable
+from daemon.process.text import printable, progress
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, graspd, start, wait_for
 
@@ -62,6 +63,23 @@ def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) ->
     assert result.returncode == 0, result.stderr
     assert "Traceback" not in result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
+
+
+COLLECTIONS = """
+import atexit, gc
+before = sum(each["collections"] for each in gc.get_stats())
+def tell():
+    done = sum(each["collections"] for each in gc.get_stats()) - before
+    print(done, gc.isenabled(), gc.get_freeze_count() > 10_000)
+atexit.register(tell)
+"""
+
+
+def test_loading_collects_no_garbage_and_what_is_loaded_is_never_looked_through() -> None:
+    result = python(COLLECTIONS, "check", DEMO_SCENE)
+    done, enabled, frozen = result.stdout.splitlines()[-1].split()
+    assert (enabled, frozen) == ("True", "True")
+    assert int(done) < 60  # it takes some 110 while loading alone
 
 
 WHILE_LEAVING = """
@@ -258,3 +276,13 @@ def test_a_path_does_not_move_the_cursor_either(tmp_path: Path) -> None:
 )
 def test_what_could_hide_is_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
+
+
+def test_what_is_being_done_is_shown_on_a_terminal_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    for is_terminal, expected in ((True, "\r\x1b[Khalf\\nway\r\x1b[K"), (False, "")):
+        stderr = io.StringIO()
+        monkeypatch.setattr(stderr, "isatty", lambda is_terminal=is_terminal: is_terminal)
+        monkeypatch.setattr("sys.stderr", stderr)
+        progress("half\nway")
+        progress("")
+        assert stderr.getvalue() == expected

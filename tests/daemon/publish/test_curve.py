@@ -30,8 +30,11 @@ def guarded() -> Iterator[tuple[Guard, list[str]]]:
 
 
 def memory() -> mmap.mmap:
-    """More than peers may hold, from the kernel and given back to it when it is closed."""
-    made = mmap.mmap(-1, GROWTH_MAX_BYTES + (4 << 20))
+    """More than peers may hold, from the kernel and given back to it when it is closed.
+
+    Much more: meanwhile the kernel may take back pages of files that this process had in memory.
+    """
+    made = mmap.mmap(-1, GROWTH_MAX_BYTES + (64 << 20))
     for at in range(0, len(made), mmap.PAGESIZE):
         made[at] = 1
     return made

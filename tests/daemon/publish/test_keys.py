@@ -25,7 +25,7 @@ from tests.daemon.processes import graspd
 
 PORT = 25931
 ENDPOINT = f"tcp://127.0.0.1:{PORT}"
-PATIENCE_S = 10.0
+PATIENCE_S = 100.0
 QUIET_S = 0.5
 """How long nothing may come to who is not let in, s."""
 

@@ -147,7 +147,7 @@ def test_a_peer_that_wants_signs_of_life_gets_them(tmp_path: Path, friends: Peer
             publisher.take()
             time.sleep(0.005)
         assert not monitor.poll(0)
-        assert monitor.poll(2000)  # nobody looks after the publisher any more
+        assert monitor.poll(WAIT_MS)  # nobody looks after the publisher any more
         subscriber.disable_monitor()
 
 

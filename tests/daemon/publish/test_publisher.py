@@ -17,7 +17,7 @@ from daemon.process.signals import StopSignal
 from daemon.publish.binding import PublishError
 from daemon.publish.publisher import Publisher
 
-WAIT_MS = 5000
+WAIT_MS = 100_000
 
 
 class Peers:
@@ -77,11 +77,17 @@ def test_a_plain_subscriber_gets_two_frames_in_order(
     endpoint = ENDPOINTS[scheme].format(folder=tmp_path)
     with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint, "verdict.")
-        assert publisher.wait_for_subscriber(5.0)
+        assert publisher.wait_for_subscriber(WAIT_MS / 1e3)
+        end_s = time.monotonic() + WAIT_MS / 1e3
         publisher.send(b"status.right", b"not wanted")
         for number in range(100):
             publisher.send(b"verdict.right", b"%d" % number)
-        received = [subscriber.recv_multipart() for _ in range(100)]
+        received = []
+        while len(received) < 100:
+            publisher.take()  # what a busy subscriber's socket has no room for is sent later
+            assert time.monotonic() < end_s
+            if subscriber.poll(10):
+                received.append(subscriber.recv_multipart())
     assert received == [[b"verdict.right", b"%d" % number] for number in range(100)]
 
 
@@ -134,7 +140,7 @@ def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
     endpoint = f"ipc://{tmp_path}/v"
     with Publisher(endpoint, high_water_mark=10) as publisher:
         subscriber = peers.subscribe(endpoint, high_water_mark=10)
-        assert publisher.wait_for_subscriber(5.0)
+        assert publisher.wait_for_subscriber(WAIT_MS / 1e3)
         for number in range(20_000):
             publisher.send(b"verdict.right", b"%d" % number + b" " * 1000)
         received = []
@@ -160,7 +166,7 @@ def test_a_peer_that_sends_more_than_a_subscription_is_cut_off(
         hostile.send(b"\x01" + b"x" * 100_000)
         assert not publisher.wait_for_subscriber(0.3)
         subscriber = peers.subscribe(endpoint)
-        assert publisher.wait_for_subscriber(5.0)
+        assert publisher.wait_for_subscriber(WAIT_MS / 1e3)
         publisher.send(b"verdict.right", b"{}")
         assert subscriber.recv_multipart() == [b"verdict.right", b"{}"]
 

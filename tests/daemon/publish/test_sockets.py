@@ -21,7 +21,7 @@ from daemon.publish.sockets import Sockets, plan
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.test_publisher import Peers
 
-PATIENCE_MS = 10_000
+PATIENCE_MS = 100_000
 HOSTILE_MESSAGES = 10_000
 
 

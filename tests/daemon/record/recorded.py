@@ -40,13 +40,14 @@ class Lab:
         return sorted((self.folder / "record").glob("*.mcap"))
 
 
-def scene(folder: Path, record: str = "", more: str = "") -> Path:
-    """A scene that plays the demo recording and records."""
+def scene(folder: Path, record: str = "", more: str = "", gate: str = "") -> Path:
+    """A scene that plays the demo recording and records; no reading is too old for it."""
     path = folder / "scene.toml"
     path.write_text(
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_RECORDING}"]\n'
         f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
         f'[record]\ndirectory = "record"\n{record}\n{more}'
+        f"[gate]\nmax_age_ms = 10000\n{gate}"
     )
     return path
 
@@ -76,11 +77,11 @@ def work(folder: Path, grasps: int, more: str = "", record: str = "") -> Lab:
 
 
 def _lift(lab: Lab, grasps: int, listener: zmq.Socket[bytes], teller: zmq.Socket[bytes]) -> None:
-    deadline_s = time.monotonic() + 40
+    deadline_s = time.monotonic() + TIMEOUT_S
     seen: set[int] = set()
     while len(seen) < grasps:
         assert time.monotonic() < deadline_s
-        assert listener.poll(10_000)
+        assert listener.poll(100_000)
         verdict = decode_verdict(listener.recv_multipart()[1])
         lab.verdicts.append(verdict)
         if not verdict.judged or verdict.grasp in seen:
@@ -90,5 +91,5 @@ def _lift(lab: Lab, grasps: int, listener: zmq.Socket[bytes], teller: zmq.Socket
             continue
         outcome = lab.told[verdict.grasp] = "slip" if len(seen) % 2 else "stable"
         teller.send(f"outcome {verdict.boot_id} {verdict.grasp} {outcome}".encode())
-        assert teller.poll(5000)
+        assert teller.poll(100_000)
         lab.answers.append(json.loads(teller.recv()))

@@ -42,7 +42,7 @@ def scene(kind: str, folder: Path) -> Path:
         f"[tactile]\n{filled(LINKS[kind], folder)}\n"
         f'[model]\nname = "cnn1"\n[session]\nkeep = false\n'
         f'[publish]\nendpoint = "ipc://{folder}/graspd"\n'
-        '[record]\ndirectory = "record"\nraw = true\n'
+        '[record]\ndirectory = "record"\nraw = true\n[gate]\nmax_age_ms = 10000\n'
     )
     return path
 

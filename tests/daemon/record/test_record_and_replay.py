@@ -146,7 +146,7 @@ def test_questions_are_in_the_recording_and_are_asked_again(tmp_path: Path) -> N
     from tests.daemon.record.recorded import scene
 
     with (
-        start("run", scene(tmp_path, more='[gate]\nmode = "request"\n')) as daemon,
+        start("run", scene(tmp_path, gate='mode = "request"\n')) as daemon,
         zmq.Context() as context,
         context.socket(zmq.REQ) as asker,
     ):
@@ -156,12 +156,12 @@ def test_questions_are_in_the_recording_and_are_asked_again(tmp_path: Path) -> N
         judged = 0
         for _ in range(40):
             asker.send(b"judge")
-            assert asker.poll(5000)
+            assert asker.poll(100_000)
             judged += json.loads(asker.recv())["judged"]
             if judged == 2:
                 break
         daemon.terminate()
-        daemon.communicate(timeout=20)
+        daemon.communicate(timeout=200)
     (path,) = (tmp_path / "record").glob("*.mcap")
     before = of_readings(path)
     assert sum(verdict["judged"] for verdict in before) >= 2

@@ -10,6 +10,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -35,7 +36,7 @@ START_NS = 10**12
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 20
+    deadline_s = time.monotonic() + 100
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.005)
@@ -171,7 +172,11 @@ def sweeps() -> list[TactileReading]:
             for reading in driver.read_ready():
                 if isinstance(reading, TactileReading):
                     t_ns = START_NS + reading.made_ns
-                    found.append(replace(reading, t_ns=t_ns, recorded_ns=None, annotation=None))
+                    found.append(
+                        msgspec.structs.replace(
+                            reading, t_ns=t_ns, recorded_ns=None, annotation=None
+                        )
+                    )
     return found
 
 
@@ -187,7 +192,8 @@ def again(*paths: Path) -> list[Judgement]:
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)
-                found.append(replace(pipeline.judge(reading), t_ns=reading.made_ns))
+                judgement = pipeline.judge(reading)
+                found.append(msgspec.structs.replace(judgement, t_ns=reading.made_ns))
                 pipeline.learn()
     return found
 

@@ -444,7 +444,7 @@ class Peer(Companion):
     def on_outcome(self, grasp: int, outcome: str, object_name: str | None) -> None:
         self.heard.append((grasp, outcome, object_name))
 
-    def on_answer(self, payload: bytes) -> None:
+    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
         self.heard.append(payload)
 
     def counters_by_part(self) -> dict[str, dict[str, int]]:

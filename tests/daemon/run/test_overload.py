@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import logging
 import selectors
@@ -10,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -335,7 +335,7 @@ def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
     for live in (False, True):
         clock = Clock()
         costs = busy(seed, clock) if live else itertools.repeat(0)
-        driver = LiveDriver([dataclasses.replace(item) for item in grasps(seed)], clock)
+        driver = LiveDriver([msgspec.structs.replace(item) for item in grasps(seed)], clock)
         driver.live = live
         bench = Bench(driver, clock, costs.__next__, grip=LIMITS)
         judged.append({seen.seq: verdict for verdict, seen in bench.judged})
@@ -356,8 +356,8 @@ def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
     for seq in range(150, 250):
         pose = POSES["other" if 205 <= seq < 209 else "grasp"]
         counts = (pose + np.random.default_rng(seq).integers(-2, 3, (3, 24))).astype(np.uint16)
-        came.append(dataclasses.replace(came[0], t_ns=START_NS + seq * PERIOD_NS, seq=seq))
-        came[-1] = dataclasses.replace(came[-1], counts=counts)
+        came.append(msgspec.structs.replace(came[0], t_ns=START_NS + seq * PERIOD_NS, seq=seq))
+        came[-1] = msgspec.structs.replace(came[-1], counts=counts)
 
     def cost_ns() -> int:
         return 15 * MS if 200 * PERIOD_NS < clock() - START_NS < 215 * PERIOD_NS else 0
@@ -382,7 +382,7 @@ def test_a_finger_that_repeats_itself_is_held_whatever_is_read_of_its_flagged_el
     counts[0, 5] += 7
     faults = np.zeros((3, 24), np.uint8)
     faults[0, 5] = ElectrodeFault.PARITY
-    found = after(former, dataclasses.replace(newest, counts=counts, faults=faults))
+    found = after(former, msgspec.structs.replace(newest, counts=counts, faults=faults))
     held = (found.faults & ElectrodeFault.HELD) != 0
     assert held[0].sum() == 23
     assert not held[0, 5]
@@ -394,9 +394,9 @@ def test_a_finger_of_which_nothing_is_read_is_missing_and_not_held() -> None:
     former, newest = reading(START_NS, 1, 1), reading(START_NS + PERIOD_NS, 2, 2)
     counts, faults = newest.counts.copy(), np.zeros((3, 24), np.uint8)
     counts[2], faults[2] = 0, ElectrodeFault.MISSING
-    gone = dataclasses.replace(newest, counts=counts, faults=faults)
+    gone = msgspec.structs.replace(newest, counts=counts, faults=faults)
     assert (
-        after(dataclasses.replace(gone, counts=counts.copy()), gone).faults[2].tolist()
+        after(msgspec.structs.replace(gone, counts=counts.copy()), gone).faults[2].tolist()
         == [ElectrodeFault.MISSING] * 24
     )
     assert after(former, gone) is gone

@@ -62,7 +62,7 @@ def in_a_process(text: str, folder: Path) -> str:
         capture_output=True,
         text=True,
         check=True,
-        timeout=50,
+        timeout=200,
     ).stdout
 
 

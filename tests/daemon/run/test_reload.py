@@ -19,7 +19,7 @@ from daemon.process.signals import StopSignal
 from daemon.run import reload
 from daemon.run.reload import Reload
 
-PATIENCE_S = 10.0
+PATIENCE_S = 100.0
 PARTS = cast(Parts, object())
 
 

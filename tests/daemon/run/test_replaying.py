@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import msgspec
 import pytest
 
 from daemon.publish.companion import Answer
@@ -51,6 +51,6 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     controller.before_wait(requests)
     note = Annotation(Path("any.csv"), 1, in_the_table, slipped=True)
     verdict = decode_verdict(GOLDEN.read_bytes())
-    controller.on_verdict(verdict, b"", replace(reading(0), annotation=note))
+    controller.on_verdict(verdict, b"", msgspec.structs.replace(reading(0), annotation=note))
     controller.tell()
     assert requests.told == [("slip", told)]

@@ -23,7 +23,7 @@ from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD
 
 DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
-PATIENCE_S = 20.0
+PATIENCE_S = 100.0
 
 SCENE = """
 [hand]

@@ -23,7 +23,7 @@ GOLDEN = Path(__file__).parents[1] / "publish" / "golden"
 def ears(tmp_path: Path) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
         ears.bind(str(tmp_path / "notify"))
-        ears.settimeout(5.0)
+        ears.settimeout(100.0)
         yield ears
 
 
@@ -124,7 +124,7 @@ def test_an_abstract_socket_is_found() -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ears:
         name = f"graspd-test-{os.getpid()}"
         ears.bind(f"\0{name}")
-        ears.settimeout(5.0)
+        ears.settimeout(100.0)
         manager = Systemd(f"@{name}")
         manager.ready("ready")
         assert heard(ears)[0] == "READY=1"

@@ -14,7 +14,7 @@ from typing import Any, Literal, Self
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 """Where it is; None where there is none."""
-PATIENCE_S = 30.0
+PATIENCE_S = 100.0
 """Longest wait for what must come, s."""
 FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),

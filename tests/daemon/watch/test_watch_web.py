@@ -25,7 +25,7 @@ from daemon.watch.web import (
     load_page,
 )
 
-PATIENCE_S = 10.0
+PATIENCE_S = 100.0
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def server() -> Iterator[Server]:
 
 def ask(server: Server, path: str = "/", method: str = "GET", **headers: str) -> tuple[int, bytes]:
     """Status and body."""
-    with closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)) as link:
+    with closing(http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=100)) as link:
         link.putrequest(method, path, skip_host=True)
         for name, value in {"Host": f"127.0.0.1:{server.server_port}", **headers}.items():
             link.putheader(name.replace("_", "-"), value)

@@ -49,23 +49,31 @@ def slcan_line() -> Iterator[tuple[str, Callable[[bytes], None], Callable[[], No
 
 def test_an_slcan_adapter_is_read_and_its_unplugging_leaves_nothing_open(
     slcan_line: tuple[str, Callable[[bytes], None], Callable[[], None]],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     path, write, unplug = slcan_line
     driver = CanBridgeDriver(
         "slcan", path, arbitration_id=SAMPLE_ID, sequence="electrodes", bitrate=1_000_000
     )
-    before_s = time.monotonic()
+    sleep, slept_s = time.sleep, []
+
+    def noted(seconds: float) -> None:
+        slept_s.append(seconds)
+        sleep(seconds)
+
+    monkeypatch.setattr(time, "sleep", noted)
+    patient_until_s = time.monotonic() + 100.0
     with driver:
         assert driver.fileno() is not None
         readings: list[Reading] = []
-        while not readings and time.monotonic() - before_s < 5.0:
+        while not readings and time.monotonic() < patient_until_s:
             driver.read_ready()
             for frame in sweep_of_frames(0):
                 write(f"t{frame.arbitration_id:03X}7{frame.data.hex().upper()}\r".encode())
                 readings += driver.read_ready()
             readings = [reading for reading in tactile(readings) if not reading.faults.any()]
         assert (tactile(readings)[0].counts == truth(0)).all()
-        assert time.monotonic() - before_s < 1.5, "python-can's default sleeps two seconds"
+        assert sum(slept_s) < 1.5, "python-can's default sleeps two seconds"
         unplug()
         driver.read_ready()
         assert driver.link_state is LinkState.WAITING

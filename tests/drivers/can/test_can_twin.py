@@ -23,6 +23,7 @@ from tests.drivers.can.can_standin import (
     tactile,
 )
 from tests.drivers.twins.signals import GeneratedContact
+from tests.threads import at_work
 
 MS = 1_000_000
 
@@ -45,20 +46,15 @@ def test_a_twin_refuses_what_its_format_cannot_show(options: Mapping[str, Any]) 
 
 
 def test_a_twin_serves_at_its_rate_until_stopped() -> None:
-    where, stop = channel(), threading.Event()
+    where = channel()
     twin = CanTwin("virtual", where, GeneratedContact(), rate_hz=100.0, sequence="electrodes")
     readings: list[TactileReading] = []
     with bridge(where) as driver, twin:
-        server = threading.Thread(target=twin.serve, args=(stop,))
-        server.start()
-        try:
-            deadline_s = time.monotonic() + 10.0
+        with at_work(twin.serve):
+            deadline_s = time.monotonic() + 100.0
             while len(readings) < 30 and time.monotonic() < deadline_s:
                 time.sleep(0.001)
                 readings += tactile(driver.read_ready())
-        finally:
-            stop.set()
-            server.join()
         period_ns = driver.period_ns
     assert len(readings) >= 30
     assert period_ns == pytest.approx(10 * MS, rel=0.2)

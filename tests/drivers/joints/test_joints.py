@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import threading
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ from drivers.link import LinkState
 from drivers.twins.faults import LinkFaults
 from drivers.twins.joints import JointTwin
 from tests.drivers.palm.palm_stream import MS, Clock, Sender, joints, listen
+from tests.threads import at_work
 
 DATAGRAM_BYTES_MAX = 4096
 
@@ -323,16 +324,9 @@ def test_the_faults_of_a_twin_are_counted() -> None:
         rate_hz=1000.0,
         faults=LinkFaults(drop_probability=0.1, duplicate_probability=0.1, seed=2),
     )
-    stop = threading.Event()
     with JointStreamDriver(LOOPBACK) as driver:
-        target = f"udp://127.0.0.1:{driver.port}"
-        thread = threading.Thread(target=twin.serve, args=(target, stop))
-        thread.start()
-        try:
+        with at_work(partial(twin.serve, f"udp://127.0.0.1:{driver.port}")):
             listen(driver, lambda readings: len(readings) >= 500)
-        finally:
-            stop.set()
-            thread.join()
         driver.read_ready()
         counters = driver.counters
     # The last message sent may have been followed by losses that nobody can know of.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import pytest
 
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.joints.driver import JointStreamDriver
@@ -18,6 +19,7 @@ from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
 from drivers.palm.rounds import RoundAssembler
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.palm import PalmTwin
+from drivers.udp.receiver import Datagram, DatagramReceiver
 
 FINGERS = ("ff", "mf", "th")
 MS = 1_000_000
@@ -29,9 +31,22 @@ class Clock:
 
     def __init__(self) -> None:
         self.now_ns = 10**12
+        self.age_ns = 0
+        """Of each datagram that is received."""
 
     def __call__(self) -> int:
         return self.now_ns
+
+    def rule(self, patch: pytest.MonkeyPatch) -> None:
+        """Let datagrams be as old as this clock says: the kernel's stamps tell when a busy machine
+        sent them."""
+        receive = DatagramReceiver.receive
+
+        def aged(receiver: DatagramReceiver, most: int) -> Iterator[Datagram]:
+            for datagram in receive(receiver, most):
+                yield datagram._replace(age_ns=self.age_ns)
+
+        patch.setattr(DatagramReceiver, "receive", aged)
 
 
 def rows(number: int, seed: int = 1) -> list[Counts]:
@@ -134,7 +149,7 @@ def wait_like_the_service(driver: PalmDriver | JointStreamDriver, most_s: float)
 def listen(
     driver: PalmDriver | JointStreamDriver,
     until: Callable[[list[Reading]], bool],
-    most_s: float = 10.0,
+    most_s: float = 100.0,
 ) -> list[Reading]:
     """Readings until a condition holds; fails after `most_s`."""
     readings: list[Reading] = []

@@ -6,6 +6,7 @@ Frames are computed with `zlib`, `cobs` and `struct` alone, so that they owe not
 from __future__ import annotations
 
 import os
+import random
 import select
 import struct
 import subprocess
@@ -47,7 +48,7 @@ def build_program(folder: Path, name: str, *sources: str) -> Path:
     files = [str(file) for source in sources for file in sorted(BRIDGE.glob(source))]
     includes = [f"-I{BRIDGE}/src", f"-I{BRIDGE}/host"]
     command = ["cc", *WARNINGS, *SANITIZERS, POSIX, *includes, *files, "-o", str(program)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=50, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
     assert done.returncode == 0, done.stderr
     return program
 
@@ -105,6 +106,29 @@ def judged(stream: bytes) -> tuple[list[str], int]:
     return found, errors
 
 
+def damaged(rng: random.Random) -> bytes:
+    """A frame of a host that something happened to, with its zero."""
+    kind = rng.choice((PING, START, STOP, rng.randrange(256)))
+    size = HOST_PAYLOADS.get(kind, rng.randrange(8))
+    whole = bytearray(frame(kind, rng.randbytes(size), rng.choice((DIGEST, DIGEST, 0))))
+    match rng.randrange(7):
+        case 0:
+            whole[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
+        case 1:
+            del whole[rng.randrange(len(whole))]
+        case 2:
+            whole.insert(rng.randrange(len(whole)), rng.randrange(256))
+        case 3:
+            del whole[rng.randrange(len(whole)) : -1]
+        case 4:
+            whole[:] = rng.randbytes(rng.randrange(1, 40)) + b"\0"
+        case 5:
+            whole[:] = bytes(rng.randrange(1, 256) for _ in range(rng.choice((32, 33, 1025))))
+        case _:
+            whole[:] = frame(kind, rng.randbytes(size + rng.choice((-1, 1, 30)) % 40))
+    return bytes(whole)
+
+
 @dataclass
 class Host:
     """The host's side of a running bridge."""
@@ -120,12 +144,12 @@ class Host:
             os.close(self.descriptor)
             self.descriptor = -1
             self.process.terminate()
-            assert self.process.wait(10) == 0
+            assert self.process.wait(100) == 0
 
     def send(self, *data: bytes) -> None:
         os.write(self.descriptor, b"".join(data))
 
-    def frames(self, timeout_s: float = 10.0) -> Iterator[tuple[int, bytes]]:
+    def frames(self, timeout_s: float = 100.0) -> Iterator[tuple[int, bytes]]:
         """Frames as they come; the test fails on a damaged one and after `timeout_s`."""
         end_s = time.monotonic() + timeout_s
         while (left_s := end_s - time.monotonic()) > 0:
@@ -151,6 +175,18 @@ class Host:
             payload = self.next_of(HELLO)[0]
             if struct.unpack_from("<I", payload, 5)[0] == nonce:
                 return payload
+
+    def first_sweeps(self, count: int) -> list[bytes]:
+        """Sweeps 0 to `count` - 1 of a run; begun anew where a host that stalled lost some."""
+        found: dict[int, bytes] = {}
+        while not found.keys() >= set(range(count)):
+            self.send(frame(STOP), frame(START))
+            for kind, payload in self.frames():
+                if kind == SWEEP:
+                    found[seq_of(payload)] = payload
+                    if seq_of(payload) >= count - 1:
+                        break
+        return [found[seq] for seq in range(count)]
 
 
 StartBridge = Callable[..., Host]

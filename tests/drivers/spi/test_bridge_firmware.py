@@ -16,23 +16,22 @@ from cobs import cobs
 
 from drivers.biotac import ERROR_WORDS
 from drivers.spi.messages import FIRMWARE
+from tests.conftest import ROOT
 from tests.drivers.spi.bridge_c import (
     BRIDGE,
     DIGEST,
     ELECTRODE_COMMANDS,
     HELLO,
-    HOST_PAYLOADS,
     PAC,
     PDC,
     PING,
-    START,
     STATUS,
-    STOP,
     SWEEP,
     TAC,
     TDC,
     ask,
     build_program,
+    damaged,
     frame,
     hexed,
     judged,
@@ -71,34 +70,8 @@ def test_the_core_needs_no_heap_and_no_floating_point() -> None:
         assert not re.search(r"\b(malloc|calloc|realloc|free|alloca|float|double)\b", code), source
 
 
+ARDUINO = ROOT / "tests" / "emulated" / "firmware" / "arduino"
 STAND_INS = {
-    "Arduino.h": """
-        #include <stddef.h>
-        #include <stdint.h>
-        enum { LOW, HIGH };
-        enum { INPUT, OUTPUT };
-        void pinMode(uint8_t pin, int mode);
-        void digitalWrite(uint8_t pin, int value);
-        struct Port {
-            void begin(unsigned long baud);
-            int available(), read(), availableForWrite();
-            size_t write(const uint8_t *data, size_t size);
-        };
-        extern Port Serial;
-        """,
-    "SPI.h": """
-        #include <stdint.h>
-        enum { LSBFIRST, MSBFIRST };
-        enum { SPI_MODE0 };
-        struct SPISettings { SPISettings(uint32_t hz, int order, int mode); };
-        struct Spi {
-            bool setRX(uint8_t pin), setTX(uint8_t pin), setSCK(uint8_t pin);
-            void begin(bool hardware_select);
-            void beginTransaction(SPISettings settings);
-            uint8_t transfer(uint8_t data);
-        };
-        extern Spi SPI;
-        """,
     "hardware/gpio.h": """
         #include <stdint.h>
         void gpio_pull_up(unsigned pin);
@@ -115,7 +88,7 @@ STAND_INS = {
         void pico_get_unique_board_id(pico_unique_board_id_t *id);
         """,
 }
-"""As much of the headers of the RP2040's Arduino core as the sketch uses."""
+"""As much of the pico-sdk's headers as the sketch uses; those of the Arduino core are ARDUINO's."""
 
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler (c++)")
@@ -125,7 +98,7 @@ def test_the_sketch_compiles_against_stand_ins(tmp_path: Path) -> None:
         (tmp_path / name).write_text("#pragma once\n" + text)
     sketch = BRIDGE / "rp2040" / "graspd_bridge" / "graspd_bridge.ino"
     flags = ["-std=gnu++17", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", "-x", "c++"]
-    includes = [f"-I{BRIDGE}/src", f"-I{tmp_path}", "-include", "Arduino.h"]
+    includes = [f"-I{BRIDGE}/src", f"-I{ARDUINO}", f"-I{tmp_path}", "-include", "Arduino.h"]
     done = subprocess.run(
         ["c++", *flags, *includes, str(sketch)], capture_output=True, text=True, check=False
     )
@@ -240,29 +213,6 @@ def test_a_sweep_takes_the_documented_bytes(
     assert 23 + len(words) == payload
     answer = ask(bridge_probe, [f"sweep 1 2 3 1 {sensors} {slots} {words.hex()}"])[0]
     assert len(bytes.fromhex(answer)) == line
-
-
-def damaged(rng: random.Random) -> bytes:
-    """A frame of a host that something happened to, with its zero."""
-    kind = rng.choice((PING, START, STOP, rng.randrange(256)))
-    size = HOST_PAYLOADS.get(kind, rng.randrange(8))
-    whole = bytearray(frame(kind, rng.randbytes(size), rng.choice((DIGEST, DIGEST, 0))))
-    match rng.randrange(7):
-        case 0:
-            whole[rng.randrange(len(whole))] ^= 1 << rng.randrange(8)
-        case 1:
-            del whole[rng.randrange(len(whole))]
-        case 2:
-            whole.insert(rng.randrange(len(whole)), rng.randrange(256))
-        case 3:
-            del whole[rng.randrange(len(whole)) : -1]
-        case 4:
-            whole[:] = rng.randbytes(rng.randrange(1, 40)) + b"\0"
-        case 5:
-            whole[:] = bytes(rng.randrange(1, 256) for _ in range(rng.choice((32, 33, 1025))))
-        case _:
-            whole[:] = frame(kind, rng.randbytes(size + rng.choice((-1, 1, 30)) % 40))
-    return bytes(whole)
 
 
 def test_100000_damaged_frames_are_judged_exactly_and_sound_ones_found(

@@ -95,7 +95,7 @@ def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBrid
     host.send(frame(START))
     for row, sweep in enumerate(host.next_of(SWEEP, 10)):
         np.testing.assert_array_equal(counts_of(sweep), rows[row])
-    assert host.process.wait(10) == 0
+    assert host.process.wait(100) == 0
 
 
 def test_faults_look_as_on_the_real_sensor(start_bridge: StartBridge) -> None:
@@ -180,7 +180,7 @@ def test_a_link_leads_to_the_terminal_and_goes_with_the_process(
     host = start_bridge("--link", link)
     assert os.readlink(link) == host.path
     host.process.send_signal(signal.SIGINT)
-    assert host.process.wait(10) == 0
+    assert host.process.wait(100) == 0
     assert not link.is_symlink()
 
 

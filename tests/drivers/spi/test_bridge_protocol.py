@@ -8,6 +8,7 @@ import re
 import struct
 import zlib
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -240,12 +241,18 @@ BEYOND: list[Message] = [
     ),
     *(dataclasses.replace(LEAST, serials=()), dataclasses.replace(MOST, serials=("S",) * 6)),
     *(dataclasses.replace(LEAST, commands=()), dataclasses.replace(MOST, commands=(0xD0,) * 65)),
-    *(dataclasses.replace(SWEEPS[0], seq=-1), dataclasses.replace(SWEEPS[1], seq=U32 + 1)),
-    *(dataclasses.replace(SWEEPS[0], present=-1), dataclasses.replace(SWEEPS[0], present=2)),
-    *(dataclasses.replace(SWEEPS[0], tick_start=-1), dataclasses.replace(SWEEPS[0], tick_end=-1)),
-    dataclasses.replace(SWEEPS[1], tick_end=U64 + 1),
+    *(msgspec.structs.replace(SWEEPS[0], seq=-1), msgspec.structs.replace(SWEEPS[1], seq=U32 + 1)),
     *(
-        dataclasses.replace(SWEEPS[0], words=np.zeros(shape, np.uint16))
+        msgspec.structs.replace(SWEEPS[0], present=-1),
+        msgspec.structs.replace(SWEEPS[0], present=2),
+    ),
+    *(
+        msgspec.structs.replace(SWEEPS[0], tick_start=-1),
+        msgspec.structs.replace(SWEEPS[0], tick_end=-1),
+    ),
+    msgspec.structs.replace(SWEEPS[1], tick_end=U64 + 1),
+    *(
+        msgspec.structs.replace(SWEEPS[0], words=np.zeros(shape, np.uint16))
         for shape in ((0, 1), (1, 0), (65, 1), (1, 6), (1,), (1, 1, 1))
     ),
     *(
@@ -291,10 +298,10 @@ def test_what_is_beyond_a_fields_range_is_not_written(message: Message) -> None:
         dataclasses.replace(HELLO, board="für"),
         dataclasses.replace(HELLO, commands=(0xA2, 0xA1)),
         dataclasses.replace(HELLO, commands=(0xA2,) * 65),
-        dataclasses.replace(SWEEP, present=8),
-        dataclasses.replace(SWEEP, tick_start=3000),
-        dataclasses.replace(SWEEP, words=np.zeros((2, 6), np.uint16)),
-        dataclasses.replace(SWEEP, words=np.zeros((2, 3), np.int64)),
+        msgspec.structs.replace(SWEEP, present=8),
+        msgspec.structs.replace(SWEEP, tick_start=3000),
+        msgspec.structs.replace(SWEEP, words=np.zeros((2, 6), np.uint16)),
+        msgspec.structs.replace(SWEEP, words=np.zeros((2, 3), np.int64)),
         dataclasses.replace(STATUS, spi_errors=()),
         dataclasses.replace(STATUS, sweeps=1 << 32),
         Ping(-1),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import os
+import pty
 import termios
 
 import pytest
@@ -156,3 +158,20 @@ def test_who_taps_a_line_gets_all_that_comes_and_goes(monkeypatch: pytest.Monkey
         (LineEvent.OPENED, b""),
     ]
     assert [int(event) for event in LineEvent] == [1, 2, 3], "as serial link logs hold them"
+
+
+def test_a_terminal_hands_over_all_there_is_and_says_that_it_has_gone() -> None:
+    master, slave = pty.openpty()
+    line = SerialLine(os.ttyname(slave), 115_200)
+    line.open()
+    try:
+        assert (line.read(), line.drained) == (b"", True)
+        for size in (1, 170, 3000):
+            os.write(master, b"\x85" * size)
+            assert (len(line.read()), line.drained) == (size, True)
+        os.close(master)
+        with pytest.raises(LinkError, match="the device went away"):
+            line.read()
+    finally:
+        line.close()
+        os.close(slave)

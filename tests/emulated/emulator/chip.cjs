@@ -30,6 +30,7 @@ class Chip {
     const watchdog = mcu.peripherals[WATCHDOG];
     watchdog.onWatchdogTrigger = () => {
       this.bitten = true;
+      watchdog.timer.enable = false; // or it would bite again at once, for ever
       this.stop(this.now());
     };
     if (before) {

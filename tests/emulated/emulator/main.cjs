@@ -9,13 +9,14 @@ const path = require('path');
 const { Chip } = require('./chip.cjs');
 
 const [folder, romFile] = process.argv.slice(2);
-const { RP2040 } = require(require.resolve('rp2040js', { paths: [folder] }));
+const { GPIOPinState, RP2040 } = require(require.resolve('rp2040js', { paths: [folder] }));
 const sensors = require(path.resolve(folder, 'sensors.node'));
 const romBytes = fs.readFileSync(romFile);
 const rom = new Uint32Array(romBytes.buffer.slice(romBytes.byteOffset, romBytes.byteOffset + 16384));
 
 const FRAME_NS = 1_000_000; // the host's controller hands over what has come once a millisecond
 const SELECT = 0, BYTE = 1; // kinds of recorded events
+const LIGHT_PIN = 25; // the Pico's own
 const EVENT_BYTES = 16; // f64 time in ns, u32 clock in Hz, u8 kind, u8 value (mask or MOSI), u8 MISO, u8 0
 const EVENTS_MAX = 2_000_000;
 
@@ -148,6 +149,7 @@ const commands = {
       device: host?.device ?? '', strings: host?.strings ?? [], resets, sweeps,
       sys_hz: mcu?.clkSys ?? 0, spi_hz: spi?.clockFrequency ?? 0,
       spi_mode: spi?.spiMode ?? 0, spi_bits: spi?.dataBits ?? 0,
+      light: mcu?.gpio[LIGHT_PIN].value === GPIOPinState.High,
     };
   },
 };

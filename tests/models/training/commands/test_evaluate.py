@@ -229,11 +229,11 @@ def test_ctrl_c_ends_with_130_and_leaves_a_folder_to_go_on_from(
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     try:
-        deadline_s = time.monotonic() + 40.0
+        deadline_s = time.monotonic() + 100.0
         while len(list(tmp_path.glob("jobs/mlp*.npz"))) < 2 and time.monotonic() < deadline_s:
             time.sleep(0.02)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers, too
-        _, errors = process.communicate(timeout=20.0)
+        _, errors = process.communicate(timeout=200.0)
     finally:
         process.kill()
         process.wait()

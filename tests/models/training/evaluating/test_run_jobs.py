@@ -33,7 +33,7 @@ from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(120)
 ROOT = Path(__file__).parents[4]
-START_S = 30.0
+START_S = 100.0
 """How long a scheduler or a worker may take to start on a busy machine."""
 
 

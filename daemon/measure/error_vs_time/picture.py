@@ -1,0 +1,213 @@
+"""Error against run time as a picture: three questions, one axis of time, each point named."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Bbox
+
+Found = dict[str, Any]
+Row = dict[str, Any]
+
+DEFAULT = "small-session"
+PANELS = (
+    (("cv",), "known objects"),
+    (("objects", "objects-whole"), "other objects"),
+    (("session",), "another day"),
+)
+"""Protocols, of which a model has one at most, and what they ask."""
+WHOLE = "objects-whole"
+"""Measured on two palm poses only: drawn hollow."""
+COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
+MARKERS = {"model": "o", "peer": "s"}
+SIZE_IN = (9.5, 9.6)
+ERROR_MAX = 104.0
+"""Upper end of an axis, %: a point at 100 is seen whole."""
+FONT_PT = 8.5
+MARKER_PT = 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One candidate in one panel."""
+
+    name: str
+    kind: str
+    """`model` or `peer`."""
+    us: float
+    """Time of a paced reading, p50."""
+    error: float
+    """1 - F1, in %."""
+    reach: tuple[float, float]
+    """From the error down and up to the ends of its 95 % interval, in %."""
+    hollow: bool
+
+    @property
+    def label(self) -> str:
+        """What stands beside it."""
+        return f"{self.name} (default)" if self.name == DEFAULT else self.name
+
+    @property
+    def weight(self) -> str:
+        """Of the font of its name."""
+        return "bold" if self.name == DEFAULT else "normal"
+
+
+def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:
+    """Figures of the first of these protocols that a row has; empty if it has none."""
+    return next((row["error"][name] for name in protocols if name in row["error"]), {})
+
+
+def points(rows: Sequence[Row], protocols: Sequence[str]) -> Iterator[Point]:
+    """Candidates for the whole hand that have figures of one of these protocols."""
+    most = max(len(row["fingers"]) for row in rows)
+    for row in rows:
+        error = error_of(row, protocols)
+        if error and len(row["fingers"]) == most:
+            yield Point(
+                row["name"],
+                row["kind"],
+                row["time"]["paced_p50_us"],
+                100.0 * (1.0 - error["f1"]),
+                (100.0 * (error["high"] - error["f1"]), 100.0 * (error["f1"] - error["low"])),
+                row["error"].get(protocols[0]) is not error,
+            )
+
+
+def front(several: Sequence[Point]) -> list[Point]:
+    """Models that none is both faster and more exact than, the fastest first."""
+    found: list[Point] = []
+    for point in sorted(several, key=lambda point: (point.us, point.error)):
+        if point.kind == "model" and (not found or point.error < found[-1].error):
+            found.append(point)
+    return found
+
+
+def draw(found: Found) -> str:
+    """The picture, as SVG."""
+    mpl.rcParams["svg.hashsalt"] = "graspd"
+    figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")
+    panels = figure.subplots(len(PANELS), 1, sharex=True)
+    drawn = [list(points(found["rows"], protocols)) for protocols, _ in PANELS]
+    times = [point.us for point in itertools.chain(*drawn)]
+    times += [row["time"]["paced_p50_us"] for row in _floors(found)]
+    panels[-1].set_xscale("log")
+    panels[-1].set_xlim(min(times) / 1.5, max(times) * 1.5)
+    for axes, several, (_, asked) in zip(panels, drawn, PANELS, strict=True):
+        _draw_panel(axes, several, asked)
+        for row in _floors(found):
+            axes.axvline(row["time"]["paced_p50_us"], color="#888", ls=":", lw=1)
+    for row in _floors(found):
+        x = row["time"]["paced_p50_us"]
+        panels[0].text(
+            x, 0.98, f" {row['name']}", fontsize=FONT_PT, va="top", color="#666",
+            transform=panels[0].get_xaxis_transform(),
+        )  # fmt: skip
+    panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
+    figure.suptitle(_title(found), fontsize=11)
+    figure.draw_without_rendering()  # now it is known where everything is
+    for axes, several in zip(panels, drawn, strict=True):
+        name_points(axes, several)
+    text = io.StringIO()
+    figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    return text.getvalue()
+
+
+def _floors(found: Found) -> list[Row]:
+    return [row for row in found["rows"] if row["kind"] == "floor"]
+
+
+def _title(found: Found) -> str:
+    said = f"Error against run time, on {found['machine']['processor']}"
+    few = " - from few readings (--quick): the times are rough" if found["quick"] else ""
+    key = (
+        "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
+        "hollow: two palm poses only"
+    )
+    return f"{said}{few}\n" + "\n".join(textwrap.wrap(key, 110))
+
+
+def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
+    for point in several:
+        colour = COLOURS[point.kind]
+        reach = [[each] for each in point.reach]
+        axes.errorbar(
+            point.us, point.error, yerr=reach, ecolor=colour, alpha=0.6, lw=1.4, capsize=3
+        )
+        marker = "*" if point.name == DEFAULT else MARKERS[point.kind]
+        axes.plot(
+            point.us, point.error, marker, color=colour,
+            markersize=MARKER_PT * (2.0 if marker == "*" else 1.0),
+            markerfacecolor="white" if point.hollow else colour, zorder=5,
+        )  # fmt: skip
+    best = front(several)
+    axes.plot(
+        [point.us for point in best], [point.error for point in best],
+        color=COLOURS["model"], lw=1.6, alpha=0.5, zorder=1,
+    )  # fmt: skip
+    if several:
+        low = min(point.error - point.reach[0] for point in several)
+        high = max(point.error + point.reach[1] for point in several)
+        margin = 0.08 * (high - low)
+        axes.set_ylim(max(low - margin, 0.0), min(high + margin, ERROR_MAX))
+    axes.set_ylabel(f"{asked}\n1 - F1, %")
+    axes.grid(alpha=0.25)
+
+
+Box = tuple[float, float, float, float]
+"""Left, bottom, right, top, in points."""
+
+
+def name_points(axes: Axes, several: Sequence[Point]) -> None:
+    """Put each name where it covers nothing, as near to its point as can be."""
+    where = axes.get_window_extent()
+    at = {point: axes.transData.transform((point.us, point.error)) for point in several}
+    reach = 0.5 * MARKER_PT + 1.0
+    taken: list[Box] = [(x - reach, y - reach, x + reach, y + reach) for x, y in at.values()]
+    for point in sorted(several, key=lambda point: -at[point][1]):
+        x, y = (float(each) for each in at[point])
+        near, *others = _places(x, y, _width(point))
+        box = next((box for box in (near, *others) if _is_free(box, taken, where)), near)
+        taken.append(box)
+        axes.annotate(
+            point.label, (point.us, point.error), fontsize=FONT_PT, color=COLOURS[point.kind],
+            fontweight=point.weight, va="center", zorder=6,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.4},
+            xytext=(box[0] - x, 0.5 * (box[1] + box[3]) - y), textcoords="offset points",
+            arrowprops={"arrowstyle": "-", "lw": 0.6, "color": "#999", "shrinkB": 4},
+        )  # fmt: skip
+
+
+def _width(point: Point) -> float:
+    """Of its name, with a little air, in points."""
+    font = FontProperties(size=FONT_PT, weight=point.weight)
+    return float(TextPath((0.0, 0.0), point.label, prop=font).get_extents().width) + 3.0
+
+
+def _places(x: float, y: float, width: float) -> Iterator[Box]:
+    """Places for a name of this width, the nearest first."""
+    for distance in np.arange(MARKER_PT, 400.0, 4.0):
+        for angle in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
+            across, up = distance * np.cos(angle), distance * np.sin(angle)
+            left = x + across - (0.0 if across >= 0.0 else width)
+            yield left, y + up - 0.6 * FONT_PT, left + width, y + up + 0.6 * FONT_PT
+
+
+def _is_free(box: Box, taken: Sequence[Box], within: Bbox) -> bool:
+    left, bottom, right, top = box
+    inside = within.x0 < left and right < within.x1 and within.y0 < bottom and top < within.y1
+    return inside and not any(
+        left < other[2] and other[0] < right and bottom < other[3] and other[1] < top
+        for other in taken
+    )
