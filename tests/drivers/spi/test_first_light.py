@@ -44,7 +44,7 @@ STEPS: dict[str, Sequence[object] | None] = {
     "One sensor": (*ABSENT[1], *ABSENT[2]),
     "Swapped chip selects": (*ABSENT[0], *ABSENT[2], "--serial", "1:BTSP000000000001"),
     "All well": (),
-    "The wrong finger moves": (),
+    "Touch": (),
 }
 """Steps by how the page calls them, and what the PC port is told; without any, there is none."""
 VARIES = re.compile(r"bridge overruns|readings/s|^...(model|realtime priority|you are not in)")
@@ -104,7 +104,7 @@ def test_the_doctor_says_at_each_step_what_the_page_quotes(
 ) -> None:
     port, options = str(tmp_path / "absent"), STEPS[step]
     if options is not None:
-        feels = counts(tmp_path, 1 if step == "The wrong finger moves" else None)
+        feels = counts(tmp_path, 1 if step == "Touch" else None)
         told = (*BOARD, "--period-us", PERIOD_US, "--counts", feels, *options)
         port = start_bridge(*told).path
     code = look(scene_for(tmp_path, port), "--listen", LISTEN_S)
