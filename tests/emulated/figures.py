@@ -1,0 +1,66 @@
+"""Size and timing of the firmware's images on the emulated chip: the table of the bridge's README.
+
+`python -m tests.emulated.figures` prints it.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Final
+
+from tests.emulated.board import Board
+from tests.emulated.build import CLOCKS_MHZ, TARGETS, Port, Sequence, flash_and_ram, image
+from tests.emulated.bus import sweeps, timing, transactions
+
+SECONDS = 2
+"""In which STATUS is sent twice."""
+OTHERS: Final[tuple[tuple[Port, int, int, Sequence, int], ...]] = (
+    ("pico", 125, 1, "all", 28),
+    ("pico", 125, 5, "interleaved", 54),
+)
+"""Port, clock, sensors, sequence and its slots, beside three sensors and 24 electrodes."""
+HEAD = """\
+| image | sensors, samples | flash | RAM | SPI | longest sweep | start jitter | settle | gap |
+|---|---|---|---|---|---|---|---|---|
+"""
+
+
+def row(port: Port, clock_mhz: int, sensors: int, sequence: Sequence, slots: int) -> str:
+    """Figures of one image, as a row of the table."""
+    file = image(port, sensors, clock_mhz, sequence)
+    flash, ram = flash_and_ram(file)
+    with Board() as board, tempfile.TemporaryDirectory() as folder:
+        board.power(file)
+        board.hello()
+        board.start()
+        with board.recording(Path(folder)) as events:
+            board.run(1000.0 * SECONDS)
+    found = timing(sweeps(transactions(events()), slots, sensors), 10_000.0)
+    columns = (
+        f"{port}, {clock_mhz} MHz",
+        f"{sensors}, {slots}",
+        f"{flash / 1e3:.1f} kB",
+        f"{ram / 1e3:.1f} kB",
+        f"{found.spi_hz / 1e6:.2f} MHz",
+        f"{found.duration_us[1]:.0f} us",
+        f"{found.late_us:.1f} us",
+        f"{found.settle_us:.2f} us",
+        f"{found.gap_us:.2f} us",
+    )
+    return f"| {' | '.join(columns)} |\n"
+
+
+def main() -> None:
+    """Print the table."""
+    sys.stdout.write(HEAD)
+    for port in TARGETS:
+        for clock_mhz in CLOCKS_MHZ:
+            sys.stdout.write(row(port, clock_mhz, 3, "electrodes", 24))
+    for other in OTHERS:
+        sys.stdout.write(row(*other))
+
+
+if __name__ == "__main__":
+    main()
