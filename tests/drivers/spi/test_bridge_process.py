@@ -49,7 +49,7 @@ def test_a_hello_says_what_the_bridge_is(start_bridge: StartBridge) -> None:
     assert struct.unpack_from("<BII", hello) == (1, DIGEST, 0xCAFE)
     tick, tick_hz, firmware, board, *numbers = struct.unpack_from("<QIH16sIBB", hello, 9)
     assert numbers == [12345, 2, 24]
-    assert (tick_hz, firmware) == (1_000_000, 0x0001)
+    assert (tick_hz, firmware) == (1_000_000, 0x0002)
     assert tick < 60_000_000
     assert board == b"left hand".ljust(16, b"\0")
     assert hello[45:61] == b"BTSP000000000001"

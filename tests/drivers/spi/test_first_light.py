@@ -123,7 +123,7 @@ def test_programs_are_told_the_same(tmp_path: Path, start_bridge: StartBridge) -
     host = start_bridge(*BOARD, "--period-us", PERIOD_US, "--counts", counts(tmp_path, None))
     said = graspd("doctor", scene_for(tmp_path, host.path), "--listen", LISTEN_S, "--json")
     device = json.loads(said.stdout)["spi"]["device"]
-    assert device["firmware"] == "0.1"
+    assert device["firmware"] == "0.2"
     assert "newer firmware" not in device
     assert device["clock rate"] == "1000000 Hz"
     least, most = re.findall(r"[+-]\d+", device["clock drift"])
@@ -272,6 +272,6 @@ def test_older_firmware_is_named_with_how_to_flash_the_newer(
     with bridge(tmp_path) as port:
         found = findings(port, tmp_path, capsys)
     (newer,) = (finding for finding in found if "newer firmware" in finding["what"])
-    assert newer["what"] == "spi: newer firmware 0.1"
+    assert newer["what"] == "spi: newer firmware 0.2"
     assert newer["level"] == "warning"
     assert "flash the firmware of this graspd: deploy/bridge/BUILD.md" in newer["advice"]
