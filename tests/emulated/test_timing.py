@@ -5,9 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
+from daemon.commands.doctor import BRIDGE_VENDOR
 from drivers.biotac import ERROR_WORDS
 from tests.drivers.spi.bridge_c import (
     ELECTRODE_COMMANDS,
@@ -21,7 +23,7 @@ from tests.drivers.spi.bridge_c import (
     seq_of,
     words_of,
 )
-from tests.emulated.board import Board, serials
+from tests.emulated.board import BOARD_ID, Board, serials
 from tests.emulated.bus import Timing, Transaction, sweeps, timing, transactions
 from tests.emulated.conftest import Image
 
@@ -70,7 +72,7 @@ class Run:
     """What a board with this setting did: the greeting, then some sweeps."""
 
     setting: Setting
-    state: dict[str, object]
+    state: dict[str, Any]
     hello: bytes
     greeting: list[Transaction]
     """On the bus while sensors were looked for."""
@@ -112,6 +114,13 @@ def test_the_chip_runs_at_the_clock_it_was_built_for(run: Run) -> None:
     assert run.state["sys_hz"] == run.setting.clock_mhz * 1_000_000
     assert (run.state["spi_mode"], run.state["spi_bits"]) == (0, 8)
     assert run.state["resets"] == 0
+
+
+def test_usb_names_the_vendor_the_doctor_greets_and_the_board_by_its_number(run: Run) -> None:
+    device = bytes.fromhex(run.state["device"])
+    assert int.from_bytes(device[8:10], "little") == BRIDGE_VENDOR
+    assert run.state["strings"][-1] == BOARD_ID
+    assert run.hello[23:39].decode() == BOARD_ID
 
 
 def test_hello_names_every_sensor_and_the_sequence(run: Run) -> None:
