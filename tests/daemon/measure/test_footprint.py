@@ -38,7 +38,7 @@ NEVER = {
         "daemon.assembly.recordings",
         "daemon.assembly.link_logs",
     ),
-    *("models.onnx_file", "numpy.random", "numpy.testing", "jsonschema"),
+    *("models.onnx_file", "numpy.ma", "numpy.random", "numpy.testing", "jsonschema"),
     *(
         "drivers.recordings.can_log",
         "drivers.recordings.serial_log",
