@@ -136,9 +136,10 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
                 while not any(verdict.valid for verdict in published(tmp_path, 10)):
                     assert time.monotonic() < deadline_s
                 end(hardware)
-            while (gone := published(tmp_path, 10))[-1].reasons != ["stale"]:
-                assert time.monotonic() < deadline_s
+            gone = published(tmp_path, 10)
             assert [verdict.verdict for verdict in gone[-5:]] == ["unknown"] * 5
+            # Where it went in the middle of a release, the last that was seen moved.
+            assert gone[-1].reasons in (["stale"], ["stale", "moving"])
         end(daemon)
 
 

@@ -51,6 +51,7 @@ def start_bridge(bridge_program: Path) -> Iterator[StartBridge]:
     hosts: list[Host] = []
 
     def start(*options: object, stdin: bytes | None = None) -> Host:
+        """What is given on `stdin` ends when the test closes it."""
         process = subprocess.Popen(
             [bridge_program, *map(str, options)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
@@ -59,7 +60,9 @@ def start_bridge(bridge_program: Path) -> Iterator[StartBridge]:
         assert process.stdout is not None
         if stdin is not None:
             process.stdin.write(stdin)
-        process.stdin.close()
+            process.stdin.flush()
+        else:
+            process.stdin.close()
         path = process.stdout.readline().decode().strip()
         process.stdout.close()
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)
