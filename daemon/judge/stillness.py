@@ -66,10 +66,12 @@ def mean_distance(
     """
     distance = one - other
     np.abs(distance, out=distance)
+    mean: NDArray[np.float64]
     if all_of(usable):
-        return distance.dot(ONES).astype(np.float64) / ELECTRODES
+        mean = distance.dot(ONES).astype(np.float64) / ELECTRODES
+        return mean
     distance *= usable
-    mean: NDArray[np.float64] = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
+    mean = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
     return mean
 
 
