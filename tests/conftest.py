@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.daemon.processes import before_others
+
 # A shell's background jobs ignore it, and so would all that the tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before anybody imports onnxruntime: its telemetry opens descriptors whenever it likes.
@@ -48,6 +50,13 @@ def pytest_collection_finish() -> None:
     """Take what the imports made out of the garbage collector's sight: it runs after every test."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def comes_first() -> Iterator[None]:
+    """A test that is itself one end of a link in real time comes before other work."""
+    with before_others():
+        yield
 
 
 @pytest.fixture(autouse=True)

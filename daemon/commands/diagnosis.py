@@ -53,7 +53,7 @@ LINK_ADVICE = {
     "other sensors": "serial numbers are misread: see supply, ground, MISO and its pull-up",
     "no sweep": "it began and stopped: see its supply and cable, and how busy this computer is",
     "went away|was reset": "plug, cable, hub and supply: it was unplugged, or lost power",
-    "^greeting$": "it has not answered yet: listen longer, --listen 10",
+    "^greeting$": "it has said nothing yet: is it on and connected? longer: --listen 10",
     "": "is it powered, connected, and the one that the scene names?",
 }
 """What to do about a link that is not up, by the first pattern that is found in why it is not."""

@@ -7,7 +7,9 @@ the finger as a whole: what moves all electrodes alike is the supply or the temp
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,22 +138,83 @@ class Touch:
 
 @dataclass(slots=True)
 class Tare:
-    """How much is known of one finger at rest."""
+    """When to look at how one finger rests."""
 
     number: Number = 0
     """Sweeps since something touched: the latest of the window, and those before it."""
     settled_ns: int | None = None
     """When a baseline was last taken from them."""
 
+    def clear(self) -> None:
+        """Something touches: begin again afterwards."""
+        self.number = 0
+
+    def add(self) -> bool:
+        """Count a sweep; True when it is time to look at the window."""
+        self.number += 1
+        return self.number >= WINDOW and self.number % TARE_EVERY == 0
+
+
+class Rest(NamedTuple):
+    """How a finger rests; arrays have shape (24,)."""
+
+    baseline: Floats
+    sigma: float
+    """Of its median electrode."""
+    known: NDArray[np.bool_]
+    """Of which electrodes that is known."""
+
+
+@dataclass(slots=True, eq=False)
+class Window:
+    """The last sweeps of all fingers, written round and round; shape (100, fingers, 24)."""
+
+    counts: NDArray[np.uint16]
+    usable: NDArray[np.bool_]
+    number: Number = 0
+    """Sweeps so far."""
+
+    @classmethod
+    def of(cls, fingers: int) -> Window:
+        """An empty one."""
+        shape = (WINDOW, fingers, ELECTRODES)
+        return cls(np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.bool_))
+
+    def add(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
+        """Take in a sweep, shape (fingers, 24)."""
+        place = self.number % WINDOW
+        self.counts[place] = counts
+        self.usable[place] = usable
+        self.number += 1
+
+    def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
+        """How each of these fingers rests; None of one that has moved. Only of a full window."""
+        oldest = self.number % WINDOW
+        window = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
+        baseline = _median(window)
+        # Twice as large they are whole numbers, which are sorted in a fifth of the time.
+        twice = np.abs(2 * window.astype(np.int32) - (2.0 * baseline).astype(np.int32))
+        sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
+        halves = _median(window[WINDOW // 2 :]) - _median(window[: WINDOW // 2])
+        usable = np.logical_and.reduce(self.usable, axis=0)
+        sound = (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
+        sound &= usable
+        for finger in fingers:
+            known = usable[finger]
+            if np.count_nonzero(sound[finger]) < SOUND_MIN:
+                yield None
+                continue
+            sigma = max(_middle(sigmas[finger, known]), SIGMA_MIN_COUNTS)
+            trend = abs(_middle(halves[finger, known]))
+            moved = sigma > SIGMA_MAX_COUNTS or trend > TREND_MAX_COUNTS
+            yield None if moved else Rest(baseline[finger], sigma, sound[finger])
+
 
 @dataclass(slots=True, eq=False)
 class ContactMemory:
     """What is known of the fingers' rest and touch; arrays of shape (fingers, 24) or (fingers,)."""
 
-    window: NDArray[np.uint16]
-    """Shape (100, fingers, 24): the last sweeps, written round and round."""
-    usable: NDArray[np.bool_]
-    """Of the same shape: which of their electrodes were usable."""
+    window: Window
     tares: list[Tare]
     touches: list[Touch]
     baseline: NDArray[np.float64]
@@ -162,8 +225,6 @@ class ContactMemory:
     """Which fingers touch."""
     tared: NDArray[np.bool_]
     """Whether each finger has a baseline. Without one, nobody knows whether it touches."""
-    sweeps: Number = 0
-    """Sweeps so far."""
     last_ns: int | None = None
     """Time of the last sweep."""
     rest: NDArray[np.float64] = field(init=False)
@@ -191,8 +252,7 @@ class Contact:
         shape = (fingers, ELECTRODES)
         self._limits = limits
         self.memory = ContactMemory(
-            window=np.zeros((WINDOW, *shape), dtype=np.uint16),
-            usable=np.zeros((WINDOW, *shape), dtype=np.bool_),
+            window=Window.of(fingers),
             tares=[Tare() for _ in range(fingers)],
             touches=[Touch(limits.counts) for _ in range(fingers)],
             baseline=np.zeros(shape),
@@ -231,9 +291,7 @@ class Contact:
         falls, numbers = self._falls(median, usable)
         elapsed_s = 0.0 if memory.last_ns is None else max(t_ns - memory.last_ns, 0) / 1e9
         memory.last_ns = t_ns
-        memory.window[memory.sweeps % WINDOW] = counts
-        memory.usable[memory.sweeps % WINDOW] = usable
-        memory.sweeps += 1
+        memory.window.add(counts, usable)
         middles = [0.0] * len(numbers)
         tared, touches = memory.tared.tolist(), memory.touches
         for finger, touch in enumerate(touches):
@@ -253,10 +311,14 @@ class Contact:
             memory.touching[finger] = touch.touching
             if anew and memory.tared[finger]:
                 self._forget(finger)
-            if self._is_due(finger):
+            if memory.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
+                memory.tares[finger].clear()  # it may be the beginning of a touch
+            elif memory.tares[finger].add():
                 due.append(finger)
         if due:
-            self._settle(due, t_ns)
+            for finger, rest in zip(due, memory.window.rests(due), strict=True):
+                if rest is not None:
+                    self._settle(finger, rest, t_ns)
 
     def _falls(
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_]
@@ -270,16 +332,6 @@ class Contact:
         falls.sort(axis=1)
         return falls, numbers
 
-    def _is_due(self, finger: int) -> bool:
-        """Take a sweep for the tare, unless it may be the beginning of a touch; whether to look."""
-        memory = self.memory
-        tare, touch = memory.tares[finger], memory.touches[finger]
-        if touch.fall >= SUSPECT * touch.threshold and memory.tared[finger]:
-            tare.number = 0
-            return False
-        tare.number += 1
-        return tare.number >= WINDOW and tare.number % TARE_EVERY == 0
-
     def _forget(self, finger: int) -> None:
         memory = self.memory
         memory.tared[finger] = memory.touching[finger] = False
@@ -287,55 +339,21 @@ class Contact:
         memory.touches[finger] = Touch(memory.touches[finger].threshold)
         memory.tares[finger] = Tare()
 
-    def _settle(self, fingers: list[int], t_ns: int) -> None:
-        """Take over what the window says of fingers, of those that were at rest."""
+    def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
+        """Take over how a finger rests."""
         memory = self.memory
-        usable = np.logical_and.reduce(memory.usable[:, fingers], axis=0)
-        oldest = memory.sweeps % WINDOW
-        window = np.concatenate((memory.window[oldest:, fingers], memory.window[:oldest, fingers]))
-        baselines = _median(window)
-        # Twice as large they are whole numbers, which are sorted in a fifth of the time.
-        twice = np.abs(2 * window.astype(np.int32) - (2.0 * baselines).astype(np.int32))
-        sigmas = MAD_TO_SIGMA * (_median(twice) / 2.0)
-        halves = _median(window[WINDOW // 2 :]) - _median(window[: WINDOW // 2])
-        for finger, *found in zip(fingers, baselines, sigmas, halves, usable, strict=True):
-            self._settle_finger(finger, t_ns, *found)
-
-    def _settle_finger(
-        self,
-        finger: int,
-        t_ns: int,
-        baseline: Floats,
-        sigmas: Floats,
-        halves: Floats,
-        known: NDArray[np.bool_],
-    ) -> None:
-        """Take over what the window says of a finger, each of shape (24,), if it was at rest.
-
-        `halves` are by how much the second half of the window is above the first; `known` are the
-        electrodes that were usable all the time.
-        """
-        if np.count_nonzero(known) < SOUND_MIN:
-            return
-        sigma = max(_middle(sigmas[known]), SIGMA_MIN_COUNTS)
-        if sigma > SIGMA_MAX_COUNTS or abs(_middle(halves[known])) > TREND_MAX_COUNTS:
-            return
-        known &= (baseline > 0) & (baseline < COUNT_MAX) & (sigmas <= 3.0 * SIGMA_MAX_COUNTS)
-        if np.count_nonzero(known) < SOUND_MIN:
-            return
-        memory = self.memory
-        tare = memory.tares[finger]
+        tare, step = memory.tares[finger], rest.baseline - memory.baseline[finger]
         elapsed_s = 0.0 if tare.settled_ns is None else max(t_ns - tare.settled_ns, 0) / 1e9
         tare.settled_ns = t_ns
-        step = baseline - memory.baseline[finger]
         if memory.tared[finger]:
             limited = np.maximum(step, -DOWN_COUNTS_PER_S * elapsed_s)
             np.minimum(limited, UP_COUNTS_PER_S * elapsed_s, out=limited)
             # An electrode that was not known before is taken as it is.
             step = np.where(memory.known[finger], limited, step)
         memory.baseline[finger] += step
-        memory.know(finger, known)
-        memory.touches[finger].threshold = max(self._limits.counts, self._limits.sigmas * sigma)
+        memory.know(finger, rest.known)
+        limits = self._limits
+        memory.touches[finger].threshold = max(limits.counts, limits.sigmas * rest.sigma)
         memory.tared[finger] = True
 
 

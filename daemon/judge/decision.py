@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import msgspec
 from msgspec.structs import replace
 
 from daemon.judge.reasons import Decision, Reason
+from daemon.trust.risk import Permission
+
+WITHHELD: Final = {
+    Permission.ALLOWED: None,
+    Permission.WITHHELD: Reason.LOW_CONFIDENCE,
+    Permission.UNPROVEN: Reason.UNPROVEN,
+    Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
+}
+"""What is against calling a grasp `stable`, by what the risk permits."""
 
 
 # Without slots, so that a default can be read from the class.

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.decision import NO_DOUBT, Doubt
 from daemon.judge.reasons import GateChange, GateState, Reason
 from daemon.trust.trust import Assessment
 from models.contract import Finger
@@ -92,6 +93,23 @@ class Opinion(msgspec.Struct, frozen=True, gc=False):
 
 
 NO_OPINION = Opinion(None, ())
+
+
+@dataclass(slots=True, eq=False)
+class PipelineMemory:
+    """What is known of the grasps judged so far."""
+
+    to_learn: NDArray[np.float64]
+    """Shape (fingers, 24): counts that the session is to take in; means nothing if none are."""
+    is_to_learn: bool = False
+    to_learn_slip: bool | None = None
+    """Whether they were judged to slip."""
+    readings: Number = 0
+    learnt_grasp: Number = 0
+    """The grasp that the session took in last, or is about to."""
+    opinion: Opinion = NO_OPINION
+    """Of the grasp at hand."""
+    doubt: Doubt = NO_DOUBT
 
 
 def any_of(which: NDArray[np.bool_]) -> bool:

@@ -49,8 +49,8 @@ STILL = 20
 JUMPS_MAX = 2.0
 """An electrode that jumps more than twice within about ten readings has a loose contact."""
 JUMPS_FADE = 0.9
-JUMPS_FORGOTTEN = 1e-9
-"""Of a jump, after 200 readings: as good as none."""
+JUMPS_FORGOTTEN, JUMPS_LOOKED_AT = 1e-9, 16
+"""Of a jump, after 200 readings: as good as none. Every so many readings it is seen."""
 # At a rail, far from the last count, not the same: so is a count that, less 1 or less the last one
 # and so much more, is above a limit. Modulo 2**16, so that steps down are small numbers, too.
 MORE = np.array([JUMP_COUNTS, 0], dtype=np.uint16)[:, np.newaxis, np.newaxis]
@@ -176,9 +176,10 @@ class Health:
         np.copyto(memory.changed, memory.number, where=differs)
         if memory.has_jumped:
             memory.jumps *= JUMPS_FADE
-            remembered = memory.jumps >= JUMPS_FORGOTTEN
-            memory.jumps *= remembered
-            memory.has_jumped = any_of(remembered)
+            if memory.number % JUMPS_LOOKED_AT == 0:
+                remembered = memory.jumps >= JUMPS_FORGOTTEN
+                memory.jumps *= remembered
+                memory.has_jumped = any_of(remembered)
         if any_of(far):
             near = counts - previous + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import NO_DOUBT, Case, Doubt, Limits, alone, decide
-from daemon.judge.findings import NO_OPINION, Felt, Number, Opinion, Watched, electrode_name
+from daemon.judge.decision import NO_DOUBT, WITHHELD, Case, Doubt, Limits, alone, decide
+from daemon.judge.findings import (
+    NO_OPINION,
+    Felt,
+    Opinion,
+    PipelineMemory,
+    Watched,
+    any_of,
+    electrode_name,
+)
 from daemon.judge.health import Health
 from daemon.judge.limits import GripLimits
 from daemon.judge.network import Network
 from daemon.judge.plausibility import Plausibility
 from daemon.judge.reasons import WATCHED_LIFT, Decision, GateChange, GateState, Reason
 from daemon.trust.ledger import GraspId
-from daemon.trust.risk import Permission, RiskReport
+from daemon.trust.risk import RiskReport
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
@@ -28,16 +35,9 @@ if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
     from daemon.judge.grip import Grip
     from daemon.trust.learner import LearnerState
-    from daemon.trust.trust import Assessment, Trust
+    from daemon.trust.trust import Trust
     from models.session_statistics import SessionState
 
-WITHHELD: Final = {
-    Permission.ALLOWED: None,
-    Permission.WITHHELD: Reason.LOW_CONFIDENCE,
-    Permission.UNPROVEN: Reason.UNPROVEN,
-    Permission.RISK_EXCEEDED: Reason.RISK_EXCEEDED,
-}
-"""What is against calling a grasp `stable`, by what the risk permits."""
 NOT_HELD: Final = {GateState.IDLE, GateState.RELEASED}
 """Where a grasp is over."""
 
@@ -90,23 +90,6 @@ class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW16
         if not isinstance(other, Judgement):
             return NotImplemented
         return msgspec.structs.astuple(self)[:-1] == msgspec.structs.astuple(other)[:-1]
-
-
-@dataclass(slots=True, eq=False)
-class PipelineMemory:
-    """What is known of the grasps judged so far."""
-
-    to_learn: NDArray[np.float64]
-    """Shape (fingers, 24): counts that the session is to take in; means nothing if none are."""
-    is_to_learn: bool = False
-    to_learn_slip: bool | None = None
-    """Whether they were judged to slip."""
-    readings: Number = 0
-    learnt_grasp: Number = 0
-    """The grasp that the session took in last, or is about to."""
-    opinion: Opinion = NO_OPINION
-    """Of the grasp at hand."""
-    doubt: Doubt = NO_DOUBT
 
 
 class Pipeline:
@@ -257,7 +240,7 @@ class Pipeline:
             examined = self._plausibility.examine(felt.counts, watched.broken, session)
             memory.opinion = self._assess(self._network.judge(examined, session), felt.grasp)
             grasp = examined.grasp
-            counts = None if np.count_nonzero(watched.broken) else felt.counts
+            counts = None if any_of(watched.broken) else felt.counts
         elif felt.gate is not GateState.JUDGED:
             memory.opinion = NO_OPINION
         judgement = self._decide(reading.t_ns, watched.reasons, felt, memory.opinion, counts)
@@ -370,7 +353,9 @@ class Pipeline:
             gate=felt.reasons,
             # Taken last, so that a slow inference counts too.
             age_ns=self._age_ns(t_ns),
-            against_stable=self._against_stable(felt.grasp, assessment),
+            against_stable=None
+            if self.trust is None or assessment is None
+            else WITHHELD[self.trust.permission(GraspId(self.boot_id, felt.grasp), assessment)],
         )
         memory, made_ns = self.memory, 0 if self._latest is None else self._latest.made_ns
         judged = felt.counts is not None and p_slip is not None
@@ -386,7 +371,7 @@ class Pipeline:
             grasp=felt.grasp,
             decision=decision,
             p_slip=p_slip if known else None,
-            reasons=tuple(dict.fromkeys(reasons)),
+            reasons=reasons if len(reasons) < 2 else tuple(dict.fromkeys(reasons)),
             judged=felt.judged,
             repaired=opinion.repaired,
             session_calibrated=calibrated,
@@ -407,11 +392,6 @@ class Pipeline:
             risk=None if trust is None else trust.report(),
             judged_counts=counts,
         )
-
-    def _against_stable(self, grasp: int, assessment: Assessment | None) -> Reason | None:
-        if self.trust is None or assessment is None:
-            return None
-        return WITHHELD[self.trust.permission(GraspId(self.boot_id, grasp), assessment)]
 
     def _age_ns(self, t_ns: int) -> int:
         return self._clock() - t_ns

@@ -66,10 +66,12 @@ def mean_distance(
     """
     distance = one - other
     np.abs(distance, out=distance)
+    mean: NDArray[np.float64]
     if all_of(usable):
-        return (distance @ ONES).astype(np.float64) / ELECTRODES
+        mean = distance.dot(ONES).astype(np.float64) / ELECTRODES
+        return mean
     distance *= usable
-    mean: NDArray[np.float64] = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
+    mean = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
     return mean
 
 
@@ -313,7 +315,7 @@ class Motion:
         """Of each finger over its electrodes usable from a step on; infinite if too few are."""
         memory, since_ns = self.memory, self.memory.times_ns.item(begin)
         if memory.all_usable_since_ns <= since_ns:
-            return [total / ELECTRODES for total in (values @ ONES).tolist()]
+            return [total / ELECTRODES for total in values.dot(ONES).tolist()]
         usable = memory.usable_since_ns <= since_ns
         totals = ((values * usable) @ ONES).tolist()
         numbers = np.count_nonzero(usable, axis=1).tolist()
@@ -362,7 +364,7 @@ class Motion:
         times_s = centred(times_s)
         extent = float(times_s.dot(times_s))
         times_s /= extent
-        slopes = times_s.astype(np.float32) @ memory.steps[begin:end].reshape(number, -1)
+        slopes = times_s.astype(np.float32).dot(memory.steps[begin:end].reshape(number, -1))
         slopes = np.abs(slopes, out=slopes).reshape(memory.clean.shape)
         root = math.sqrt(extent)
         by_noise = [each / root for each in noise.slope[number].tolist()]

@@ -70,6 +70,7 @@ class Learner:
         """How many were learned from since the start or the last reset."""
         self._mean = self._prior_mean.copy()
         self._covariance = np.diag(self._prior_variance)
+        self._is_prior = True
 
     @property
     def uncertainty(self) -> float:
@@ -87,8 +88,8 @@ class Learner:
         """
         if inputs.shape != (self._width - 2,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
-        largest = float(np.maximum.reduce(np.abs(inputs), initial=0.0))  # NaN if one is
-        if not (math.isfinite(margin) and largest <= INPUT_MAX):
+        within = (np.abs(inputs) <= INPUT_MAX).tobytes()  # false for NaN
+        if 0 in within or not math.isfinite(margin):
             raise ValueError("margin or inputs are not finite, or too large")
         values = np.empty(self._width)
         values[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE
@@ -101,7 +102,10 @@ class Learner:
 
         MacKay's moderated output.
         """
-        variance = float(features @ (self._covariance @ features))
+        # The prior's covariance is diagonal: the same in a third of the time.
+        prior = self._prior_variance if self._is_prior else None
+        seen = self._covariance @ features if prior is None else prior * features
+        variance = float(features @ seen)
         return float(features @ self._mean) / math.sqrt(1.0 + math.pi / 8.0 * variance)
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
@@ -118,6 +122,7 @@ class Learner:
         diagonal += self._drift
         scale = np.sqrt(np.minimum(self._prior_variance / diagonal, 1.0))
         self._covariance *= np.outer(scale, scale)
+        self._is_prior = False
         self.outcomes += 1
 
     def state(self) -> LearnerState:
@@ -136,6 +141,7 @@ class Learner:
         if (covariance != covariance.T).any() or not _is_positive_definite(covariance):
             raise ValueError("holds a matrix that is no covariance")
         self.outcomes, self._mean, self._covariance = state.outcomes, mean, covariance
+        self._is_prior = False
 
 
 def sigmoid(log_odds: float) -> float:

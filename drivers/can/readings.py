@@ -122,14 +122,14 @@ class ReadingMaker:
         nothing and is not looked at.
         """
         counts, faults = decode_words(words)
-        absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
-        faults[absent] = 0
-        if faults.any():
+        if np.count_nonzero(faults) or np.count_nonzero(marks):
+            absent = marks & np.uint8(ElectrodeFault.MISSING) != 0
+            faults[absent] = 0
             self._count_words(faults)
-        faults |= marks
-        counts[absent] = 0
+            faults |= marks
+            counts[absent] = 0
+            self.counters.faulty_readings += bool(faults.any())
         self.counters.readings += 1
-        self.counters.faulty_readings += bool(faults.any())
         reading = TactileReading(t_ns, self.seq, counts, faults)
         self.seq += 1
         return reading

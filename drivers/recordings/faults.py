@@ -100,7 +100,9 @@ class FaultInjector:
     ) -> None:
         self._faults = faults
         self._counters = counters
-        self._rng = np.random.default_rng(faults.seed)
+        by_chance = max(faults.garbage_probability, faults.intermittent_probability) > 0.0
+        # Where nothing is left to chance, numpy.random need not be imported: 7 MiB.
+        self._rng = np.random.default_rng(faults.seed) if by_chance else None
         self._where = _mask(faults, fingers)
         self._held: tuple[NDArray[np.uint16], NDArray[np.uint8]] | None = None
         self._is_stuck = False
@@ -144,7 +146,7 @@ class FaultInjector:
             # A value that is no count stays 0.
             np.copyto(counts, shifted.astype(np.uint16), where=where & (flags == 0))
             counters.injected_wrong += 1
-        if self._happens(faults.garbage_probability):
+        if self._rng is not None and self._happens(faults.garbage_probability):
             words = self._rng.integers(0, WORD_MAX, size=counts.shape, endpoint=True)
             is_count = words <= COUNT_MAX
             garbage = np.where(is_count, words, 0).astype(np.uint16)
@@ -154,7 +156,9 @@ class FaultInjector:
             counters.injected_garbage += 1
 
     def _happens(self, probability: float) -> bool:
-        return probability > 0.0 and bool(self._rng.random() < probability)
+        if self._rng is None or probability <= 0.0:
+            return False
+        return bool(self._rng.random() < probability)
 
 
 def _mask(faults: ReplayFaults, fingers: Sequence[str]) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from drivers.biotac import FORBIDDEN_COMMAND
 from drivers.spi.framing import FrameParser, encode_frame
 
 VERSION = 1
-FIRMWARE = 0x0001
+FIRMWARE = 0x0002
 """Firmware in `deploy/bridge` of this graspd, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
 SCHEMA = """\
 graspd bridge 1

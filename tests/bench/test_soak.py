@@ -17,6 +17,7 @@ from drivers.twins.faults import LinkFaults
 from tests.bench.live import TALLIED, Kind, Usage
 from tests.bench.soak import Plan, link_faults, soak
 from tests.bench.soak_judge import Found, Heard, Row, judge, slope
+from tests.daemon.processes import before_others
 
 SPEED = {"late verdicts", "worst, last byte to subscriber", "time to stop"}
 """Of the machine as much as of the daemon: no test is about them."""
@@ -34,7 +35,8 @@ def broken(rows: list[Row]) -> set[str]:
 
 @pytest.mark.parametrize("kind", ["spi", "can"])
 def test_a_short_soak_finds_nothing(kind: Kind) -> None:
-    found = soak(Plan(SECONDS, kind))
+    with before_others():
+        found = soak(Plan(SECONDS, kind))
     rows = judge(found)
     assert broken(rows) <= SPEED, [row for row in rows if row.broken]
     assert found.kills >= 1

@@ -1,15 +1,20 @@
-"""Compiling the C++ client, as its Makefile does."""
+"""Compiling the C++ client, as its Makefile does; what was compiled is kept by its content."""
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
 CPP = ROOT / "deploy" / "clients" / "cpp"
+KEPT = Path.home() / ".cache" / "graspd-tests"
+Words = Sequence[str | Path]
 HEADERS = {"zmq_addon.hpp": "cppzmq-dev", "nlohmann/json.hpp": "nlohmann-json3-dev"}
 """What the client includes, and the Debian package that has it."""
 
@@ -28,54 +33,66 @@ def _is_there(header: str) -> bool:
     )
 
 
-def compiled(name: str, folder: Path) -> Path:
+def compiled(name: str) -> Path:
     """The example of that name, made by the Makefile with its warnings as errors."""
     skip_unless_it_can_be_compiled()
-    subprocess.run(
-        ["make", "-s", "-C", CPP, f"BUILD={folder}", "CXXFLAGS=-O0", f"{folder}/{name}"],
-        check=True,
-        timeout=200,
+    return kept(
+        lambda folder: ["make", "-s", "-C", CPP, f"BUILD={folder}", "CXXFLAGS=-O0", folder / name],
+        name,
     )
-    return folder / name
+
+
+def kept(command: Callable[[Path], Words], name: str) -> Path:
+    """The program that `command` makes in the folder that it is given, or did of the same sources.
+
+    Four seconds of a processor for one, in each of the processes that run tests.
+    """
+    sources = [
+        *CPP.glob("*.?pp"),
+        CPP / "Makefile",
+        *Path(__file__).parent.glob("*.c*"),
+        Path(__file__),
+    ]
+    compiler = subprocess.run(["g++", "--version"], capture_output=True, check=True).stdout
+    digest = hashlib.sha256(compiler)
+    for source in sorted(sources):
+        digest.update(source.read_bytes())
+    program = KEPT / digest.hexdigest()[:16] / name
+    if not program.exists():
+        program.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=program.parent) as folder:
+            subprocess.run(command(Path(folder)), check=True, timeout=200)
+            (Path(folder) / name).replace(program)
+    return program
 
 
 def sleep_at_will(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The file of which programs started from now on take the beginning for a computer's sleep."""
     skip_unless_it_can_be_compiled()
-    library = folder / "sleep.so"
     source = Path(__file__).parent / "sleep.c"
-    subprocess.run(
-        ["gcc", "-shared", "-fPIC", "-Wall", "-Werror", source, "-o", library],
-        check=True,
-        timeout=200,
-    )
+    words: Words = ["gcc", "-shared", "-fPIC", "-Wall", "-Werror", source, "-o"]
+    library = kept(lambda made: [*words, made / "sleep.so"], "sleep.so")
     slept = folder / "slept"
     monkeypatch.setenv("SLEPT", str(slept))
     monkeypatch.setenv("LD_PRELOAD", str(library))
     return slept
 
 
-def compiled_probe(folder: Path) -> Path:
+def compiled_probe() -> Path:
     """The probe that tells what the header's rules say."""
     skip_unless_it_can_be_compiled()
-    binary = folder / "probe"
     warnings = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
     sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     source = Path(__file__).parent / "probe.cpp"
-    subprocess.run(
-        [
-            "g++",
-            "-std=c++17",
-            "-O0",
-            *warnings,
-            *sanitizers,
-            f"-I{CPP}",
-            source,
-            "-o",
-            binary,
-            "-lzmq",
-        ],
-        check=True,
-        timeout=200,
-    )
-    return binary
+    words: Words = [
+        "g++",
+        "-std=c++17",
+        "-O0",
+        *warnings,
+        *sanitizers,
+        f"-I{CPP}",
+        source,
+        "-lzmq",
+        "-o",
+    ]
+    return kept(lambda folder: [*words, folder / "probe"], "probe")

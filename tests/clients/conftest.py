@@ -10,12 +10,12 @@ from tests.clients.building import compiled, compiled_probe
 
 
 @pytest.fixture(scope="session")
-def lift_gate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def lift_gate() -> Path:
     """The binary of deploy/clients/cpp/lift_gate.cpp."""
-    return compiled("lift_gate", tmp_path_factory.mktemp("cpp"))
+    return compiled("lift_gate")
 
 
 @pytest.fixture(scope="session")
-def binary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def binary() -> Path:
     """The probe that tells what the header's rules say."""
-    return compiled_probe(tmp_path_factory.mktemp("probe"))
+    return compiled_probe()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from daemon.publish.messages import Verdict
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.subscribers import Crowd, Setup, Turn, take_turn
+from tests.daemon.processes import before_others
 
 CROWD = Crowd(listeners=27, stopped=3, flood=True, garbage=True)
 SETUP = Setup(learns=False, high_water_mark=1000)
@@ -23,9 +22,9 @@ def said(verdict: Verdict) -> tuple[str, float | None, list[str]]:
     return verdict.verdict, verdict.p_slip, verdict.repaired
 
 
-@pytest.mark.timeout(120)
 def test_a_crowd_changes_no_verdict_and_loses_none() -> None:
-    alone, crowded = (take_turn(crowd, 3.0, SETUP) for crowd in (Crowd(), CROWD))
+    with before_others():
+        alone, crowded = (take_turn(crowd, 3.0, SETUP) for crowd in (Crowd(), CROWD))
     for turn in (alone, crowded):
         assert turn.lost == 0
         assert len(turn.verdicts) > 50

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 GRASPD = (sys.executable, "-m", "daemon")
@@ -40,21 +40,46 @@ def graspd(*arguments: object, timeout_s: float = TIMEOUT_S) -> subprocess.Compl
     )
 
 
-def start(*arguments: object, before: Sequence[str] = ()) -> subprocess.Popen[str]:
+class Started(subprocess.Popen[str]):
+    """What a failing test leaves running is not waited for."""
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        if kind is not None:
+            self.kill()
+        super().__exit__(kind, *rest)  # type: ignore[arg-type]
+
+
+def start(*arguments: object, before: Sequence[str] = ()) -> Started:
     """Start a command, by the words `before` it, and leave it running.
 
     Before other work, where that may be: a robot's computer leaves it time, one full of tests not.
     """
-    process = subprocess.Popen(
+    process = Started(
         [*before, *GRASPD, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
     if not before:
-        with contextlib.suppress(PermissionError):
-            os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+        put_first(process.pid)
     return process
+
+
+def put_first(pid: int) -> None:
+    """Let a process come before other work, where that may be."""
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, pid, NICENESS)
+
+
+@contextlib.contextmanager
+def before_others() -> Iterator[None]:
+    """Meanwhile this thread and what it starts come before other work, where that may be."""
+    former = os.getpriority(os.PRIO_PROCESS, 0)
+    put_first(0)
+    try:
+        yield
+    finally:
+        os.setpriority(os.PRIO_PROCESS, 0, former)
 
 
 def wait_for(path: Path) -> None:

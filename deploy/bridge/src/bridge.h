@@ -15,7 +15,7 @@ extern "C" {
 #endif
 
 enum {
-    BRIDGE_FIRMWARE = 0x0001, /* 0.1 */
+    BRIDGE_FIRMWARE = 0x0002, /* 0.2; 0.1 waited too little at 200 MHz */
     BRIDGE_TICK_HZ = 1000000,
     BRIDGE_STATUS_US = 1000000, /* STATUS once a second */
     BRIDGE_PERIOD_MIN_US = 200, /* a sweep over one slot takes 80 us at 4.4 MHz */

@@ -57,11 +57,13 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def heard(folder: Path, wanted: int) -> list[Tactile]:
-    """Readings as the daemon publishes them."""
+    """Readings as the daemon publishes them, so many sound ones: one that stalls loses sweeps."""
     found: list[Tactile] = []
     with Subscriber(f"ipc://{folder}/graspd", topics=("tactile.",)) as subscriber:
-        while len(found) < wanted and (message := subscriber.take(20.0)) is not None:
-            found.append(decode_tactile(message[1]))
+        while len(found) < wanted and (message := subscriber.take(TIMEOUT_S)) is not None:
+            reading = decode_tactile(message[1])
+            if not np.any(reading.faults):
+                found.append(reading)
     return found
 
 
@@ -79,9 +81,9 @@ def test_a_recording_on_the_wire_is_read_as_its_replay_is(tmp_path: Path, kind: 
             readings = heard(tmp_path, WANTED)
             output = end(hardware)
         end(daemon)
-    sound = [str(reading.counts) for reading in readings if not np.any(reading.faults)]
+    sound = [str(reading.counts) for reading in readings]
     assert json.loads(output)["injected"] == {}
-    assert len(sound) > WANTED * 0.8
+    assert len(sound) == WANTED
     with ReplayDriver([DEMO_TABLE], ("ff", "mf", "th"), pace=Pace.FAST) as replay:
         rows: set[str] = set()
         while not replay.exhausted:
@@ -136,7 +138,8 @@ def test_a_bridge_that_goes_away_gives_unknown_and_comes_back(tmp_path: Path) ->
                 end(hardware)
             gone = published(tmp_path, 10)
             assert [verdict.verdict for verdict in gone[-5:]] == ["unknown"] * 5
-            assert gone[-1].reasons == ["stale"]
+            # Where it went in the middle of a release, the last that was seen moved.
+            assert gone[-1].reasons in (["stale"], ["stale", "moving"])
         end(daemon)
 
 

@@ -133,7 +133,7 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     known = []
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
         motion.add(index * 10_000_000, sweep, FINGER)
-        known.append(np.isfinite(motion.motion).all())
+        known.append(bool(np.isfinite(motion.motion).all()))
     # Four blocks of 24 differences over three sweeps.
     assert known.index(True) == 4 * 24 + 3 - 1
     motion.reset()

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.contact import Contact, Tare, Touch
+from daemon.judge.contact import Contact, Rest, Tare, Touch, Window
 from daemon.judge.limits import ContactLimits
 
 THRESHOLD = 20.0
@@ -156,25 +156,26 @@ def stepping(step: float) -> Sweeps:
     return sweeps_of([3000.0] * 50 + [3000.0 + step] * 50)
 
 
-def tared(sweeps: Sweeps, usable: int = 24) -> Tare:
-    tare = Tare()
+def rest_of(sweeps: Sweeps, usable: int = 24) -> Rest | None:
+    window = Window.of(1)
     for counts in sweeps:
-        tare.add(counts, np.arange(24) < usable)
-    return tare
+        window.add(counts[None], np.arange(24)[None] < usable)
+    (rest,) = window.rests([0])
+    return rest
 
 
 def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> None:
     tare = Tare()
-    looks = [tare.add(sweep, ALL[0]) for sweep in wavering(0, number=160)]
+    looks = [tare.add() for _ in range(160)]
     assert [place + 1 for place, look in enumerate(looks) if look] == [100, 125, 150]
     tare.clear()
-    looks = [tare.add(sweep, ALL[0]) for sweep in wavering(0)]
+    looks = [tare.add() for _ in range(100)]
     assert looks == [False] * 99 + [True]
 
 
 def test_the_baseline_is_the_median_of_the_last_hundred_sweeps_only() -> None:
     old, new = [np.full(24, 9, dtype=np.uint16)] * 50, wavering(0)
-    rest = tared([*old, *new]).rest()
+    rest = rest_of([*old, *new])
     assert rest is not None
     assert rest[0].tolist() == [3000.0] * 24
 
@@ -195,7 +196,7 @@ def test_the_baseline_is_the_median_of_the_last_hundred_sweeps_only() -> None:
     ],
 )
 def test_a_finger_rests_that_neither_wavers_nor_rises(sweeps: Sweeps, sigma: float | None) -> None:
-    rest = tared(sweeps).rest()
+    rest = rest_of(sweeps)
     assert (rest is None) == (sigma is None)
     if rest is not None and sigma is not None:
         assert rest[1] == pytest.approx(sigma, rel=1e-9)
@@ -203,7 +204,7 @@ def test_a_finger_rests_that_neither_wavers_nor_rises(sweeps: Sweeps, sigma: flo
 
 @pytest.mark.parametrize(("usable", "known"), [(24, 24), (12, 12), (11, None)])
 def test_twelve_electrodes_make_a_tare(usable: int, known: int | None) -> None:
-    rest = tared(wavering(2), usable).rest()
+    rest = rest_of(wavering(2), usable)
     assert (None if rest is None else int(rest[2].sum())) == known
 
 
@@ -215,7 +216,7 @@ def test_an_electrode_at_a_rail_has_no_rest(place: int, value: int, known: bool)
     sweeps = wavering(2)
     for sweep in sweeps:
         sweep[place] = value
-    rest = tared(sweeps).rest()
+    rest = rest_of(sweeps)
     assert rest is not None
     assert rest[2].tolist() == [electrode != place or known for electrode in range(24)]
 
@@ -227,7 +228,7 @@ def test_an_electrode_that_wavers_three_times_as_much_as_a_finger_may_has_no_res
     sweeps = wavering(2)
     for place, sweep in enumerate(sweeps):
         sweep[5] = 3000 + step * (-1) ** place  # sigma 29.7 or 31.1, the limit is 30
-    rest = tared(sweeps).rest()
+    rest = rest_of(sweeps)
     assert rest is not None
     assert rest[2][5] == known
 
@@ -264,8 +265,7 @@ def test_a_baseline_rises_five_and_sinks_one_and_a_half_counts_a_second(
     for place in range(100):
         counts = np.full((1, 24), 3000, dtype=np.uint16)
         contact.observe(place * 10 * MS, counts, counts, ALL)
-    tare = contact.memory.tares[0]
-    tare.window[:] = 3000
+    contact.memory.window.counts[:] = 3000
     contact.memory.baseline[:] = 3000.0 - step
     for place in range(100, 125):
         contact.observe(place * 10 * MS, counts, counts, ALL)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.bench.outages import Bench, outages
+from tests.daemon.processes import before_others
 
 PROMISED_S = {
     "sensor": 0.02,
@@ -20,7 +21,7 @@ STALL_S = 1.0
 
 
 def test_every_outage_is_unknown_in_time_and_says_why(tmp_path: Path) -> None:
-    with Bench(tmp_path) as bench:
+    with before_others(), Bench(tmp_path) as bench:
         found = {name: (took_s, reasons) for name, took_s, reasons in outages(bench)}
     assert found.keys() == PROMISED_S.keys()
     late = {

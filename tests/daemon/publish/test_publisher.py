@@ -82,7 +82,7 @@ def test_a_plain_subscriber_gets_two_frames_in_order(
         publisher.send(b"status.right", b"not wanted")
         for number in range(100):
             publisher.send(b"verdict.right", b"%d" % number)
-        received = []
+        received: list[list[bytes]] = []
         while len(received) < 100:
             publisher.take()  # what a busy subscriber's socket has no room for is sent later
             assert time.monotonic() < end_s

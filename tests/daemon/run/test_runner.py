@@ -20,7 +20,7 @@ from daemon.process.signals import StopSignal
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
 from daemon.run import runner
 from tests.clients.building import sleep_at_will
-from tests.daemon.processes import GRASPD
+from tests.daemon.processes import GRASPD, put_first
 
 DEMO = Path(__file__).parents[3] / "drivers" / "recordings" / "demo" / "synthetic_stream.csv"
 PATIENCE_S = 100.0
@@ -74,6 +74,7 @@ class Running:
                 text=True,
                 env=environment,
             )
+            put_first(self.process.pid)
             try:
                 yield self
             finally:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,8 +21,8 @@ from tests.drivers.can.can_standin import (
     contact,
     tactile,
 )
+from tests.drivers.can.can_words import Clock
 from tests.drivers.twins.signals import GeneratedContact
-from tests.threads import at_work
 
 MS = 1_000_000
 
@@ -45,18 +44,24 @@ def test_a_twin_refuses_what_its_format_cannot_show(options: Mapping[str, Any]) 
         CanTwin("virtual", "x", iter(()), **options)
 
 
-def test_a_twin_serves_at_its_rate_until_stopped() -> None:
-    where = channel()
-    twin = CanTwin("virtual", where, GeneratedContact(), rate_hz=100.0, sequence="electrodes")
+def test_a_twin_serves_at_its_rate_until_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    where, stop, clock = channel(), threading.Event(), Clock()
+    twin = CanTwin(
+        "virtual", where, GeneratedContact(), rate_hz=100.0, sequence="electrodes", clock=clock
+    )
     readings: list[TactileReading] = []
-    with bridge(where) as driver, twin:
-        with at_work(twin.serve):
-            deadline_s = time.monotonic() + 100.0
-            while len(readings) < 30 and time.monotonic() < deadline_s:
-                time.sleep(0.001)
-                readings += tactile(driver.read_ready())
+    with bridge(where, clock=clock, wall_clock=clock) as driver, twin:
+
+        def sleep(seconds: float) -> None:
+            readings.extend(tactile(driver.read_ready()))
+            clock.now_ns += round(seconds * 1e9)
+            if len(readings) >= 30:
+                stop.set()
+
+        monkeypatch.setattr("drivers.twins.can.time.sleep", sleep)
+        twin.serve(stop)
         period_ns = driver.period_ns
-    assert len(readings) >= 30
+    assert 30 <= len(readings) <= 31
     assert period_ns == pytest.approx(10 * MS, rel=0.2)
     elapsed_ns = readings[29].t_ns - readings[0].t_ns
     assert elapsed_ns == pytest.approx(290 * MS, rel=0.2)

@@ -160,7 +160,9 @@ class Host:
                 assert one is not None, whole[0].hex()
                 yield one
             elif not whole and select.select([self.descriptor], [], [], left_s)[0]:
-                self.held += os.read(self.descriptor, 65536)
+                came = os.read(self.descriptor, 65536)
+                assert came, "the bridge has ended"
+                self.held += came
         pytest.fail(f"nothing more came within {timeout_s} s")
 
     def next_of(self, kind: int, count: int = 1) -> list[bytes]:

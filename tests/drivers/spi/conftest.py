@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.daemon.processes import put_first
 from tests.drivers.spi.bridge_c import SANITIZERS, Host, StartBridge, build_program
 
 
@@ -50,14 +51,18 @@ def start_bridge(bridge_program: Path) -> Iterator[StartBridge]:
     hosts: list[Host] = []
 
     def start(*options: object, stdin: bytes | None = None) -> Host:
+        """What is given on `stdin` ends when the test closes it."""
         process = subprocess.Popen(
             [bridge_program, *map(str, options)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
+        put_first(process.pid)
         assert process.stdin is not None
         assert process.stdout is not None
         if stdin is not None:
             process.stdin.write(stdin)
-        process.stdin.close()
+            process.stdin.flush()
+        else:
+            process.stdin.close()
         path = process.stdout.readline().decode().strip()
         process.stdout.close()
         descriptor = os.open(path, os.O_RDWR | os.O_NOCTTY)

@@ -38,6 +38,8 @@ from tests.drivers.spi.bridge_c import (
     words_of,
 )
 
+pytestmark = pytest.mark.usefixtures("comes_first")
+
 FINGERS = ("ff", "mf", "th")
 
 
@@ -49,7 +51,7 @@ def test_a_hello_says_what_the_bridge_is(start_bridge: StartBridge) -> None:
     assert struct.unpack_from("<BII", hello) == (1, DIGEST, 0xCAFE)
     tick, tick_hz, firmware, board, *numbers = struct.unpack_from("<QIH16sIBB", hello, 9)
     assert numbers == [12345, 2, 24]
-    assert (tick_hz, firmware) == (1_000_000, 0x0001)
+    assert (tick_hz, firmware) == (1_000_000, 0x0002)
     assert tick < 60_000_000
     assert board == b"left hand".ljust(16, b"\0")
     assert hello[45:61] == b"BTSP000000000001"
@@ -88,13 +90,15 @@ def test_a_file_of_counts_is_played_again_at_its_end(
 
 
 def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBridge) -> None:
-    rows = np.random.default_rng(5).integers(0, 4096, (10, 1, 24))
+    rows = np.random.default_rng(5).integers(0, 4096, (12, 1, 24))
     lines = "".join(" ".join(map(str, row.ravel())) + "\n" for row in rows)
     host = start_bridge("--counts", "-", "--sensors", 1, "--period-us", 2000, stdin=lines.encode())
     host.hello()
     host.send(frame(START))
     for row, sweep in enumerate(host.next_of(SWEEP, 10)):
         np.testing.assert_array_equal(counts_of(sweep), rows[row])
+    assert host.process.stdin is not None
+    host.process.stdin.close()  # not earlier: what nobody has read is lost with the terminal
     assert host.process.wait(100) == 0
 
 

@@ -188,7 +188,7 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
 
 @pytest.mark.parametrize(
     ("firmware", "newer"),
-    [(FIRMWARE - 1, "0.1"), (FIRMWARE, None), (FIRMWARE + 1, None), (0x0200, None)],
+    [(FIRMWARE - 1, "0.2"), (FIRMWARE, None), (FIRMWARE + 1, None), (0x0200, None)],
 )
 def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None) -> None:
     conversation = opened()
