@@ -16,7 +16,7 @@ import pytest
 
 from daemon.publish.messages import Tactile, decode_tactile
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, before_others, graspd, start, wait_for
 from tests.emulated.board import BOARD_ID
 from tests.emulated.conftest import Image
 from tests.emulated.test_driver import grasps, write_counts
@@ -52,9 +52,12 @@ def live(image: Image, tmp_path: Path) -> Iterator[Live]:
     )
     counts = write_counts(tmp_path / "counts", grasps())
     command = [sys.executable, "-m", "tests.emulated.live", "--link", link, "--counts", counts]
-    with subprocess.Popen(
-        [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
+    with (
+        before_others(),
+        subprocess.Popen(
+            [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as process,
+    ):
         end_s = time.monotonic() + READY_S
         while not link.is_symlink():
             assert process.poll() is None
