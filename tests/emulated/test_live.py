@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from daemon.publish.messages import Tactile, decode_tactile
+from drivers.recordings.csv_player import DEMO_RECORDING
+from drivers.twins.grasps.grasps import recorded_counts
 from tests.bench.live import Subscriber
-from tests.daemon.processes import TIMEOUT_S, before_others, graspd, start, wait_for
+from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
 from tests.emulated.board import BOARD_ID
 from tests.emulated.conftest import Image
 from tests.emulated.test_driver import grasps, write_counts
@@ -52,12 +54,9 @@ def live(image: Image, tmp_path: Path) -> Iterator[Live]:
     )
     counts = write_counts(tmp_path / "counts", grasps())
     command = [sys.executable, "-m", "tests.emulated.live", "--link", link, "--counts", counts]
-    with (
-        before_others(),
-        subprocess.Popen(
-            [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-        ) as process,
-    ):
+    with subprocess.Popen(
+        [*map(str, command)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
         end_s = time.monotonic() + READY_S
         while not link.is_symlink():
             assert process.poll() is None
@@ -88,13 +87,15 @@ def test_the_doctor_and_the_daemon_take_it_for_a_board(live: Live, tmp_path: Pat
         assert daemon.wait(TIMEOUT_S) == 0
     behind_ms = live.behind_ms()
     assert len(found) == READINGS
-    rows = {row.tobytes(): at for at, row in enumerate(grasps())}
+    once = list(recorded_counts(DEMO_RECORDING))  # the board plays it over and over
+    rows = {row.tobytes(): at for at, row in enumerate(once)}
     at = [rows[np.array(reading.counts, dtype=np.uint16).tobytes()] for reading in found]
-    steps = np.diff(at)
+    steps = np.diff(at) % len(once)
     assert not any(any(map(any, reading.faults)) for reading in found)
     times_ns = [reading.t_mono_ns for reading in found]
     if behind_ms < ON_TIME_MS:
-        assert times_ns == sorted(times_ns)
         assert (steps == 1).all()
         assert report["readings"] > 250
+        # What comes late by less than a sweep is timed by its arrival until the clock is known.
+        assert min(np.diff(times_ns)) > -ON_TIME_MS * 1e6
         assert float(np.median(np.diff(times_ns))) == pytest.approx(10e6, rel=0.01)
