@@ -95,14 +95,7 @@ def _summary(rows: Sequence[Row]) -> list[list[str]]:
     names = list(dict.fromkeys(chosen))[:SUMMARY_MAX]
     shown = [row for row in rows if row["name"] in names]
     shown.sort(key=lambda row: float(row["time"]["paced_p50_us"]))
-    return [
-        [
-            _named(row),
-            *(_percent(error_of(row, protocols)) for protocols, _ in PANELS),
-            *_paced(row),
-        ]
-        for row in shown
-    ]
+    return [[_named(row), *_percents(row), *_paced(row)] for row in shown]
 
 
 def _named(row: Row) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import itertools
-import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,9 +25,9 @@ PANELS = (
     (("objects", "objects-whole"), "other objects"),
     (("session",), "another day"),
 )
-"""Protocols, of which a model has one at most, and what they ask."""
-WHOLE = "objects-whole"
-"""Measured on two palm poses only: drawn hollow."""
+"""Protocols, of which a model has one at most, and what they ask.
+
+What lacks the first of them was measured on two palm poses only, and is drawn hollow."""
 COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
 MARKERS = {"model": "o", "peer": "s"}
 SIZE_IN = (9.5, 9.6)
@@ -135,7 +134,7 @@ def _title(found: Found) -> str:
         "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
         "hollow: two palm poses only"
     )
-    return f"{said}{few}\n" + "\n".join(textwrap.wrap(key, 110))
+    return f"{said}{few}\n{key}"
 
 
 def _draw_panel(axes: Axes, several: Sequence[Point], asked: str) -> None:
