@@ -151,7 +151,7 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
         now_ns = message["t_mono_ns"] + round(message["age_ms"] * 1e6)
         found.take(frames(message), now_ns, now_ns)
         seen = found.at(now_ns)
-        assert (seen.verdict, seen.reasons) == (message["verdict"], tuple(message["reasons"]))
+        assert (seen.decision, seen.reasons) == (message["verdict"], tuple(message["reasons"]))
         assert msgspec.json.decode(frames(message)[1], type=Former) == msgspec.convert(
             former, Former
         )
@@ -204,7 +204,7 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
 def test_what_was_added_and_contradicts_itself_is_malformed(
     outcome: str, change: dict[str, object]
 ) -> None:
-    assert said(verdict(0, START_NS, outcome, **ADDED)).verdict == outcome
+    assert said(verdict(0, START_NS, outcome, **ADDED)).decision == outcome
     found = said(verdict(0, START_NS, outcome, **ADDED | change))
     assert (found.reasons, found.supervised) == (("malformed",), False)
 
@@ -259,7 +259,7 @@ def test_a_lift_under_supervision_gets_old_as_any(later_ms: int) -> None:
     newest.take(frames(supervised(0, START_NS)), START_NS, START_NS)
     assert newest.at(START_NS + 99 * MS).supervised
     found = newest.at(START_NS + MS + later_ms * MS)
-    assert (found.verdict, found.supervised) == ("unknown", False)
+    assert (found.decision, found.supervised) == ("unknown", False)
 
 
 def test_another_version_is_unknown_until_this_one_comes_again() -> None:
