@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -93,6 +94,29 @@ def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> N
     line = block("sh", "cmake -S")[1]
     run("sh", "-c", f"cd {project} && {line}", PKG_CONFIG_PATH=str(described.parent))
     works(project / PROGRAM, project)
+
+
+def test_the_program_of_the_readme_says_not_to_lift_where_nobody_answers(
+    prefix: Path, project: Path
+) -> None:
+    """In both languages."""
+    said = {}
+    endpoint = f"ipc://{project}/nobody"
+    programs = {each: "\n".join(block(each, "")) for each in ("python", "cpp")}
+    assert all(code.count("ipc:///run/graspd/right") == 2 for code in programs.values())
+    cpp, python = (
+        programs[each].replace("ipc:///run/graspd/right", endpoint) for each in ("cpp", "python")
+    )
+    (project / "program.cpp").write_text(f"{cpp}\nbool lift() {{ return true; }}\n")
+    words = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{prefix}/include"]
+    run(*words, project / "program.cpp", "-lzmq", "-o", project / "program")
+    said["cpp"] = run(project / "program")
+    path = str(CPP.parent / "python")
+    said["python"] = run(sys.executable, "-c", python, PYTHONPATH=path)
+    assert said == {
+        "cpp": "do not lift: unknown\n",
+        "python": "do not lift: unknown ('no-message',)\n",
+    }
 
 
 def test_another_minor_version_is_not_taken_for_this_one(prefix: Path, project: Path) -> None:
