@@ -16,7 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Newest, Risk, Verdict, is_same_computer
+from deploy.clients.python.graspd_client import (
+    Decision,
+    Newest,
+    Risk,
+    Verdict,
+    is_same_computer,
+)
 from tests.clients.messages import (
     ADDED,
     MS,
@@ -368,6 +374,17 @@ def test_what_waited_while_nobody_read_has_no_time_of_arrival() -> None:
 )
 def test_only_endpoints_of_this_computer_share_its_clock(endpoint: str, same: bool) -> None:
     assert is_same_computer(endpoint) is same
+
+
+@pytest.mark.parametrize("word", ["stable", "slip", "unknown"])
+def test_a_decision_is_the_word_of_the_wire_and_printed_as_it(word: str) -> None:
+    decision = Decision(word)
+    assert (decision == word, str(decision), f"{decision}", json.dumps(decision)) == (
+        True,
+        word,
+        word,
+        f'"{word}"',
+    )
 
 
 def test_the_file_is_python_3_9() -> None:
