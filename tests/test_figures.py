@@ -44,7 +44,7 @@ def tables(text: str) -> Iterator[list[Cells]]:
         head, _, *rows = (
             [cell.strip() for cell in line.split("|")[1:-1]] for line in table.split("\n")[:-1]
         )
-        yield [dict(zip(["", *head[1:]], row, strict=True)) for row in rows]
+        yield [dict(zip(["", *head[1:]], row, strict=False)) for row in rows]
 
 
 def section(number: int) -> list[list[Cells]]:
