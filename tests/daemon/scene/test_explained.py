@@ -110,7 +110,9 @@ def test_what_the_schema_refuses_the_daemon_refuses(text: str) -> None:
 
 
 def test_a_default_of_the_schema_is_the_default_of_the_scene() -> None:
-    optional = {section: {} for section in ("risk", "ask", "realtime", "record")}
+    optional: dict[str, dict[str, int]] = {
+        section: {} for section in ("risk", "ask", "realtime", "record")
+    }
     data = {"tactile": {"driver": "spi", "port": "x"}, **optional}
     found = scene.parse(data, Path("scene.toml"))
     said = {
