@@ -15,7 +15,8 @@ from models.runtime import ModelFile, read
 
 SYSTEM_FOLDER = Path("/var/lib/graspd/models")
 """Looked into by everybody; the service's user has no other."""
-NAME_PATTERN = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+NAME_MAX = 64
+"""Characters of a name."""
 
 
 def user_folder() -> Path | None:
@@ -41,7 +42,8 @@ def added() -> dict[str, Path]:
 
 def is_name(text: str) -> bool:
     """Whether a model may be called so: it is a file's name, and no file's path."""
-    return re.fullmatch(NAME_PATTERN, text) is not None and not text.endswith(".onnx")
+    whole = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", text) is not None
+    return whole and len(text) <= NAME_MAX and not text.endswith(".onnx")
 
 
 def find(name: str) -> Path:

@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
     )
+    parser.add_argument("--force", action="store_true", help="replace a TABLE that is there")
     parser.add_argument(
         "--object",
         type=_name,
@@ -40,6 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the table; 0 if it has a grasp, 1 if it cannot be written or none has an outcome."""
+    if args.out.exists() and not args.force:
+        complain(f"{args.out} is there already: --force replaces it")
+        return WRONG
     try:
         found = collect(args.recordings)
     except RecordingError as error:

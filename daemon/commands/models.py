@@ -164,7 +164,8 @@ def _add(args: argparse.Namespace) -> int:
         raise ModelError(f"graspd ships a model '{name}': give yours another --name")
     if not own.is_name(name) or name in (ADD, REMOVE):
         raise ModelError(
-            f"{name!r} is no name for a model: up to 64 letters, digits, '.', '_' and '-' (--name)"
+            f"{name!r} is no name for a model: up to {own.NAME_MAX} letters, digits, '.', '_' and "
+            "'-' (--name)"
         )
     folder = _folder(args)
     target = folder / f"{name}.onnx"
