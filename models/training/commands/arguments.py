@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
 from models.training.data.datasets import DatasetError
 from models.training.data.folds import TooFewGraspsError
 
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+SEEDS = 3
+"""Of the splits, that an evaluation takes by default."""
 
 
 class WrongInputError(Exception):
@@ -77,15 +76,18 @@ def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[
     Call what it yields after each training, with the text that is to stand in front of the bar;
     until then that is `first`.
     """
+    from rich import progress
+    from rich.console import Console
+
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trainings, left"),
-        TimeRemainingColumn(),
+        progress.TextColumn("{task.description}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        progress.TextColumn("trainings, left"),
+        progress.TimeRemainingColumn(),
     )
-    with Progress(
+    with progress.Progress(
         *columns, console=console, disable=hidden or not console.is_terminal, transient=True
     ) as bar:
         task = bar.add_task(first, total=total)

@@ -7,6 +7,7 @@ import dataclasses
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from models.training.commands.arguments import (
     EXIT_INPUT,
@@ -20,12 +21,11 @@ from models.training.commands.arguments import (
 from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
 from models.training.data.folds import TooFewGraspsError
 from models.training.data.lab_tables import ENOUGH_GRASPS, FEWEST_GRASPS, read_with_lab_tables
-from models.training.making.card import Card
-from models.training.making.export import ExportError
-from models.training.making.make_model import EXTRA_TRAININGS, make_model
-from models.training.making.plan import TrainingPlan
-from models.training.making.preflight import preflight
-from models.training.systems.registry import SYSTEMS
+from models.training.systems.names import SYSTEM_NAMES
+
+if TYPE_CHECKING:
+    from models.training.making.card import Card
+    from models.training.making.plan import TrainingPlan
 
 MAX_SEED = 2**32 - 1
 """The largest that scikit-learn takes."""
@@ -34,7 +34,10 @@ MAX_SEED = 2**32 - 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
     parser.add_argument(
-        "model", choices=sorted(SYSTEMS), metavar="MODEL", help=f"one of {', '.join(SYSTEMS)}"
+        "model",
+        choices=sorted(SYSTEM_NAMES),
+        metavar="MODEL",
+        help=f"one of {', '.join(SYSTEM_NAMES)}",
     )
     parser.add_argument(
         "--data",
@@ -91,11 +94,16 @@ def run(args: argparse.Namespace) -> int:
     if args.data is None and not args.own:
         say("train", "needs --data DIR, --own FILE, or both")
         return EXIT_INPUT
+    from models.training.making.export import ExportError
+
     out: Path = args.out or Path("runs") / args.model
     return exit_code("train", out, lambda: _train(args, out), ExportError)
 
 
 def _train(args: argparse.Namespace, out: Path) -> None:
+    from models.training.making.make_model import EXTRA_TRAININGS, make_model
+    from models.training.making.preflight import preflight
+
     started_s = time.monotonic()
     grasps = read_with_lab_tables(args.data, args.own)
     plan = _plan(args, grasps)
@@ -122,6 +130,9 @@ def _train(args: argparse.Namespace, out: Path) -> None:
 
 
 def _plan(args: argparse.Namespace, grasps: Grasps) -> TrainingPlan:
+    from models.training.making.plan import TrainingPlan
+    from models.training.systems.registry import SYSTEMS
+
     system, lab = SYSTEMS[args.model], lab_table_names(grasps.files)
     if lab:
         published = () if args.data is None else system.tables
