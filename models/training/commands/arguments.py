@@ -1,11 +1,10 @@
-"""What the commands of the training half share: arguments, messages, exit codes, progress."""
+"""What the commands of the training half share: arguments, messages, exit codes."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from models.training.data.datasets import DatasetError
@@ -67,28 +66,3 @@ def warn_of_unpublished(command: str, names: Iterable[str]) -> None:
 def say(command: str, text: str) -> None:
     """One line on standard error."""
     sys.stderr.write(f"graspd {command}: {text}\n")
-
-
-@contextmanager
-def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
-    """Shows how many of `total` trainings are done, on standard error if that is a terminal.
-
-    Call what it yields after each training, with the text that is to stand in front of the bar;
-    until then that is `first`.
-    """
-    from rich import progress
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    columns = (
-        progress.TextColumn("{task.description}"),
-        progress.BarColumn(),
-        progress.MofNCompleteColumn(),
-        progress.TextColumn("trainings, left"),
-        progress.TimeRemainingColumn(),
-    )
-    with progress.Progress(
-        *columns, console=console, disable=hidden or not console.is_terminal, transient=True
-    ) as bar:
-        task = bar.add_task(first, total=total)
-        yield lambda name: bar.update(task, advance=1, description=name)

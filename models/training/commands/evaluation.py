@@ -13,9 +13,9 @@ from itertools import product
 from models.training.commands.arguments import (
     SEEDS,
     WrongInputError,
-    progress_bar,
     warn_of_unpublished,
 )
+from models.training.commands.progress import progress_bar
 from models.training.data.datasets import read_all, unpublished
 from models.training.data.protocols import STANDARD, EvalProtocol
 from models.training.evaluating.campaign import Campaign, campaign, quickened

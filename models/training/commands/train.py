@@ -13,7 +13,6 @@ from models.training.commands.arguments import (
     EXIT_INPUT,
     WrongInputError,
     exit_code,
-    progress_bar,
     say,
     warn_of_unpublished,
     whole,
@@ -101,6 +100,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace, out: Path) -> None:
+    from models.training.commands.progress import progress_bar
     from models.training.making.make_model import EXTRA_TRAININGS, make_model
     from models.training.making.preflight import preflight
 
