@@ -7,12 +7,15 @@ import io
 import re
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from daemon.process.files import write_atomically
 from daemon.process.text import complain
 from daemon.publish.messages import OBJECT_PATTERN
-from daemon.record.export import Export, collect, write
 from drivers.base import RecordingError
+
+if TYPE_CHECKING:
+    from daemon.record.export import Export
 
 WRONG, FAILED = 2, 1
 
@@ -44,6 +47,8 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists() and not args.force:
         complain(f"{args.out} is there already: --force replaces it")
         return WRONG
+    from daemon.record.export import collect
+
     try:
         found = collect(args.recordings)
     except RecordingError as error:
@@ -82,6 +87,8 @@ def _summary(found: Export) -> str:
 
 def _store(found: Export, target: Path, object_name: str) -> None:
     """Replace the table in one step. Raises `OSError`."""
+    from daemon.record.export import write
+
     table = io.StringIO(newline="")
     write(table, found, object_name)
     write_atomically(target, table.getvalue().encode(), mode=0o644)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 from collections.abc import Collection
 from pathlib import Path
@@ -80,5 +81,9 @@ def ships(path: Path, sha256: str) -> bool:
 def find(name: str) -> Path:
     """Path of a model by its name. Raises `ModelError` listing the names that exist."""
     if name not in names():
-        raise ModelError(f"no model '{name}' in the zoo; there are: {', '.join(names()) or 'none'}")
+        near = difflib.get_close_matches(name, names(), n=1)
+        meant = f"; did you mean {near[0]}?" if near else ""
+        raise ModelError(
+            f"no model '{name}' in the zoo; there are: {', '.join(names()) or 'none'}{meant}"
+        )
     return ZOO / f"{name}.onnx"

@@ -8,13 +8,13 @@ import shlex
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from models import own, zoo
 from models.training.commands.arguments import (
     EXIT_INPUT,
     WrongInputError,
     exit_code,
-    progress_bar,
     say,
     warn_of_unpublished,
     whole,
@@ -22,12 +22,11 @@ from models.training.commands.arguments import (
 from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
 from models.training.data.folds import TooFewGraspsError
 from models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
-from models.training.making.card import Card
-from models.training.making.export import ExportError
-from models.training.making.make_model import EXTRA_TRAININGS, make_model
-from models.training.making.plan import TrainingPlan
-from models.training.making.preflight import enough_folds, limits, preflight
-from models.training.systems.registry import SYSTEMS
+from models.training.systems.names import SYSTEM_NAMES
+
+if TYPE_CHECKING:
+    from models.training.making.card import Card
+    from models.training.making.plan import TrainingPlan
 
 MAX_SEED = 2**32 - 1
 """The largest that scikit-learn takes."""
@@ -36,7 +35,10 @@ MAX_SEED = 2**32 - 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
     parser.add_argument(
-        "model", choices=sorted(SYSTEMS), metavar="MODEL", help=f"one of {', '.join(SYSTEMS)}"
+        "model",
+        choices=sorted(SYSTEM_NAMES),
+        metavar="MODEL",
+        help=f"one of {', '.join(SYSTEM_NAMES)}",
     )
     parser.add_argument(
         "--data",
@@ -99,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
     if args.data is None and not args.own:
         say("train", "needs --data DIR, --own FILE, or both")
         return EXIT_INPUT
+    from models.training.making.export import ExportError
+
     name = _plan(args).model
     if args.own and name in zoo.names():
         say("train", f"graspd ships a model {name!r}: choose another --name")
@@ -108,6 +112,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace, out: Path) -> None:
+    from models.training.commands.progress import progress_bar
+    from models.training.making.make_model import EXTRA_TRAININGS, make_model
+    from models.training.making.preflight import limits, preflight
+
     started_s = time.monotonic()
     grasps = read_with_lab_tables(args.data, args.own)
     plan = _plan(args)
@@ -134,6 +142,8 @@ def _train(args: argparse.Namespace, out: Path) -> None:
 
 def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
     """Say with which options these grasps are enough, if there are such."""
+    from models.training.making.preflight import enough_folds
+
     for only in (plan.only, "cv"):
         other = dataclasses.replace(plan, only=only, folds=plan.folds + (only != plan.only))
         if (folds := enough_folds(other, grasps)) is not None:
@@ -143,6 +153,9 @@ def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
 
 
 def _plan(args: argparse.Namespace) -> TrainingPlan:
+    from models.training.making.plan import TrainingPlan
+    from models.training.systems.registry import SYSTEMS
+
     system, lab = SYSTEMS[args.model], tuple(path.stem for path in args.own)
     if lab:
         published = () if args.data is None else system.tables

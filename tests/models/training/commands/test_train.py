@@ -21,6 +21,7 @@ from models.runtime import TactileModel
 from models.training.commands import train
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
+from models.training.making import make_model
 from models.training.making.export import ExportError
 from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
 from tests.models.training.training_samples import separable_counts, write_table
@@ -332,7 +333,7 @@ def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "make_model", interrupted)
+    monkeypatch.setattr(make_model, "make_model", interrupted)
     write(tmp_path / "lab.csv", smallest())
     small = ["--own", str(tmp_path / "lab.csv"), "--folds", "2", "--only", "cv"]
     small += ["--out", str(tmp_path / "out")]
@@ -462,7 +463,7 @@ def test_ctrl_c_ends_cleanly_with_130(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "make_model", interrupted)
+    monkeypatch.setattr(make_model, "make_model", interrupted)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 130
     assert capsys.readouterr().err.splitlines()[-1] == (
         "graspd train: interrupted; the same command goes on from here"
@@ -478,6 +479,6 @@ def test_a_failed_export_is_exit_code_1(
     def failing(*_: object) -> None:
         raise ExportError("the exported file differs")
 
-    monkeypatch.setattr(train, "make_model", failing)
+    monkeypatch.setattr(make_model, "make_model", failing)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "graspd train: the exported file differs"
