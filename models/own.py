@@ -3,6 +3,7 @@ of the user or, for services, of the system."""
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
 import re
@@ -57,12 +58,13 @@ def find(name: str) -> Path:
         path = folder / f"{name}.onnx"
         if os.path.isfile(path):  # without an error where the folder may not be read
             return path
-    try:
-        return zoo.find(name)
-    except ModelError as error:
-        own = f"; added: {', '.join(added())}" if added() else ""
-        looked = " or ".join(map(str, folders()))
-        raise ModelError(f"{error}{own} (looked for {name!r} in {looked} too)") from None
+    others = added()
+    near = difflib.get_close_matches(name, [*zoo.names(), *others], n=1)
+    meant = f"; did you mean {near[0]}?" if near else ""
+    raise ModelError(
+        f"no model '{name}' in the zoo; there are: {', '.join(zoo.names())}; in "
+        f"{' or '.join(map(str, folders()))}: {', '.join(others) or 'none'}{meant}"
+    )
 
 
 def card(path: Path, file: ModelFile | None = None) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Collection
 from pathlib import Path
@@ -81,9 +80,5 @@ def ships(path: Path, sha256: str) -> bool:
 def find(name: str) -> Path:
     """Path of a model by its name. Raises `ModelError` listing the names that exist."""
     if name not in names():
-        near = difflib.get_close_matches(name, names(), n=1)
-        meant = f"; did you mean {near[0]}?" if near else ""
-        raise ModelError(
-            f"no model '{name}' in the zoo; there are: {', '.join(names()) or 'none'}{meant}"
-        )
+        raise ModelError(f"no model '{name}' in the zoo; there are: {', '.join(names()) or 'none'}")
     return ZOO / f"{name}.onnx"
