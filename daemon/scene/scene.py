@@ -239,6 +239,9 @@ class Record(Section):
     """Of this hand; the oldest are removed."""
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0)] = 4096.0
     """All files of this hand together, the one being written included, MB."""
+    images_hz: Annotated[float, Field(ge=0.0, le=1000.0)] = 10.0
+    """Tactile images a second, for viewers; 0 draws none. Every reading's counts are kept anyway.
+    """
     raw: bool = False
     """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
 
