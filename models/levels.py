@@ -66,6 +66,8 @@ def fall_of(
     """
     reference = np.median(counts[sound]) if rest is None and sound.any() else rest
     fall = np.zeros(ELECTRODES) if reference is None else reference - counts
+    if sound.all():
+        return fall
     return np.where(sound, fall, np.median(fall[sound]) if sound.any() else 0.0)
 
 

@@ -327,8 +327,10 @@ class Recorder(Companion):
 
     def _write_message(self, files: _Open, topic: bytes, content: object, at_ns: int) -> None:
         """Write a message, and what it comes to for people."""
-        made = content() if callable(content) else msgspec.json.decode(cast(bytes, content))
-        message = msgspec.to_builtins(made)
+        if callable(content):
+            message = msgspec.to_builtins(content())
+        else:
+            message = msgspec.json.decode(cast(bytes, content))
         files.messages.write(topic, msgspec.json.encode(flat(message)), at_ns)
         kind, wall_ns = topic.partition(b".")[0].decode(), at_ns + files.offset_ns
         for line in self._journal.of(kind, message, wall_ns):
