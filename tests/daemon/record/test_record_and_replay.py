@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from daemon.publish.messages import encode
 from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
-from tests.daemon.record.recorded import IGNORED_FIELDS, Lab, messages, work
+from tests.daemon.record.recorded import IGNORED_FIELDS, Lab, messages, without_null, work
 
 GRASPS = 4
 
@@ -27,7 +27,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
 
 
 def compared(verdict: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
+    said = {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
+    return dict(without_null(said))
 
 
 def of_kind(path: Path, kind: str) -> list[dict[str, Any]]:
@@ -53,12 +54,13 @@ def again(*arguments: object) -> list[dict[str, Any]]:
 def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None:
     (path,) = lab.files
     kinds = [kind for kind, _ in messages(path)]
-    assert set(kinds) == {"tactile", "joints", "verdict", "gate", "outcome", "status", "judged"}
+    published = {"tactile", "verdict", "gate", "outcome", "status"}
+    assert set(kinds) == published | {"joints", "judged", "image", "log"}
     assert kinds.count("tactile") == kinds.count("joints") == len(of_readings(path)) > 0
     recorded = {content["seq"]: content for content in of_kind(path, "verdict")}
     published = {verdict.seq: json.loads(encode(verdict)) for verdict in lab.verdicts}
     for seq, verdict in published.items():
-        assert recorded[seq] == verdict
+        assert recorded[seq] == without_null(verdict)
     last = of_kind(path, "status")[-1]
     assert last["drivers"]["record"]["dropped"] == last["drivers"]["record"]["lost"] == 0
     assert last["drivers"]["ask"]["outcomes"] == GRASPS - 1
@@ -78,8 +80,7 @@ def test_the_library_reads_it_and_every_message_is_as_its_schema_says(lab: Lab) 
                 checks = jsonschema.validators.validator_for(told)
                 checks.check_schema(told)
                 validators[schema.id] = checks(told)
-            if seen[channel.topic] < 20:
-                validators[schema.id].validate(json.loads(message.data))
+            validators[schema.id].validate(json.loads(message.data))
     assert set(seen) >= {"tactile.right", "joints.right", "verdict.right", "outcome.right"}
 
 
