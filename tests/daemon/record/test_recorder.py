@@ -112,7 +112,9 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     assert path.stat().st_mode & 0o777 == 0o640
 
 
-def test_an_angle_that_there_is_not_is_left_out_and_its_joint_named(tmp_path: Path, make: Make) -> None:
+def test_an_angle_that_there_is_not_is_left_out_and_its_joint_named(
+    tmp_path: Path, make: Make
+) -> None:
     recorder = make()
     recorder.on_joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
     recorder.close()
