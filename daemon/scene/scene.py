@@ -255,6 +255,9 @@ class Record(Section):
     """So many of this hand are kept; the oldest are removed."""
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), Unit("MB")] = 4096.0
     """All files of this hand together, the one being written included."""
+    images_hz: Annotated[float, Field(ge=0.0, le=1000.0), Unit("1/s")] = 10.0
+    """Tactile images a second, for viewers; 0 draws none. Every reading's counts are kept anyway.
+    """
     raw: bool = False
     """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
 
