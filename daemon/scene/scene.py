@@ -39,7 +39,6 @@ SCENE_MAX_BYTES = 128 << 10
 """A scene has a kilobyte, and one with the names of a thousand recordings a hundred; a larger file
 was named by mistake."""
 
-
 STATE_DIRECTORY = Path("/var/lib/graspd")
 """Where a service keeps its state (file-hierarchy(7))."""
 
@@ -142,14 +141,9 @@ class Gate(Section):
     given, 3, and with mode `every` 1."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that must touch; all of `hand.fingers` unless given."""
-    contact_counts: Annotated[float, Field(ge=5.0, le=1000.0), Unit("counts")] = (
-        ContactLimits.counts
-    )
-    """A finger touches when three electrodes fall by so much below where they rest, and by
-    `contact_sigmas`."""
-    contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0), Unit("standard deviations")] = (
-        ContactLimits.sigmas
-    )
+    contact_counts: Annotated[float, Field(ge=5, le=1000), Unit("counts")] = ContactLimits.counts
+    """A finger touches when three electrodes fall so far below their rest, and `contact_sigmas`."""
+    contact_sigmas: Annotated[float, Field(ge=3, le=100), Unit("sigma")] = ContactLimits.sigmas
     """The same in standard deviations of the finger's noise: both must be reached."""
     false_alarms: Annotated[float, Field(ge=0.001, le=0.3), Unit()] = GateLimits.false_alarms
     """Share of the time in which a hand that holds may be said to move. Less of it lets more slow
@@ -157,9 +151,7 @@ class Gate(Section):
     early: bool = GateLimits.early
     """Judge a grasp as soon as nothing moves fast, marked `early`, and once more when it is known
     that nothing slides slowly either."""
-    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0), Unit("rad/s")] = (
-        JointLimits.rad_per_s
-    )
+    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), Unit("rad/s")] = JointLimits.rad_per_s
     """A joint that turns faster is moving; only with `[joints]`."""
     joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), Unit("ms")] = (
         JointLimits.lost_ns / 1e6
@@ -170,7 +162,7 @@ class Gate(Section):
     gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
     """After so long without a usable reading the grasp must settle anew. More than two periods
     of the readings."""
-    change_counts: Annotated[float, Field(ge=10.0, le=1000.0), Unit("counts")] = (
+    change_counts: Annotated[float, Field(ge=10, le=1000), Unit("counts")] = (
         GateLimits.change_counts
     )
     """Electrodes of a finger that are so far from where they were judged, in the mean, are another
@@ -256,8 +248,7 @@ class Record(Section):
     keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), Unit("MB")] = 4096.0
     """All files of this hand together, the one being written included."""
     images_hz: Annotated[float, Field(ge=0.0, le=1000.0), Unit("1/s")] = 10.0
-    """Tactile images a second, for viewers; 0 draws none. Every reading's counts are kept anyway.
-    """
+    """Tactile images a second, for viewers; 0 draws none. All counts are kept anyway."""
     raw: bool = False
     """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
 
