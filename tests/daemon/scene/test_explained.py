@@ -51,6 +51,11 @@ def test_every_key_has_a_meaning_and_every_number_a_unit(key: str, about: dict[s
         assert number["unit"] == "-" or f"Unit: {number['unit']}." in about["description"]
 
 
+def test_the_package_has_the_very_examples_of_deploy() -> None:
+    assert explained.EXAMPLES.resolve() == DEPLOY / "scenes"
+    assert {"spi", "can", "palm", "demo"} <= set(explained.examples())
+
+
 def test_no_key_is_forgotten() -> None:
     named = {key for key, _ in KEYS}
     assert set(scene.Scene.model_fields) < named
