@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import importlib
 import os
+import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
+from typing import NoReturn
 
+from daemon.commands.arguments import Parser
 from daemon.process import logs
 from daemon.process.extras import needs
 from daemon.process.text import complain
@@ -24,6 +26,7 @@ COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
     "replay": ("daemon.commands.replay", "judge recordings and print the verdicts"),
     "watch": ("daemon.commands.watch", "see it live, in a terminal (extra: watch) or a browser"),
+    "scene": ("daemon.commands.scene", "print an example scene, or what each of its keys means"),
     "check": ("daemon.commands.check", "say whether a scene is right and what it needs"),
     "doctor": (
         "daemon.commands.doctor",
@@ -48,6 +51,8 @@ COMMANDS = {
         "daemon.commands.report",
         "measure error, time and exactness of the models (extras: train, report)",
     ),
+    "completion": ("daemon.commands.completion", "print what makes a shell complete commands"),
+    "manual": ("daemon.commands.manual", "print the manual page: graspd manual | man -l -"),
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 EXTRAS = {
@@ -56,7 +61,9 @@ EXTRAS = {
     "evaluate": "train",
     "report": "train,report",
 }
-"""Extras without which a command cannot be loaded."""
+"""Extras without which a command cannot be run; its help needs none."""
+LIBRARIES = ("onnxruntime", "numpy", "pyzmq", "python-can", "pyserial")
+"""Whose versions `--version` tells."""
 WRONG = 2
 
 
@@ -71,34 +78,55 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     Raises `SystemExit` where there is nothing to run: 0 after --help, 2 for what is wrong.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    parser = argparse.ArgumentParser(
+    named = next((word for word in arguments if not word.startswith("-")), None)
+    parser = _parser(lambda name: name == named)
+    args = parser.parse_args(arguments)
+    logs.set_up(os.environ)
+    if args.command != named:
+        parser.error(f"'{args.command}' must come first")
+
+    def run() -> int:
+        with _saying_which_extra(args.command):
+            code: int = importlib.import_module(COMMANDS[args.command][0]).run(args)
+        return code
+
+    return run
+
+
+def whole_parser() -> Parser:
+    """The parser of all commands, with all their arguments."""
+    return _parser(lambda _name: True)
+
+
+def _parser(is_wanted: Callable[[str], bool]) -> Parser:
+    """The parser of all commands; of those that are not wanted it knows the names alone."""
+    parser = Parser(
         prog="graspd",
         description="Says before a Shadow Dexterous Hand lifts whether the grasp will hold.",
     )
-    parser.add_argument("--version", action="version", version=f"graspd {version('graspd')}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    named = next((word for word in arguments if not word.startswith("-")), None)
-    run = None
-    for name, (module_name, text) in COMMANDS.items():
+    parser.add_argument("--version", action=_Version, nargs=0, help="tell versions and leave")
+    parser.set_defaults(whole_parser=whole_parser)
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, help="what to do; each has its own --help"
+    )
+    for name, (module, text) in COMMANDS.items():
         command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        if name == named:
-            run = _load(name, module_name, command)
-    with _saying_which_extra(named):  # a report is imported when its arguments are read
-        args = parser.parse_args(arguments)
-    logs.set_up(os.environ)
-    if run is None:
-        parser.error(f"'{args.command}' must come first")
-    return functools.partial(run, args)
+        if is_wanted(name):
+            importlib.import_module(module).add_arguments(command)
+    return parser
 
 
-def _load(
-    command: str, module: str, parser: argparse.ArgumentParser
-) -> Callable[[argparse.Namespace], int]:
-    with _saying_which_extra(command):
-        loaded = importlib.import_module(module)
-        loaded.add_arguments(parser)
-    run: Callable[[argparse.Namespace], int] = loaded.run
-    return run
+class _Version(argparse.Action):
+    """Tells graspd's version in the first line, and of what it stands on in the second."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        import zmq
+
+        libraries = [f"Python {platform.python_version()}"]
+        libraries += [f"{name} {version(name)}" for name in LIBRARIES]
+        libraries.append(f"libzmq {zmq.zmq_version()}")
+        sys.stdout.write(f"graspd {version('graspd')}\n{', '.join(libraries)}\n")
+        parser.exit()
 
 
 @contextlib.contextmanager

@@ -26,9 +26,12 @@ passed: deque[str] = deque(maxlen=8)
 """Digests of models that were tried and are fine, the newest last."""
 
 
-def load(path: Path) -> TactileModel:
-    """The model at `path`, warm. Raises `ModelError`, for one that is too slow or large too."""
-    file = read(path)
+def load(path: Path, file: ModelFile | None = None) -> TactileModel:
+    """The model at `path`, warm; `file` is its content where that was read.
+
+    Raises `ModelError`, for one that is too slow or large too.
+    """
+    file = read(path) if file is None else file
     if file.sha256 not in passed and not zoo.ships(path, file.sha256):
         _try(path, file.data)
         passed.append(file.sha256)

@@ -26,7 +26,7 @@ from daemon.scene.drivers import (
 from daemon.trust.risk import RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import Driver, DriverError, LinkError
-from models import trial, zoo
+from models import own, trial, zoo
 from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
 
@@ -46,13 +46,13 @@ Clock = Callable[[], int]
 def model_path(scene: Scene) -> Path:
     """File of the scene's model.
 
-    `model.name` is any name of the zoo; where the zoo has that model in a form for the hand's
-    fingers alone, it is that form. Raises `ModelError` if the zoo does not have it.
+    `model.name` is any name of the zoo or of an added model; where the zoo has that model in a
+    form for the hand's fingers alone, it is that form. Raises `ModelError` if there is none.
     """
     if scene.model.path is not None:
         return scene.model.path
     name = DEFAULT_MODEL if scene.model.name is None else scene.model.name
-    return zoo.find(zoo.for_hand(name, scene.hand.fingers))
+    return own.find(zoo.for_hand(name, scene.hand.fingers))
 
 
 def load_model(scene: Scene) -> TactileModel:

@@ -1,10 +1,48 @@
-"""Numbers on the command line."""
+"""The command line: a parser that suggests what was probably meant, and numbers on it."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from itertools import takewhile
+from typing import Any
+
+from daemon.process.text import did_you_mean
+
+
+class Parser(argparse.ArgumentParser):
+    """As `argparse` has it, but what is mistyped is answered with the nearest that there is."""
+
+    @property
+    def actions(self) -> Sequence[argparse.Action]:
+        """All that it takes: options, positional arguments, and the choice of a subcommand."""
+        return self._actions
+
+    @property
+    def subparsers(self) -> Mapping[str, Parser]:
+        """Parsers of its subcommands by name."""
+        choices = (action.choices for action in self._actions)
+        return next((each for each in choices if isinstance(each, Mapping)), {})
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
+        """Parse; an option that there is not is an error before those that are missing."""
+        words: Sequence[str] = sys.argv[1:] if args is None else args
+        is_mine = (lambda word: word.startswith("-")) if self.subparsers else lambda _word: True
+        for word in takewhile(lambda word: word != "--" and is_mine(word), words):
+            name = word.partition("=")[0]
+            known = self._option_string_actions
+            if name.startswith("--") and not any(option.startswith(name) for option in known):
+                self.error(f"no such option: {name}{did_you_mean(name, known)}")
+        return super().parse_known_args(args, namespace)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:  # noqa: ANN401
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            said = f"{error.message}{did_you_mean(str(value), map(str, action.choices or ()))}"
+            raise argparse.ArgumentError(action, said) from None
 
 
 def positive(text: str) -> float:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, get_args
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.process.text import complain, printable, progress
+from daemon.process.text import Colour, coloured, complain, printable, progress
 from daemon.scene import drivers as scene_drivers
 from drivers.base import DriverError
 from drivers.udp.receiver import SCHEME, Endpoint
@@ -138,7 +138,7 @@ def _write_json(path: Path, parts: Mapping[str, object], cost: Footprint | None)
 
 
 def _write(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None) -> None:
-    sys.stdout.write(f"{printable(str(path))}: fine\n")
+    sys.stdout.write(f"{printable(str(path))}: {coloured('fine', Colour.GREEN)}\n")
     for title, entries in (("in", parts["in"]), ("left out", parts["left_out"])):
         sys.stdout.write(f"{title}\n")
         for key, value in entries.items():

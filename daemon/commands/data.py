@@ -37,7 +37,11 @@ class DataError(Exception):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     parser.add_argument(
-        "--to", type=Path, default=Path("data/bts3"), metavar="DIR", help="(default: data/bts3)"
+        "--to",
+        type=Path,
+        default=Path("data/bts3"),
+        metavar="DIR",
+        help="into here (default: data/bts3)",
     )
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--from", dest="folder", type=Path, metavar="DIR", help="copy from here")

@@ -7,12 +7,15 @@ import io
 import re
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from daemon.process.files import write_atomically
 from daemon.process.text import complain
 from daemon.publish.messages import OBJECT_PATTERN
-from daemon.record.export import Export, collect, write
 from drivers.base import RecordingError
+
+if TYPE_CHECKING:
+    from daemon.record.export import Export
 
 WRONG, FAILED = 2, 1
 
@@ -29,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="TABLE", help="grasp table (CSV) to write"
     )
+    parser.add_argument("--force", action="store_true", help="replace a TABLE that is there")
     parser.add_argument(
         "--object",
         type=_name,
@@ -40,6 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the table; 0 if it has a grasp, 1 if it cannot be written or none has an outcome."""
+    if args.out.exists() and not args.force:
+        complain(f"{args.out} is there already: --force replaces it")
+        return WRONG
+    from daemon.record.export import collect
+
     try:
         found = collect(args.recordings)
     except RecordingError as error:
@@ -78,6 +87,8 @@ def _summary(found: Export) -> str:
 
 def _store(found: Export, target: Path, object_name: str) -> None:
     """Replace the table in one step. Raises `OSError`."""
+    from daemon.record.export import write
+
     table = io.StringIO(newline="")
     write(table, found, object_name)
     write_atomically(target, table.getvalue().encode(), mode=0o644)

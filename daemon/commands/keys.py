@@ -19,14 +19,22 @@ WRONG = 2
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    make = actions.add_parser("make", help="make a pair of keys: NAME.key and NAME.key_secret")
+    actions = parser.add_subparsers(
+        dest="action", metavar="ACTION", required=True, help="what to do"
+    )
+    text = "make a pair of keys: NAME.key and NAME.key_secret"
+    make = actions.add_parser("make", help=text, description=f"M{text[1:]}.")
     make.add_argument("name", help="whose keys: `daemon`, or the name of a computer")
-    listing = actions.add_parser("list", help="list the keys, and what is wrong with them")
+    text = "list the keys, and what is wrong with them"
+    listing = actions.add_parser("list", help=text, description=f"L{text[1:]}.")
     listing.add_argument("--json", action="store_true", help="one JSON object on stdout")
     for action in (make, listing):
         action.add_argument(
-            "--dir", type=Path, default=FOLDER, metavar="DIR", help=f"(default: {FOLDER})"
+            "--dir",
+            type=Path,
+            default=FOLDER,
+            metavar="DIR",
+            help=f"folder of the keys (default: {FOLDER})",
         )
 
 

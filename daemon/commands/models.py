@@ -1,17 +1,24 @@
-"""`graspd models [NAME]`: which models there are, what each is worth, where it ends."""
+"""`graspd models`: which models there are, what each is worth, where it ends; and adding others."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from daemon.assembly.assembly import DEFAULT_MODEL
+from daemon.process.files import write_atomically
 from daemon.process.text import complain, printable
-from models import zoo
-from models.contract import ModelError
+from models import own, zoo
+from models.contract import ModelContract, ModelError
+from models.runtime import read
 
 TITLES = {
     "cv": "known objects",
@@ -32,29 +39,175 @@ SHOWN = {
 """Columns of the list: the first of these protocols that a card has."""
 
 
+ADD, REMOVE = "add", "remove"
+WRONG, FAILED = 2, 1
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    parser.add_argument("name", nargs="?", help="show this model's card")
+    parser.usage = """graspd models [--json] [NAME | FILE]
+       graspd models add FILE [--name NAME] [--user | --system] [--force]
+       graspd models remove NAME [--user | --system]"""
+    parser.add_argument(
+        "what",
+        nargs="?",
+        metavar="NAME",
+        help="show the card of this model, or of an .onnx file; without it, list all. 'add' copies "
+        "a model file and its card to where [model] name of a scene, and --model, find it by name; "
+        "'remove' takes it away again",
+    )
+    parser.add_argument("which", nargs="?", metavar="FILE", help="what to add, or to remove")
+    parser.add_argument(
+        "--name", help="with add: name to give it (default: the one in its contract)"
+    )
+    parser.add_argument("--force", action="store_true", help="with add: replace what is called so")
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument(
+        "--user",
+        dest="is_system",
+        action="store_false",
+        default=os.geteuid() == 0,
+        help="in ~/.local/share/graspd/models, for this user alone (default but for root)",
+    )
+    where.add_argument(
+        "--system",
+        dest="is_system",
+        action="store_true",
+        help=f"in {own.SYSTEM_FOLDER}, for services and all who may read there (default for root)",
+    )
     parser.add_argument("--json", action="store_true", help="the cards as JSON on stdout")
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the zoo, or show one card; 2 if there is no such model."""
+    """List the models, show a card, add or remove one; 2 for what is wrong with it, 1 if a folder
+    cannot be written."""
     try:
-        names = zoo.names() if args.name is None else [args.name]
-        cards = {name: zoo.card(name) for name in names}
+        if args.what in (ADD, REMOVE):
+            if args.which is None:
+                raise ModelError(f"{args.what} needs a {'FILE' if args.what == ADD else 'NAME'}")
+            return _add(args) if args.what == ADD else _remove(args)
+        if args.which is not None:
+            raise ModelError(f"only {ADD} and {REMOVE} take a second word: {args.which}")
+        return _show(args)
     except ModelError as error:
         complain(error)
-        return 2
+        return WRONG
+    except OSError as error:
+        complain(f"{error.filename or args.which}: {error.strerror or error}")
+        return FAILED
+
+
+def _show(args: argparse.Namespace) -> int:
+    added = own.added()
+    if args.what is None:
+        cards = {name: zoo.card(name) for name in zoo.names()}
+        for name, path in added.items():
+            try:
+                cards[name] = _checked(zoo.read_card(path.with_suffix(".json")))
+            except ModelError as error:
+                complain(error)
+        lines = _listing(cards, added)
+        content: object = cards
+    else:
+        content = card = _card_of(args.what)
+        lines = _card(card)
     if args.json:
-        sys.stdout.write(json.dumps(cards if args.name is None else cards[args.name]) + "\n")
-        return 0
-    lines = _listing(cards) if args.name is None else _card(cards[args.name])
-    sys.stdout.write("\n".join(printable(line) for line in lines) + "\n")
+        sys.stdout.write(json.dumps(content) + "\n")
+    else:
+        sys.stdout.write("\n".join(printable(line) for line in lines) + "\n")
     return 0
 
 
-def _listing(cards: dict[str, dict[str, Any]]) -> Iterator[str]:
+def _card_of(what: str) -> dict[str, Any]:
+    """Of a name or a file."""
+    if what in zoo.names():
+        return zoo.card(what)
+    is_file = what.endswith(".onnx") or os.sep in what
+    return _checked(own.card(Path(what) if is_file else own.find(what)))
+
+
+class _Size(msgspec.Struct):
+    size_bytes: int
+
+
+class _Data(msgspec.Struct):
+    licence: str
+
+
+class _Shown(msgspec.Struct):
+    """What is shown of a card; one of your own may lack what has a default."""
+
+    what: str
+    contract: ModelContract
+    file: _Size
+    parameters: int | None = None
+    weak_points: tuple[str, ...] = ()
+    data: _Data | None = None
+    command: str = ""
+
+
+def _checked(card: dict[str, Any]) -> dict[str, Any]:
+    """A card of which all that is shown has its form. Raises `ModelError`."""
+    try:
+        msgspec.convert(card, _Shown)
+    except msgspec.ValidationError as error:
+        raise ModelError(f"a card is wrong: {error}") from error
+    return card
+
+
+def _add(args: argparse.Namespace) -> int:
+    source = Path(args.which)
+    file = read(source)
+    card = _checked(own.card(source, file))
+    name = card["contract"]["name"] if args.name is None else args.name
+    if name in zoo.names():
+        raise ModelError(f"graspd ships a model '{name}': give yours another --name")
+    if not own.is_name(name) or name in (ADD, REMOVE):
+        raise ModelError(
+            f"{name!r} is no name for a model: up to {own.NAME_MAX} letters, digits, '.', '_' and "
+            "'-' (--name)"
+        )
+    folder = _folder(args)
+    target = folder / f"{name}.onnx"
+    if target.exists() and not args.force:
+        raise ModelError(f"{target} is there already: --force replaces it")
+    if not folder.is_dir():
+        folder.mkdir(parents=True)
+        folder.chmod(0o755)  # whatever the umask: the service reads it as another user
+    write_atomically(target.with_suffix(".json"), json.dumps(card).encode(), mode=0o644)
+    write_atomically(target, file.data, mode=0o644)
+    sys.stdout.write(
+        f'{printable(str(target))}: added; in a scene, below [model]: name = "{name}"\n'
+    )
+    found = own.find(name)
+    if found != target:
+        complain(f"{found} has this name too, and comes first for you")
+    elif not args.is_system:
+        complain(f"for you alone; for a service: sudo graspd models add --system --name {name} ...")
+    return 0
+
+
+def _remove(args: argparse.Namespace) -> int:
+    name, target = args.which, _folder(args) / f"{args.which}.onnx"
+    if name in zoo.names():
+        raise ModelError(f"'{name}' ships with graspd and stays")
+    if not own.is_name(name) or not target.exists():
+        raise ModelError(f"no model '{name}' in {target.parent} (see --user and --system)")
+    target.unlink()
+    with suppress(FileNotFoundError):
+        target.with_suffix(".json").unlink()
+    sys.stdout.write(f"{printable(str(target))}: removed\n")
+    return 0
+
+
+def _folder(args: argparse.Namespace) -> Path:
+    folder = own.SYSTEM_FOLDER if args.is_system else own.user_folder()
+    if folder is None:
+        raise ModelError("there is no home folder to keep it in: --system")
+    return folder
+
+
+def _listing(cards: dict[str, dict[str, Any]], added: dict[str, Path]) -> Iterator[str]:
     titles = "".join(f"{title:>16}" for title in SHOWN)
     yield f"{'F1, %':26}{'fingers':10}{'MB':>6}{'numbers':>10}{titles}"
     for name, card in cards.items():
@@ -63,15 +216,17 @@ def _listing(cards: dict[str, dict[str, Any]]) -> Iterator[str]:
             f"{100 * measured['f1_std']:.1f}"
             for measured in card["contract"]["measured"]
         }
-        default = " (default)" if name == DEFAULT_MODEL else ""
+        mark = " (default)" if name == DEFAULT_MODEL else " (own)" if name in added else ""
         chosen = (next(filter(None, map(f1.get, group)), "-") for group in SHOWN.values())
         figures = "".join(f"{text:>16}" for text in chosen)
-        size = card["file"]["size_bytes"] / 1e6
+        size = f"{card['file']['size_bytes'] / 1e6:.1f}"
+        parameters = card.get("parameters") or "-"
         fingers = " ".join(card["contract"]["fingers"])
-        yield f"{name + default:26}{fingers:10}{size:6.1f}{card['parameters']:>10}{figures}"
+        yield f"{name + mark:26}{fingers:10}{size:>6}{parameters:>10}{figures}"
     yield ""
     for name, card in cards.items():
-        yield f"{name}: {card['what']}"
+        where = f" ({added[name]})" if name in added else ""
+        yield f"{name}: {card['what']}{where}"
 
 
 def _card(card: dict[str, Any]) -> Iterator[str]:
@@ -95,10 +250,12 @@ def _card(card: dict[str, Any]) -> Iterator[str]:
             )
     yield ""
     yield "known weak points:"
-    for point in card["weak_points"]:
+    for point in card.get("weak_points", ("nobody has said",)):
         yield f"  - {point}"
     yield ""
     for dataset in contract["datasets"]:
         yield f"trained on {dataset['name']} ({dataset['rows']} grasps, {dataset['sha256'][:12]})"
-    yield f"licence of the data: {card['data']['licence']}"
-    yield f"made by: {card['command']}"
+    if card.get("data"):
+        yield f"licence of the data: {card['data']['licence']}"
+    if "command" in card:
+        yield f"made by: {card['command']}"

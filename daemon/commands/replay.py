@@ -66,8 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--model",
-        help=f"model of the zoo, or an .onnx file (default: {assembly.DEFAULT_MODEL}; of an MCAP "
-        "recording, the one that judged then)",
+        help="name of a model, as `graspd models` lists them, or an .onnx file (default: "
+        f"{assembly.DEFAULT_MODEL}; of an MCAP recording, the one that judged then)",
     )
     parser.add_argument(
         "--speed",

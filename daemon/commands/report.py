@@ -4,47 +4,88 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from typing import Any
+from pathlib import Path
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the reports and their arguments; what measures takes seconds to load."""
+    reports = parser.add_subparsers(
+        dest="report", metavar="WHAT", required=True, help="what to measure"
+    )
+    for name, (_, text, declare) in REPORTS.items():
+        report = reports.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        declare(report)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the report; its exit code."""
+    code: int = importlib.import_module(REPORTS[args.report][0]).run(args)
+    return code
+
+
+def _error_vs_time(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
+    )
+    parser.add_argument(
+        "--models",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="DIR",
+        help="further models with their cards, as `graspd train --out DIR` writes them",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/error-vs-time"),
+        metavar="DIR",
+        help="folder for the page, the table, the picture and the figures",
+    )
+    parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
+
+
+def _stability(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", nargs="*", help="names in the zoo (default: all)")
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="folder of the real grasps: all of them too"
+    )
+    parser.add_argument("--quick", action="store_true", help="10^4 outcomes instead of 10^6")
+    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables here too")
+
+
+def _worth(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/worth"),
+        metavar="DIR",
+        help="folder for the picture and the table, and for what networks said (runs/worth)",
+    )
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the object folds")
+    parser.add_argument("--quick", action="store_true", help="few grasps, one epoch: does it run?")
+
 
 REPORTS = {
     "error-vs-time": (
         "daemon.measure.error_vs_time.report",
         "how wrong each model is against how long it takes",
+        _error_vs_time,
     ),
     "stability": (
         "daemon.measure.stability.report",
         "numerical error of the whole chain on stiff and extreme readings",
+        _stability,
     ),
     "worth": (
         "daemon.measure.worth.report",
         "what `stable` is worth on another day, by how many outcomes were told",
+        _worth,
     ),
 }
-"""Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
-
-
-class _Report(argparse.ArgumentParser):
-    """Imports its report, which takes seconds, once that is chosen."""
-
-    module = ""
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # noqa: ANN401
-        importlib.import_module(self.module).add_arguments(self)
-        return super().parse_known_args(args, namespace)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the reports."""
-    reports = parser.add_subparsers(
-        dest="report", metavar="WHAT", required=True, parser_class=_Report
-    )
-    for name, (module, text) in REPORTS.items():
-        report = reports.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        report.module = module
-
-
-def run(args: argparse.Namespace) -> int:
-    """Make the report; its exit code."""
-    module, _ = REPORTS[args.report]
-    code: int = importlib.import_module(module).run(args)
-    return code
+"""Name: module with `run(args) -> int`, one line of help, what declares the arguments."""

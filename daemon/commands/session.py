@@ -41,7 +41,9 @@ from models.session_statistics import SessionState
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    actions = parser.add_subparsers(
+        dest="action", metavar="ACTION", required=True, help="what to do"
+    )
     for action, text in (
         ("show", "say how many grasps are known, of which sensors, and what outcomes have taught"),
         ("reset", "forget the session and what was learned: after a sensor was refilled"),

@@ -26,26 +26,64 @@ CAN_GROUP = "239.74.163.2"
 """Default multicast group of python-can's `udp_multicast`."""
 PALM_TARGET = "udp://127.0.0.1:9870"
 JOINT_TARGET = "udp://127.0.0.1:9871"
-PROBABILITIES = ("bit-flip", "drop", "duplicate", "reorder")
+PROBABILITIES = {
+    "bit-flip": "one random bit of it flips",
+    "drop": "it is lost",
+    "duplicate": "it comes twice",
+    "reorder": "it comes after the next one instead of before it",
+}
+KINDS = {
+    "spi": "an SPI bridge on a pseudo-terminal",
+    "can": "a CAN board on any python-can bus",
+    "palm": "a Shadow hand's palm over UDP",
+    "joints": "a stream of joint angles over UDP",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    kinds = parser.add_subparsers(dest="kind", metavar="KIND", required=True)
-    spi = kinds.add_parser("spi", help="an SPI bridge on a pseudo-terminal")
-    spi.add_argument("--path", type=Path, default=SPI_PATH, help=f"(default: {SPI_PATH})")
-    can = kinds.add_parser("can", help="a CAN board on any python-can bus")
-    can.add_argument("--interface", default="udp_multicast", help="(default: udp_multicast)")
-    can.add_argument("--channel", default=CAN_GROUP, help=f"(default: {CAN_GROUP})")
-    can.add_argument("--format", choices=("syntouch", "sweep_fd"), default="syntouch")
-    can.add_argument("--arbitration-id", type=lambda text: int(text, 0), metavar="ID")
-    palm = kinds.add_parser("palm", help="a Shadow hand's palm over UDP")
-    palm.add_argument("--to", default=PALM_TARGET, help=f"(default: {PALM_TARGET})")
-    joints = kinds.add_parser("joints", help="a stream of joint angles over UDP")
-    joints.add_argument("--to", default=JOINT_TARGET, help=f"(default: {JOINT_TARGET})")
+    kinds = parser.add_subparsers(
+        dest="kind", metavar="KIND", required=True, help="what to stand in for"
+    )
+    spi, can, palm, joints = (
+        kinds.add_parser(name, help=text, description=f"Stands in for {text}.")
+        for name, text in KINDS.items()
+    )
+    spi.add_argument(
+        "--path", type=Path, default=SPI_PATH, help=f"link to the terminal (default: {SPI_PATH})"
+    )
+    can.add_argument(
+        "--interface",
+        default="udp_multicast",
+        help="of python-can, as in a scene (default: udp_multicast, which needs msgpack)",
+    )
+    can.add_argument(
+        "--channel", default=CAN_GROUP, help=f"of that interface (default: {CAN_GROUP})"
+    )
+    can.add_argument(
+        "--format",
+        choices=("syntouch", "sweep_fd"),
+        default="syntouch",
+        help="a frame per sample, or a CAN FD frame per finger (default: syntouch)",
+    )
+    can.add_argument(
+        "--arbitration-id",
+        type=lambda text: int(text, 0),
+        metavar="ID",
+        help="of its frames, such as 0x100 (default: one of the format's)",
+    )
+    for kind, target in ((palm, PALM_TARGET), (joints, JOINT_TARGET)):
+        kind.add_argument("--to", default=target, help=f"where to send (default: {target})")
     for kind in (spi, can):
-        kind.add_argument("--rate", type=float, default=100.0, metavar="HZ", help="sweeps/s")
-        kind.add_argument("--sequence", choices=sorted(SEQUENCES), default="electrodes")
+        kind.add_argument(
+            "--rate", type=float, default=100.0, metavar="HZ", help="sweeps/s (default: 100)"
+        )
+        kind.add_argument(
+            "--sequence",
+            choices=sorted(SEQUENCES),
+            default="electrodes",
+            help="channels that a sweep samples, as in a scene (default: electrodes)",
+        )
     for kind in (spi, can, palm):
         kind.add_argument(
             "--recording",
@@ -61,18 +99,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_faults(parser: argparse.ArgumentParser) -> None:
     faults = parser.add_argument_group("faults, none by default; chances are per frame")
-    for name in PROBABILITIES:
-        faults.add_argument(f"--{name}", type=float, default=0.0, metavar="P")
-    faults.add_argument("--one-byte-at-a-time", action="store_true")
-    faults.add_argument("--burst", type=int, default=1, metavar="FRAMES")
-    faults.add_argument("--disconnect-every", type=int, metavar="FRAMES")
-    faults.add_argument("--wrong-version", action="store_true")
-    faults.add_argument("--stuck-clock", action="store_true")
+    for name, text in PROBABILITIES.items():
+        help_text = f"chance, from 0 to 1, that {text}"
+        faults.add_argument(f"--{name}", type=float, default=0.0, metavar="P", help=help_text)
     faults.add_argument(
-        "--dead", action="append", default=[], metavar="ELECTRODE", help="such as ff_7"
+        "--one-byte-at-a-time", action="store_true", help="write every byte on its own (spi)"
     )
-    faults.add_argument("--unplugged", action="append", default=[], choices=FINGERS)
-    faults.add_argument("--seed", type=int, default=0)
+    faults.add_argument(
+        "--burst", type=int, default=1, metavar="FRAMES", help="hold back and send so many at once"
+    )
+    faults.add_argument(
+        "--disconnect-every",
+        type=int,
+        metavar="FRAMES",
+        help="break the link in the middle of every such frame",
+    )
+    faults.add_argument(
+        "--wrong-version", action="store_true", help="speak a later version of the protocol"
+    )
+    faults.add_argument(
+        "--stuck-clock", action="store_true", help="the device's clock does not move"
+    )
+    faults.add_argument(
+        "--dead",
+        action="append",
+        default=[],
+        metavar="ELECTRODE",
+        help="reads 0 for ever, such as ff_7; may be given several times",
+    )
+    faults.add_argument(
+        "--unplugged",
+        action="append",
+        default=[],
+        choices=FINGERS,
+        help="finger whose line nothing drives; may be given several times",
+    )
+    faults.add_argument(
+        "--seed", type=int, default=0, help="of chance: the same faults again (default: 0)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

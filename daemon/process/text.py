@@ -1,15 +1,44 @@
-"""Text for people: untrusted text made harmless for a terminal, errors, Markdown tables."""
+"""Text for people: untrusted text made harmless for a terminal, colours, errors, tables."""
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from enum import IntEnum
+from typing import TextIO
 
 from daemon.process.logs import JOURNAL_ERROR, is_journal
 
 PROGRESS_MAX = 78
 """Characters: one that wraps could not be taken back."""
+
+
+class Colour(IntEnum):
+    """How a terminal shows a text; the numbers are those of ECMA-48, SGR."""
+
+    BOLD = 1
+    RED = 31
+    GREEN = 32
+    YELLOW = 33
+
+
+def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
+    """The text in this colour if `stream`, stdout unless given, is a terminal that shows colours.
+
+    `NO_COLOR` (https://no-color.org) and `TERM=dumb` say that it is not to.
+    """
+    stream = sys.stdout if stream is None else stream
+    if not stream.isatty() or os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb":
+        return text
+    return f"\x1b[{colour.value}m{text}\x1b[0m"
+
+
+def did_you_mean(wrong: str, known: Iterable[str]) -> str:
+    """What to add to an error about a mistyped word: the nearest that is known, if one is near."""
+    near = difflib.get_close_matches(wrong, list(known), n=1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def printable(text: str, length_max: int | None = None) -> str:

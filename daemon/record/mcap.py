@@ -16,10 +16,9 @@ from functools import cache
 from io import BytesIO
 from itertools import count
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import BinaryIO, Final
 
 import lz4.frame
-import msgspec
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, McapError, UnsupportedCompressionError
@@ -29,6 +28,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
 from daemon.record.files import create
+from daemon.record.flat import schema_of
 from daemon.record.header import RecordingHeader
 from daemon.record.topics import Topic
 from drivers.base import RecordingError
@@ -45,6 +45,9 @@ RATIO_MAX: Final = 100
 """How many times as large as packed all chunks may be, beyond the first `CHUNK_MAX_BYTES`. Held
 grasps pack to a twelfth, a sensor that says nothing but zeros to a thirty-sixth."""
 
+_FAMILY = {Topic.IMAGE: "foxglove", Topic.LOG: "foxglove"}
+"""Whose schema a topic has, if it is not ours: viewers know it by its name."""
+
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
@@ -55,14 +58,14 @@ beyond all memory."""
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """By topic, without events: name and JSON Schema of its messages."""
-    messages = {topic: topic.message for topic in Topic if topic.message is not None}
-    definitions = msgspec.json.schema_components(messages.values())[1]
-    found = {}
-    for topic, message in messages.items():
-        whole: dict[str, Any] = {**definitions[message.__name__], "$defs": definitions}
-        found[topic.value] = f"graspd.{message.__name__}", json.dumps(whole).encode()
-    return found
+    """By topic: name and JSON Schema of its messages."""
+    return {
+        topic.value: (
+            f"{_FAMILY.get(topic, 'graspd')}.{topic.message.__name__}",
+            json.dumps(schema_of(topic.message)).encode(),
+        )
+        for topic in Topic
+    }
 
 
 class McapWriter:

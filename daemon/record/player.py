@@ -127,25 +127,25 @@ class McapReplayDriver(RecordedDriver[_Item]):
             with open_recording(path) as stream:
                 recording = McapReader(path, stream)
                 for message in recording:
-                    item = self._item(message)
-                    if item is not None:
+                    for item in self._items_of(message):
                         yield message.at_ns, item
                 if recording.cut_off:
                     self.counters.cut_off += 1
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
-    def _item(self, message: RecordedMessage) -> _Item | None:
-        """The reading, event or outcome in a message; None if it is none of them."""
+    def _items_of(self, message: RecordedMessage) -> Sequence[_Item]:
+        """Readings, events or outcomes in a message, in their order; none for any other one."""
         try:
             if message.kind == Topic.TACTILE:
-                return tactile_reading(message.payload, self._fingers)
+                reading, asked = tactile_reading(message.payload, self._fingers)
+                return (Topic.ASKED, reading) if asked else (reading,)
             if message.kind == Topic.JOINTS:
-                return joint_reading(message.payload)
+                return (joint_reading(message.payload),)
             if message.kind == Topic.OUTCOME:
-                return decode_outcome(message.payload)
+                return (decode_outcome(message.payload),)
             if message.kind == Topic.EXCHANGED:
-                return decode_exchanged(message.payload)
+                return (decode_exchanged(message.payload),)
         except (ValueError, OverflowError):
             self.counters.malformed += 1
-            return None
-        return Topic(message.kind) if message.kind in EVENTS else None
+            return ()
+        return (Topic(message.kind),) if message.kind in EVENTS else ()

@@ -17,15 +17,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, cast
 
 import msgspec
 
 from daemon.publish.companion import Companion
 from daemon.record.files import Retention
+from daemon.record.flat import flat
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
+from daemon.record.viewers import Journal, Painter
 from daemon.scene import Record
 
 if TYPE_CHECKING:
@@ -138,7 +140,9 @@ class Recorder(Companion):
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
         self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
-        self._encoder = msgspec.json.Encoder()
+        self._asked = False
+        """Whether somebody has asked since the last reading; the next one says so."""
+        self._journal, self._painter = Journal(), Painter(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
         self._open: _Open | None = None
@@ -158,7 +162,11 @@ class Recorder(Companion):
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Record a published message."""
-        self._put(topic, payload)
+        if self._asked and topic == self._names[Topic.TACTILE]:
+            self._asked = False
+            self._put(topic, partial(_asked, payload))
+        else:
+            self._put(topic, payload)
         if self._wants_turn and self._take_state is not None and topic == self._names[Topic.STATUS]:
             self._wants_turn = False
             self._queue.append((self._clock(), b"", _Turn(self._take_state())))
@@ -178,16 +186,24 @@ class Recorder(Companion):
             self._put(self._names[Topic.JUDGED], making)
 
     def on_asked(self) -> None:
-        """Record that the controller asks for a judgement."""
-        self._put(self._names[Topic.ASKED], EVENT)
+        """Record, with the next reading, that the controller asks for a judgement."""
+        self._asked = True
 
     def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
         """Record that a sensor is another one than before, and what was known of the new ones."""
+        self._tell_asked()
         self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
 
     def on_skipped(self) -> None:
         """Record that readings were left out before the next one."""
+        self._tell_asked()
         self._put(self._names[Topic.SKIPPED], EVENT)
+
+    def _tell_asked(self) -> None:
+        """Record a question before what the judge does before the next reading."""
+        if self._asked:
+            self._asked = False
+            self._put(self._names[Topic.ASKED], EVENT)
 
     def on_link(self, entry: object, at_ns: int) -> None:
         """Record what came over the link at monotonic `at_ns`, ns, in the link log."""
@@ -302,14 +318,26 @@ class Recorder(Companion):
         files.unflushed += len(entries)  # all of them, wherever among them the disk fails
         try:
             for at_ns, topic, content in entries:
-                if callable(content):
-                    content = self._encoder.encode(content())
-                if topic and isinstance(content, bytes):
-                    files.messages.write(topic, content, at_ns)
+                if topic:
+                    self._write_message(files, topic, content, at_ns)
                 elif files.link_log is not None:
                     files.link_log.write(content, at_ns, files.offset_ns)
         except OSError as error:
             self._fail(error)
+
+    def _write_message(self, files: _Open, topic: bytes, content: object, at_ns: int) -> None:
+        """Write a message, and what it comes to for people."""
+        if callable(content):
+            message = msgspec.to_builtins(content())
+        else:
+            message = msgspec.json.decode(cast(bytes, content))
+        files.messages.write(topic, msgspec.json.encode(flat(message)), at_ns)
+        kind, wall_ns = topic.partition(b".")[0].decode(), at_ns + files.offset_ns
+        for line in self._journal.of(kind, message, wall_ns):
+            files.messages.write(self._names[Topic.LOG], msgspec.json.encode(line), at_ns)
+        image = self._painter.of(kind, message, wall_ns)
+        if image is not None:
+            files.messages.write(self._names[Topic.IMAGE], msgspec.json.encode(image), at_ns)
 
     def _flush(self, files: _Open, now_ns: int) -> None:
         try:
@@ -350,3 +378,8 @@ class Recorder(Companion):
         say = log.warning if first else log.debug
         where = self._retention.directory
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)
+
+
+def _asked(payload: bytes) -> object:
+    """The content of a reading before which somebody has asked for a judgement."""
+    return {**msgspec.json.decode(payload), "asked": True}

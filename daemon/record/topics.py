@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import StrEnum
-from typing import Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import msgspec
 import numpy as np
@@ -18,11 +18,25 @@ from daemon.publish.messages import (
     Status,
     Tactile,
     Verdict,
-    decode_tactile,
 )
+from daemon.record.flat import table
+from daemon.record.viewers import Log, RawImage
 from daemon.trust.learner import LearnerState
 from drivers.base import ELECTRODES, JointReading, TactileReading
+from drivers.hand import JOINTS
 from models.session_statistics import SessionState
+
+_ANGLES = msgspec.Meta(
+    extra_json_schema={"properties": {name: {"type": "number"} for name in sorted(JOINTS)}}
+)
+"""So that a viewer offers them by name."""
+
+
+class RecordedTactile(Tactile, frozen=True, kw_only=True):
+    """A reading as it was judged; comes before its verdict."""
+
+    asked: bool = False
+    """Whether somebody has asked for a judgement since the reading before."""
 
 
 class Joints(msgspec.Struct, frozen=True, kw_only=True):
@@ -33,13 +47,14 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
     t_mono_ns: int
     """Monotonic time, ns, of the reading's last byte."""
     names: tuple[str, ...]
-    position_rad: list[float | None]
-    """By name, rad; null where a joint has no valid angle."""
+    position_rad: Annotated[dict[str, float], _ANGLES]
+    """Of each joint that has a valid angle, rad."""
 
     @classmethod
     def of(cls, reading: JointReading) -> Self:
         """The message for `reading`."""
-        angles = [None if angle != angle else angle for angle in reading.position_rad.tolist()]
+        pairs = zip(reading.names, reading.position_rad.tolist(), strict=True)
+        angles = {name: angle for name, angle in pairs if angle == angle}
         return cls(
             seq=reading.seq, t_mono_ns=reading.t_ns, names=reading.names, position_rad=angles
         )
@@ -73,8 +88,12 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
+class Event(msgspec.Struct, frozen=True):
+    """Something has happened; what, the topic says."""
+
+
 class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A sensor is another one than before: an event, empty unless that one was known already."""
+    """A sensor is another one than before; empty unless that one was known already."""
 
     session: SessionState | None = None
     """What was known of them."""
@@ -83,15 +102,11 @@ class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Topic(StrEnum):
-    """First part of a topic's name, `<kind>.<hand>`, and the struct of its messages.
+    """First part of a topic's name, `<kind>.<hand>`, and the struct of its messages."""
 
-    A topic without a struct is an event: its messages are empty objects, mostly.
-    """
+    message: type[msgspec.Struct]
 
-    message: type[msgspec.Struct] | None
-    """None for an event."""
-
-    def __new__(cls, kind: str, message: type[msgspec.Struct] | None = None) -> Self:
+    def __new__(cls, kind: str, message: type[msgspec.Struct] = Event) -> Self:
         """A member is the string `kind`, with the attribute `message`."""
         topic = str.__new__(cls, kind)
         topic._value_ = kind
@@ -99,7 +114,7 @@ class Topic(StrEnum):
         return topic
 
     # Written by the outbox:
-    TACTILE = "tactile", Tactile  # read by replay
+    TACTILE = "tactile", RecordedTactile  # read by replay
     VERDICT = "verdict", Verdict  # read by other tools
     GATE = "gate", GateMessage  # read by other tools
     STATUS = "status", Status  # read by other tools
@@ -107,38 +122,62 @@ class Topic(StrEnum):
     # Written by the recorder:
     JOINTS = "joints", Joints  # read by replay
     JUDGED = "judged", Judged  # read by export
-    ASKED = "asked"  # read by replay: somebody has asked for a judgement
-    EXCHANGED = "exchanged"  # read by replay: a sensor was exchanged, see `Exchanged`
+    ASKED = "asked"  # read by replay: as in `RecordedTactile`, where something came between
+    EXCHANGED = "exchanged", Exchanged  # read by replay
     SKIPPED = "skipped"  # read by replay: readings before the next one were left out
 
+    # Made of them for people, read by viewers:
+    IMAGE = "image", RawImage
+    LOG = "log", Log
 
-EVENTS: Final = frozenset(topic for topic in Topic if topic.message is None)
+
+EVENTS: Final = frozenset(topic for topic in Topic if topic.message is Event)
 EVENT: Final = b"{}"
 """Payload of an event."""
 
-_decode_joints = msgspec.json.Decoder(Joints).decode
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
-decode_judged = msgspec.json.Decoder(Judged).decode
+_decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 
-def tactile_reading(payload: bytes, fingers: Sequence[str]) -> TactileReading:
-    """The reading of a `tactile` message, reduced to `fingers`, in their order.
+def decode_judged(payload: bytes) -> Judged:
+    """A `judged` message. Raises `ValueError` if the payload is not one."""
+    content = _decode(payload)
+    content["counts"] = table(content.get("counts"))
+    return msgspec.convert(content, Judged)
+
+
+def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileReading, bool]:
+    """The reading of a `tactile` message, reduced to `fingers`, in their order; and whether
+    somebody asked for a judgement before it.
 
     Raises `ValueError` or `OverflowError` if the payload is not such a message.
     """
-    message = decode_tactile(payload)
+    content = _decode(payload)
+    content["counts"] = table(content.get("counts"))
+    content["faults"] = table(content.get("faults"))
+    message = msgspec.convert(content, RecordedTactile)
     names: Sequence[str] = message.fingers
     rows = [names.index(finger) for finger in fingers]
     shape = (len(names), ELECTRODES)
     counts = np.array(message.counts, dtype=np.uint16).reshape(shape)
     faults = np.array(message.faults, dtype=np.uint8).reshape(shape)
-    return TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
+    reading = TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
+    return reading, message.asked
 
 
 def joint_reading(payload: bytes) -> JointReading:
     """The reading of a `joints` message. Raises `ValueError` if the payload is not one."""
-    message = _decode_joints(payload)
-    if len(message.names) != len(message.position_rad):
-        raise ValueError("as many names as angles are needed")
-    angles = np.array(message.position_rad, dtype=np.float64)  # None becomes NaN
-    return JointReading(message.t_mono_ns, message.seq, message.names, angles)
+    content = _decode(payload)
+    angles = content.get("position_rad")
+    if isinstance(angles, list):  # as older recordings have them
+        if len(angles) != len(content.get("names", ())):
+            raise ValueError("as many names as angles are needed")
+        pairs = zip(content["names"], angles, strict=True)
+        content["position_rad"] = {name: angle for name, angle in pairs if angle is not None}
+    message = msgspec.convert(content, Joints)
+    if not message.position_rad.keys() <= set(message.names):
+        raise ValueError("an angle of no joint")
+    position_rad = [message.position_rad.get(name, np.nan) for name in message.names]
+    return JointReading(
+        message.t_mono_ns, message.seq, message.names, np.array(position_rad, dtype=np.float64)
+    )

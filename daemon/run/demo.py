@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import sys
 
 from daemon.judge.findings import Examined
 from daemon.judge.network import Network
 from daemon.judge.reasons import Decision
+from daemon.process.text import Colour, coloured
 from daemon.publish.companion import Companion
 from daemon.publish.messages import Verdict
 from daemon.run.summary import Tally
@@ -20,8 +20,6 @@ GRASPS = 25
 PUBLISHED = "cnn1"
 """The published network, in the zoo."""
 COLUMNS = f"{'stable':>8}{'slipped':>15}{'good lifts kept':>18}"
-BOLD, RED, GREEN = 1, 31, 32
-"""As terminals number them."""
 
 
 class Demo(Companion):
@@ -37,17 +35,15 @@ class Demo(Companion):
         self._part = Tally(), Tally()
         self._whole = Tally(), Tally()
         self._grasps = 0
-        # As others have it who colour what they write: https://no-color.org
-        self._in_colour = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
         self._write(
             "A day on which the sensors drift. All grasps are synthetic: nobody ever grasped them.",
             "",
-            self._coloured(
+            coloured(
                 f"{'':10}{f'the published method ({PUBLISHED})':>{len(COLUMNS)}}"
                 f"{'graspd':>{len(COLUMNS)}}",
-                BOLD,
+                Colour.BOLD,
             ),
-            self._coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", BOLD),
+            coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", Colour.BOLD),
         )
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
@@ -92,12 +88,9 @@ class Demo(Companion):
         share, kept = worth.get("slips_among_stable"), worth.get("coverage")
         slipped = f"{slips:9}" + (f"{100 * share:4.0f} %" if share is not None else f"{'-':>6}")
         if share is not None and allowed is not None:
-            slipped = self._coloured(slipped, RED if share > allowed else GREEN)
+            slipped = coloured(slipped, Colour.RED if share > allowed else Colour.GREEN)
         good = f"{100 * kept:.0f} %" if kept is not None else "-"
         return f"{stable:8}{slipped}{good:>18}"
-
-    def _coloured(self, text: str, colour: int) -> str:
-        return f"\x1b[{colour}m{text}\x1b[0m" if self._in_colour else text
 
     def _write(self, *lines: str) -> None:
         sys.stdout.writelines(f"{line}\n" for line in lines)

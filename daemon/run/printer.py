@@ -7,8 +7,8 @@ import sys
 import time
 from typing import Literal
 
-from daemon.judge.reasons import GateState
-from daemon.process.text import printable
+from daemon.judge.reasons import Decision, GateState
+from daemon.process.text import Colour, coloured, printable
 from daemon.publish.companion import Companion
 from daemon.publish.messages import Verdict
 from daemon.run.summary import Summary
@@ -17,6 +17,7 @@ from drivers.base import Annotation, TactileReading
 
 NAME_MAX = 80
 """Characters of an object's name that are shown."""
+COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 
 
 class Printer(Companion):
@@ -73,7 +74,10 @@ def _line(verdict: Verdict, annotation: Annotation | None) -> str:
     else:
         finding = f"p_slip {verdict.p_slip:.3f}"
     gate = "" if verdict.gate is None else f"{verdict.gate:9}"
-    line = f"{verdict.grasp:6d}  {gate}{verdict.verdict:8}{finding:16}{verdict.latency_us:6.0f} us"
+    said = f"{verdict.verdict:8}"
+    if verdict.verdict in COLOURS:
+        said = coloured(said, COLOURS[verdict.verdict])
+    line = f"{verdict.grasp:6d}  {gate}{said}{finding:16}{verdict.latency_us:6.0f} us"
     if annotation is not None:
         line += f"  {printable(annotation.object_name or '', NAME_MAX)}"
         if annotation.slipped is not None:

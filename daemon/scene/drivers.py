@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 import ipaddress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
+    GetJsonSchemaHandler,
     ValidationInfo,
     field_validator,
 )
+from pydantic_core import CoreSchema
 
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger
 
 StrOrPath = TypeVar("StrOrPath", str, Path)
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """Unit of a number, for those who read the schema; `-` where it has none."""
+
+    symbol: str = "-"
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """The schema of the number, with its `unit`; asked for by pydantic."""
+        return {**handler(schema), "unit": self.symbol}
 
 
 def _without_nul(value: StrOrPath) -> StrOrPath:
@@ -37,7 +53,7 @@ def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
     return base / path
 
 
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0), Unit()]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
 Address = Annotated[str, AfterValidator(_ip_address)]
 FilePath = Annotated[
@@ -57,94 +73,103 @@ class Section(BaseModel):
 class ReplayFaultsSection(Section):
     """`[tactile.faults]`: break the replayed sensor on purpose, to test what listens to graspd."""
 
-    off_from: Annotated[int, Field(ge=0)] | None = None
-    """From this reading on nothing comes."""
-    stuck_from: Annotated[int, Field(ge=1)] | None = None
-    """From this reading on the counts are those of the reading before it."""
+    off_from: Annotated[int, Field(ge=0), Unit("readings")] | None = None
+    """From this reading on nothing comes; unless given, all come."""
+    stuck_from: Annotated[int, Field(ge=1), Unit("readings")] | None = None
+    """From this reading on the counts are those of the reading before it; unless given, never."""
     garbage_probability: Probability = 0.0
     """Chance per reading that the counts are random 16-bit values."""
-    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX)] = 0
+    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), Unit("counts")] = 0
     """Constant offset added to the counts."""
-    slow_every: Annotated[int, Field(ge=1)] = 1
+    slow_every: Annotated[int, Field(ge=1), Unit("readings")] = 1
     """Only every n-th reading arrives."""
-    delayed_s: Annotated[float, Field(ge=0.0, le=3600.0)] = 0.0
-    """Readings arrive this much late, s."""
+    delayed_s: Annotated[float, Field(ge=0.0, le=3600.0), Unit("s")] = 0.0
+    """Readings arrive this much late."""
     intermittent_probability: Probability = 0.0
     """Chance that a reading is lost."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that stuck, garbage and wrong apply to; all unless given."""
     electrodes: (
         Annotated[
-            tuple[Annotated[int, Field(ge=1, le=ELECTRODES)], ...],
+            tuple[Annotated[int, Field(ge=1, le=ELECTRODES), Unit()], ...],
             Field(min_length=1, strict=False),
         ]
         | None
     ) = None
     """Electrodes 1..24 that stuck, garbage and wrong apply to; all unless given."""
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0), Unit()] = 0
+    """Of the chance: the same seed breaks the same readings."""
 
 
 class ReplayTactile(Section):
     """`[tactile]` with `driver = "replay"`: recorded CSV files instead of sensors."""
 
     driver: Literal["replay"]
+    """Makes this section one of this driver."""
     recordings: Annotated[tuple[FilePath, ...], Field(min_length=1, strict=False)]
-    """Grasp tables or streams."""
+    """Grasp tables or streams (deploy/RECORDING.md), played one after the other."""
     pace: Literal["realtime", "fast"] = "realtime"
-    speed: Annotated[float, Field(ge=1e-3, le=1e3)] = 1.0
-    """Factor on real time."""
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e5)] = 100.0
+    """`fast`: as fast as they can be judged."""
+    speed: Annotated[float, Field(ge=1e-3, le=1e3), Unit()] = 1.0
+    """Factor on real time: 2 plays twice as fast. Not with pace `fast`."""
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), Unit("1/s")] = 100.0
     """Readings per second of a grasp table, which has no times of its own."""
     loop: bool = False
+    """Begin again at the end, for ever."""
     strict: bool = False
     """Stop at the first value that is not a 12-bit count."""
     faults: ReplayFaultsSection = ReplayFaultsSection()
+    """`[tactile.faults]`."""
 
 
 class SpiTactile(Section):
     """`[tactile]` with `driver = "spi"`: a bridge on a serial line (deploy/bridge/PROTOCOL.md)."""
 
     driver: Literal["spi"]
+    """Makes this section one of this driver."""
     port: Name
     """Serial port, best by its name in `/dev/serial/by-id/`, or a pyserial URL."""
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
     ) = None
     """Fingers in the order of the chip selects; `hand.fingers` unless given."""
-    baud: Annotated[int, Field(ge=115_200, le=12_000_000)] = 921_600
-    """Line rate, bit/s; USB CDC ignores it."""
+    baud: Annotated[int, Field(ge=115_200, le=12_000_000), Unit("bit/s")] = 921_600
+    """Line rate; USB CDC ignores it."""
 
 
 class CanTactile(Section):
     """`[tactile]` with `driver = "can"`: sensors behind a CAN board (deploy/can/PROTOCOL.md)."""
 
     driver: Literal["can"]
+    """Makes this section one of this driver."""
     interface: Name = "socketcan"
     """Name of a python-can interface."""
     channel: Name = "can0"
+    """Name of the bus at that interface, as `ip link` lists it for socketcan."""
     sensors: (
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=3, strict=False)] | None
     ) = None
     """Fingers in the order of the board's words (`syntouch`); `hand.fingers` unless given."""
     format: Literal["syntouch", "sweep_fd"] = "syntouch"
     """SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
-    arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF)] | None = None
+    arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), Unit()] | None = None
     """Of the samples, or of finger `ff` of the sweep frames. With `syntouch`, where it is not
     documented, every frame of the right form is taken unless given."""
     sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
     """Order in which the board samples (`syntouch` only)."""
-    data_length: Annotated[int, Field(ge=3, le=8)] | None = None
-    """Bytes of a sample frame, where the board pads it."""
-    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] | None = None
-    """Bit/s; not with socketcan, where it belongs to `ip link`."""
-    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = None
-    """Bit/s of the data phase of CAN FD; not with socketcan."""
+    data_length: Annotated[int, Field(ge=3, le=8), Unit("bytes")] | None = None
+    """Length of a sample frame, where the board pads it."""
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), Unit("bit/s")] | None = None
+    """Rate of the bus; not with socketcan, where it belongs to `ip link`."""
+    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), Unit("bit/s")] | None = None
+    """Rate of the data phase of CAN FD; not with socketcan."""
 
 
 class PalmTactile(Section):
     """`[tactile]` with `driver = "palm"`: status packets of the hand's palm."""
 
     driver: Literal["palm"]
+    """Makes this section one of this driver."""
     source: Name
     """`udp://ADDRESS:PORT` to listen on, or a file of packets, relative to the scene file."""
     only_from: Address | None = None
@@ -168,15 +193,17 @@ class PalmJoints(Section):
     """`[joints]` with `driver = "palm"`: Hall sensors in the palm's packets."""
 
     driver: Literal["palm"]
+    """Makes this section one of this driver."""
     calibration: FilePath
-    """The hand's calibration (TOML)."""
+    """The hand's calibration (TOML, as deploy/calibration/example_hand.toml)."""
 
 
 class StreamJoints(Section):
     """`[joints]` with `driver = "stream"`: joint angles from elsewhere (deploy/wire/JOINTS.md)."""
 
     driver: Literal["stream"]
-    source: Annotated[Name, Field(pattern=r"^udp://")]
+    """Makes this section one of this driver."""
+    source: Annotated[str, Field(pattern=r"^udp://"), AfterValidator(_without_nul)]
     """`udp://ADDRESS:PORT` to listen on."""
     only_from: Address | None = None
     """IP address of the sender, if messages of no other may be heard."""

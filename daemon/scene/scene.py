@@ -29,6 +29,7 @@ from daemon.scene.drivers import (
     Section,
     SpiTactile,
     Tactile,
+    Unit,
 )
 from daemon.scene.endpoints import check_endpoint, is_private
 from drivers import toml
@@ -37,7 +38,6 @@ from models.contract import Finger
 SCENE_MAX_BYTES = 128 << 10
 """A scene has a kilobyte, and one with the names of a thousand recordings a hundred; a larger file
 was named by mistake."""
-
 
 STATE_DIRECTORY = Path("/var/lib/graspd")
 """Where a service keeps its state (file-hierarchy(7))."""
@@ -53,6 +53,7 @@ class Hand(Section):
     name: Annotated[str, Field(pattern=r"^[a-z0-9_-]{1,32}$")] = "right"
     """Part of the topics and of the default socket's name."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] = ("ff", "mf", "th")
+    """First, middle, ring, little finger, thumb: those with a sensor, in the order of the model."""
 
     @field_validator("fingers")
     @classmethod
@@ -66,13 +67,14 @@ class Model(Section):
     """`[model]`: which network judges."""
 
     name: Name | None = None
-    """A model of the zoo, `small-session` when neither name nor path is given; for a hand of fewer
-    fingers in its form for these, where the zoo has one."""
+    """A model that ships with graspd or was added by `graspd models add`; `small-session` when
+    neither name nor path is given. For a hand of fewer fingers in its form for these, where graspd
+    ships one."""
     path: FilePath | None = None
     """A model file of your own, relative to the scene file."""
-    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0)] = Limits.slip_threshold
+    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0), Unit()] = Limits.slip_threshold
     """`p_slip` from here on is slip."""
-    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = Limits.min_confidence
+    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0), Unit()] = Limits.min_confidence
     """Less sure verdicts become `unknown`: `p_slip` of a slip, 1 - `p_slip` of a `stable` one must
     reach this. It is no promise of how many are right: that is `[risk]`."""
 
@@ -103,12 +105,12 @@ class Risk(Section):
     `stable` is said only as far as the outcomes that were told allow it.
     """
 
-    max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5)] = 0.05
+    max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), Unit()] = 0.05
     """Share of the `stable` lifts that may slip."""
-    warm_up: Annotated[int, Field(ge=0, le=1000)] = 50
+    warm_up: Annotated[int, Field(ge=0, le=1000), Unit("outcomes")] = 50
     """Outcomes, since the start of the session, until which all grasps are to be lifted under
     supervision."""
-    explore: Annotated[float, Field(ge=0.0, le=1.0)] = 0.05
+    explore: Annotated[float, Field(ge=0.0, le=1.0), Unit()] = 0.05
     """Share of the grasps that are not `stable` to be lifted under supervision after that: without
     their outcomes nobody learns that the rule is too strict."""
 
@@ -121,7 +123,7 @@ class Learn(Section):
 
 
 GateMode = Literal["settled", "every", "request"]
-Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0)]
+Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0), Unit("ms")]
 
 
 class Gate(Section):
@@ -134,33 +136,37 @@ class Gate(Section):
     sensors and for recorded streams, `every` for grasp tables."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
     """An older reading gives `unknown`; so does silence for that long."""
-    sweeps: Literal[1, 3] | None = None
+    sweeps: Annotated[Literal[1, 3], Unit("readings")] | None = None
     """What is judged: 1, a single reading; 3, each electrode's median of three fresh ones. Unless
     given, 3, and with mode `every` 1."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that must touch; all of `hand.fingers` unless given."""
-    contact_counts: Annotated[float, Field(ge=5.0, le=1000.0)] = ContactLimits.counts
-    """A finger touches when three electrodes fall by so much below where they rest, counts ..."""
-    contact_sigmas: Annotated[float, Field(ge=3.0, le=100.0)] = ContactLimits.sigmas
-    """... and by so many standard deviations of its noise."""
-    false_alarms: Annotated[float, Field(ge=0.001, le=0.3)] = GateLimits.false_alarms
+    contact_counts: Annotated[float, Field(ge=5, le=1000), Unit("counts")] = ContactLimits.counts
+    """A finger touches when three electrodes fall so far below their rest, and `contact_sigmas`."""
+    contact_sigmas: Annotated[float, Field(ge=3, le=100), Unit("sigma")] = ContactLimits.sigmas
+    """The same in standard deviations of the finger's noise: both must be reached."""
+    false_alarms: Annotated[float, Field(ge=0.001, le=0.3), Unit()] = GateLimits.false_alarms
     """Share of the time in which a hand that holds may be said to move. Less of it lets more slow
     slides pass for stillness (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
     """Judge a grasp as soon as nothing moves fast, marked `early`, and once more when it is known
     that nothing slides slowly either."""
-    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10.0)] = JointLimits.rad_per_s
-    """A joint that turns faster is moving, rad/s; only with `[joints]`."""
-    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0)] = JointLimits.lost_ns / 1e6
-    """Late joint angles block a verdict no longer than this, ms; only with `[joints]`."""
+    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), Unit("rad/s")] = JointLimits.rad_per_s
+    """A joint that turns faster is moving; only with `[joints]`."""
+    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), Unit("ms")] = (
+        JointLimits.lost_ns / 1e6
+    )
+    """Late joint angles block a verdict no longer than this; only with `[joints]`."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
     """A question that cannot be answered with a judgement by then is answered with `unknown`."""
     gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
-    """After so long without a usable reading the grasp must settle anew, ms. More than two periods
+    """After so long without a usable reading the grasp must settle anew. More than two periods
     of the readings."""
-    change_counts: Annotated[float, Field(ge=10.0, le=1000.0)] = GateLimits.change_counts
+    change_counts: Annotated[float, Field(ge=10, le=1000), Unit("counts")] = (
+        GateLimits.change_counts
+    )
     """Electrodes of a finger that are so far from where they were judged, in the mean, are another
-    grasp, counts."""
+    grasp."""
 
 
 def _checked(endpoint: str) -> str:
@@ -181,7 +187,7 @@ class Publish(Section):
     endpoint: Endpoint | None = None
     """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
     addresses."""
-    high_water_mark: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    high_water_mark: Annotated[int, Field(ge=1, le=100_000), Unit("messages")] = 1000
     """Messages kept for a subscriber that is slow; those that come then are lost to it."""
     file_mode: FileMode | None = None
     """Of the file of an `ipc://` socket, as in chmod: who may write may connect. As the umask has
@@ -216,9 +222,11 @@ class Ask(Section):
 class Realtime(Section):
     """`[realtime]`: run before everything that is not. Without it nothing of this is done."""
 
-    priority: Annotated[int, Field(ge=1, le=98)] | None = 50
+    priority: Annotated[int, Field(ge=1, le=98), Unit()] | None = 50
     """Of SCHED_FIFO; below that of the hand's own controller."""
-    cpus: Annotated[tuple[int, ...], Field(min_length=1, strict=False)] | None = None
+    cpus: (
+        Annotated[tuple[Annotated[int, Unit()], ...], Field(min_length=1, strict=False)] | None
+    ) = None
     """Processors to run on, numbered from 0; all unless given."""
     lock_memory: bool = True
     """Keep what was touched in memory (mlockall), so that no reading waits for a disk."""
@@ -229,16 +237,18 @@ class Record(Section):
 
     directory: FilePath | None = None
     """`/var/lib/graspd/record` unless given. Made if it is not there."""
-    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0)] = 1000.0
-    """What a killed daemon or a power cut may cost, ms."""
-    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0)] = 256.0
-    """A file that is larger is followed by the next, MB."""
-    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0)] = 60.0
-    """So is one that is older, minutes."""
-    keep_files: Annotated[int, Field(ge=1, le=100_000)] = 1000
-    """Of this hand; the oldest are removed."""
-    keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0)] = 4096.0
-    """All files of this hand together, the one being written included, MB."""
+    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0), Unit("ms")] = 1000.0
+    """What a killed daemon or a power cut may cost at most."""
+    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0), Unit("MB")] = 256.0
+    """A file that is larger is followed by the next."""
+    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0), Unit("minutes")] = 60.0
+    """A file that is older is followed by the next."""
+    keep_files: Annotated[int, Field(ge=1, le=100_000), Unit("files")] = 1000
+    """So many of this hand are kept; the oldest are removed."""
+    keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), Unit("MB")] = 4096.0
+    """All files of this hand together, the one being written included."""
+    images_hz: Annotated[float, Field(ge=0.0, le=1000.0), Unit("1/s")] = 10.0
+    """Tactile images a second, for viewers; 0 draws none. All counts are kept anyway."""
     raw: bool = False
     """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
 
@@ -248,7 +258,9 @@ class Scene(Section):
 
     hand: Hand = Hand()
     tactile: Tactile
+    """Where the readings of the fingers come from; the keys depend on `driver`."""
     joints: Joints | None = None
+    """Where joint angles come from; the keys depend on `driver`. Without it none are used."""
     model: Model = Model()
     session: Session = Session()
     learn: Learn = Learn()

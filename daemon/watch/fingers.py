@@ -1,9 +1,4 @@
-"""Tactile images for the eye: how far each electrode is below where its finger rests.
-
-Where a finger rests is not in the messages, so it is learned here, while the gate says that nothing
-touches. Before that, and where there is no gate, an image shows how the finger's electrodes differ
-from each other.
-"""
+"""What is drawn of a finger: its tactile image for the eye, what is wrong in it, how it moves."""
 
 from __future__ import annotations
 
@@ -13,27 +8,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from models.layout import D1, ELECTRODES
-from models.tactile_image import Fill, fill_matrix
-
-HEIGHT, WIDTH = D1.shape
-FULL = 100
-"""Level of the strongest colour."""
-FULL_COUNTS = 1600.0
-"""Fall that has it, counts. Levels go with the square root: a touch begins at 20 counts, which is
-level 11, and real grasps press single electrodes by up to 1800."""
-FULL_DEVIATIONS = 2.5
-"""The same for a finger whose rest is not known, in standard deviations of its own electrodes."""
-SHARE = 0.02
-"""Of a new reading in the rest: at 100 Hz it follows in half a second."""
-STRAY_COUNTS = 20.0
-"""No reading counts as further from the rest than a touch begins: one may be a touch already that
-the gate has not seen yet."""
-KNOWN_AFTER = 25
-"""Readings after which the mean of what came is taken for the rest."""
-
-_FILL = fill_matrix(D1, Fill.NEIGHBOUR_MEAN)[:, :ELECTRODES]
-_PIXELS = [row * WIDTH + column for row, column in zip(D1.rows, D1.columns, strict=True)]
+from models.levels import FULL as FULL
+from models.levels import HEIGHT as HEIGHT
+from models.levels import PIXELS, fall_of, levels_of
+from models.levels import WIDTH as WIDTH
+from models.levels import Rest as Rest
 
 
 class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,29 +42,6 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     """None where nobody says: each reading is a grasp of its own."""
 
 
-class Rest:
-    """Learns where the electrodes of one finger rest."""
-
-    def __init__(self) -> None:
-        """Without a reading."""
-        self._mean: NDArray[np.float64] = np.zeros(ELECTRODES)
-        self._number = 0
-
-    @property
-    def counts(self) -> NDArray[np.float64] | None:
-        """Where each electrode rests, counts, shape (24,); None as long as it is not known."""
-        return self._mean if self._number >= KNOWN_AFTER else None
-
-    def learn(self, counts: NDArray[np.float64], sound: NDArray[np.bool_]) -> None:
-        """Take in a reading of a finger that touches nothing; shapes (24,)."""
-        self._number += 1
-        share = max(1.0 / self._number, SHARE)
-        strays = counts - self._mean
-        if self.counts is not None:
-            strays = np.clip(strays, -STRAY_COUNTS, STRAY_COUNTS)
-        self._mean += np.where(sound, share * strays, 0.0)
-
-
 def image(
     name: str,
     counts: NDArray[np.float64],
@@ -100,27 +56,15 @@ def image(
 
     Electrodes that are not `sound` are drawn as the median of the others, and marked.
     """
-    marked = {_PIXELS[index] for index in np.flatnonzero(~sound)}
-    marked |= {_PIXELS[number - 1] for number in range(1, 25) if f"{name}_{number}" in repaired}
-    reference = np.median(counts[sound]) if rest is None and sound.any() else rest
-    fall = np.zeros(ELECTRODES) if reference is None else reference - counts
-    fall = np.where(sound, fall, np.median(fall[sound]) if sound.any() else 0.0)
+    marked = {PIXELS[index] for index in np.flatnonzero(~sound)}
+    marked |= {PIXELS[number - 1] for number in range(1, 25) if f"{name}_{number}" in repaired}
+    fall = fall_of(counts, sound, rest)
     return FingerImage(
         name=name,
         touches=touches,
         from_rest=rest is not None,
-        levels=_levels(fall, from_rest=rest is not None),
+        levels=levels_of(fall, from_rest=rest is not None).tolist(),
         deepest=round(float(fall.max())),
         marked=sorted(marked),
         motion=motion,
     )
-
-
-def _levels(fall: NDArray[np.float64], *, from_rest: bool) -> list[int]:
-    pixels = _FILL @ fall
-    if from_rest:
-        share = np.sign(pixels) * np.sqrt(np.abs(pixels) / FULL_COUNTS)
-    else:
-        share = pixels / max(FULL_DEVIATIONS * float(fall.std()), 1.0)
-    levels: list[int] = np.clip(np.rint(FULL * share), -FULL, FULL).astype(int).tolist()
-    return levels

@@ -12,6 +12,8 @@ import msgspec
 from models.contract import Finger, ModelError
 
 ZOO = Path(__file__).parent
+CARD_MAX_BYTES = 16 << 20
+"""A card has 0.1 MB."""
 
 
 def names() -> list[str]:
@@ -38,14 +40,21 @@ def judging(fingers: Collection[Finger]) -> list[str]:
 
 def card(name: str) -> dict[str, Any]:
     """The card of a model by its name. Raises `ModelError` if there is none."""
-    path = find(name).with_suffix(".json")
+    return read_card(find(name).with_suffix(".json"))
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """A card (JSON), checked to have a contract and a file. Raises `ModelError`."""
     try:
+        if path.stat().st_size > CARD_MAX_BYTES:
+            raise ModelError(f"{path}: larger than {CARD_MAX_BYTES} bytes, not a card")
         content = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ModelError(f"{path}: cannot read the card: {error}") from error
-    if not isinstance(content, dict):
+    parts = ("contract", "file") if isinstance(content, dict) else ()
+    if not parts or not all(isinstance(content.get(part), dict) for part in parts):
         raise ModelError(f"{path}: is no card")
-    return content
+    return dict(content)
 
 
 class _File(msgspec.Struct):

@@ -38,7 +38,7 @@ def install(lab: Lab) -> Outcome:
         "install -D -m 644 -t /etc/systemd/system/graspd@.service.d "
         f"{PAYLOAD}/guest/emulation.conf && systemctl daemon-reload"
     )
-    return Outcome(lab.sh("graspd --version") + ", offline, from wheels")
+    return Outcome(lab.sh("graspd --version").splitlines()[0] + ", offline, from wheels")
 
 
 def install_again(lab: Lab) -> Outcome:

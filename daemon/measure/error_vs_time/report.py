@@ -81,30 +81,6 @@ class Row:
     """That the loaded model adds to the process."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what `run` reads from the command line."""
-    parser.add_argument(
-        "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
-    )
-    parser.add_argument(
-        "--models",
-        type=Path,
-        action="append",
-        default=[],
-        metavar="DIR",
-        help="further models with their cards, as `graspd train --out DIR` writes them",
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("runs/error-vs-time"),
-        metavar="DIR",
-        help="folder for the page, the table, the picture and the figures",
-    )
-    parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
-    parser.add_argument("--json", action="store_true", help="print the figures as JSON")
-
-
 def run(args: argparse.Namespace) -> int:
     """Measure and write. Returns 0, or 2 if data, models or folder are wrong."""
     try:

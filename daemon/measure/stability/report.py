@@ -95,17 +95,6 @@ class StabilityReport:
         )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the report's arguments."""
-    parser.add_argument("model", nargs="*", help="names in the zoo (default: all)")
-    parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="folder of the real grasps: all of them too"
-    )
-    parser.add_argument("--quick", action="store_true", help="10^4 outcomes instead of 10^6")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables here too")
-
-
 def run(args: argparse.Namespace) -> int:
     """Measure and print; 1 if a bound is broken, 2 if something is not there or not known."""
     try:

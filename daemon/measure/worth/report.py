@@ -12,7 +12,6 @@ import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import matplotlib as mpl
@@ -52,22 +51,6 @@ class Point:
     """Fraction; NaN where nothing was called so."""
     coverage: float
     """Of the grasps that held, the fraction that was called stable."""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the report's arguments."""
-    parser.add_argument(
-        "--data", type=Path, required=True, metavar="DIR", help="folder with the grasp tables"
-    )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        default=Path("runs/worth"),
-        metavar="DIR",
-        help="folder for the picture and the table, and for what networks said (runs/worth)",
-    )
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the object folds")
-    parser.add_argument("--quick", action="store_true", help="few grasps, one epoch: does it run?")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,20 +1,18 @@
-"""What the commands of the training half share: arguments, messages, exit codes, progress."""
+"""What the commands of the training half share: arguments, messages, exit codes."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
-
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from models.training.data.datasets import DatasetError
 from models.training.data.folds import TooFewGraspsError
 
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
+SEEDS = 3
+"""Of the splits, that an evaluation takes by default."""
 
 
 class WrongInputError(Exception):
@@ -68,25 +66,3 @@ def warn_of_unpublished(command: str, names: Iterable[str]) -> None:
 def say(command: str, text: str) -> None:
     """One line on standard error."""
     sys.stderr.write(f"graspd {command}: {text}\n")
-
-
-@contextmanager
-def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
-    """Shows how many of `total` trainings are done, on standard error if that is a terminal.
-
-    Call what it yields after each training, with the text that is to stand in front of the bar;
-    until then that is `first`.
-    """
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trainings, left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(
-        *columns, console=console, disable=hidden or not console.is_terminal, transient=True
-    ) as bar:
-        task = bar.add_task(first, total=total)
-        yield lambda name: bar.update(task, advance=1, description=name)

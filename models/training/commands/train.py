@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import shlex
 import sys
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from models import own, zoo
 from models.training.commands.arguments import (
     EXIT_INPUT,
     WrongInputError,
     exit_code,
-    progress_bar,
     say,
     warn_of_unpublished,
     whole,
 )
 from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
 from models.training.data.folds import TooFewGraspsError
-from models.training.data.lab_tables import ENOUGH_GRASPS, FEWEST_GRASPS, read_with_lab_tables
-from models.training.making.card import Card
-from models.training.making.export import ExportError
-from models.training.making.make_model import EXTRA_TRAININGS, make_model
-from models.training.making.plan import TrainingPlan
-from models.training.making.preflight import preflight
-from models.training.systems.registry import SYSTEMS
+from models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
+from models.training.systems.names import SYSTEM_NAMES
+
+if TYPE_CHECKING:
+    from models.training.making.card import Card
+    from models.training.making.plan import TrainingPlan
 
 MAX_SEED = 2**32 - 1
 """The largest that scikit-learn takes."""
@@ -34,7 +35,10 @@ MAX_SEED = 2**32 - 1
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what `run` reads from the command line."""
     parser.add_argument(
-        "model", choices=sorted(SYSTEMS), metavar="MODEL", help=f"one of {', '.join(SYSTEMS)}"
+        "model",
+        choices=sorted(SYSTEM_NAMES),
+        metavar="MODEL",
+        help=f"one of {', '.join(SYSTEM_NAMES)}",
     )
     parser.add_argument(
         "--data",
@@ -53,7 +57,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "several times. Beside the tables of --data, or, without --data, alone",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for the result (default: runs/MODEL)"
+        "--name",
+        type=_name,
+        metavar="NAME",
+        help="name of the result (default: MODEL, with --own and the names of these tables)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder for the result (default: runs/NAME)"
     )
     parser.add_argument(
         "--results",
@@ -91,22 +101,28 @@ def run(args: argparse.Namespace) -> int:
     if args.data is None and not args.own:
         say("train", "needs --data DIR, --own FILE, or both")
         return EXIT_INPUT
-    out: Path = args.out or Path("runs") / args.model
+    from models.training.making.export import ExportError
+
+    name = _plan(args).model
+    if args.own and name in zoo.names():
+        say("train", f"graspd ships a model {name!r}: choose another --name")
+        return EXIT_INPUT
+    out: Path = args.out or Path("runs") / name
     return exit_code("train", out, lambda: _train(args, out), ExportError)
 
 
 def _train(args: argparse.Namespace, out: Path) -> None:
+    from models.training.commands.progress import progress_bar
+    from models.training.making.make_model import EXTRA_TRAININGS, make_model
+    from models.training.making.preflight import limits, preflight
+
     started_s = time.monotonic()
     grasps = read_with_lab_tables(args.data, args.own)
-    plan = _plan(args, grasps)
+    plan = _plan(args)
     if args.data is not None:
         _check_published(plan, grasps, args.data)
-    elif len(grasps) < ENOUGH_GRASPS:
-        say(
-            "train",
-            f"warning: {len(grasps)} grasps are few: the daemon will take many others for unlike "
-            f"the training, and call them unknown; {ENOUGH_GRASPS} are enough",
-        )
+    for sentence in limits(plan, grasps):
+        say("train", f"warning: {sentence}")
     try:
         preflight(plan, grasps)
         # Now, not after minutes of training.
@@ -116,18 +132,46 @@ def _train(args: argparse.Namespace, out: Path) -> None:
         with progress_bar(args.model, total, hidden=args.quiet) as on_job:
             card = make_model(plan, grasps, out, results, lambda: on_job(args.model))
     except TooFewGraspsError as error:
+        _propose(plan, grasps)
         raise WrongInputError(f"{error} (see --folds and --only)") from error
-    seconds = time.monotonic() - started_s
-    sys.stdout.write(f"{out / args.model}.onnx: {_figures(card)}, {seconds:.0f} s\n")
+    seconds, file = time.monotonic() - started_s, out / f"{plan.model}.onnx"
+    sys.stdout.write(f"{file}: {_figures(card)}, {seconds:.0f} s\n")
+    if plan.lab_files or plan.name:
+        say("train", f"for a scene: graspd models add {shlex.quote(str(file))} --name {plan.model}")
 
 
-def _plan(args: argparse.Namespace, grasps: Grasps) -> TrainingPlan:
-    system, lab = SYSTEMS[args.model], lab_table_names(grasps.files)
+def _propose(plan: TrainingPlan, grasps: Grasps) -> None:
+    """Say with which options these grasps are enough, if there are such."""
+    from models.training.making.preflight import enough_folds
+
+    for only in (plan.only, "cv"):
+        other = dataclasses.replace(plan, only=only, folds=plan.folds + (only != plan.only))
+        if (folds := enough_folds(other, grasps)) is not None:
+            words = "" if only is None else f" --only {only}"
+            say("train", f"these grasps are enough for --folds {folds}{words}")
+            return
+
+
+def _plan(args: argparse.Namespace) -> TrainingPlan:
+    from models.training.making.plan import TrainingPlan
+    from models.training.systems.registry import SYSTEMS
+
+    system, lab = SYSTEMS[args.model], tuple(path.stem for path in args.own)
     if lab:
         published = () if args.data is None else system.tables
         system = dataclasses.replace(system, tables=(*published, *lab))
-    names = tuple(path.name for path in args.own)
-    return TrainingPlan(system, args.folds, args.seed, args.jobs, args.only, names)
+    files = tuple(path.name for path in args.own)
+    return TrainingPlan(system, args.folds, args.seed, args.jobs, args.only, files, args.name)
+
+
+def _name(text: str) -> str:
+    if text in zoo.names():
+        raise argparse.ArgumentTypeError(f"graspd ships a model {text!r}: choose another name")
+    if not own.is_name(text):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no name: up to {own.NAME_MAX} letters, digits, '.', '_' and '-'"
+        )
+    return text
 
 
 def _check_published(plan: TrainingPlan, grasps: Grasps, folder: Path) -> None:

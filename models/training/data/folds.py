@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from sklearn.model_selection import StratifiedKFold
 
 from models.training.arrays import Bools, Ints
 
@@ -19,6 +18,8 @@ def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
 
     Raises `TooFewGraspsError` if a class has fewer grasps than there are folds.
     """
+    from sklearn.model_selection import StratifiedKFold
+
     fewest = min(int(slipped.sum()), int((~slipped).sum()))
     if fewest < folds:
         raise TooFewGraspsError(

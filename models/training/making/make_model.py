@@ -70,7 +70,7 @@ def make_model(
     on_done()
     contract = _contract(plan, trained, summaries)
     calibrator = _calibrator(summaries)
-    path = out / f"{system.name}.onnx"
+    path = out / f"{plan.model}.onnx"
     temperature = calibrator.main.temperature
     tables = trained.standards
     standards = None if tables is None else tables.each(trained.grasps.table_of)
@@ -117,7 +117,7 @@ def _summaries(plan: TrainingPlan, grasps: Grasps, found: list[JobResult]) -> li
 def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) -> ModelContract:
     return ModelContract(
         version=2,
-        name=plan.system.name,
+        name=plan.model,
         input=_input(plan.system, trained, summaries),
         fingers=plan.system.fingers,
         classes=CLASSES,

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from dataclasses import dataclass
+from pathlib import Path
 
 from models.bts3 import NEW_SESSION, TABLES, WHOLE
+from models.own import NAME_MAX
 from models.training.data.datasets import Grasps
 from models.training.data.protocols import EvalProtocol, splits
 from models.training.evaluating.jobs import Job
@@ -25,6 +28,16 @@ class TrainingPlan:
     is compared and not used."""
     lab_files: tuple[str, ...] = ()
     """File names of the lab tables that are trained on, with their endings."""
+    name: str | None = None
+    """Of the model that is made; that of the system and its lab tables unless given."""
+
+    @property
+    def model(self) -> str:
+        """Name of the model and of its files: small-session, small-session-monday."""
+        if self.name is not None:
+            return self.name
+        words = "-".join((self.system.name, *(Path(name).stem for name in self.lab_files)))
+        return re.sub(r"[^A-Za-z0-9._]+", "-", words)[:NAME_MAX].rstrip("-.")
 
     def protocols(self, grasps: Grasps) -> tuple[EvalProtocol, ...]:
         """By what it is measured: `cv` first; the second, with new objects, calibrates it."""
@@ -57,5 +70,6 @@ class TrainingPlan:
         data = ["--data DIR"] if published else []
         data += [f"--own {shlex.quote(name)}" for name in self.lab_files]
         only = [] if self.only is None else [f"--only {self.only}"]
-        words = (*data, f"--seed {self.seed}", f"--folds {self.folds}", *only)
+        name = [] if self.name is None else [f"--name {self.name}"]
+        words = (*data, f"--seed {self.seed}", f"--folds {self.folds}", *only, *name)
         return " ".join(("graspd train", self.system.name, *words))

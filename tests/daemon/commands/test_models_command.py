@@ -2,13 +2,44 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import shutil
+from pathlib import Path
 
 import pytest
 
+from daemon.assembly import assembly
 from daemon.assembly.assembly import DEFAULT_MODEL
-from models import zoo
+from daemon.commands import models
+from daemon.scene import Scene, parse
+from models import own, zoo
+from models.contract import ModelError
+from models.runtime import read
 from tests.daemon.processes import graspd
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Of a user who has added nothing yet, on a computer where nobody has."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(own, "SYSTEM_FOLDER", tmp_path / "system" / "models")
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    """What `graspd train` leaves behind: a model and its card."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    shutil.copy(zoo.find("mlp").with_suffix(".json"), folder / "mine.json")
+    return Path(shutil.copy(zoo.find("mlp"), folder / "mine.onnx"))
+
+
+def command(*words: object) -> int:
+    parser = argparse.ArgumentParser()
+    models.add_arguments(parser)
+    return models.run(parser.parse_args([str(word) for word in words]))
 
 
 def test_every_model_is_listed_with_its_size_and_figures() -> None:
@@ -40,3 +71,147 @@ def test_a_model_that_there_is_not_lists_those_that_there_are() -> None:
     result = graspd("models", "cnn9")
     assert result.returncode == 2
     assert result.stderr.startswith("graspd: no model 'cnn9' in the zoo; there are: cnn1")
+
+
+def scene_with(name: str, fingers: tuple[str, ...] = ("ff", "mf", "th")) -> Scene:
+    replay = {"driver": "replay", "recordings": ["x.csv"]}
+    hand, model = {"fingers": list(fingers)}, {"name": name}
+    return parse({"tactile": replay, "hand": hand, "model": model}, Path("scene.toml"))
+
+
+def test_an_added_model_is_found_by_its_name_until_it_is_removed(
+    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("add", trained, "--name", "mine", "--user") == 0
+    kept = home / ".local" / "share" / "graspd" / "models" / "mine.onnx"
+    told = capsys.readouterr().out
+    assert told == f'{kept}: added; in a scene, below [model]: name = "mine"\n'
+    assert kept.read_bytes() == trained.read_bytes()
+    assert sorted(path.name for path in kept.parent.iterdir()) == ["mine.json", "mine.onnx"]
+    assert kept.stat().st_mode & 0o777 == 0o644
+    assert assembly.model_path(scene_with("mine")) == kept
+    assert assembly.load_model(scene_with("mine")).sha256 == read(trained).sha256
+    assert command() == 0
+    listing = capsys.readouterr().out
+    assert "mine (own)  " in listing
+    assert f"mine: {zoo.card('mlp')['what']} ({kept})" in listing
+    assert command("mine", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == zoo.card("mlp")
+    assert command("remove", "mine", "--user") == 0
+    assert not list(kept.parent.iterdir())
+    with pytest.raises(ModelError, match=f"no model 'mine' .*{kept.parent}"):
+        assembly.model_path(scene_with("mine"))
+
+
+def test_a_model_without_a_card_is_shown_and_kept_by_its_contract(
+    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trained.with_suffix(".json").unlink()
+    assert command(trained) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith("mlp: no card came with it\n")
+    assert f"F1 {100 * zoo.card('mlp')['contract']['measured'][0]['f1_mean']:.1f} +- " in shown
+    assert command("add", trained, "--name", "mine", "--user") == 0
+    assert command("mine") == 0
+    assert "mlp: no card came with it\n" in capsys.readouterr().out
+    assert command() == 0
+
+
+def test_the_users_model_comes_before_the_systems(
+    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("add", trained, "--name", "mine", "--system") == 0
+    assert own.find("mine") == own.SYSTEM_FOLDER / "mine.onnx"
+    assert own.SYSTEM_FOLDER.stat().st_mode & 0o777 == 0o755
+    assert command("add", trained, "--name", "mine", "--user") == 0
+    assert own.find("mine").is_relative_to(home)
+    assert command("add", trained, "--name", "mine", "--system", "--force") == 0
+    assert "has this name too, and comes first for you" in capsys.readouterr().err
+    assert command("remove", "mine", "--user") == 0
+    assert own.find("mine") == own.SYSTEM_FOLDER / "mine.onnx"
+
+
+def test_nothing_shadows_a_model_that_ships_with_graspd(home: Path, trained: Path) -> None:
+    folder = home / ".local" / "share" / "graspd" / "models"
+    folder.mkdir(parents=True)
+    for name in ("small-session", "small-session-ff-rf"):
+        shutil.copy(trained, folder / f"{name}.onnx")
+    assert own.find("small-session") == zoo.find("small-session")
+    assert "small-session" not in own.added()
+    wanted = scene_with("small-session", ("ff", "rf"))
+    assert assembly.model_path(wanted) == zoo.find("small-session")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--name", "small-session"], "graspd ships a model 'small-session'"),
+        ([], "graspd ships a model 'mlp'"),
+        (["--name", "../mine"], "'../mine' is no name for a model"),
+        (["--name", "mine.onnx"], "'mine.onnx' is no name for a model"),
+        (["--name", "add"], "'add' is no name for a model"),
+    ],
+)
+def test_a_name_that_cannot_be_is_refused(
+    words: list[str],
+    says: str,
+    home: Path,
+    trained: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert command("add", trained, "--user", *words) == 2
+    assert says in capsys.readouterr().err
+    assert not home.exists()
+
+
+def test_what_the_daemon_would_refuse_is_not_added(
+    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = trained.read_bytes()
+    trained.write_bytes(whole[:-100])
+    assert command("add", trained, "--name", "mine", "--user") == 2
+    assert "not a usable ONNX model" in capsys.readouterr().err
+    shutil.copy(zoo.find("svm"), trained)
+    assert command("add", trained, "--name", "mine", "--user") == 2
+    assert "mine.json: is the card of another file than mine.onnx" in capsys.readouterr().err
+    trained.write_bytes(whole)
+    card = json.loads(trained.with_suffix(".json").read_text())
+    trained.with_suffix(".json").write_text(json.dumps({**card, "weak_points": 3}))
+    assert command("add", trained, "--name", "mine", "--user") == 2
+    assert "a card is wrong: Expected `array`" in capsys.readouterr().err
+    assert not home.exists()
+
+
+def test_a_model_is_replaced_only_when_that_is_said(
+    home: Path, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("add", trained, "--name", "mine", "--user") == 0
+    assert command("add", zoo.find("svm"), "--name", "mine", "--user") == 2
+    assert "mine.onnx is there already: --force replaces it" in capsys.readouterr().err
+    assert own.find("mine").read_bytes() == trained.read_bytes()
+    assert command("add", zoo.find("svm"), "--name", "mine", "--user", "--force") == 0
+    assert own.find("mine").read_bytes() == zoo.find("svm").read_bytes()
+    assert own.card(own.find("mine")) == zoo.card("svm")
+    assert home.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["add"], "add needs a FILE"),
+        (["remove"], "remove needs a NAME"),
+        (["remove", "mine"], "no model 'mine' in "),
+        (["remove", "svm"], "'svm' ships with graspd and stays"),
+        (["ad", "mine.onnx"], "only add and remove take a second word: mine.onnx"),
+        (["absent.onnx"], "absent.onnx: cannot read the model"),
+        (["add", "absent.onnx"], "absent.onnx: cannot read the model"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    words: list[str], says: str, home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(*words) == 2
+    said = capsys.readouterr().err
+    assert says in said
+    assert said.count("\n") == 1
+    assert not home.exists()

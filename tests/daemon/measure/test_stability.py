@@ -25,6 +25,7 @@ import onnx
 import onnxruntime as ort
 from onnx import helper, numpy_helper
 
+from daemon.commands.report import add_arguments
 from daemon.judge.decision import Case, Limits, decide
 from daemon.judge.findings import Examined
 from daemon.judge.network import Network
@@ -121,9 +122,9 @@ class Run:
 def run(*arguments: str) -> tuple[int, str]:
     """Exit code and standard output of the report."""
     parser = argparse.ArgumentParser()
-    stability.add_arguments(parser)
+    add_arguments(parser)
     with contextlib.redirect_stdout(io.StringIO()) as output:
-        code = stability.run(parser.parse_args(arguments))
+        code = stability.run(parser.parse_args(["stability", *arguments]))
     return code, output.getvalue()
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
+from daemon.commands.report import add_arguments
 from daemon.measure.worth import report
 from daemon.measure.worth import streams as module
 from daemon.measure.worth.lives import live
@@ -139,8 +140,8 @@ def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def options(*arguments: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    report.add_arguments(parser)
-    return parser.parse_args(arguments)
+    add_arguments(parser)
+    return parser.parse_args(["worth", *arguments])
 
 
 def test_from_tables_to_picture(folder: Path) -> None:

@@ -23,6 +23,13 @@ IGNORED_FIELDS = frozenset(
 gives all others bit for bit."""
 
 
+def without_null(value: Any) -> Any:  # noqa: ANN401
+    """A message as it is recorded, where null is left out."""
+    if isinstance(value, dict):
+        return {name: without_null(one) for name, one in value.items() if one is not None}
+    return value
+
+
 @dataclass
 class Lab:
     """What was recorded, and what the controller saw and told."""

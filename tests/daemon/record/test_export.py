@@ -228,7 +228,7 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
     writer.close()
     out = tmp_path / "t.csv"
     for options, other in (((), "unknown"), (("--object", "cup"), "cup")):
-        result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out, *options)
+        result = graspd("export-grasps", tmp_path / "a.mcap", "--out", out, "--force", *options)
         assert result.returncode == 0, result.stderr
         assert result.stdout == (
             "6 grasps, 2 slipped; 3 objects by name; 3 grasps without an object\n"
@@ -236,6 +236,19 @@ def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
         table = read_table(out)
         assert table.objects == ("mug", "ball", other, other, "box", other)
         assert table.slipped.tolist() == [True, False, False, True, False, False]
+
+
+def test_a_table_that_is_there_is_replaced_only_when_that_is_said(tmp_path: Path) -> None:
+    recorded(tmp_path / "a.mcap")
+    out = tmp_path / "t.csv"
+    out.write_text("of another day")
+    words = ("export-grasps", tmp_path / "a.mcap", "--out", out)
+    result = graspd(*words)
+    assert (result.returncode, result.stdout) == (2, "")
+    assert result.stderr == f"graspd: {out} is there already: --force replaces it\n"
+    assert out.read_text() == "of another day"
+    assert graspd(*words, "--force").returncode == 0
+    assert len(read_table(out)) > 0
 
 
 @pytest.mark.parametrize("name", ["=HYPERLINK(0)", "-1+1", "@SUM(1)", "mug\n=1", "a,b"])
@@ -342,8 +355,9 @@ def test_what_was_recorded_of_a_table_is_that_table_and_a_network_learns_from_it
         *("--only", "cv", "--folds", 2, "--quiet"),
     )
     assert made.returncode == 0, made.stderr
-    assert made.stderr == ""
-    judged = graspd("replay", DEMO_TABLE, "--model", tmp_path / "svm" / "svm.onnx", "--json")
+    assert all(line.startswith("graspd train: warning: ") for line in made.stderr.splitlines()[:-1])
+    assert made.stderr.splitlines()[-1].endswith("svm-lab.onnx --name svm-lab")
+    judged = graspd("replay", DEMO_TABLE, "--model", tmp_path / "svm" / "svm-lab.onnx", "--json")
     assert judged.returncode == 0, judged.stderr
     scores = json.loads(judged.stderr.splitlines()[-1])["scores"]
     assert scores is not None

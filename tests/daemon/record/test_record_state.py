@@ -301,7 +301,8 @@ def rewritten(path: Path, to: Path, judge: bytes, number: int) -> Path:
     header = header_of(path)
     file = McapWriter(to, replace(header, known=replace(header.known, judge=judge), file=number))
     for kind, content in messages(path):
-        file.write(f"{kind}.right".encode(), json.dumps(content).encode(), content["t_mono_ns"])
+        if kind not in ("image", "log"):
+            file.write(f"{kind}.right".encode(), json.dumps(content).encode(), content["t_mono_ns"])
     file.close()
     return to
 

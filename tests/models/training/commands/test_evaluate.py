@@ -17,7 +17,7 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 pytest.importorskip("rich", reason="the train extra is not installed")
 
-from models.training.commands import evaluate
+from models.training.commands import evaluate, evaluation
 from models.training.estimators.classical import SvmConfig
 from models.training.evaluating import jobs
 from models.training.evaluating.grid import grid_of
@@ -204,7 +204,7 @@ def test_no_cluster_is_exit_code_1_and_says_so(
 def test_what_is_not_installed_is_said_before_any_training(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(evaluate, "find_spec", lambda _: None)
+    monkeypatch.setattr(evaluation, "find_spec", lambda _: None)
     options = ["svm", "--data", str(data), "--out", str(tmp_path)]
     assert graspd_evaluate(*options, "--plots", str(tmp_path)) == 2
     assert graspd_evaluate(*options, "--dask", "tcp://127.0.0.1:9") == 2

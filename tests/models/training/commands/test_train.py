@@ -21,6 +21,7 @@ from models.runtime import TactileModel
 from models.training.commands import train
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
+from models.training.making import make_model
 from models.training.making.export import ExportError
 from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
 from tests.models.training.training_samples import separable_counts, write_table
@@ -172,7 +173,7 @@ def test_a_table_of_ones_own_is_trained_on_and_judged_beside_the_published(
     own = ["--own", str(tmp_path / "lab 1.csv")]
     options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "2"]
     assert graspd_train(*options, *own, system="svm") == 0
-    card = json.loads((tmp_path / "out" / "svm.json").read_text())
+    card = json.loads((tmp_path / "out" / "svm-lab-1.json").read_text())
     assert card["command"] == "graspd train svm --data DIR --own 'lab 1.csv' --seed 0 --folds 2"
     assert [(file["name"], file["rows"]) for file in card["contract"]["datasets"]] == [
         ("palm_down", GRASPS),
@@ -205,11 +206,11 @@ def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
     write(tmp_path / "lab.csv", smallest())
     options = ["--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path), "--folds", "2"]
     assert graspd_train(*options) == 0
-    contract = TactileModel(tmp_path / f"{SYSTEM}.onnx").contract
+    contract = TactileModel(tmp_path / f"{SYSTEM}-lab.onnx").contract
     assert [(file.name, file.rows) for file in contract.datasets] == [("lab", 20)]
     assert isinstance(contract.input, SessionInput)
     assert contract.confidence == ()  # 20 grasps say nothing of how sure one may be
-    card = json.loads((tmp_path / f"{SYSTEM}.json").read_text())
+    card = json.loads((tmp_path / f"{SYSTEM}-lab.json").read_text())
     assert card["command"] == f"graspd train {SYSTEM} --own lab.csv --seed 0 --folds 2"
     assert list(card["protocols"]) == ["cv", "objects"]
     assert card["calibrated_by"] == "objects"
@@ -291,7 +292,7 @@ def test_grasps_of_one_object_measure_known_objects_alone(
         "graspd train: 2 folds need 2 objects, there are 1 (see --folds and --only)"
     )
     assert graspd_train(*options, "--only", "cv") == 0
-    card = json.loads((tmp_path / "out" / f"{SYSTEM}.json").read_text())
+    card = json.loads((tmp_path / "out" / f"{SYSTEM}-lab.json").read_text())
     assert card["never_seen"]["held_out_object"] is None
     assert card["calibrated_by"] == "cv"
 
@@ -318,6 +319,104 @@ def test_a_fold_that_leaves_one_kind_of_grasps_to_train_on_is_exit_code_2(
     assert graspd_train(*options) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert re.match(r"graspd train: objects, fold 0, has 0 grasps that \w+ to train on", last)
+
+
+def warnings(capsys: pytest.CaptureFixture[str]) -> list[str]:
+    start = "graspd train: warning: "
+    lines = capsys.readouterr().err.splitlines()
+    return [line.removeprefix(start) for line in lines if line.startswith(start)]
+
+
+def test_what_a_model_will_not_be_able_to_do_is_said_before_it_is_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(make_model, "make_model", interrupted)
+    write(tmp_path / "lab.csv", smallest())
+    small = ["--own", str(tmp_path / "lab.csv"), "--folds", "2", "--only", "cv"]
+    small += ["--out", str(tmp_path / "out")]
+    assert graspd_train(*small, system="svm") == 130
+    said = warnings(capsys)
+    for wanted, sentence in zip(
+        (
+            "20 grasps are few",
+            "svm is not calibrated by the session",
+            "one table is one day",
+            "of 2 objects little is learned about others",
+            "only 10 grasps slipped",
+            "only 10 grasps stayed",
+            "with --only cv nothing else is measured",
+        ),
+        said,
+        strict=True,
+    ):
+        assert sentence.startswith(wanted)
+    for day in range(2):
+        write(tmp_path / f"day{day}.csv", table("lab", 120, day))
+    enough = ["--own", str(tmp_path / "day0.csv"), "--own", str(tmp_path / "day1.csv")]
+    assert graspd_train(*enough, "--folds", "2", "--out", str(tmp_path / "out")) == 130
+    assert warnings(capsys) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "proposal"),
+    [
+        ([], "--folds 2"),
+        (["--only", "cv"], "--folds 9 --only cv"),
+    ],
+)
+def test_fewer_folds_are_proposed_where_grasps_are_few(
+    options: list[str], proposal: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made, lab = smallest(), tmp_path / "lab.csv"
+    slipped = made.slipped.copy()
+    slipped[np.flatnonzero(slipped)[0]] = False  # nine slipped, so ten folds are too many
+    write(lab, dataclasses.replace(made, slipped=slipped))
+    words = ["--own", str(lab), "--out", str(tmp_path / "out"), *options]
+    assert graspd_train(*words) == 2
+    *_, said, reason = capsys.readouterr().err.splitlines()
+    assert said == f"graspd train: these grasps are enough for {proposal}"
+    assert "(see --folds and --only)" in reason
+    assert graspd_train(*words, *proposal.split(), "--quiet") == 0
+    assert (tmp_path / "out" / f"{SYSTEM}-lab.onnx").exists()
+
+
+def test_where_no_folds_are_enough_known_objects_alone_are_proposed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_table(tmp_path / "lab.csv", *separable_counts(GRASPS))
+    assert graspd_train("--own", str(tmp_path / "lab.csv"), "--out", str(tmp_path / "out")) == 2
+    said = capsys.readouterr().err.splitlines()[-2]
+    assert said == "graspd train: these grasps are enough for --folds 10 --only cv"
+
+
+def test_a_model_is_named_and_its_end_says_how_a_scene_gets_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(tmp_path / "lab.csv", smallest())
+    options = ["--own", str(tmp_path / "lab.csv"), "--folds", "2", "--only", "cv"]
+    out = tmp_path / "out"
+    for words, name in (([], f"{SYSTEM}-lab"), (["--name", "cups"], "cups")):
+        assert graspd_train(*options, *words, "--out", str(out)) == 0
+        printed = capsys.readouterr()
+        assert printed.out.startswith(f"{out / name}.onnx: cv F1 ")
+        assert printed.err.splitlines()[-1] == (
+            f"graspd train: for a scene: graspd models add {out / name}.onnx --name {name}"
+        )
+        assert TactileModel(out / f"{name}.onnx").contract.name == name
+        command = json.loads((out / f"{name}.json").read_text())["command"]
+        assert command.endswith(" ".join(("--only cv", *words)))
+
+
+@pytest.mark.parametrize("name", ["svm", "small-session-ff", "a/b", ".hidden", "x.onnx", "a" * 65])
+def test_a_name_that_a_scene_could_not_use_is_refused(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        graspd_train("--data", "anywhere", "--name", name)
+    assert "graspd ships a model" in (said := capsys.readouterr().err) or "is no name" in said
 
 
 def test_without_any_data_there_is_nothing_to_train_on(capsys: pytest.CaptureFixture[str]) -> None:
@@ -364,7 +463,7 @@ def test_ctrl_c_ends_cleanly_with_130(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "make_model", interrupted)
+    monkeypatch.setattr(make_model, "make_model", interrupted)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 130
     assert capsys.readouterr().err.splitlines()[-1] == (
         "graspd train: interrupted; the same command goes on from here"
@@ -380,6 +479,6 @@ def test_a_failed_export_is_exit_code_1(
     def failing(*_: object) -> None:
         raise ExportError("the exported file differs")
 
-    monkeypatch.setattr(train, "make_model", failing)
+    monkeypatch.setattr(make_model, "make_model", failing)
     assert graspd_train("--data", str(data), "--out", str(tmp_path / "out")) == 1
     assert capsys.readouterr().err.splitlines()[-1] == "graspd train: the exported file differs"

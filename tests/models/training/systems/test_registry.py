@@ -14,6 +14,7 @@ from models.contract import CountsInput, ImageInput, VectorInput
 from models.training.estimators.classical import ForestConfig, MlpConfig, SvmConfig
 from models.training.estimators.networks import CNN1, build, parameter_count
 from models.training.estimators.recipe import PublishedRecipe, Recipe
+from models.training.systems.names import SYSTEM_NAMES
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import (
     BlendConfig,
@@ -97,6 +98,10 @@ DIGESTS = {
 
 def test_stored_results_of_every_system_stay_valid() -> None:
     assert {name: digest(system)[:16] for name, system in SYSTEMS.items()} == DIGESTS
+
+
+def test_their_names_are_known_without_the_training() -> None:
+    assert tuple(SYSTEMS) == SYSTEM_NAMES
 
 
 @pytest.mark.parametrize("name", zoo.names())

@@ -1,0 +1,200 @@
+"""The scene explained from its own classes: a JSON Schema for editors and the page deploy/SCENE.md;
+and the example scenes."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import drivers.recordings
+from daemon.process.text import markdown_table
+from daemon.scene import drivers as driver_sections
+from daemon.scene import scene
+
+EXAMPLES = Path(__file__).parent / "examples"
+"""In the repository a link to deploy/scenes, in an installed package a copy of it."""
+SCHEMA = "scene.schema.json"
+"""File beside the examples, which their first line names for editors."""
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+COLUMNS = ("key", "type", "unit", "default", "range", "meaning")
+INTRODUCTION = """# The scene, key by key
+
+Made from the classes that read a scene, by `graspd scene --page`. A scene is one TOML file; only
+`[tactile]` must be there. `graspd scene --example spi > right.toml` prints one to edit, and
+`graspd check right.toml` says whether it is right, also where keys must agree with each other. An
+unknown key, or a value out of its range, is an error.
+
+A default `-` means that the key may be left out, and the meaning says what is then; `needed`, that
+it may not. A path is relative to the folder of the scene file.
+
+Editors that know Taplo (VS Code: Even Better TOML) complete and explain keys by the JSON Schema
+that the first line of an example names. `graspd scene --schema > scene.schema.json` writes it for
+`#:schema ./scene.schema.json`.
+"""
+
+
+def examples() -> list[str]:
+    """Names of the example scenes, sorted."""
+    return sorted(path.stem for path in EXAMPLES.glob("*.toml"))
+
+
+def example(name: str) -> str:
+    """The text of an example scene, whose files are found from any folder."""
+    text = (EXAMPLES / f"{name}.toml").read_text()
+    recordings = Path(drivers.recordings.__file__).resolve().parent
+    text = text.replace("../../drivers/recordings", str(recordings))
+    return text.replace(f"./{SCHEMA}", (EXAMPLES / SCHEMA).resolve().as_uri())
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema of a scene: each number with its `unit`, and no null, which TOML has not."""
+    found = scene.Scene.model_json_schema()
+    sections = found.pop("$defs")
+    meanings = _meanings()
+    for name, section in {"Scene": found, **sections}.items():
+        for key, about in section["properties"].items():
+            _describe(about, meanings.get((name, key)))
+    return {"$schema": DIALECT, **_plain(found, sections)}
+
+
+def schema_text() -> str:
+    """The schema as the file beside the examples holds it."""
+    return json.dumps(schema(), indent=2) + "\n"
+
+
+def page() -> str:
+    """The text of deploy/SCENE.md: a table of the keys of each section."""
+    tables = [INTRODUCTION]
+    for section in _sections(schema()):
+        title, _, about = _linked(section["description"]).partition(": ")
+        rows = (_row(key, value, section) for key, value in section["properties"].items())
+        table = "\n".join(markdown_table(COLUMNS, rows))
+        tables.append(f"## {title}\n\n{about[0].upper()}{about[1:]}\n\n{table}\n")
+    return "\n".join(tables)
+
+
+def _meanings() -> dict[tuple[str, str], str]:
+    """By class and key: the string that stands below the key in the source.
+
+    It is read there when somebody asks: a daemon that starts pays nothing for it.
+    """
+    found = {}
+    for module in (driver_sections, scene):
+        for section in ast.parse(inspect.getsource(module)).body:
+            if not isinstance(section, ast.ClassDef):
+                continue
+            for key, below in pairwise(section.body):
+                match key, below:
+                    case (
+                        ast.AnnAssign(target=ast.Name(id=name)),
+                        ast.Expr(value=ast.Constant(value=str(text))),
+                    ):
+                        found[section.name, name] = " ".join(text.split())
+    return found
+
+
+def _describe(about: dict[str, Any], meaning: str | None) -> None:
+    """Put a key's meaning and unit into its schema; sections have theirs from their class."""
+    if "$ref" in about:
+        about.pop("default", None)
+    elif meaning is not None:
+        unit = _unit(about)
+        about["description"] = meaning if unit in ("", "-") else f"{meaning} Unit: {unit}."
+
+
+def _unit(about: Mapping[str, Any]) -> str:
+    """That of a number, or of the numbers in a list; empty for what is none."""
+    inner = (*about.get("anyOf", ()), about.get("items", {}))
+    return about.get("unit") or next(filter(None, map(_unit, filter(None, inner))), "")
+
+
+def _plain(node: Any, sections: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Each section in its place, without null and without what only repeats the key."""
+    if isinstance(node, list):
+        return [_plain(item, sections) for item in node]
+    if not isinstance(node, dict):
+        return node
+    whole = dict(node)
+    if "$ref" in whole:
+        whole = sections[whole.pop("$ref").rpartition("/")[2]] | whole
+    left = [choice for choice in whole.get("anyOf", ()) if choice != {"type": "null"}]
+    if len(left) == 1:
+        del whole["anyOf"]
+        whole = {**left[0], **whole}
+    if "$ref" in whole:
+        return _plain(whole, sections)
+    return {
+        key: _plain(value, sections)
+        for key, value in whole.items()
+        if key not in ("title", "discriminator") and (key, value) != ("default", None)
+    }
+
+
+def _sections(of: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """All sections below one, in the order of the file."""
+    for about in of["properties"].values():
+        for section in about.get("oneOf", (about,)):
+            if "properties" in section:
+                yield section
+                yield from _sections(section)
+
+
+def _row(key: str, about: Mapping[str, Any], section: Mapping[str, Any]) -> tuple[str, ...]:
+    if "properties" in about:
+        return f"`{key}`", "section", "-", "-", "-", "a section of its own, below"
+    item = about.get("items")
+    allowed = ": ".join(filter(None, (_lengths(about), _range(item or about))))
+    if key in section.get("required", ()):
+        default = "needed"
+    else:
+        default = f"`{json.dumps(about['default'])}`" if "default" in about else "-"
+    meaning = about["description"].removesuffix(f" Unit: {_unit(about)}.")
+    return (
+        f"`{key}`",
+        f"list of {_type(item)}s" if item else _type(about),
+        _unit(about) or "-",
+        default,
+        allowed or "-",
+        _linked(meaning),
+    )
+
+
+def _type(about: Mapping[str, Any]) -> str:
+    return str(about.get("format", about["type"]))
+
+
+def _lengths(about: Mapping[str, Any]) -> str:
+    if "minItems" not in about:
+        return ""
+    most = f" to {about['maxItems']}" if "maxItems" in about else " or more"
+    return f"{about['minItems']}{most}"
+
+
+def _range(about: Mapping[str, Any]) -> str:
+    if "const" in about or "enum" in about:
+        return ", ".join(f"`{value}`" for value in about.get("enum", [about.get("const")]))
+    if "pattern" in about:
+        return f"`{about['pattern']}`"
+    words = (
+        ("minimum", "from"),
+        ("exclusiveMinimum", "above"),
+        ("maximum", "to"),
+        ("exclusiveMaximum", "below"),
+    )
+    return " ".join(f"{word} {_number(about[key])}" for key, word in words if key in about)
+
+
+def _number(value: float) -> str:
+    """As TOML takes it too: 12_000_000."""
+    return f"{int(value):_}" if value == int(value) else str(value)
+
+
+def _linked(text: str) -> str:
+    """With links, from the folder deploy, to the files there."""
+    return re.sub(r"deploy/([\w./-]+\w)", r"[\1](\1)", " ".join(text.split()))

@@ -1,0 +1,85 @@
+"""Models that were added to those that ship with graspd: `graspd models add` keeps them in a folder
+of the user or, for services, of the system."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from models import trial, zoo
+from models.contract import ModelError
+from models.runtime import ModelFile, read
+
+SYSTEM_FOLDER = Path("/var/lib/graspd/models")
+"""Looked into by everybody; the service's user has no other."""
+NAME_MAX = 64
+"""Characters of a name."""
+
+
+def user_folder() -> Path | None:
+    """Looked into before the system's; None for a user without a home."""
+    try:
+        return Path.home() / ".local" / "share" / "graspd" / "models"
+    except RuntimeError:
+        return None
+
+
+def folders() -> list[Path]:
+    """Where added models are looked for, in this order."""
+    return [folder for folder in (user_folder(), SYSTEM_FOLDER) if folder is not None]
+
+
+def added() -> dict[str, Path]:
+    """Files of the added models by name, sorted; what cannot be read is left out."""
+    found: dict[str, Path] = {}
+    for folder in reversed(folders()):
+        found |= {path.stem: path for path in folder.glob("*.onnx") if is_name(path.stem)}
+    return {name: path for name, path in sorted(found.items()) if name not in zoo.names()}
+
+
+def is_name(text: str) -> bool:
+    """Whether a model may be called so: it is a file's name, and no file's path."""
+    whole = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", text) is not None
+    return whole and len(text) <= NAME_MAX and not text.endswith(".onnx")
+
+
+def find(name: str) -> Path:
+    """File of a model by its name: one that ships with graspd, else the user's, else the system's.
+
+    Raises `ModelError` listing the names that there are.
+    """
+    if name in zoo.names():
+        return zoo.find(name)
+    for folder in folders() if is_name(name) else ():
+        path = folder / f"{name}.onnx"
+        if os.path.isfile(path):  # without an error where the folder may not be read
+            return path
+    others = added()
+    near = difflib.get_close_matches(name, [*zoo.names(), *others], n=1)
+    meant = f"; did you mean {near[0]}?" if near else ""
+    raise ModelError(
+        f"no model '{name}' in the zoo; there are: {', '.join(zoo.names())}; in "
+        f"{' or '.join(map(str, folders()))}: {', '.join(others) or 'none'}{meant}"
+    )
+
+
+def card(path: Path, file: ModelFile | None = None) -> dict[str, Any]:
+    """The card beside a model file or, where there is none, what its contract says.
+
+    The model is loaded as the daemon does; `file` is its content where that was read. Raises
+    `ModelError` for one that the daemon would refuse, and for the card of another file.
+    """
+    file = read(path) if file is None else file
+    contract = json.loads(trial.load(path, file).contract.to_json())
+    about = path.with_suffix(".json")
+    if not about.exists():
+        size = {"sha256": file.sha256, "size_bytes": len(file.data)}
+        return {"what": "no card came with it", "contract": contract, "file": size}
+    content = zoo.read_card(about)
+    if content["file"].get("sha256") != file.sha256:
+        raise ModelError(f"{about}: is the card of another file than {path.name}")
+    return {**content, "contract": contract}

@@ -1,0 +1,232 @@
+"""The command line as people type it: help, what is mistyped, versions, completion, the manual."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon.cli import COMMANDS, LIBRARIES, whole_parser
+from daemon.commands.arguments import Parser
+from daemon.commands.manual import page
+from models import zoo
+from tests.daemon.processes import GRASPD, graspd
+
+MANUAL = Path(__file__).parents[3] / "deploy/man/graspd.1"
+EXTRAS = (
+    "torch", "sklearn", "scipy", "joblib", "threadpoolctl", "onnx", "onnxscript", "skl2onnx",
+    "rich", "distributed", "matplotlib", "keras", "mcap", "lz4", "zstandard", "foxglove",
+)  # fmt: skip
+"""Packages that only extras bring."""
+CORE_ONLY = f"""
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {EXTRAS!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Missing())
+from daemon.cli import main
+"""
+
+
+def parsers(parser: Parser) -> Iterator[Parser]:
+    yield parser
+    for command in parser.subparsers.values():
+        yield from parsers(command)
+
+
+def test_the_help_of_every_command_needs_no_extra() -> None:
+    names = [parser.prog.split()[1:] for parser in parsers(whole_parser())]
+    assert len(names) > len(COMMANDS)
+    code = f"""{CORE_ONLY}
+for words in {names!r}:
+    try:
+        main([*words, "--help"])
+    except SystemExit as left:
+        assert left.code == 0, words
+    else:
+        raise AssertionError(words)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("usage: graspd") == len(names)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (["train", "svm", "--own", "absent.csv"], "train"),
+        (["evaluate", "--data", "absent"], "train"),
+        (["report", "worth", "--data", "absent"], "train,report"),
+        (["export-grasps", "absent.mcap", "--out", "absent.csv"], "record"),
+    ],
+)
+def test_a_command_without_its_extra_says_how_to_have_it(arguments: list[str], extra: str) -> None:
+    code = f"{CORE_ONLY}\nsys.exit(main({arguments!r}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"pip install '.[{extra}]'" in line
+
+
+def test_every_argument_of_every_command_has_help() -> None:
+    silent = [
+        f"{parser.prog} {action.option_strings or action.dest}"
+        for parser in parsers(whole_parser())
+        for action in parser.actions
+        if not action.help
+    ]
+    assert silent == []
+    assert [parser.prog for parser in parsers(whole_parser()) if not parser.description] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "meant"),
+    [
+        (["rnu"], "run"),
+        (["--verison"], "--version"),
+        (["session", "shwo", "scene.toml"], "show"),
+        (["twin", "spy"], "spi"),
+        (["twin", "spi", "--stuk-clock"], "--stuck-clock"),
+        (["watch", "--wbe"], "--web"),
+        (["evaluate", "--dta", "folder"], "--data"),
+        (["replay", "--max-slip-when-stabel=0.1"], "--max-slip-when-stable"),
+        (["replay", "--gate", "setled"], "settled"),
+        (["replay", "--model", "cnn1-sesion"], "cnn1-session"),
+        (["models", "smal-session"], "small-session"),
+        (["train", "smal-session"], "small-session"),
+        (["report", "wroth"], "worth"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], meant: str) -> None:
+    done = graspd(*arguments)
+    assert done.returncode == 2
+    assert done.stderr.endswith(f"; did you mean {meant}?\n")
+
+
+def test_what_is_like_nothing_is_answered_with_no_guess() -> None:
+    done = graspd("qqqq")
+    assert done.returncode == 2
+    assert "did you mean" not in done.stderr
+
+
+def test_a_value_may_look_like_an_option_behind_two_dashes() -> None:
+    done = graspd("run", "--", "--scene.toml")
+    assert "graspd: --scene.toml: cannot read the scene" in done.stderr
+
+
+def test_the_version_tells_what_graspd_stands_on() -> None:
+    first, second = graspd("--version").stdout.splitlines()
+    assert first == f"graspd {version('graspd')}"
+    told = dict(part.rsplit(" ", 1) for part in second.split(", "))
+    assert told.pop("Python") == ".".join(map(str, sys.version_info[:3]))
+    assert told.pop("libzmq") == zmq.zmq_version()
+    assert told == {name: version(name) for name in LIBRARIES}
+
+
+LINES = {
+    "graspd re": {"replay", "report"},
+    "graspd twin ": {"spi", "can", "palm", "joints"},
+    "graspd twin spi --st": {"--stuck-clock"},
+    "graspd replay --gate ": {"settled", "every"},
+    "graspd replay --model ": set(zoo.names()),
+    "graspd train cnn1-rank-8": {"cnn1-rank-8"},
+    "graspd run --p": {"--print"},
+}
+"""What is typed, and what is offered for its last word."""
+BASH = """
+eval "$1"; shift
+COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
+_graspd; printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_bash_completes(line: str) -> None:
+    script = graspd("completion", "bash").stdout
+    command = ["bash", "--norc", "-euc", BASH, "bash", script, *line.split(" ")]
+    environment = {**os.environ, "ZSH_VERSION": ""}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert set(done.stdout.split()) == LINES[line]
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_fish_completes(line: str) -> None:
+    fish = shutil.which("fish")
+    if fish is None:
+        pytest.skip("no fish: apt install fish")
+    script = graspd("completion", "fish").stdout + f"\ncomplete -C '{line}'\n"
+    done = subprocess.run(
+        [fish, "--no-config"], input=script, capture_output=True, text=True, check=True
+    )
+    assert {row.split("\t")[0] for row in done.stdout.splitlines()} == LINES[line]
+
+
+def test_zsh_takes_what_bash_does() -> None:
+    zsh = shutil.which("zsh")
+    if zsh is None:
+        pytest.skip("no zsh: apt install zsh")
+    script = graspd("completion", "zsh").stdout
+    code = 'autoload -U compinit && compinit -D -u; eval "$1"; print ${_comps[graspd]}'
+    done = subprocess.run(
+        [zsh, "-f", "-c", code, "zsh", script], capture_output=True, text=True, check=True
+    )
+    assert "_graspd" in done.stdout
+
+
+def test_the_manual_page_in_deploy_is_that_of_these_commands() -> None:
+    assert MANUAL.read_text() == page(whole_parser()), (
+        "run: python -m daemon manual > deploy/man/graspd.1"
+    )
+
+
+def test_the_manual_page_is_shown_without_a_warning() -> None:
+    man = shutil.which("man")
+    if man is None:
+        pytest.skip("no man: apt install man-db")
+    command = [man, "--local-file", "--warnings", str(MANUAL)]
+    environment = {**os.environ, "MANWIDTH": "80", "LC_ALL": "C.UTF-8"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stderr == ""
+    shown = " ".join(re.sub(r"\x1b\[[0-9;]*m|.\x08", "", done.stdout).split())
+    assert "graspd export-grasps Make a grasp table of what was recorded" in shown
+
+
+@pytest.mark.parametrize(
+    ("setting", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
+)
+def test_verdicts_are_coloured_on_a_terminal_that_wants_it(
+    setting: dict[str, str], is_coloured: bool
+) -> None:
+    own, terminal = os.openpty()
+    environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "", **setting}
+    with subprocess.Popen(
+        [*GRASPD, "replay", "--verbose"], stdout=terminal, stderr=terminal, env=environment
+    ) as process:
+        os.close(terminal)
+        text = b""
+        try:
+            while part := os.read(own, 1 << 16):
+                text += part
+        except OSError:  # the end of a terminal that nobody holds any more
+            pass
+    os.close(own)
+    assert process.returncode == 0
+    assert (b"\x1b[32mstable" in text) == is_coloured
+    assert (b"\x1b" in text) == is_coloured
+
+
+def test_what_is_piped_is_not_coloured() -> None:
+    assert "\x1b" not in graspd("replay", "--verbose").stdout

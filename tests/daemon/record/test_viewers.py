@@ -1,0 +1,399 @@
+"""What viewers get of a recording: schemas that their parsers take, images, and a log."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.publish.messages import Tactile, encode
+from daemon.record.files import Retention
+from daemon.record.flat import flat, schema_of, table
+from daemon.record.header import RecordingHeader
+from daemon.record.mcap import McapReader, McapWriter, schemas
+from daemon.record.player import McapReplayDriver
+from daemon.record.recorder import Recorder
+from daemon.record.topics import EVENT, Event, Exchanged, Topic
+from daemon.record.viewers import INFO, SCALE, WARNING, Journal, Painter, RawImage
+from daemon.scene import Record
+from daemon.trust.learner import LearnerState
+from drivers.base import JointReading, TactileReading
+from drivers.recordings.csv_rows import open_recording
+from models.layout import D1
+from models.session_statistics import SessionState
+from tests.daemon.record.recorded import messages
+
+BOOT = "0123456789abcdef" * 2
+HEADER = RecordingHeader(
+    fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
+)
+PLAIN = ("boolean", "string", "number", "integer")
+TIME = {"sec": "integer", "nsec": "integer"}
+WELL_KNOWN: dict[str, dict[str, Any]] = {
+    "foxglove.RawImage": {
+        "timestamp": TIME,
+        "frame_id": "string",
+        "width": "integer",
+        "height": "integer",
+        "encoding": "string",
+        "step": "integer",
+        "data": "base64",
+    },
+    "foxglove.Log": {
+        "timestamp": TIME,
+        "level": "integer",
+        "message": "string",
+        "name": "string",
+        "file": "string",
+        "line": "integer",
+    },
+}
+"""Fields, all of them required, as the package @foxglove/schemas 2.1.0 has them."""
+
+
+def faults(schema: dict[str, Any], where: str) -> Iterator[str]:
+    """Whatever Lichtblick's `parseJsonSchema` throws at, and more: only words that it knows."""
+    known = {"$schema", "title", "description", "type", "properties", "additionalProperties"}
+    known |= {"required", "items", "enum", "contentEncoding"}
+    known |= {"minimum", "maximum", "maxItems", "pattern"}
+    yield from (f"{where}: {word}" for word in schema.keys() - known)
+    kind = schema.get("type")
+    if kind == "object":
+        if "properties" not in schema:
+            yield f"{where}: an object without properties"
+        for name, inner in schema.get("properties", {}).items():
+            yield from faults(inner, f"{where}.{name}")
+        if isinstance(schema.get("additionalProperties"), dict):
+            yield from faults(schema["additionalProperties"], f"{where}.*")
+    elif kind == "array":
+        if schema.get("items", {}).get("type") not in (*PLAIN, "object"):
+            yield f"{where}: an array of {schema.get('items', {}).get('type')}"
+        yield from faults(schema.get("items", {}), f"{where}[]")
+    elif kind not in PLAIN:
+        yield f"{where}: type {kind}"
+    if schema.get("contentEncoding", "base64") != "base64":
+        yield f"{where}: contentEncoding {schema['contentEncoding']}"
+
+
+@pytest.mark.parametrize("topic", list(Topic))
+def test_a_viewer_can_read_the_schema_of_every_topic(topic: Topic) -> None:
+    name, text = schemas()[topic]
+    assert name.count(".") == 1
+    schema = json.loads(text)
+    assert schema["type"] == "object"
+    assert list(faults(schema, topic)) == []
+
+
+@pytest.mark.parametrize(
+    ("schema", "fault"),
+    [
+        ({"type": "object", "properties": {"v": {"enum": [1]}}}, "a.v: type None"),
+        ({"type": "object", "properties": {"v": {"$ref": "#/$defs/V"}}}, "a.v: $ref"),
+        ({"type": "object", "properties": {"v": {"type": ["number", "null"]}}}, "type ['number'"),
+        ({"type": "object", "properties": {"v": {"anyOf": []}}}, "a.v: anyOf"),
+        ({"type": "object"}, "a: an object without properties"),
+        ({"type": "object", "properties": {}, "$defs": {}}, "a: $defs"),
+        ({"type": "array", "items": {"type": "array"}}, "a: an array of array"),
+        ({"type": "string", "contentEncoding": "base32"}, "a: contentEncoding base32"),
+    ],
+)
+def test_the_checker_finds_what_a_viewer_cannot_read(schema: dict[str, Any], fault: str) -> None:
+    assert any(fault in found for found in faults(schema, "a"))
+
+
+@pytest.mark.parametrize("topic", [Topic.IMAGE, Topic.LOG])
+def test_what_viewers_know_by_name_has_their_fields(topic: Topic) -> None:
+    name, text = schemas()[topic]
+    schema = json.loads(text)
+    assert {field: _kind(told) for field, told in schema["properties"].items()} == WELL_KNOWN[name]
+
+
+def _kind(told: dict[str, Any]) -> object:
+    if told["type"] == "object":
+        return {field: _kind(inner) for field, inner in told["properties"].items()}
+    return told.get("contentEncoding", told["type"])
+
+
+def test_counts_say_in_the_schema_how_their_list_is_to_be_read() -> None:
+    for topic, field in (
+        (Topic.TACTILE, "counts"),
+        (Topic.TACTILE, "faults"),
+        (Topic.JUDGED, "counts"),
+    ):
+        told = json.loads(schemas()[topic][1])["properties"][field]
+        assert "Shape (fingers, 24), row by row" in told["description"]
+
+
+def test_a_type_with_two_meanings_has_no_schema() -> None:
+    class Either(msgspec.Struct):
+        value: int | str
+
+    with pytest.raises(TypeError, match="no viewer can read"):
+        schema_of(Either)
+
+
+def test_null_is_left_out_and_a_table_is_one_list() -> None:
+    content = {"a": None, "b": {"c": None, "d": 0}, "e": [[1, 2], [3, 4]], "f": [], "g": False}
+    assert flat(content) == {"b": {"d": 0}, "e": [1, 2, 3, 4], "f": [], "g": False}
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_a_list_of_counts_becomes_the_table_again(rows: int) -> None:
+    counts = np.arange(24 * rows).reshape(rows, 24).tolist()
+    assert table(flat(counts)) == table(counts) == counts
+
+
+def reading(counts: NDArray[np.int64], faulty: tuple[int, int] | None = None) -> dict[str, Any]:
+    wrong = np.zeros((2, 24), int)
+    if faulty is not None:
+        wrong[faulty] = 1
+    return {"fingers": ["ff", "th"], "counts": counts.tolist(), "faults": wrong.tolist()}
+
+
+def verdict(gate: str | None, **more: object) -> dict[str, Any]:
+    return {"grasp": 1, "verdict": "unknown", "reasons": [], "gate": gate, **more}
+
+
+def pixels(image: RawImage | None) -> NDArray[np.uint8]:
+    """Colour of each pixel of the tactile image."""
+    assert image is not None
+    assert (image.encoding, image.step) == ("rgb8", 3 * image.width)
+    whole = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+    small = whole[::SCALE, ::SCALE]
+    assert np.array_equal(small.repeat(SCALE, 0).repeat(SCALE, 1), whole)
+    return small
+
+
+REST = np.full((2, 24), 2000)
+DARK, YELLOW, CYAN, BLACK = (38, 44, 54), (252, 255, 190), (0, 220, 220), (0, 0, 0)
+
+
+def test_a_pressed_electrode_shines_where_it_is_and_nothing_else_does() -> None:
+    painter = Painter(10.0)
+    painter.of("verdict", verdict("idle"), 0)
+    for number in range(1, 30):
+        still = pixels(painter.of("tactile", reading(REST), number * 10**8))
+    assert still.shape == (12, 2 * 11 + 1, 3)
+    assert {tuple(one) for one in still[:, 12:].reshape(-1, 3).tolist()} == {DARK}
+    assert {tuple(one) for one in still[:, 11].tolist()} == {BLACK}
+    pressed = REST.copy()
+    pressed[1, 6] = 300  # E7 of the thumb, 1700 counts below rest
+    painter.of("verdict", verdict("judged"), 0)
+    image = pixels(painter.of("tactile", reading(pressed, faulty=(0, 3)), 30 * 10**8))
+    assert tuple(image[D1.rows[6], 12 + D1.columns[6]]) == YELLOW
+    assert tuple(image[D1.rows[3], D1.columns[3]]) == CYAN
+    others = [(row, 12 + column) for row, column in zip(D1.rows, D1.columns, strict=True)]
+    others.remove((D1.rows[6], 12 + D1.columns[6]))
+    assert {tuple(image[pixel]) for pixel in others} == {DARK}
+
+
+def test_without_a_gate_an_image_shows_how_electrodes_differ() -> None:
+    painter = Painter(10.0)
+    painter.of("verdict", verdict(None), 0)
+    counts = REST + np.arange(24)
+    image = pixels(painter.of("tactile", reading(counts), 10**8)).astype(int)
+    red = [image[row, column, 0] for row, column in zip(D1.rows, D1.columns, strict=True)]
+    assert red[0] == max(red) > 200
+    assert image[D1.rows[23], D1.columns[23], 2] > 150  # the highest count is blue
+
+
+@pytest.mark.parametrize(("images_hz", "images"), [(10.0, 10), (0.0, 0), (1000.0, 100)])
+def test_so_many_images_are_drawn_a_second(images_hz: float, images: int) -> None:
+    painter = Painter(images_hz)
+    drawn = [painter.of("tactile", reading(REST), 10**18 + n * 10_000_000) for n in range(100)]
+    assert sum(image is not None for image in drawn) == images
+
+
+def test_images_go_on_where_the_clock_was_set_back() -> None:
+    painter = Painter(10.0)
+    assert painter.of("tactile", reading(REST), 10**18) is not None
+    assert painter.of("tactile", reading(REST), 10**18 - 10**12) is not None
+
+
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {},
+        {"fingers": ["ff"], "counts": [[1, 2]], "faults": [[0, 0]]},
+        {**reading(REST), "faults": 0},
+    ],
+)
+def test_a_broken_reading_has_no_image(broken: dict[str, Any]) -> None:
+    assert Painter(10.0).of("tactile", broken, 10**9) is None
+
+
+def said(journal: Journal, kind: str, content: dict[str, Any]) -> list[tuple[int, str, str]]:
+    return [(line.level, line.name, line.message) for line in journal.of(kind, content, 5 * 10**9)]
+
+
+def test_a_verdict_is_said_when_it_changes_and_not_again() -> None:
+    journal = Journal()
+    (line,) = said(journal, "verdict", verdict("closing", reasons=["moving"]))
+    assert line[:2] == (INFO, "verdict")
+    assert line[2].startswith("grasp 1: unknown (moving: fingers or object move")
+    assert said(journal, "verdict", verdict("closing", reasons=["moving"])) == []
+    slip = {"grasp": 1, "verdict": "slip", "reasons": [], "p_slip": 0.813}
+    assert said(journal, "verdict", slip) == [
+        (WARNING, "verdict", "grasp 1: slip (slips with a probability of 81.3%)")
+    ]
+    assert said(journal, "verdict", {**slip, "p_slip": 0.9}) == []
+
+
+def test_gate_outcome_state_and_health_are_said() -> None:
+    journal = Journal()
+    golden = Path(__file__).parents[1] / "publish" / "golden"
+    gate = json.loads((golden / "gate.json").read_bytes())
+    (line,) = said(journal, "gate", gate)
+    assert line[0] == INFO
+    assert f"{gate['former']} to {gate['state']} ({gate['cause']})" in line[2]
+    outcome = json.loads((golden / "outcome.json").read_bytes())
+    (line,) = said(journal, "outcome", outcome)
+    assert f"grasp {outcome['grasp']}: the lift ended in {outcome['outcome']}" in line[2]
+    well = {"state": "running", "health": {}}
+    ill = {"state": "running", "health": {"ff_7": "electrode-dead"}}
+    assert said(journal, "status", well) == [(INFO, "state", "running")]
+    (line,) = said(journal, "status", ill)
+    assert line[:2] == (WARNING, "health")
+    assert line[2].startswith("ff_7: electrode-dead: ")
+    assert said(journal, "status", ill) == []
+    assert said(journal, "status", well) == [(INFO, "health", "ff_7: well again")]
+    (line,) = said(journal, "status", {"state": "silent", "health": {"link": "stale"}})[:1]
+    assert line == (WARNING, "state", "silent")
+
+
+@pytest.mark.parametrize("kind", ["gate", "verdict", "outcome", "status", "joints", "log"])
+def test_a_broken_message_is_not_said(kind: str) -> None:
+    assert said(Journal(), kind, {"grasp": "one"}) == []
+
+
+def recorder(folder: Path) -> Recorder:
+    options = Record(flush_ms=100.0)
+    return Recorder(Retention(folder, "right", BOOT, 9, 10**9), options, HEADER)
+
+
+def tactile(number: int, counts: NDArray[np.int64] = REST) -> bytes:
+    return encode(
+        Tactile(
+            boot_id=BOOT,
+            seq=number,
+            t=0.0,
+            t_mono_ns=number,
+            fingers=["ff", "th"],
+            counts=counts.tolist(),
+            faults=np.zeros((2, 24), int).tolist(),
+        )
+    )
+
+
+def recorded(folder: Path) -> list[tuple[str, dict[str, Any]]]:
+    (path,) = folder.glob("*.mcap")
+    return [(kind, content) for kind, content in messages(path) if kind != "image"]
+
+
+def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
+    writing = recorder(tmp_path)
+    for number in range(3):
+        if number:
+            writing.on_asked()
+            writing.on_asked()
+        writing.send(b"tactile.right", tactile(number))
+    writing.close()
+    found = recorded(tmp_path)
+    assert [kind for kind, _ in found] == ["tactile"] * 3
+    assert [content.get("asked", False) for _, content in found] == [False, True, True]
+
+
+@pytest.mark.parametrize("event", ["skipped", "exchanged"])
+def test_a_question_before_an_event_stays_before_it(tmp_path: Path, event: str) -> None:
+    writing = recorder(tmp_path)
+    writing.on_asked()
+    if event == "skipped":
+        writing.on_skipped()
+    else:
+        writing.exchanged(None, None)
+    writing.send(b"tactile.right", tactile(0))
+    writing.close()
+    found = recorded(tmp_path)
+    assert [kind for kind, _ in found] == ["asked", event, "tactile"]
+    assert "asked" not in found[2][1]
+
+
+def play(path: Path) -> list[object]:
+    """Readings and questions, in their order."""
+    found: list[object] = []
+    driver = McapReplayDriver([path], ("th", "ff"))
+    driver.on_event = {Topic.ASKED: lambda: found.append("asked")}
+    with driver:
+        while not driver.exhausted:
+            found.extend(driver.read_ready())
+    assert driver.counters.malformed == 0
+    return found
+
+
+def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
+    counts = np.arange(48).reshape(2, 24)
+    writing = recorder(tmp_path)
+    angles = JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan]))
+    writing.on_joints(angles)
+    writing.on_asked()
+    writing.send(b"tactile.right", tactile(0, counts))
+    writing.close()
+    (path,) = tmp_path.glob("*.mcap")
+    joints, asked, played = play(path)
+    assert isinstance(joints, JointReading)
+    assert joints.names == angles.names
+    assert np.array_equal(joints.position_rad, angles.position_rad, equal_nan=True)
+    assert asked == "asked"
+    assert isinstance(played, TactileReading)
+    assert played.counts.tolist() == counts[::-1].tolist()
+
+
+def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
+    counts = np.arange(48).reshape(2, 24)
+    path = tmp_path / "old.mcap"
+    file = McapWriter(path, HEADER)
+    joints = {"v": 1, "seq": 3, "t_mono_ns": 5, "names": ["FFJ3", "THJ4"]}
+    old = json.dumps({**joints, "position_rad": [0.25, None]}).encode()
+    file.write(b"joints.right", old, 1)
+    file.write(b"asked.right", EVENT, 2)
+    file.write(b"tactile.right", tactile(0, counts), 3)
+    file.close()
+    angles, asked, played = play(path)
+    assert isinstance(angles, JointReading)
+    assert angles.names == ("FFJ3", "THJ4")
+    assert np.array_equal(angles.position_rad, [0.25, np.nan], equal_nan=True)
+    assert asked == "asked"
+    assert isinstance(played, TactileReading)
+    assert played.counts.tolist() == counts[::-1].tolist()
+
+
+def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
+    session = SessionState(weight=2.5, grasps=3, mean=(0.1, 1e-9), squares=(4.0, 0.0))
+    learned = LearnerState(outcomes=4, mean=bytes(range(16)), covariance=b"\xff" * 32)
+    writing = recorder(tmp_path)
+    writing.exchanged(session, learned)
+    writing.close()
+    (path,) = tmp_path.glob("*.mcap")
+    told: list[Exchanged] = []
+    driver = McapReplayDriver([path], ("ff",))
+    driver.on_exchange = told.append
+    with driver:
+        while not driver.exhausted:
+            driver.read_ready()
+    assert told == [Exchanged(session, learned)]
+
+
+def test_an_event_has_a_schema_too(tmp_path: Path) -> None:
+    assert {topic for topic in Topic if topic.message is Event} == {Topic.ASKED, Topic.SKIPPED}
+    writing = recorder(tmp_path)
+    writing.on_skipped()
+    writing.close()
+    (path,) = tmp_path.glob("*.mcap")
+    with open_recording(path) as stream:
+        assert [message.payload for message in McapReader(path, stream)] == [EVENT]

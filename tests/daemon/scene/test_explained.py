@@ -1,0 +1,135 @@
+"""What is told of a scene's keys is what its classes do."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from daemon import scene
+from daemon.scene import explained
+from tests.daemon.processes import graspd
+
+DEPLOY = Path(__file__).parents[3] / "deploy"
+SCHEMA = explained.schema()
+UNITS = {"_ms": "ms", "_s": "s", "_hz": "1/s", "_mb": "MB", "_minutes": "minutes"}
+"""What the end of a key's name says of its unit."""
+
+
+def keys_of(section: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """All keys of all sections, with what is said of each."""
+    for key, about in section["properties"].items():
+        yield f"{path}{key}", about
+        for inner in about.get("oneOf", (about,)):
+            if "properties" in inner:
+                yield from keys_of(inner, f"{path}{key}.")
+
+
+KEYS = list(keys_of(SCHEMA))
+
+
+def numbers(about: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    if about.get("type") in ("integer", "number"):
+        yield about
+    elif "items" in about:
+        yield from numbers(about["items"])
+
+
+@pytest.mark.parametrize(("key", "about"), KEYS, ids=[key for key, _ in KEYS])
+def test_every_key_has_a_meaning_and_every_number_a_unit(key: str, about: dict[str, Any]) -> None:
+    assert about["description"].endswith((".", ")"))
+    assert about["description"][0].isupper() or about["description"].startswith("`")
+    for number in numbers(about):
+        assert number["unit"]
+        for ending, unit in UNITS.items():
+            if key.endswith(ending) and not key.endswith("_per_s"):
+                assert number["unit"] == unit
+        assert number["unit"] == "-" or f"Unit: {number['unit']}." in about["description"]
+
+
+def test_the_package_has_the_very_examples_of_deploy() -> None:
+    assert explained.EXAMPLES.resolve() == DEPLOY / "scenes"
+    assert {"spi", "can", "palm", "demo"} <= set(explained.examples())
+
+
+def test_no_key_is_forgotten() -> None:
+    named = {key for key, _ in KEYS}
+    assert set(scene.Scene.model_fields) < named
+    assert {"tactile.port", "tactile.faults.seed", "gate.max_age_ms", "joints.calibration"} < named
+
+
+def test_the_schema_is_valid_and_the_file_of_the_editors_is_it() -> None:
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    assert (DEPLOY / "scenes" / explained.SCHEMA).read_text() == explained.schema_text(), (
+        "run: python -m daemon scene --schema > deploy/scenes/scene.schema.json"
+    )
+    assert graspd("scene", "--schema").stdout == explained.schema_text()
+
+
+def test_the_page_of_all_keys_is_up_to_date() -> None:
+    text = (DEPLOY / "SCENE.md").read_text()
+    assert text == explained.page(), "run: python -m daemon scene --page > deploy/SCENE.md"
+    assert text == graspd("scene", "--page").stdout
+    assert "| `max_age_ms` | number | ms | `100.0` | above 0 to 10_000 |" in text
+    assert "| `port` | string | - | needed | - |" in text
+    for link in (part.split(")")[0] for part in text.split("](")[1:]):
+        assert (DEPLOY / link).exists(), link
+
+
+@pytest.mark.parametrize("name", explained.examples())
+def test_an_example_is_the_file_in_deploy_and_right_anywhere(name: str, tmp_path: Path) -> None:
+    result = graspd("scene", "--example", name)
+    assert result.returncode == 0, result.stderr
+    path = tmp_path / "right.toml"
+    path.write_text(result.stdout)
+    assert result.stdout.startswith("#:schema file:///")
+    file = DEPLOY / "scenes" / f"{name}.toml"
+    assert file.read_text().startswith(f"#:schema ./{explained.SCHEMA}\n")
+    assert len(result.stdout.splitlines()) == len(file.read_text().splitlines())
+    checked = graspd("check", path)
+    assert (checked.returncode, checked.stdout.splitlines()[0]) == (0, f"{path}: fine")
+    jsonschema.validate(tomllib.loads(result.stdout), SCHEMA)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        '[tactile]\ndriver = "tactile"',
+        '[tactile]\ndriver = "spi"',
+        '[tactile]\ndriver = "spi"\nport = "x"\nbaud = 9600',
+        '[tactile]\ndriver = "spi"\nport = "x"\n[gate]\nmax_age_ms = 0',
+        '[tactile]\ndriver = "spi"\nport = "x"\n[gate]\nmax_age = 10',
+        '[tactile]\ndriver = "spi"\nport = "x"\n[hand]\nfingers = ["ft"]',
+        '[tactile]\ndriver = "spi"\nport = "x"\n[joints]\ndriver = "stream"\nsource = "tcp://x"',
+        '[tactile]\ndriver = "spi"\nport = "x"\n[realtime]\npriority = 99',
+    ],
+)
+def test_what_the_schema_refuses_the_daemon_refuses(text: str) -> None:
+    data = tomllib.loads(text)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(data, SCHEMA)
+    with pytest.raises(scene.SceneError):
+        scene.parse(data, Path("scene.toml"))
+
+
+def test_a_default_of_the_schema_is_the_default_of_the_scene() -> None:
+    optional: dict[str, dict[str, int]] = {
+        section: {} for section in ("risk", "ask", "realtime", "record")
+    }
+    data = {"tactile": {"driver": "spi", "port": "x"}, **optional}
+    found = scene.parse(data, Path("scene.toml"))
+    said = {
+        (section, key): about["default"]
+        for section, inside in SCHEMA["properties"].items()
+        for key, about in inside.get("properties", {}).items()
+        if "default" in about and getattr(found, section) is not None
+    }
+    assert len(said) >= 27
+    for (section, key), default in said.items():
+        actual = getattr(getattr(found, section), key)
+        assert default == (list(actual) if isinstance(actual, tuple) else actual)
