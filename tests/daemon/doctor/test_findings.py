@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.commands.diagnosis import (
-    ElectrodeStatistics,
-    Level,
-    counter_findings,
-    device_findings,
-    rate_finding,
-)
-from daemon.commands.doctor import can_interfaces
+from daemon.doctor.computer import can_interfaces
+from daemon.doctor.electrodes import ElectrodeStatistics
+from daemon.doctor.finding import Level
+from daemon.doctor.link import counter_findings, device_findings, rate_finding
+from daemon.doctor.surroundings import can_finding
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.link import LinkState
 
@@ -146,10 +143,10 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
         (tmp_path / name / "operstate").write_text(f"{state}\n")
-    up, down = can_interfaces(tmp_path)
+    up, down = map(can_finding, can_interfaces(tmp_path))
     assert up.what == "CAN interface can0 is up"
     assert (down.level, down.what) == (Level.WARNING, "CAN interface can1 is down")
-    assert "ip link set can1 up" in down.advice
+    assert "ip link set can1 up" in (down.advice or "")
 
 
 @pytest.mark.parametrize(
@@ -171,15 +168,15 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
         ("sweep", "10.42 ms is too long for 10.00 ms", Level.WARNING, "longer period"),
         ("clock", "trusted", Level.OK, ""),
         ("clock", "not trusted", Level.WARNING, "flash"),
-        ("last error", "no buffer space", Level.WARNING, ""),
+        ("last error", "no buffer space", Level.WARNING, "terminators"),
     ],
 )
 def test_what_a_device_says_is_judged(key: str, value: str, level: Level, advice: str) -> None:
     up, finding = device_findings("spi", {"link": "up", key: value})
     assert (up.level, up.what) == (Level.OK, "spi: link up")
     assert (finding.level, finding.what) == (level, f"spi: {key} {value}")
-    assert advice in finding.advice
-    assert bool(advice) == bool(finding.advice)
+    assert advice in (finding.advice or "")
+    assert bool(advice) == bool(finding.advice) == bool(finding.cause)
 
 
 @pytest.mark.parametrize("state", sorted({*LinkState} - {LinkState.UP}))
