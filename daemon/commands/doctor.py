@@ -43,6 +43,8 @@ above in their description, are greeted unasked: other devices may not like it."
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
 NARROWEST = 40
 """Columns of a terminal that lines are broken for."""
+WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
+"""Of a device, these explain that no finger is felt."""
 FINGER_COLUMNS, USUAL_COLUMNS = 25, 80
 """Of a finger in the table of electrodes, and of that where there is no terminal."""
 
@@ -108,7 +110,7 @@ def examine(
             what = f"{told[0].what}; no reading in {seconds:.1f} s"
             told[0] = dataclasses.replace(told[0], what=what)
         if readings:
-            told += _of_electrodes(statistics, told)
+            told = _with_electrodes(told, statistics)
         found.append(roots(told))
     return found
 
@@ -215,17 +217,19 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     return (last_s - first_s) * statistics.readings / (statistics.readings - 1)
 
 
-def _of_electrodes(statistics: ElectrodeStatistics, told: Sequence[Finding]) -> list[Finding]:
-    """What the electrodes say; not of every finger that it is absent, where the device says so of
-    all."""
-    is_bare = any(
-        finding.cause is Cause.SENSOR_ABSENT and finding.level is Level.ERROR for finding in told
-    )
-    return [
-        finding
-        for finding in statistics.findings()
-        if not (is_bare and finding.cause is Cause.SENSOR_ABSENT)
+def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:
+    """What was told of a device, and what its electrodes say; where no finger is felt and the
+    device as a whole explains it, that is the error, and not every finger."""
+    found = statistics.findings()
+    absent = [finding for finding in found if finding.cause is Cause.SENSOR_ABSENT]
+    whole = [finding for finding in told if finding.cause in WHOLE_DEVICE]
+    if not whole or len(absent) < len(statistics.fingers):
+        return told + found
+    raised = [
+        dataclasses.replace(finding, level=Level.ERROR) if finding in whole else finding
+        for finding in told
     ]
+    return raised + [finding for finding in found if finding not in absent]
 
 
 def _wrapped(text: str, first: str, further: str, width: int) -> list[str]:

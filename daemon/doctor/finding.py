@@ -40,6 +40,9 @@ class Cause(StrEnum):
     FOREIGN_SENDER = "foreign-sender"
     DAMAGED = "damaged-bytes"
     FRAMES_LOST = "frames-lost"
+    OUT_OF_ORDER = "out-of-order"
+    RESTARTED = "restarted"
+    """The board began anew."""
     COMPUTER_BUSY = "computer-busy"
     SLOW = "slow"
     CLOCK = "clock"
@@ -66,17 +69,21 @@ class Cause(StrEnum):
     REALTIME = "realtime"
 
 
-_ANY_LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD})
+_LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD})
+_NOISE = frozenset({Cause.SENSOR_WORDS, Cause.REPEATED, Cause.ELECTRODE_RESTLESS})
 EXPLAINS = {
-    Cause.LINK_LOST: _ANY_LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED},
-    Cause.DAMAGED: _ANY_LOSS | {Cause.CLOCK, Cause.REPEATED},
-    Cause.BUS_ERRORS: _ANY_LOSS,
-    Cause.COMPUTER_BUSY: _ANY_LOSS | {Cause.CLOCK},
-    Cause.REPEATED: frozenset({Cause.FRAMES_LOST, Cause.SLOW}),
-    Cause.CLOCK: frozenset({Cause.REPEATED}),
-    Cause.SETTINGS: _ANY_LOSS,
+    Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED, Cause.RESTARTED},
+    Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
+    Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},
+    Cause.COMPUTER_BUSY: _LOSS | {Cause.CLOCK, Cause.OUT_OF_ORDER, Cause.RESTARTED},
+    Cause.SENSOR_WORDS: frozenset({Cause.RESTARTED, Cause.ELECTRODE_UNREAD}),
+    Cause.CLOCK: frozenset({Cause.REPEATED, Cause.RESTARTED}),
+    Cause.OUT_OF_ORDER: _LOSS | {Cause.RESTARTED},
+    Cause.REPEATED: frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.RESTARTED}),
+    Cause.RESTARTED: _LOSS,
+    Cause.SETTINGS: _LOSS,
     Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
-    Cause.PORT_HELD: _ANY_LOSS | {Cause.DAMAGED, Cause.SOCKET_HELD},
+    Cause.PORT_HELD: _LOSS | {Cause.DAMAGED, Cause.SOCKET_HELD},
 }
 """What follows from a cause, and is not named beside it."""
 

@@ -104,15 +104,18 @@ NOT_OURS = {
         *("foreign_frames", "frames"),
     ): Trouble(
         Cause.SETTINGS,
-        "let format, arbitration_id, sequence and data_length be those of the board: candump "
-        "shows what it sends",
+        "let format, arbitration_id, sequence and data_length be those of the board (candump shows "
+        "what it sends); are sensors connected to it?",
     ),
 }
 """What comes over a link that is silent for us, by counters."""
 COUNTERS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
-    ("link_losses", "restarts"): Trouble(
+    ("link_losses",): Trouble(
         Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"
+    ),
+    ("restarts",): Trouble(
+        Cause.RESTARTED, f"the board began anew: {AGAIN}, its supply and reset line"
     ),
     ("error_frames", "bus_off"): Trouble(
         Cause.BUS_ERRORS,
@@ -121,6 +124,7 @@ COUNTERS = {
     (
         *("bad_cobs", "bad_crc", "too_long", "bad_frames", "unknown_frames", "malformed_frames"),
         *("wrong_length_frames", "unknown_commands", "nonsense_packets", "bad_lengths"),
+        "not_counts",
     ): Trouble(
         Cause.DAMAGED,
         f"damaged or foreign bytes: {AGAIN}, cable and hub, and who else sends there",
@@ -147,12 +151,17 @@ COUNTERS = {
     ),
     (
         *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
-        *("interrupted_rounds", "controller_overflows", "reordered", "reordered_frames"),
-        *("reordered_packets", "late_frames", "late_packets"),
+        *("interrupted_rounds", "controller_overflows"),
         *("unsynchronised_frames", "unsynchronised_packets"),
     ): Trouble(
         Cause.FRAMES_LOST,
         f"lost or late on the way: {AGAIN}, see the load of bus, hub and this computer",
+    ),
+    (
+        *("reordered", "reordered_frames", "reordered_packets", "late_frames", "late_packets"),
+    ): Trouble(
+        Cause.OUT_OF_ORDER,
+        f"frames overtake each other: {AGAIN}, what lies between board and computer (relay, hub)",
     ),
     ("service_packets", "empty_packets"): Trouble(
         Cause.PALM_MODE,
@@ -161,7 +170,7 @@ COUNTERS = {
     ("bad_messages", "unknown_names", "bad_angles"): Trouble(
         Cause.JOINTS, "what is no joint or no angle is left out: deploy/wire/JOINTS.md"
     ),
-    ("not_counts", "cut_off", "malformed"): Trouble(
+    ("cut_off", "malformed"): Trouble(
         Cause.RECORDING, "the recording is damaged or ends in the middle: record it again"
     ),
 }
@@ -202,6 +211,8 @@ def device_findings(
     if link != "up":
         return [_of_link(driver, link if why is None else f"{link}: {why}", counters or {})]
     found = [fine(f"{driver}: link up")] if "link" in device else []
+    if told.get("last error", "").startswith("nothing from"):
+        del told["last error"]  # a silence that is over: counted among the losses of the link
     if "spi errors" in told:
         told["spi errors"] = _of_present(told["spi errors"], told.get("sensors", ""))
     for key, value in told.items():
