@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 
@@ -69,9 +69,9 @@ class Cause(StrEnum):
     REALTIME = "realtime"
 
 
-_LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD})
+_LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD, Cause.SILENT})
 _NOISE = frozenset({Cause.SENSOR_WORDS, Cause.REPEATED, Cause.ELECTRODE_RESTLESS})
-EXPLAINS = {
+EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED, Cause.RESTARTED},
     Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
     Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},
@@ -79,9 +79,11 @@ EXPLAINS = {
     Cause.SENSOR_WORDS: frozenset({Cause.RESTARTED, Cause.ELECTRODE_UNREAD}),
     Cause.CLOCK: frozenset({Cause.REPEATED, Cause.RESTARTED}),
     Cause.OUT_OF_ORDER: _LOSS | {Cause.RESTARTED},
-    Cause.REPEATED: frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.RESTARTED}),
+    Cause.REPEATED: _LOSS | {Cause.RESTARTED},
     Cause.RESTARTED: _LOSS,
     Cause.SETTINGS: _LOSS,
+    Cause.PALM_MODE: _LOSS,
+    Cause.JOINTS: frozenset({Cause.FRAMES_LOST}),
     Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
     Cause.PORT_HELD: _LOSS | {Cause.DAMAGED, Cause.SOCKET_HELD},
 }
@@ -110,8 +112,18 @@ def fine(what: str) -> Finding:
 
 
 def roots(findings: Iterable[Finding]) -> list[Finding]:
-    """The findings without those that follow from another one's cause."""
+    """The findings without those that follow from another one's cause.
+
+    A cause is as bad as what follows from it.
+    """
     findings = list(findings)
-    causes = {finding.cause for finding in findings if finding.cause is not None}
-    explained = frozenset[Cause]().union(*(EXPLAINS.get(cause, ()) for cause in causes))
-    return [finding for finding in findings if finding.cause not in explained]
+    causes = {finding.cause for finding in findings}
+    follows = {effect for cause in causes for effect in EXPLAINS.get(cause, ())}
+    errors = {finding.cause for finding in findings if finding.level is Level.ERROR}
+    return [
+        replace(finding, level=Level.ERROR)
+        if errors & EXPLAINS.get(finding.cause, frozenset())
+        else finding
+        for finding in findings
+        if finding.cause not in follows
+    ]

@@ -50,7 +50,7 @@ LINK_TROUBLES = {
         Cause.SENSOR_WORDS, "serial numbers are misread: see supply, ground, MISO and its pull-up"
     ),
     "no sweep|nothing from the board|nothing good": Trouble(
-        Cause.SILENT,
+        Cause.LINK_LOST,
         "it began and stopped: see its supply and cable, and how busy this computer is",
     ),
     "went away|was reset": Trouble(
@@ -256,7 +256,7 @@ def _of_link(driver: str, link: str, counters: Mapping[str, int]) -> Finding:
     """Why a link is not up, by what it says and by what came nevertheless."""
     what = f"{driver}: link {link}"
     trouble = next(trouble for part, trouble in LINK_TROUBLES.items() if re.search(part, link))
-    if trouble.cause is Cause.SILENT:
+    if trouble.cause is Cause.SILENT and not counters.get("link_losses"):
         for names, other in NOT_OURS.items():
             if counted := _counted(names, counters):
                 what, trouble = f"{what}, but {counted}", other
