@@ -62,7 +62,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="listen so long (default: 3)",
     )
     parser.add_argument("--all", action="store_true", help="a table of all electrodes too")
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="one JSON object on stdout; a finding that is not ok has a cause and advice",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -35,11 +35,12 @@ LINK_TROUBLES = {
         Cause.PORT_MISSING,
         "plug it in, or name one that there is; a Pico that is a drive has no firmware yet",
     ),
-    "another program|in use": Trouble(
+    "another program|in use|exclusively lock": Trouble(
         Cause.PORT_HELD,
-        "fuser -v and the port names it; a daemon: systemctl stop 'graspd@*'",
+        "sudo fuser -v and the port names it (of UDP: sudo ss -ulpn); a daemon: systemctl stop "
+        "'graspd@*'",
     ),
-    "[Pp]ermission denied": Trouble(
+    "permission denied": Trouble(
         Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
     ),
     "speaks version|has layout": Trouble(Cause.VERSION, FLASH),
@@ -255,7 +256,9 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
 def _of_link(driver: str, link: str, counters: Mapping[str, int]) -> Finding:
     """Why a link is not up, by what it says and by what came nevertheless."""
     what = f"{driver}: link {link}"
-    trouble = next(trouble for part, trouble in LINK_TROUBLES.items() if re.search(part, link))
+    trouble = next(
+        trouble for part, trouble in LINK_TROUBLES.items() if re.search(part, link, re.IGNORECASE)
+    )
     if trouble.cause is Cause.SILENT and not counters.get("link_losses"):
         for names, other in NOT_OURS.items():
             if counted := _counted(names, counters):

@@ -51,18 +51,17 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
     `section` is the one of the scene that names the link's driver.
     """
     match section, finding.cause:
-        case SpiTactile(), Cause.PORT_MISSING:
-            ports = [fine(str(port)) for port in computer.serial_ports()]
-            return [finding, *(ports or [fine("no serial port is there")])]
-        case SpiTactile(), Cause.PORT_DENIED:
-            return [_denied(finding, section.port)]
-        case SpiTactile(), Cause.PORT_HELD:
-            return [_held(finding, computer.file_holders(section.port))]
-        case PalmTactile() | StreamJoints(), Cause.PORT_HELD:
-            port = Endpoint.parse(section.source).port
-            return [_held(finding, computer.udp_holders(port))]
         case CanTactile(interface="socketcan"), _:
             return _on_socketcan(finding, section)
+        case SpiTactile() | CanTactile(), Cause.PORT_MISSING:
+            ports = [fine(str(port)) for port in computer.serial_ports()]
+            return [finding, *(ports or [fine("no serial port is there")])]
+        case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_DENIED:
+            return [_denied(finding, port)]
+        case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_HELD:
+            return [_held(finding, computer.file_holders(port))]
+        case PalmTactile(source=source) | StreamJoints(source=source), Cause.PORT_HELD:
+            return [_held(finding, computer.udp_holders(Endpoint.parse(source).port))]
         case _:
             return [finding]
 
@@ -115,6 +114,9 @@ def _denied(finding: Finding, port: str) -> Finding:
         group = grp.getgrgid(os.stat(port).st_gid).gr_name
     except (OSError, KeyError):
         return finding
+    if group == "root":  # whose groups are nobody's to join
+        advice = "install deploy/udev/70-graspd.rules, and plug it in anew"
+        return replace(finding, advice=advice)
     return replace(finding, advice=f"sudo usermod -aG {group} $USER, then log in again")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ import threading
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -233,13 +235,24 @@ def refused(number: int) -> Callable[..., object]:
     return open_port
 
 
+@pytest.mark.parametrize(
+    ("group", "advice"),
+    [
+        ("dialout", "sudo usermod -aG dialout $USER, then log in again"),
+        ("root", "install deploy/udev/70-graspd.rules, and plug it in anew"),
+    ],
+)
 def test_a_port_that_is_denied_is_told_with_its_group(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    group: str,
+    advice: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("serial.serial_for_url", refused(13))
+    monkeypatch.setattr("serial.serial_for_url", refused(errno.EACCES))
+    monkeypatch.setattr("grp.getgrgid", lambda number: SimpleNamespace(gr_name=group))
     (told,) = look(tmp_path, capsys, SPI.format("/dev/tty") + MODEL + published(tmp_path))
-    assert told["cause"] == "port-denied"
-    assert told["advice"].startswith("sudo usermod -aG ")
+    assert (told["cause"], told["advice"]) == ("port-denied", advice)
 
 
 HOLD_LOCKED = """
@@ -464,7 +477,7 @@ def test_rights_that_a_user_lacks_are_told(
     monkeypatch.setattr("os.geteuid", lambda: 12345)
     monkeypatch.setattr("os.getegid", lambda: 12345)
     monkeypatch.setattr("os.getgroups", list)
-    monkeypatch.setattr("os.sched_setscheduler", refused(1))
+    monkeypatch.setattr("os.sched_setscheduler", refused(errno.EPERM))
     text = healthy + MODEL + "[realtime]\npriority = 40\nlock_memory = false\n"
     told = look(tmp_path, capsys, text + published(tmp_path, 'group = "daemon"\n'))
     mine = {f["cause"]: f["advice"] for f in told if not f["what"].startswith("spi: ")}
@@ -483,3 +496,35 @@ def test_a_folder_that_one_may_not_write_is_told(
     told = look(tmp_path, capsys, healthy + MODEL + published(tmp_path))
     mine = [finding for finding in told if not finding["what"].startswith("spi: ")]
     assert [finding["cause"] for finding in mine] == ["socket-denied"]
+
+
+# ---- how it is said -----------------------------------------------------------------------------
+
+
+def test_a_terminal_of_80_columns_is_not_overrun_and_elsewhere_a_finding_is_a_line() -> None:
+    advice = "look at this and at that, " * 8
+    told = [
+        Finding(Level.ERROR, "something is wrong " * 6, Cause.SLOW, advice),
+        Finding(Level.OK, "something is fine"),
+    ]
+    people = list(doctor.in_words(told, 80))
+    assert max(map(len, people)) <= 80
+    assert people[0].startswith("!! something")
+    assert sum(line.startswith("   -> look") for line in people) == 1
+    assert people[-3:] == ["ok something is fine", "", "1 wrong, 0 to look at"]
+    assert len(list(doctor.in_words(told, None))) == len(told) + 2
+
+
+def test_the_table_of_electrodes_is_shown_with_all_only_and_fits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(healthy + MODEL + published(tmp_path))
+    doctor.run(_arguments(scene))
+    assert "mean, sd, faulty" not in capsys.readouterr().out
+    doctor.run(_arguments(scene, "--all"))
+    _, table = capsys.readouterr().out.split("to look at\n\n")
+    lines = table.splitlines()
+    assert len(lines) == 25
+    assert max(map(len, lines)) <= 80
+    assert [line.split()[0] for line in lines[1:]] == [str(number) for number in range(1, 25)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from daemon.doctor.computer import can_interfaces
 from daemon.doctor.electrodes import ElectrodeStatistics
-from daemon.doctor.finding import Level
+from daemon.doctor.finding import Cause, Level
 from daemon.doctor.link import counter_findings, device_findings, rate_finding
 from daemon.doctor.surroundings import can_finding
 from drivers.base import ElectrodeFault, TactileReading
@@ -106,6 +106,40 @@ def test_a_fault_is_found_and_named(
     assert finding.level is level
     assert finding.what.startswith(says)
     assert finding.advice
+
+
+def at_a_rail_with_noise(counts: Counts, _faults: object, number: int) -> None:
+    counts[1, 7] = 4085.0 + 3.0 * (number % 3)
+
+
+def touched(counts: Counts, _faults: object, number: int) -> None:
+    counts[1, 3:12] -= 300.0 * np.sin(number / 10.0)
+
+
+def all_at_a_rail(counts: Counts, _faults: object, _number: int) -> None:
+    counts[1] = 0.0
+
+
+def all_frozen(counts: Counts, _faults: object, _number: int) -> None:
+    counts[1] = 2500.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "level", "cause", "says"),
+    [
+        (at_a_rail_with_noise, Level.WARNING, Cause.ELECTRODE_RAIL, "mf_8 near the end"),
+        (touched, Level.OK, None, "mf is touched or moves: 9 of its electrodes do"),
+        (all_at_a_rail, Level.ERROR, Cause.SENSOR_ABSENT, "mf: no electrode can be read"),
+        (all_frozen, Level.ERROR, Cause.REPEATED, "mf: all counts are frozen"),
+    ],
+)
+def test_hardware_is_accused_by_two_signs_only(
+    spoil: Callable[[Counts, Faults, int], None], level: Level, cause: Cause | None, says: str
+) -> None:
+    (finding,) = statistics(spoil).findings()
+    assert (finding.level, finding.cause) == (level, cause)
+    assert finding.what.startswith(says)
+    assert "replace" not in (finding.advice or "")
 
 
 def test_no_readings_is_no_electrode_finding() -> None:
