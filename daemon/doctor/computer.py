@@ -15,6 +15,8 @@ PROC = Path("/proc")
 NETWORK = Path("/sys/class/net")
 ARPHRD_CAN = "280"
 """Type of a CAN interface in `/sys/class/net/*/type`."""
+LISTENING = {"tcp": {"0A"}, "udp": {"01", "07"}}
+"""States in `/proc/net` of a socket that has a port for itself."""
 IP_TIMEOUT_S = 5.0
 COMMAND_MAX = 120
 """Characters of a command that are shown."""
@@ -56,6 +58,11 @@ class CanInterface:
     def is_down(self) -> bool:
         """Whether nothing can come over it."""
         return self.state in ("down", "stopped")
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether its controller has nothing to complain of."""
+        return self.state in ("up", "error-active")
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,14 +153,15 @@ def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
     return _processes(opened, proc)
 
 
-def udp_holders(port: int, proc: Path = PROC) -> list[Process]:
-    """Other processes that listen on a UDP port, as far as we may know it."""
+def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
+    """Other processes that listen on a port of `udp` or `tcp`, as far as we may know it."""
     inodes = set()
-    for table in ("udp", "udp6"):
+    for table in (protocol, f"{protocol}6"):
         with suppress(OSError):
             for line in (proc / "net" / table).read_text().splitlines()[1:]:
                 words = line.split()
-                if int(words[1].rpartition(":")[2], 16) == port:
+                is_mine = int(words[1].rpartition(":")[2], 16) == port
+                if is_mine and words[3] in LISTENING[protocol]:
                     inodes.add(int(words[9]))
     return _processes(_with_open(inodes, proc), proc)
 

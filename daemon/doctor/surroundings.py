@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import grp
 import os
+import socket
 import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,6 +22,10 @@ from models.contract import ModelError
 
 BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
 """Of the boards in deploy/can/PROTOCOL.md, bit/s, unless the scene says otherwise."""
+NOT_HEARD = frozenset(
+    {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
+)
+"""Where nothing comes over an interface, the kernel knows more of it."""
 HELD_BY_GRASPD = (
     "graspd itself runs: graspd watch shows what it sees; to look from here end it first "
     "(systemctl stop 'graspd@*')"
@@ -51,7 +57,7 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
     `section` is the one of the scene that names the link's driver.
     """
     match section, finding.cause:
-        case CanTactile(interface="socketcan"), _:
+        case CanTactile(interface="socketcan"), cause if cause in NOT_HEARD:
             return _on_socketcan(finding, section)
         case SpiTactile() | CanTactile(), Cause.PORT_MISSING:
             ports = [fine(str(port)) for port in computer.serial_ports()]
@@ -61,17 +67,21 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
         case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_HELD:
             return [_held(finding, computer.file_holders(port))]
         case PalmTactile(source=source) | StreamJoints(source=source), Cause.PORT_HELD:
-            return [_held(finding, computer.udp_holders(Endpoint.parse(source).port))]
+            number = Endpoint.parse(source).port
+            return [_held(finding, computer.port_holders("udp", number))]
         case _:
             return [finding]
 
 
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
     """The state of a CAN interface, and how to bring it up for this section of a scene."""
-    if not interface.is_down:
+    if interface.is_fine:
         return fine(str(interface))
-    advice = ip_link(interface.name, tactile)
-    return Finding(Level.WARNING, str(interface), Cause.INTERFACE_DOWN, advice)
+    line = ip_link(interface.name, tactile)
+    if interface.is_down:
+        return Finding(Level.WARNING, str(interface), Cause.INTERFACE_DOWN, line)
+    advice = f"is its bit rate the board's? sudo ip link set {interface.name} down; {line}"
+    return Finding(Level.WARNING, str(interface), Cause.BUS_ERRORS, advice)
 
 
 def ip_link(name: str, tactile: CanTactile | None) -> str:
@@ -90,10 +100,13 @@ def socket_findings(wanted: Scene) -> list[Finding]:
     sockets += [] if ask is None else [("ask", ask, wanted.ask_group)]
     found: dict[Cause | None, Finding] = {}
     for name, endpoint, group in sockets:
-        if endpoint.startswith("ipc://"):
-            path = Path(endpoint.removeprefix("ipc://"))
-            for finding in (*_of_socket(name, path), *_of_group(name, group)):
-                found.setdefault(finding.cause, finding)
+        scheme, _, address = endpoint.partition("://")
+        if scheme == "ipc":
+            told = (*_of_socket(name, Path(address)), *_of_group(name, group))
+        else:
+            told = tuple(_of_port(name, address))
+        for finding in told:
+            found.setdefault(finding.cause, finding)
     return list(found.values())
 
 
@@ -167,6 +180,25 @@ def _of_socket(name: str, path: Path) -> Iterator[Finding]:
         what = f"{name}: you may not make {path}"
         owner = folder.owner()
         yield Finding(warning, what, Cause.SOCKET_DENIED, f"as its owner: sudo -u {owner} graspd")
+
+
+def _of_port(name: str, address: str) -> Iterator[Finding]:
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, int(port)))
+        except OSError as error:
+            what = f"{name}: tcp://{address}: {error.strerror}"
+            if error.errno != errno.EADDRINUSE:
+                advice = "ip -brief address has those of this computer: name one of them"
+                yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
+                return
+            advice = f"sudo ss -tlpn 'sport = {port}' names who has it"
+            held = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
+            yield _held(held, computer.port_holders("tcp", int(port)))
 
 
 def _of_group(name: str, group: str | None) -> Iterator[Finding]:

@@ -24,6 +24,7 @@ from daemon.doctor import computer
 from daemon.doctor.electrodes import ElectrodeStatistics
 from daemon.doctor.finding import Cause, Finding, Level
 from daemon.doctor.link import COUNTERS, counter_findings
+from daemon.doctor.surroundings import can_finding
 from drivers.base import DriverCounters
 from drivers.can.readings import CanCounters
 from drivers.joints.message import JointCounters
@@ -36,7 +37,7 @@ from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from tests.daemon.doctor.emulated import FINGERS, LINKS, STEPS_PER_S, Hand, faults_told, listen
 from tests.daemon.processes import start, wait_for
-from tests.drivers.can.can_standin import LOOPBACK, SocketBus
+from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
 
 LOOK_S = 3
 
@@ -270,6 +271,13 @@ print(held.getsockname()[1], flush=True)
 sys.stdin.read()
 """
 
+HOLD_TCP = """
+import socket, sys
+held = socket.create_server(("127.0.0.1", 0))
+print(held.getsockname()[1], flush=True)
+sys.stdin.read()
+"""
+
 
 @contextlib.contextmanager
 def holder(program: str, *arguments: object) -> Iterator[tuple[int, str]]:
@@ -381,6 +389,44 @@ def test_an_interface_that_is_down_or_at_another_rate_is_told_with_the_command(
         (told,) = look(tmp_path, capsys, text)
     assert told["cause"] == cause
     assert advice in told["advice"]
+
+
+@pytest.mark.parametrize("state", ["bus-off", "error-passive"])
+def test_a_controller_in_trouble_is_not_said_to_be_fine(state: str) -> None:
+    told = can_finding(computer.CanInterface("can0", state, 1_000_000))
+    assert (told.level, told.cause) == (Level.WARNING, Cause.BUS_ERRORS)
+    assert "sudo ip link set can0 down; sudo ip link set can0 up type can" in (told.advice or "")
+
+
+def test_a_board_that_is_heard_has_the_bit_rate_of_its_interface(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    there = computer.CanInterface(LOOPBACK, "error-active", 500_000)
+    monkeypatch.setattr(computer, "can_interfaces", lambda: [there])
+    with SocketBus() as bus:
+        monkeypatch.setattr("drivers.can.bus.can.Bus", lambda **_: bus)
+        for sweep in range(3):
+            for frame in sweep_of_frames(sweep):
+                bus.send(frame)
+        text = CAN.format(LOOPBACK) + 'sequence = "electrodes"\n' + MODEL + published(tmp_path)
+        told = look(tmp_path, capsys, text)
+    assert {finding["cause"] for finding in told} == {"link-lost"}, told
+
+
+@pytest.mark.parametrize(
+    ("host", "cause"), [("127.0.0.1", "socket-held"), ("192.0.2.1", "address")]
+)
+def test_a_port_to_publish_on_that_cannot_be_had_is_told(
+    host: str, cause: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
+) -> None:
+    with holder(HOLD_TCP) as (pid, port):
+        endpoint = f'[publish]\nendpoint = "tcp://{host}:{port}"\n'
+        if cause == "address":
+            endpoint += '[curve]\nsecret_key = "k"\nclients = "c"\n'
+        told = look(tmp_path, capsys, healthy + MODEL + endpoint)
+    mine = [finding for finding in told if not finding["what"].startswith("spi: ")]
+    assert [finding["cause"] for finding in mine] == [cause]
+    assert (f"PID {pid}, " in mine[0]["what"]) == (cause == "socket-held")
 
 
 def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
