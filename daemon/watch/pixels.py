@@ -12,7 +12,7 @@ from rich.style import Style
 from rich.text import Text
 
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerImage, FingerMotion
-from daemon.watch.snapshot import TONE_CODE, Tone
+from daemon.watch.snapshot import Tone
 
 COLOURS = {
     Tone.STABLE: "#2da44e",
@@ -31,14 +31,19 @@ PLAIN = {
     Tone.SLIP: "X",
     Tone.WAITING: ".",
     Tone.TROUBLE: "?",
-    Tone.SILENT: " ",
+    Tone.SILENT: "~",
 }
-"""The same in a strip without colour."""
-ALARM = (
-    *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
-    *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
-)
-"""Of several moments in one column, the first of these is shown."""
+"""Signs of the same in a timeline."""
+WORDS = {
+    Tone.SLIP: "slip",
+    Tone.STABLE: "stable",
+    Tone.LEANS: "leans",
+    Tone.LEARNING: "watched",
+    Tone.TROUBLE: "wrong",
+    Tone.WAITING: "waiting",
+    Tone.SILENT: "silent",
+}
+"""Words for the same."""
 _RISEN, _REST = (59, 125, 216), (38, 44, 54)
 _PRESSED = ((11, (92, 44, 104)), (30, (158, 47, 98)), (55, (229, 92, 48)), (80, (251, 180, 26)))
 _DEEPEST = (252, 255, 190)
@@ -119,22 +124,36 @@ class Canvas:
         text.append(self.limit, "bold").append(full * moving, style)
         return text.append(empty * (above - moving), "dim")
 
-    def strip(self, history: str, moments: int, width: int) -> Text:
-        """Tones of the last `moments` snapshots, the newest at the right."""
-        tones = {code: tone for tone, code in TONE_CODE.items()}
-        padded = history.rjust(moments)
-        text = Text()
-        for column in range(width):
-            part = padded[column * moments // width : (column + 1) * moments // width]
-            seen = {tones[code] for code in part if code in tones}
-            tone = next((each for each in ALARM if each in seen), None)
-            if tone is None:
-                text.append(" ")
-            elif self.colour and not self.ascii_only:
-                text.append("█", self.style(tone))
-            else:
-                text.append(PLAIN[tone])
-        return text
+    @property
+    def sigma(self) -> str:
+        """The unit of motion, one character wide; blank where it cannot be written."""
+        return " " if self.ascii_only else "\u03c3"
+
+    @property
+    def point(self) -> str:
+        """A point of a plot."""
+        return "*" if self.ascii_only else "\u25cf"
+
+    @property
+    def rule(self) -> str:
+        """What a plot is where it has no point."""
+        return "." if self.ascii_only else "\u00b7"
+
+    def moment(self, tone: Tone | None) -> Text:
+        """A moment of the timeline: its sign, on its colour where there is colour."""
+        if tone is None:
+            return Text(" ")
+        return Text(PLAIN[tone], self._on_colour(tone))
+
+    def legend(self) -> list[Text]:
+        """The signs of the timeline, each with its word."""
+        return [
+            Text(PLAIN[tone], self._on_colour(tone)).append(f" {word}", "dim")
+            for tone, word in WORDS.items()
+        ]
+
+    def _on_colour(self, tone: Tone) -> Style:
+        return _moment(tone) if self.colour and not self.ascii_only else Style()
 
     def style(self, tone: Tone) -> Style:
         """Letters in the colour of a tone."""
@@ -166,6 +185,11 @@ def _between(one: tuple[int, int, int], other: tuple[int, int, int], share: floa
 def _style(upper: int, lower: int) -> Style:
     """Of two pixels in one character; made once, because that takes longer than all else."""
     return Style(color=_colour(upper), bgcolor=_colour(lower))
+
+
+@functools.cache
+def _moment(tone: Tone) -> Style:
+    return Style(color="#ffffff", bgcolor=COLOURS[tone])
 
 
 def _colour(level: int) -> Color:

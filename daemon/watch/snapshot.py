@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import StrEnum
 
 import msgspec
@@ -36,6 +37,19 @@ TONE_CODE = {
     Tone.SILENT: ".",
 }
 """In `Snapshot.history`."""
+TONES = {code: tone for tone, code in TONE_CODE.items()}
+WORST_FIRST = (
+    *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
+    *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
+)
+"""Of several moments in one column, the first of these is shown."""
+MOMENTS = 300
+"""Seconds that the timeline goes back: five minutes."""
+
+
+def worst(tones: Iterable[Tone]) -> Tone:
+    """The one of them to be shown where there is room for one. Raises `ValueError` for none."""
+    return min(tones, key=WORST_FIRST.index)
 
 
 class Line(msgspec.Struct, frozen=True):
@@ -96,6 +110,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     hand: str | None
     t: float
     """Wall-clock seconds since 1970 here."""
+    last_t: float | None
+    """The same of the last verdict's arrival: of a silent hand, all figures are of then."""
     tone: Tone
     verdict: str
     """`stable`, `slip` or `unknown`; unknown too when no message comes."""
@@ -126,11 +142,11 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     state: str | None
     """Of the daemon: `running`, `silent` or `stopping`."""
     counts: dict[str, int]
-    """Verdicts since the daemon's start, by outcome."""
+    """Grasps seen here, by the verdict that each had last."""
     drivers: dict[str, dict[str, int]]
     model: str | None
     versions: dict[str, str]
     history: str
-    """Tones of the last half minute, oldest first, ten per second; see `TONE_CODE`."""
+    """Worst tone of each second of the last five minutes, the oldest first; see `TONE_CODE`."""
     history_p: list[int]
-    """The same for the probability of slip, %; -1 where there is none."""
+    """The same for the highest probability of slip, %; -1 where there is none."""

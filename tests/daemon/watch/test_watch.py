@@ -25,7 +25,7 @@ from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerMotion, Rest, image
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Line, Snapshot, Tone
 from daemon.watch.terminal import draw
-from daemon.watch.view import HISTORY, View
+from daemon.watch.view import View
 from models.layout import D1
 from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, status, tactile, verdict
 
@@ -71,10 +71,13 @@ def rested(view: View, readings: int = 30) -> None:
         view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
 
 
-def text_of(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[str]:
+def text_of(
+    seen: Snapshot | list[Snapshot], width: int, height: int, canvas: Canvas, chosen: int = 0
+) -> list[str]:
+    hands = seen if isinstance(seen, list) else [seen]
     file = io.StringIO()
     console = Console(file=file, width=width, height=height, color_system=None)
-    console.print(draw(seen, width, height, canvas))
+    console.print(draw(hands, width, height, canvas, chosen))
     return file.getvalue().splitlines()
 
 

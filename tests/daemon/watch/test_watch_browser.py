@@ -15,7 +15,7 @@ import pytest
 from daemon.judge.reasons import Decision
 from daemon.watch.feed import Feed
 from daemon.watch.view import View
-from daemon.watch.watching import TICK_S, snapshots
+from daemon.watch.watching import TICK_S, Watched, snapshots
 from daemon.watch.web import Newest, Server
 from tests.daemon.watch.browser import CHROMIUM, Browser
 from tests.daemon.watch.watch_fakes import Talker, verdict
@@ -24,10 +24,10 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt insta
 
 COLOURS = {
     "light": {"stable": "rgb(26, 127, 55)", "slip": "rgb(207, 34, 46)"},
-    "dark": {"stable": "rgb(35, 139, 67)", "slip": "rgb(218, 63, 69)"},
+    "dark": {"stable": "rgb(31, 128, 64)", "slip": "rgb(208, 53, 60)"},
 }
 """Green and red of both themes, as the page's style has them."""
-BANNER = "document.getElementById('banner')"
+BANNER = "document.querySelector('.banner')"
 
 
 class Page:
@@ -51,8 +51,8 @@ class Page:
 
     def _publish(self) -> None:
         with Feed(self._endpoint) as feed:
-            view = View(self._endpoint)
-            for seen in snapshots(feed, view, lambda: self._over.wait(TICK_S)):
+            hands = [Watched(feed, View(self._endpoint))]
+            for seen in snapshots(hands, lambda: self._over.wait(TICK_S)):
                 self._server.newest.put(msgspec.json.encode(seen))
 
     def stop(self) -> None:
@@ -88,7 +88,7 @@ def see(browser: Browser, tone: str) -> None:
 
 
 def text(browser: Browser, element: str) -> str:
-    return str(browser.value(f"document.getElementById('{element}').innerText"))
+    return str(browser.value(f"document.querySelector('.{element}').innerText"))
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
@@ -176,14 +176,14 @@ def test_each_finger_s_motion_is_a_bar_and_what_is_not_known_is_none(
         "motion": {"ff": 1.0, "th": None},
         "motion_limits": {"ff": 1.25, "th": 1.0},
     }
-    browser.wait_for("document.getElementById('still').innerText == '130 ms, may slide'")
-    known = ["still", "40%", False, "moves 1.0, still to 1.3"]  # by hand: half of 1 / 1.25
+    browser.wait_for("document.querySelector('.still').innerText == '130 ms, may slide'")
+    known = ["still", "40%", False, "moves 1.0, still to 1.3 σ"]  # by hand: half of 1 / 1.25
     assert bars() == [known, ["unknown", "0%", False, "motion unknown"]]
     talker.more |= {"still_ms": 0.0, "motion": {"ff": 2.0, "th": 9.0}}
-    browser.wait_for("document.getElementById('still').innerText == '0 ms'")
+    browser.wait_for("document.querySelector('.still').innerText == '0 ms'")
     assert bars() == [
-        ["moving", "80%", False, "moves 2.0, still to 1.3"],
-        ["moving", "100%", False, "moves 9.0, still to 1.0"],
+        ["moving", "80%", False, "moves 2.0, still to 1.3 σ"],
+        ["moving", "100%", False, "moves 9.0, still to 1.0 σ"],
     ]
     talker.decision = None
     see(browser, "silent")
@@ -205,15 +205,15 @@ def test_past_grasps_stay_and_so_does_the_verdict_until_the_next_one(
     assert text(browser, "was") == "past: stable 25 %"
     assert ", past; its lift not told" in text(browser, "judged")
     talker.more = {"grasp": 8}
-    browser.wait_for("document.getElementById('was').innerText == ''")
+    browser.wait_for("document.querySelector('.was').innerText == ''")
     talker.more = {"grasp": 8, "supervised": True}
     talker.decision = Decision.SLIP
     see(browser, "slip")
     assert text(browser, "grasps").split("\n") == [
-        "8\tslip 75 %\tsupervised\tnot told",
-        "7\tstable 25 %\t\tnot told",
+        "8\t✕slip 75 %\tsupervised\tnot told",
+        "7\t●stable 25 %\t\tnot told",
     ]
-    assert "slips of `stable`\t2 of 41, at most 9.5" in text(browser, "learning")
+    assert "slips of `stable`\t2 of 41 lifts, at most 9.5" in text(browser, "learning")
     assert browser.complaints == []
 
 
@@ -303,7 +303,7 @@ def test_the_page_has_a_clock_that_goes_on(page: Page, talker: Talker, browser: 
     see(browser, "waiting")
     first = text(browser, "clock")
     assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
-    browser.wait_for(f"document.getElementById('clock').innerText > '{first}'")
+    browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
 
 
 def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
@@ -315,7 +315,7 @@ def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> N
         seq = 0
         while not over.wait(0.05):
             view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
-            server.newest.put(msgspec.json.encode(view.snapshot(0)))
+            server.newest.put(msgspec.json.encode([view.snapshot(0)]))
             seq += 1
 
     threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]

@@ -1,0 +1,82 @@
+"""The last five minutes in a terminal: a strip, or a lane for each kind of verdict and a plot."""
+
+from __future__ import annotations
+
+from rich.text import Text
+
+from daemon.watch.pixels import WORDS, Canvas
+from daemon.watch.snapshot import MOMENTS, TONE_CODE, TONES, Snapshot, worst
+
+LANES = len(WORDS)
+LABEL = 8
+"""Columns left of the time axis."""
+LEVELS = (100, 75, 50, 25, 0)
+"""Probabilities of slip that have a line in the plot, %."""
+PLOT_LINES = len(LEVELS) + 1
+AXIS_LINES = 2
+"""Lines of the strip with its axis."""
+MINUTES = 5
+
+
+def strip(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
+    """The worst kind of each moment in one line, and the time axis."""
+    text = Text(f"{'verdict':{LABEL}}", "dim")
+    for part in _parts(seen.history, width - LABEL):
+        tones = [TONES[code] for code in part if code in TONES]
+        text.append_text(canvas.moment(worst(tones) if tones else None))
+    return [text, _axis(width, canvas)]
+
+
+def lanes(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
+    """A line for each kind of verdict, and the time axis."""
+    parts = _parts(seen.history, width - LABEL)
+    rows = []
+    for tone, name in WORDS.items():
+        row = Text(f"{name:{LABEL}}", canvas.style(tone))
+        for part in parts:
+            row.append_text(canvas.moment(tone if TONE_CODE[tone] in part else None))
+        rows.append(row)
+    return [*rows, _axis(width, canvas)]
+
+
+def plot(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
+    """The highest probability of slip of each moment, under a title."""
+    room = max(width - LABEL, 1)
+    padded = [-1] * (MOMENTS - len(seen.history_p)) + seen.history_p
+    highest = [
+        max(padded[at * MOMENTS // room : (at + 1) * MOMENTS // room], default=-1)
+        for at in range(room)
+    ]
+    step = LEVELS[0] // (len(LEVELS) - 1)
+    rows = [Text("slip probability of judged grasps, %, and the worst verdict, by time", "dim")]
+    for level in LEVELS:
+        row = Text(f"{level:3} %".ljust(LABEL), "dim")
+        for share in highest:
+            is_here = share >= 0 and round(share / step) * step == level
+            row.append(canvas.point if is_here else canvas.rule, "bold" if is_here else "dim")
+        rows.append(row)
+    return rows
+
+
+def _parts(history: str, width: int) -> list[str]:
+    room = max(width, 1)
+    padded = history.rjust(MOMENTS)
+    found = []
+    for at in range(room):
+        first = at * MOMENTS // room
+        found.append(padded[first : max((at + 1) * MOMENTS // room, first + 1)])
+    return found
+
+
+def _axis(width: int, canvas: Canvas) -> Text:
+    """A tick at every minute; the right end is now."""
+    room = max(width - LABEL, 1)
+    row = [" "] * room
+    unit = " min" if room // MINUTES >= LABEL + len("-1 min") else ""
+    for minute in range(MINUTES):
+        label = f"{canvas.limit}-{MINUTES - minute}{unit if minute else ' min'}"
+        at = minute * room // MINUTES
+        row[at : at + len(label)] = label
+    now = f"now{canvas.limit}"
+    row[room - len(now) :] = now
+    return Text(" " * LABEL + "".join(row)[:room], "dim")
