@@ -20,6 +20,7 @@ JOINT = 15
 """Columns of a joint."""
 GRASPS = 26
 """Columns of the list of the last grasps."""
+NO_READINGS = "no readings to see"
 DIM = Style(dim=True)
 BOLD = Style(bold=True)
 OLD = Style(dim=True, italic=True)
@@ -127,23 +128,28 @@ def _number(value: float | None, unit: str, digits: int = 0) -> str:
     return "-" if value is None else f"{value:.{digits}f}{unit}"
 
 
-def images(seen: Snapshot, width: int, canvas: Canvas, *, large: bool) -> list[Text]:
-    """Tactile images with what stands beside them; always as many lines."""
-    lines, across = (12, 22) if large else (6, 11)
-    number = len(seen.fingers)
+def images_end(seen: Snapshot, width: int, *, large: bool) -> int:
+    """The column where what stands beside the images begins, which may be the last one."""
+    number, across = len(seen.fingers), 22 if large else 11
     gap = GAP if number * (across + GAP) <= width else 1
-    rows = [line(("no readings to see", DIM))] if not number else []
+    return number * (across + gap) or len(NO_READINGS) + GAP
+
+
+def images(seen: Snapshot, width: int, canvas: Canvas, *, large: bool) -> list[Text]:
+    """Tactile images with what stands beside them if there is room; always as many lines."""
+    lines = 12 if large else 6
+    number, at = len(seen.fingers), images_end(seen, width, large=large)
+    rows = [] if number else [line((NO_READINGS, DIM))]
     for place, finger in enumerate(seen.fingers):
         known = {True: "touches", False: "free", None: ""}[finger.touches]
         title = line((f"{finger.name} ", BOLD), (known, canvas.style(seen.tone)))
         cell = [title, *canvas.picture(finger, large=large).split("\n")]
         cell += _depth_and_motion(finger, canvas, large=large)
-        rows = beside(rows, place * (across + gap), cell)
+        rows = beside(rows, place * at // number, cell)
     rows += [Text()] * (lines + (3 if large else 2) - len(rows))
-    at = number * (across + gap) or len(rows[0]) + GAP
     if width - at < JOINT:
         return rows
-    right = _grasps_and_joints(seen, width - at, lines)
+    right = grasps_and_joints(seen, width - at, lines)
     return beside(rows, at, [*right, *_scale(seen, width - at, canvas)])
 
 
@@ -170,7 +176,7 @@ def _scale(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     depth = "fall" if first.from_rest else "span"
     short = ["; counts", ""]
     if first.motion is None:
-        said = [f", counts below {'rest' if first.from_rest else 'the median'}", *short]
+        said = [f", below {'rest' if first.from_rest else 'the median'}, counts", *short]
     else:
         limit = f"motion to {canvas.limit}"
         units = f"counts, {canvas.sigma.strip() or 'sigma'}"
@@ -183,7 +189,7 @@ def _scale(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     return [next((row for row in rows if len(row) <= width), rows[-1])]
 
 
-def _grasps_and_joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
+def grasps_and_joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
     """A title and so many lines: joints, and the last grasps where there is room."""
     if not seen.grasps or width < GRASPS:
         return _joints(seen, width, lines)

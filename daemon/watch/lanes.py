@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 from rich.text import Text
 
 from daemon.watch.pixels import WORDS, Canvas
@@ -21,9 +23,9 @@ MINUTES = 5
 def strip(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     """The worst kind of each moment in one line, and the time axis."""
     text = Text(f"{'verdict':{LABEL}}", "dim")
-    for part in _parts(seen.history, width - LABEL):
-        tones = [TONES[code] for code in part if code in TONES]
-        text.append_text(canvas.moment(worst(tones) if tones else None))
+    parts = _parts(seen.history, width - LABEL)
+    known = [[TONES[code] for code in part if code in TONES] for part in parts]
+    text.append_text(canvas.moments([worst(tones) if tones else None for tones in known]))
     return [text, _axis(width, canvas)]
 
 
@@ -33,9 +35,8 @@ def lanes(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     rows = []
     for tone, name in WORDS.items():
         row = Text(f"{name:{LABEL}}", canvas.style(tone))
-        for part in parts:
-            row.append_text(canvas.moment(tone if TONE_CODE[tone] in part else None))
-        rows.append(row)
+        at = [tone if TONE_CODE[tone] in part else None for part in parts]
+        rows.append(row.append_text(canvas.moments(at)))
     return [*rows, _axis(width, canvas)]
 
 
@@ -48,12 +49,15 @@ def plot(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
         for at in range(room)
     ]
     step = LEVELS[0] // (len(LEVELS) - 1)
-    rows = [Text("slip probability of judged grasps, %, and the worst verdict, by time", "dim")]
+    rows = [Text("slip probability, %, and worst verdict by time", "dim")]
     for level in LEVELS:
         row = Text(f"{level:3} %".ljust(LABEL), "dim")
-        for share in highest:
-            is_here = share >= 0 and round(share / step) * step == level
-            row.append(canvas.point if is_here else canvas.rule, "bold" if is_here else "dim")
+        at = [share >= 0 and round(share / step) * step == level for share in highest]
+        for is_here, run in itertools.groupby(at):
+            number = sum(1 for _ in run)
+            row.append(
+                (canvas.point if is_here else canvas.rule) * number, "" if is_here else "dim"
+            )
         rows.append(row)
     return rows
 

@@ -91,18 +91,20 @@ function drawMotion(bar, words, motion) {
   const {now, limit} = motion;
   bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
   bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
-  text(words, now === null ? "motion unknown" : `moves ${number(now, "", 1)}, still to ${number(limit, " \u03c3", 1)}`);
+  text(words, now === null ? "motion unknown" : `moves ${number(now, "", 1)} / ${number(limit, " \u03c3", 1)}`);
 }
 
 // A lane for each kind of verdict, below it the probability of slip, and the minutes before now.
 function drawTimeline(canvas, history, probability) {
   const context = sized(canvas), ratio = window.devicePixelRatio || 1;
-  const left = 62 * ratio, lane = 13 * ratio, bottom = canvas.height - 16 * ratio, top = LANES.length * lane + 10 * ratio;
+  const left = 62 * ratio, lane = 12 * ratio, bottom = canvas.height - 16 * ratio, top = LANES.length * lane + 10 * ratio;
   const step = (canvas.width - left - 4 * ratio) / MOMENTS, start = MOMENTS - history.length;
-  const size = 3.2 * ratio, level = share => bottom - (bottom - top) * share / 100;
+  const size = 2.8 * ratio, level = share => bottom - (bottom - top) * share / 100;
   context.font = `${11 * ratio}px system-ui, sans-serif`; context.textBaseline = "middle";
   for (let minute = 0; minute <= MINUTES; minute++) {
-    const x = left + minute * MOMENTS / MINUTES * step, label = minute === MINUTES ? "now" : `\u2212${MINUTES - minute} min`;
+    const x = left + minute * MOMENTS / MINUTES * step;
+    const unit = minute && canvas.width < 560 * ratio ? "" : " min";
+    const label = minute === MINUTES ? "now" : `\u2212${MINUTES - minute}${unit}`;
     context.fillStyle = colours.track; context.fillRect(x, 0, ratio, bottom + 4 * ratio);
     context.fillStyle = colours.faint; context.textAlign = minute === MINUTES ? "right" : minute ? "center" : "left";
     context.fillText(label, x, canvas.height - 6 * ratio);
@@ -199,14 +201,14 @@ class Hand {
 
   drawFingers(fingers) {
     children(this.part("fingers"), fingers,
-      () => element("figure", element("figcaption", element("b"), element("span")), element("canvas"), element("div"), element("span")),
+      () => element("figure", element("figcaption", element("b"), element("span"), element("span")), element("canvas"), element("div"), element("span")),
       (node, finger) => {
-        const [name, depth] = node.children[0].children, [, canvas, bar, words] = node.children;
+        const [name, touch, depth] = node.children[0].children, [, canvas, bar, words] = node.children;
         text(name, finger.name);
-        const touch = finger.touches === null ? "" : finger.touches ? "touches " : "free ";
-        text(depth, touch + (finger.from_rest ? `${finger.deepest} counts` : ""));
-        depth.className = finger.touches ? "touch" : "faint";
-        canvas.role = "img"; canvas.ariaLabel = `tactile image of ${finger.name}: ${depth.textContent}`;
+        text(touch, finger.touches === null ? "" : finger.touches ? "touches" : "free");
+        touch.className = finger.touches ? "touch" : "faint";
+        text(depth, finger.from_rest ? `${finger.deepest} counts` : "");
+        canvas.role = "img"; canvas.ariaLabel = `tactile image of ${finger.name}: ${touch.textContent} ${depth.textContent}`;
         drawFinger(canvas, finger);
         bar.className = "moves"; words.className = "faint";
         drawMotion(bar, words, finger.motion);
@@ -218,12 +220,12 @@ class Hand {
     }
     const rest = fingers.length === 0 || fingers[0].from_rest;
     this.say("scale", fingers.length === 0 ? "no readings to see" :
-      rest ? "pressed, to 1600 counts below rest; \u2715 faulty or repaired; \u03c3: a finger's own noise" : "pressed, below the finger's own median");
+      `pressed, ${rest ? "to 1600 counts below rest" : "below the finger's own median"}; \u2715 faulty or repaired`);
   }
 
   drawTables() {
     const {timing: time, session, counts} = this.seen;
-    rows(this.part("counts"), Object.entries(counts).map(([name, count]) => [`${name}, seen here`, count]));
+    this.say("counts", Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", "));
     children(this.part("grasps"), this.seen.grasps,
       () => element("tr", element("td"), element("td", element("i"), element("span")), element("td"), element("td")),
       (node, grasp) => {
@@ -237,11 +239,9 @@ class Hand {
       });
     rows(this.part("learning"), this.seen.learning.map(line => [line.what, line.advice]));
     rows(this.part("timing"), [
-      ["readings", number(time.readings_hz, " /s")],
-      ["verdicts", number(time.verdicts_hz, " /s")],
+      ["readings, verdicts", `${number(time.readings_hz, " /s")}, ${number(time.verdicts_hz, " /s")}`],
       ["age of the last", number(time.age_ms, " ms", 1)],
-      ["latency p50", number(time.p50_us, " us")],
-      ["latency p99", number(time.p99_us, " us")],
+      ["latency p50, p99", `${number(time.p50_us, " us")}, ${number(time.p99_us, " us")}`],
       ["longest latency", number(time.max_us, " us")],
       ["jitter p99", number(time.jitter_p99_us, " us")],
       ["late", number(time.late, " readings")],

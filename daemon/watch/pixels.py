@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich.color import Color
@@ -139,11 +140,16 @@ class Canvas:
         """What a plot is where it has no point."""
         return "." if self.ascii_only else "\u00b7"
 
-    def moment(self, tone: Tone | None) -> Text:
-        """A moment of the timeline: its sign, on its colour where there is colour."""
-        if tone is None:
-            return Text(" ")
-        return Text(PLAIN[tone], self._on_colour(tone))
+    def moments(self, tones: Sequence[Tone | None]) -> Text:
+        """A part of the timeline: a sign for each moment, on its colour where there is colour."""
+        text = Text()
+        for tone, run in itertools.groupby(tones):
+            number = sum(1 for _ in run)
+            if tone is None:
+                text.append(" " * number)
+            else:
+                text.append(PLAIN[tone] * number, self._on_colour(tone))
+        return text
 
     def legend(self) -> list[Text]:
         """The signs of the timeline, each with its word."""

@@ -14,13 +14,16 @@ from daemon.watch.blocks import (
     BOLD,
     DIM,
     GAP,
+    JOINT,
     Items,
     aside,
     beside,
     columns,
     figures,
     flow,
+    grasps_and_joints,
     images,
+    images_end,
     line,
     percent,
 )
@@ -38,6 +41,8 @@ HIGH = 26
 """Lines from which on there are three for reasons."""
 BANNER_LINES, BANNER, BANNER_NARROW = 5, 24, 20
 """Lines and columns of the coloured field that has the verdict in its middle."""
+LIST_LINES = 6
+"""Of the last grasps and the joints where they stand below the images."""
 FACTS = 45
 """Columns beside the field of the verdict below which words are left out."""
 HAND_COLUMNS, HAND_LINES = 80, 24
@@ -91,6 +96,9 @@ def _hand(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]
         pictures = []
     below = below[: max(left, 0)]
     left -= len(below)
+    if width - images_end(seen, width, large=large) < JOINT and left > LIST_LINES:
+        pictures += grasps_and_joints(seen, width, LIST_LINES)
+        left -= LIST_LINES + 1
     timeline = strip(seen, width, canvas)
     if left >= LANES - 1:
         timeline = lanes(seen, width, canvas)

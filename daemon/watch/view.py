@@ -151,7 +151,7 @@ class View:
             tone=tone,
             verdict=said,
             headline="leans to stable" if tone is Tone.LEANS else said,
-            evidence="" if verdict is None else rests_on(verdict),
+            evidence="" if verdict is None or silent else rests_on(verdict),
             learning=learning(verdict, status),
             p_slip=p_slip,
             why=why,
