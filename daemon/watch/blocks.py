@@ -18,8 +18,8 @@ GAP = 2
 """Columns between fingers, and between figures."""
 JOINT = 15
 """Columns of a joint."""
-GRASPS = 26
-"""Columns of the list of the last grasps."""
+GRASPS, GRASPS_SHORT = 27, 18
+"""Columns of the list of the last grasps, with and without how their lifts ended."""
 NO_READINGS = "no readings to see"
 DIM = Style(dim=True)
 BOLD = Style(bold=True)
@@ -191,27 +191,27 @@ def _scale(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
 
 def grasps_and_joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
     """A title and so many lines: joints, and the last grasps where there is room."""
-    if not seen.grasps or width < GRASPS:
+    if not seen.grasps or width < GRASPS_SHORT:
         return _joints(seen, width, lines)
     if width >= GRASPS + JOINT - 1:
         at = GRASPS + 1
-        return beside(_grasps(seen, lines), at, _joints(seen, width - at, lines))
+        return beside(_grasps(seen, at, lines), at, _joints(seen, width - at, lines))
     if not seen.joints:
-        return _grasps(seen, lines)
+        return _grasps(seen, width, lines)
     half = lines // 2
-    return [*_grasps(seen, half), *_joints(seen, width, lines - half - 1)]
+    return [*_grasps(seen, width, half), *_joints(seen, width, lines - half - 1)]
 
 
-def _grasps(seen: Snapshot, lines: int) -> list[Text]:
+def _grasps(seen: Snapshot, width: int, lines: int) -> list[Text]:
     """A title and so many lines, the newest grasp first."""
     style = OLD if seen.tone is Tone.SILENT else Style()
-    rows = [
-        f"{last.grasp:4} {last.verdict:7}{percent(last.p_slip):>5} {last.lift}"
-        f"{'*' if last.supervised else ''}"
-        for last in seen.grasps[:lines]
-    ]
+    rows = []
+    for last in seen.grasps[:lines]:
+        lift = f" {last.lift}{'*' if last.supervised else ''}" if width >= GRASPS else ""
+        rows.append(f"{last.grasp:4} {last.verdict:7}{percent(last.p_slip):>5}{lift}")
     rows += [""] * (lines - len(rows))
-    return [line(("last grasps (* watched)", DIM)), *[line((row, style)) for row in rows]]
+    title = "last grasps (* watched)" if width >= GRASPS else "last grasps"
+    return [line((title, DIM)), *[line((row, style)) for row in rows]]
 
 
 def _joints(seen: Snapshot, width: int, lines: int) -> list[Text]:

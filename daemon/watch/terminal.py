@@ -89,7 +89,8 @@ def _hand(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]
     pictures = images(seen, width, canvas, large=large)
     known = figures(seen, NAME_MAX)
     below = aside(known, width, dim=seen.tone is Tone.SILENT)
-    health = 1 if width >= NARROW or not seen.health else 2
+    first = "".join(f"{each.what}: {each.advice}" for each in seen.health[:1])
+    health = 2 if len(first) > width else 1
     left = height - 1 - len(verdict) - len(pictures) - AXIS_LINES - health
     if left < 0:
         left += len(pictures)
