@@ -22,7 +22,7 @@ MINUTES = 5
 
 def strip(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     """The worst kind of each moment in one line, and the time axis."""
-    text = Text(f"{'verdict':{LABEL}}", "dim")
+    text = Text().append(f"{'verdict':{LABEL}}", "dim")
     parts = _parts(seen.history, width - LABEL)
     known = [[TONES[code] for code in part if code in TONES] for part in parts]
     text.append_text(canvas.moments([worst(tones) if tones else None for tones in known]))
@@ -34,7 +34,7 @@ def lanes(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     parts = _parts(seen.history, width - LABEL)
     rows = []
     for tone, name in WORDS.items():
-        row = Text(f"{name:{LABEL}}", canvas.style(tone))
+        row = Text().append(f"{name:{LABEL}}", canvas.style(tone))
         at = [tone if TONE_CODE[tone] in part else None for part in parts]
         rows.append(row.append_text(canvas.moments(at)))
     return [*rows, _axis(width, canvas)]
@@ -49,9 +49,9 @@ def plot(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
         for at in range(room)
     ]
     step = LEVELS[0] // (len(LEVELS) - 1)
-    rows = [Text("slip probability, %, and worst verdict by time", "dim")]
+    rows = [Text().append("slip probability, %, and worst verdict by time", "dim")]
     for level in LEVELS:
-        row = Text(f"{level:3} %".ljust(LABEL), "dim")
+        row = Text().append(f"{level:3} %".ljust(LABEL), "dim")
         at = [share >= 0 and round(share / step) * step == level for share in highest]
         for is_here, run in itertools.groupby(at):
             number = sum(1 for _ in run)
@@ -83,4 +83,4 @@ def _axis(width: int, canvas: Canvas) -> Text:
         row[at : at + len(label)] = label
     now = f"now{canvas.limit}"
     row[room - len(now) :] = now
-    return Text(" " * LABEL + "".join(row)[:room], "dim")
+    return Text().append(" " * LABEL + "".join(row)[:room], "dim")

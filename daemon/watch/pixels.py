@@ -103,7 +103,7 @@ class Canvas:
         """A share of 0..1 as a bar; empty without one."""
         full, empty = ("#", "-") if self.ascii_only else ("█", "░")
         number = 0 if share is None else round(share * width)
-        text = Text(full * number, self.style(tone))
+        text = Text().append(full * number, self.style(tone))
         return text.append(empty * (width - number), "dim")
 
     @property
@@ -114,14 +114,14 @@ class Canvas:
     def motion(self, motion: FingerMotion, width: int) -> Text:
         """How a finger moves: up to the mark it is still, and at the end it is twice as much."""
         if motion.now is None:
-            return Text("?" * width, self.style(Tone.TROUBLE))
+            return Text().append("?" * width, self.style(Tone.TROUBLE))
         full, empty = ("#", "-") if self.ascii_only else ("█", "░")
         share, below = min(motion.now / motion.limit, 2.0), width // 2
         above = width - below - 1
         still = min(round(share * below), below)
         moving = min(math.ceil(max(share - 1.0, 0.0) * below), above)
         style: Style | str = self.style(Tone.TROUBLE) if moving else ""
-        text = Text(full * still, style).append(empty * (below - still), "dim")
+        text = Text().append(full * still, style).append(empty * (below - still), "dim")
         text.append(self.limit, "bold").append(full * moving, style)
         return text.append(empty * (above - moving), "dim")
 
@@ -154,7 +154,7 @@ class Canvas:
     def legend(self) -> list[Text]:
         """The signs of the timeline, each with its word."""
         return [
-            Text(PLAIN[tone], self._on_colour(tone)).append(f" {word}", "dim")
+            Text.assemble((PLAIN[tone], self._on_colour(tone)), (f" {word}", "dim"))
             for tone, word in WORDS.items()
         ]
 

@@ -152,7 +152,7 @@ def _verdict(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Te
     words[BANNER_LINES // 2] = seen.headline.upper()
     words[BANNER_LINES // 2 + 1] = _former(seen)
     style = canvas.banner(seen.tone)
-    rows = [Text(word.center(banner)[:banner], style) for word in words]
+    rows = [line((word.center(banner)[:banner], style)) for word in words]
     rows = beside(rows, banner + 2, facts)
     if width >= WIDE:
         at = banner + 2 + 60

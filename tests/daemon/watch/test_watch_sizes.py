@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from msgspec import structs
 from rich.console import Console
+from rich.text import Text
 
 from daemon.judge.reasons import ADVICE, Decision, Reason
 from daemon.watch.pixels import Canvas
@@ -65,6 +66,21 @@ def a_full_hand(hand: str = "right", decision: Decision = Decision.SLIP) -> Snap
     said = verdict(0, decision, still_ms=131.0, reasons=reasons, **more)
     view.take(f"verdict.{hand}".encode(), said, 0)
     return view.snapshot(0)
+
+
+@pytest.mark.parametrize("size", [(80, 24), (60, 30), (200, 50)])
+def test_no_part_of_a_line_colours_what_stands_beside_it(size: tuple[int, int]) -> None:
+    rows = draw([a_full_hand()], *size, Canvas()).renderables
+    assert {str(row.style) for row in rows if isinstance(row, Text)} == {""}
+    banner = next(row for row in rows if isinstance(row, Text) and "SLIP" in row.plain)
+    console = Console(color_system="truecolor")
+    behind = [
+        style.bgcolor is not None
+        for at in range(len(banner.plain.rstrip()))
+        for style in [banner.get_style_at_offset(console, at)]
+    ]
+    across = 20 if size[0] == 60 else 24
+    assert behind == [True] * across + [False] * (len(behind) - across)
 
 
 @pytest.mark.parametrize("decision", Decision)
