@@ -160,7 +160,7 @@ def _depth_and_motion(finger: FingerImage, canvas: Canvas, *, large: bool) -> li
         below = line((f"{depth} {finger.deepest} counts", DIM))
         if motion is None:
             return [below, Text()]
-        now = "" if motion.now is None else f"{motion.now:.1f}{canvas.sigma}"
+        now = "" if motion.now is None else f"{motion.now:.{motion.now < 10.0:d}f}{canvas.sigma}"
         moves = line(("moves ", DIM), (f"{now:5}", ""))
         return [below, moves.append_text(canvas.motion(motion, 11))]
     if motion is None:
