@@ -7,7 +7,7 @@ import itertools
 from rich.text import Text
 
 from daemon.watch.pixels import WORDS, Canvas
-from daemon.watch.snapshot import MOMENTS, TONE_CODE, TONES, Snapshot, worst
+from daemon.watch.snapshot import MOMENTS, TONE_CODE, WORST_FIRST, Snapshot
 
 LANES = len(WORDS)
 LABEL = 8
@@ -24,8 +24,8 @@ def strip(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     """The worst kind of each moment in one line, and the time axis."""
     text = Text().append(f"{'verdict':{LABEL}}", "dim")
     parts = _parts(seen.history, width - LABEL)
-    known = [[TONES[code] for code in part if code in TONES] for part in parts]
-    text.append_text(canvas.moments([worst(tones) if tones else None for tones in known]))
+    worst = [next((t for t in WORST_FIRST if TONE_CODE[t] in part), None) for part in parts]
+    text.append_text(canvas.moments(worst))
     return [text, _axis(width, canvas)]
 
 
@@ -49,7 +49,7 @@ def plot(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
         for at in range(room)
     ]
     step = LEVELS[0] // (len(LEVELS) - 1)
-    rows = [Text().append("slip probability, %, and worst verdict by time", "dim")]
+    rows = [Text().append("slip probability, %, and verdicts by time", "dim")]
     for level in LEVELS:
         row = Text().append(f"{level:3} %".ljust(LABEL), "dim")
         at = [share >= 0 and round(share / step) * step == level for share in highest]
@@ -62,14 +62,12 @@ def plot(seen: Snapshot, width: int, canvas: Canvas) -> list[Text]:
     return rows
 
 
-def _parts(history: str, width: int) -> list[str]:
+def _parts(history: list[str], width: int) -> list[str]:
+    """What there was in each column."""
     room = max(width, 1)
-    padded = history.rjust(MOMENTS)
-    found = []
-    for at in range(room):
-        first = at * MOMENTS // room
-        found.append(padded[first : max((at + 1) * MOMENTS // room, first + 1)])
-    return found
+    padded = [""] * (MOMENTS - len(history)) + history
+    firsts = [at * MOMENTS // room for at in range(room + 1)]
+    return ["".join(padded[a : max(b, a + 1)]) for a, b in itertools.pairwise(firsts)]
 
 
 def _axis(width: int, canvas: Canvas) -> Text:

@@ -119,22 +119,22 @@ function drawTimeline(canvas, history, probability) {
     context.fillStyle = colours.faint; context.fillText(name, left - 6 * ratio, y + lane / 2);
     context.fillStyle = code === "w" ? colours.faint : colours[TONES[code]];
     for (let at = 0; at < history.length; at++)
-      if (history[at] === code) context.fillRect(left + (start + at) * step, y + 2 * ratio, step + .6, lane - 4 * ratio);
+      if (history[at].includes(code)) context.fillRect(left + (start + at) * step, y + 2 * ratio, step + .6, lane - 4 * ratio);
   });
   context.lineWidth = 1.5 * ratio;
   probability.forEach((share, at) => {
     if (share < 0) return;
-    const x = left + (start + at + .5) * step, y = level(share), slip = history[at] === "x";
+    const x = left + (start + at + .5) * step, y = level(share), slip = history[at].includes("x");
     context.beginPath();
     context.strokeStyle = context.fillStyle = slip ? colours.bad : colours.leans;
     if (slip) {
       context.moveTo(x - size, y - size); context.lineTo(x + size, y + size);
       context.moveTo(x + size, y - size); context.lineTo(x - size, y + size);
     } else context.arc(x, y, size, 0, 2 * Math.PI);
-    if (history[at] === "s") context.fill(); else context.stroke();
+    if (history[at].includes("s")) context.fill(); else context.stroke();
   });
-  const seconds = LANES.map(([code, name]) => [name, [...history].filter(each => each === code).length]);
-  canvas.ariaLabel = "worst verdict by second: " + seconds.filter(([, count]) => count).map(([name, count]) => `${name} ${count} s`).join(", ");
+  const seconds = LANES.map(([code, name]) => [name, history.filter(each => each.includes(code)).length]);
+  canvas.ariaLabel = "verdicts by second: " + seconds.filter(([, count]) => count).map(([name, count]) => `${name} ${count} s`).join(", ");
 }
 
 class Hand {
@@ -173,7 +173,7 @@ class Hand {
     this.drawGrasp(none, quiet);
     this.drawFingers(none ? [] : seen.fingers);
     const missed = Math.min(Math.floor(quiet / 1000), MOMENTS);  // it moves on where nothing comes
-    drawTimeline(this.part("timeline"), (seen.history + ".".repeat(missed)).slice(-MOMENTS),
+    drawTimeline(this.part("timeline"), [...seen.history, ...Array(missed).fill(".")].slice(-MOMENTS),
       [...seen.history_p, ...Array(missed).fill(-1)].slice(-MOMENTS));
     const joints = Object.entries(none ? {} : seen.joints).sort();
     this.say("joints-title", joints.length ? "Joints" : "No joints");

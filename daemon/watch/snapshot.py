@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from enum import StrEnum
 
 import msgspec
@@ -37,7 +36,6 @@ TONE_CODE = {
     Tone.SILENT: ".",
 }
 """In `Snapshot.history`."""
-TONES = {code: tone for tone, code in TONE_CODE.items()}
 WORST_FIRST = (
     *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
     *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
@@ -45,11 +43,6 @@ WORST_FIRST = (
 """Of several moments in one column, the first of these is shown."""
 MOMENTS = 300
 """Seconds that the timeline goes back: five minutes."""
-
-
-def worst(tones: Iterable[Tone]) -> Tone:
-    """The one of them to be shown where there is room for one. Raises `ValueError` for none."""
-    return min(tones, key=WORST_FIRST.index)
 
 
 class Line(msgspec.Struct, frozen=True):
@@ -146,7 +139,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     drivers: dict[str, dict[str, int]]
     model: str | None
     versions: dict[str, str]
-    history: str
-    """Worst tone of each second of the last five minutes, the oldest first; see `TONE_CODE`."""
+    history: list[str]
+    """Tones of each second of the last five minutes, the oldest second and the worst tone first;
+    see `TONE_CODE`."""
     history_p: list[int]
     """The same for the highest probability of slip, %; -1 where there is none."""

@@ -14,24 +14,28 @@ from tests.daemon.watch.watch_fakes import MS, a_view, after, text_of, verdict
 @pytest.mark.parametrize(
     ("moments", "tones", "shares"),
     [
-        ([(0, Tone.STABLE, 0.1), (900, Tone.STABLE, 0.2)], "s", [20]),
-        ([(0, Tone.SLIP, 0.9), (999, Tone.STABLE, 0.1)], "x", [90]),
+        ([(0, Tone.STABLE, 0.1), (900, Tone.STABLE, 0.2)], ["s"], [20]),
+        ([(0, Tone.SLIP, 0.9), (999, Tone.STABLE, 0.1)], ["xs"], [90]),
         (
             [(0, Tone.STABLE, 0.1), (999, Tone.TROUBLE, None), (1000, Tone.WAITING, None)],
-            "tw",
+            ["ts", "w"],
             [10, -1],
         ),
-        ([(0, Tone.STABLE, 0.1), (4000, Tone.SLIP, 0.8)], "s...x", [10, -1, -1, -1, 80]),
+        (
+            [(0, Tone.STABLE, 0.1), (4000, Tone.SLIP, 0.8)],
+            ["s", ".", ".", ".", "x"],
+            [10, -1, -1, -1, 80],
+        ),
         (
             [(0, Tone.WAITING, None), (3_600_000, Tone.STABLE, 0.0)],
-            "." * 299 + "s",
+            ["."] * 299 + ["s"],
             [-1] * 299 + [0],
         ),
     ],
     ids=["one", "worst", "next", "gap", "hour"],
 )
-def test_a_column_is_the_worst_of_its_second_and_a_second_unwatched_is_silent(
-    moments: list[tuple[int, Tone, float | None]], tones: str, shares: list[int]
+def test_a_second_has_all_that_was_said_in_it_and_one_unwatched_is_silent(
+    moments: list[tuple[int, Tone, float | None]], tones: list[str], shares: list[int]
 ) -> None:
     timeline = Timeline()
     for at_ms, tone, p_slip in moments:

@@ -111,7 +111,7 @@ def test_a_large_terminal_has_a_lane_for_each_kind_of_verdict_and_a_plot() -> No
     """By hand, 192 columns for 300 s: 60 s end in column 38, and 180 s within column 115."""
     seen = structs.replace(
         a_full_hand(),
-        history="." * 60 + "s" * 120 + "x" * 120,
+        history=["."] * 60 + ["s"] * 120 + ["x"] * 120,
         history_p=[-1] * 60 + [0] * 120 + [75] * 120,
     )
     lines = text_of(seen, 200, 50, Canvas(colour=False, ascii_only=True))
