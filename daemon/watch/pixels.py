@@ -163,7 +163,8 @@ class Canvas:
 
     def style(self, tone: Tone) -> Style:
         """Letters in the colour of a tone."""
-        return Style(color=COLOURS[tone], bold=True) if self.colour else Style(bold=True)
+        named = self.colour and tone is not Tone.WAITING  # grey letters are hard to read
+        return Style(color=COLOURS[tone], bold=True) if named else Style(bold=True)
 
     def banner(self, tone: Tone) -> Style:
         """Letters on the colour of a tone."""
