@@ -60,11 +60,12 @@ def draw(
     the one that is shown, and of the others there is a line each.
     """
     number, several = len(hands), len(hands) > 1
-    footer = _footer(width, canvas)
+    signs = canvas.legend() if height >= HAND_LINES else []
+    footer = _footer(width, signs)
     left = height - len(footer)
     rows: list[Text] = []
     if several and width // number < HAND_COLUMNS and left // number < HAND_LINES:
-        footer = _footer(width, canvas, "  tab next hand")
+        footer = _footer(width, signs, "  tab next hand")
         rows = [_one_line(seen, canvas) for seen in hands if seen is not hands[chosen]]
         rows += _hand(hands[chosen], width, height - len(rows) - len(footer), canvas)
     elif several and width // number < HAND_COLUMNS:
@@ -113,7 +114,7 @@ def _hand(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]
             left -= len(tables) - len(below)
             below = tables
     rows = [_header(seen), *verdict, *pictures, *timeline, *below]
-    return [*rows, *_health(seen, width, canvas, max(left, 0) + health)][:height]
+    return [*rows, *_health(seen, width, canvas, max(left, 0) + health)][: max(height, 0)]
 
 
 def _header(seen: Snapshot) -> Text:
@@ -127,9 +128,9 @@ def _header(seen: Snapshot) -> Text:
     )
 
 
-def _footer(width: int, canvas: Canvas, keys: str = "") -> list[Text]:
+def _footer(width: int, signs: list[Text], keys: str = "") -> list[Text]:
     rows = [line(("q ", BOLD), (f"ends{keys}", DIM))]
-    for sign in canvas.legend():
+    for sign in signs:
         if len(rows[-1]) + GAP + len(sign) > width:
             rows.append(line())
         rows[-1].append(" " * GAP if len(rows[-1]) else "").append_text(sign)

@@ -68,6 +68,16 @@ def a_full_hand(hand: str = "right", decision: Decision = Decision.SLIP) -> Snap
     return view.snapshot(0)
 
 
+@pytest.mark.parametrize("size", [(24, 6), (40, 12), (79, 23), (200, 8)])
+@pytest.mark.parametrize("decision", Decision)
+def test_the_verdict_is_what_goes_last_from_a_terminal_that_is_too_small(
+    size: tuple[int, int], decision: Decision
+) -> None:
+    lines = text_of(a_full_hand(decision=decision), *size, Canvas())
+    assert len(lines) <= size[1]
+    assert decision.value.upper() in "\n".join(lines)
+
+
 @pytest.mark.parametrize("size", [(80, 24), (60, 30), (200, 50)])
 def test_no_part_of_a_line_colours_what_stands_beside_it(size: tuple[int, int]) -> None:
     rows = draw([a_full_hand()], *size, Canvas()).renderables
