@@ -1,7 +1,7 @@
 """No reading of any driver mixes two sweeps, whatever is lost, doubled, late, or begins anew.
 
 What boards must number and how long links may hold frames back, so that this holds, say
-`deploy/bridge/PROTOCOL.md`, `deploy/can/PROTOCOL.md` and the README's part on palms.
+`deploy/bridge/PROTOCOL.md`, `deploy/can/PROTOCOL.md` and, of palms, `deploy/CONNECT.md`.
 """
 
 from __future__ import annotations
