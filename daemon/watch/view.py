@@ -137,7 +137,8 @@ class View:
         p_slip = verdict.p_slip if verdict is not None and stands else None
         said = verdict.verdict.value if verdict is not None and stands else "unknown"
         self._timeline.add(now_ns, tone, p_slip)
-        self._rate_marks.append((now_ns, self._received))
+        if tone is not Tone.SILENT or not self._rate_marks:
+            self._rate_marks.append((now_ns, self._received))
         silent = tone is Tone.SILENT
         status = self._status
         grasps = self._grasps.last(now_ns, None if silent else self._held())

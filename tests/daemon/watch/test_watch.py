@@ -437,6 +437,9 @@ def test_rates_and_the_last_five_minutes_are_of_what_arrived() -> None:
             view.take(b"verdict.right", verdict(moment * 5 + part, Decision.STABLE), now_ns)
         seen = view.snapshot(now_ns)
     assert seen.timing.verdicts_hz == pytest.approx(20.0)
+    silent = view.snapshot(now_ns + 60_000 * MS)
+    assert silent.tone is Tone.SILENT
+    assert silent.timing.verdicts_hz == pytest.approx(20.0)  # as all figures, of then
     assert seen.history == ["s"] * 300
     assert seen.history_p == [25] * 300
 
