@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import ast
 import re
-import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from daemon.publish.messages import decode_verdict
 from drivers.recordings.csv_player import DEMO_TABLE
+from tests.clients.building import skip_unless_it_can_be_compiled
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -34,42 +35,86 @@ def block(language: str) -> str:
     return str(code)
 
 
-def verdict_lines(command: list[str], endpoint: str) -> list[str]:
-    """Run a subscriber while a replay publishes 200 verdicts to it."""
+def run_subscriber(command: list[str], endpoint: str) -> list[str]:
+    """What a subscriber prints while a replay publishes 200 verdicts to it, up to the silence."""
+    replay = [sys.executable, "-m", "daemon", "replay", str(DEMO_TABLE), "--speed", "2"]
+    replay += ["--publish", endpoint, "--wait", "20"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as subscriber:
-        replay = [sys.executable, "-m", "daemon", "replay", str(DEMO_TABLE), "--speed", "2"]
-        subprocess.run(
-            [*replay, "--publish", endpoint, "--wait", "20"],
-            check=True,
-            capture_output=True,
-            timeout=200,
-        )
-        return subscriber.communicate(timeout=100)[0].splitlines()
+        try:
+            subprocess.run(replay, check=True, capture_output=True, timeout=200)
+            assert subscriber.stdout is not None
+            lines: list[str] = []
+            for line in subscriber.stdout:
+                lines.append(line.rstrip("\n"))
+                if lines[-1] == "unknown" and len(lines) - lines.count("unknown") == 200:
+                    break
+            return lines
+        finally:
+            subscriber.kill()
 
 
-def test_the_python_subscriber_prints_verdicts(tmp_path: Path) -> None:
-    endpoint = f"ipc://{tmp_path}/graspd"
+PATIENCE = "60000"
+"""In place of the README's time, ms: what is called unknown is called so by `silence_ms`."""
+
+
+def python_subscriber(endpoint: str, first_ms: str) -> list[str]:
     code = block("python")
     assert ENDPOINT in code
-    # The process that starts first waits longer for the replay to come up.
-    code = code.replace(ENDPOINT, endpoint).replace("2000", "5000", 1)
-    lines = verdict_lines([sys.executable, "-Wignore", "-u", "-c", code], endpoint)
-    assert len(lines) == 200
-    assert [ast.literal_eval(line)["seq"] for line in lines] == list(range(200))
+    assert code.count("2000") == 1
+    code = code.replace(ENDPOINT, endpoint).replace("2000", first_ms)
+    return [sys.executable, "-Wignore", "-u", "-c", code]
 
 
-def test_the_cpp_subscriber_compiles_and_prints_verdicts(tmp_path: Path) -> None:
-    if shutil.which("g++") is None or not Path("/usr/include/zmq_addon.hpp").exists():
-        pytest.skip("no C++ compiler or no cppzmq: apt install g++ cppzmq-dev")
+@pytest.fixture
+def cpp_subscriber(tmp_path: Path) -> Callable[[str, str], list[str]]:
+    """Compiles the C++ subscriber for an endpoint and a time."""
+    skip_unless_it_can_be_compiled()
+
+    def compile_it(endpoint: str, first_ms: str) -> list[str]:
+        source, binary = tmp_path / "subscriber.cpp", tmp_path / "subscriber"
+        code = block("cpp")
+        assert ENDPOINT in code
+        assert code.count("2000") == 1
+        source.write_text(code.replace(ENDPOINT, endpoint).replace("2000", first_ms))
+        warnings = ["-Wall", "-Wextra", "-Werror"]
+        subprocess.run(["g++", "-std=c++17", *warnings, source, "-o", binary, "-lzmq"], check=True)
+        return [str(binary)]
+
+    return compile_it
+
+
+def test_the_python_subscriber_prints_verdicts_and_unknown_on_silence(tmp_path: Path) -> None:
     endpoint = f"ipc://{tmp_path}/graspd"
-    source = tmp_path / "subscriber.cpp"
-    code = block("cpp")
-    assert ENDPOINT in code
-    source.write_text(code.replace(ENDPOINT, endpoint).replace("2000", "5000"))
-    binary = tmp_path / "subscriber"
-    subprocess.run(
-        ["g++", "-std=c++17", "-Wall", "-Wextra", source, "-o", binary, "-lzmq"], check=True
-    )
-    lines = verdict_lines([str(binary)], endpoint)
-    assert [decode_verdict(line.encode()).seq for line in lines] == list(range(len(lines)))
-    assert len(lines) == 200
+    *lines, last = run_subscriber(python_subscriber(endpoint, PATIENCE), endpoint)
+    said = [ast.literal_eval(line) for line in lines if line != "unknown"]
+    assert [each["seq"] for each in said] == list(range(200))
+    assert last == "unknown"
+
+
+def test_the_cpp_subscriber_prints_verdicts_and_unknown_on_silence(
+    cpp_subscriber: Callable[[str, str], list[str]], tmp_path: Path
+) -> None:
+    endpoint = f"ipc://{tmp_path}/graspd"
+    *lines, last = run_subscriber(cpp_subscriber(endpoint, PATIENCE), endpoint)
+    said = [decode_verdict(line.encode()) for line in lines if line != "unknown"]
+    assert [each.seq for each in said] == list(range(200))
+    assert last == "unknown"
+
+
+def first_line(command: list[str]) -> str:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as subscriber:
+        assert subscriber.stdout is not None
+        try:
+            return subscriber.stdout.readline()
+        finally:
+            subscriber.kill()
+
+
+def test_the_python_subscriber_of_nobody_prints_unknown(tmp_path: Path) -> None:
+    assert first_line(python_subscriber(f"ipc://{tmp_path}/nobody", "200")) == "unknown\n"
+
+
+def test_the_cpp_subscriber_of_nobody_prints_unknown(
+    cpp_subscriber: Callable[[str, str], list[str]], tmp_path: Path
+) -> None:
+    assert first_line(cpp_subscriber(f"ipc://{tmp_path}/nobody", "200")) == "unknown\n"

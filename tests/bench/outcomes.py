@@ -32,7 +32,7 @@ from daemon.publish.messages import decode_tactile, decode_verdict
 from daemon.session.file import SessionFile, load
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.trust import Trust, TrustState, decode
-from deploy.clients.python.graspd_client import Graspd, Verdict
+from deploy.clients.python.graspd_client import Client, Outcome, Verdict
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.recordings.csv_rows import read_rows
@@ -134,7 +134,7 @@ class Bench:
         self._counts: dict[int, NDArray[np.uint16]] = {}
         self._known: dict[GraspId, tuple[NDArray[np.uint16], bool]] = {}
         self._client = stack.enter_context(
-            Graspd(f"ipc://{folder}/graspd", ask_endpoint=f"ipc://{folder}/ask", max_age_ms=1e4)
+            Client(f"ipc://{folder}/graspd", ask_endpoint=f"ipc://{folder}/ask", max_age_ms=1e4)
         )
         self._ask = folder / "ask"
         self._start()
@@ -179,9 +179,10 @@ class Bench:
     def _lift(self, grasp: GraspId, said: Verdict) -> None:
         counts, stable = self._known[grasp]
         slipped = self._slipped[counts.tobytes()]
+        how = Outcome.SLIPPED if slipped else Outcome.HELD
         self._reference.note(grasp, counts, stable=stable)
         began_s = time.monotonic()
-        while not (answer := self._client.outcome(said, slipped, wait_s=ANSWER_S)):
+        while not (answer := self._client.tell(said, how, wait_s=ANSWER_S)):
             if answer.why.startswith("unknown"):
                 self.found.refused += 1
                 return

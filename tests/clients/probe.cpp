@@ -19,7 +19,7 @@ std::string unhexed(const std::string& text) {
 }
 
 void say(const graspd::Verdict& verdict, const graspd::Counts& counts) {
-    std::cout << graspd::name(verdict.outcome) << ' ' << verdict.reasons.size();
+    std::cout << graspd::name(verdict.decision) << ' ' << verdict.reasons.size();
     for (const std::string& reason : verdict.reasons) std::cout << ' ' << reason;
     std::cout << ' ' << verdict.grasp.value_or(-1) << ' ' << verdict.seq.value_or(-1) << ' '
               << (verdict.boot_id.empty() ? "-" : verdict.boot_id) << ' '

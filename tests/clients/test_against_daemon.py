@@ -14,7 +14,7 @@ import zmq
 from daemon.publish.keys import make
 from daemon.publish.messages import OutcomeMessage, decode_outcome
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Graspd, Keys
+from deploy.clients.python.graspd_client import Client, Keys, Outcome
 from tests.clients.bench import PATIENCE_S, Daemon, free_endpoint, unlisted, until
 
 SILENCE_S = 0.1
@@ -24,9 +24,9 @@ SILENCE_S = 0.1
 def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, whole_grasps=True) as daemon,
-        Graspd(daemon.endpoint) as listening,
-        Graspd(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asking,
-        Graspd(daemon.endpoint, ask_endpoint=f"{daemon.ask_endpoint}.nobody") as unanswered,
+        Client(daemon.endpoint) as listening,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as asking,
+        Client(daemon.endpoint, ask_endpoint=f"{daemon.ask_endpoint}.nobody") as unanswered,
     ):
         until(lambda: bool(asking.may_i_lift(0.5)))
         until(lambda: bool(listening.verdict(0.1)))
@@ -41,7 +41,7 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(tmp_p
 def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
     with (
         Daemon(tmp_path, "[gate]\nearly = true\n", whole_grasps=True) as daemon,
-        Graspd(daemon.endpoint) as graspd,
+        Client(daemon.endpoint) as graspd,
     ):
         lifted = dict.fromkeys((None, 240.0), graspd.verdict())
         for still_ms, early in ((None, True), (240.0, False)):
@@ -64,7 +64,7 @@ def test_soon_or_sure_is_for_who_lifts_to_choose(tmp_path: Path) -> None:
 def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: Path) -> None:
     with (
         Daemon(tmp_path) as daemon,
-        Graspd(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as graspd,
+        Client(daemon.endpoint, ask_endpoint=daemon.ask_endpoint) as graspd,
         zmq.Context() as context,
         context.socket(zmq.SUB) as listener,
     ):
@@ -75,7 +75,7 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
         until(lambda: graspd.verdict(0.1).p_slip is not None)
         assert listener.poll(100_000)  # so its first subscription has been taken, too
         lifted_on = graspd.verdict()
-        assert graspd.outcome(lifted_on, slipped=True, object_name="mug", wait_s=10.0)
+        assert graspd.tell(lifted_on, Outcome.SLIPPED, "mug", wait_s=10.0)
         grasp = [str(lifted_on.boot_id), str(lifted_on.grasp)]
         tell = [str(lift_gate), "--tell", daemon.endpoint, daemon.ask_endpoint, *grasp]
         assert subprocess.run([*tell, "stable"], check=False, timeout=200).returncode == 1
@@ -87,13 +87,13 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
             if about == b"outcome.right":
                 heard.append(decode_outcome(payload))
         never = replace(lifted_on, grasp=10**9)
-        assert graspd.outcome(never, slipped=True, wait_s=10.0).why.startswith("unknown grasp")
+        assert graspd.tell(never, Outcome.SLIPPED, wait_s=10.0).why.startswith("unknown grasp")
     assert [(told.outcome, told.object) for told in heard] == [("slip", "mug"), ("slip", None)]
     assert {(told.boot_id, told.grasp) for told in heard} == {(lifted_on.boot_id, lifted_on.grasp)}
 
 
 def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Graspd(daemon.endpoint) as graspd:
+    with Daemon(tmp_path) as daemon, Client(daemon.endpoint) as graspd:
         until(lambda: graspd.verdict(0.1).p_slip is not None)
         daemon.send(signal.SIGSTOP)
         time.sleep(SILENCE_S)
@@ -106,7 +106,7 @@ def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -
 
 
 def test_a_new_start_forgets_the_former(tmp_path: Path) -> None:
-    with Daemon(tmp_path) as daemon, Graspd(daemon.endpoint) as graspd:
+    with Daemon(tmp_path) as daemon, Client(daemon.endpoint) as graspd:
         until(lambda: graspd.verdict(0.1).p_slip is not None)
         former = graspd.verdict(0.1)
         daemon.kill()
@@ -121,7 +121,7 @@ def test_messages_that_are_lost_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(graspd_client, "READ_WITHIN_NS", 200_000_000)
-    with Daemon(tmp_path) as daemon, Graspd(daemon.endpoint) as graspd:
+    with Daemon(tmp_path) as daemon, Client(daemon.endpoint) as graspd:
         until(lambda: graspd.verdict(0.1).p_slip is not None)
         before = graspd.counts.lost
         seq = graspd.verdict().seq
@@ -137,7 +137,7 @@ def test_messages_that_are_lost_are_counted(
 def test_a_sensor_that_is_broken_lifts_nothing(tmp_path: Path, fault: str) -> None:
     with (
         Daemon(tmp_path, f"[tactile.faults]\n{fault}\n") as daemon,
-        Graspd(daemon.endpoint) as graspd,
+        Client(daemon.endpoint) as graspd,
     ):
         until(lambda: graspd.verdict(0.1) is not None and graspd.counts.messages > 5)
         answer = graspd.may_i_lift(0.3)
@@ -149,7 +149,7 @@ def test_over_tcp_as_from_another_computer(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with (
         Daemon(tmp_path, endpoint=endpoint),
-        Graspd(endpoint, same_computer=False) as graspd,
+        Client(endpoint, same_computer=False) as graspd,
     ):
         until(lambda: bool(graspd.may_i_lift(1.0)))
         assert graspd.counts.lost == 0
@@ -162,8 +162,8 @@ def test_only_who_has_keys_is_told(tmp_path: Path) -> None:
     curve = f'[curve]\nsecret_key = "{secret}"\nclients = "{own_public.parent}"\n'
     with (
         Daemon(tmp_path, curve, endpoint=endpoint),
-        Graspd(endpoint, keys=Keys.load(public, own_secret)) as admitted,
-        Graspd(endpoint) as stranger,
+        Client(endpoint, keys=Keys.load(public, own_secret)) as admitted,
+        Client(endpoint) as stranger,
     ):
         until(lambda: admitted.verdict(0.1).p_slip is not None)
         assert stranger.verdict(0.2).reasons == ("no-message",)
@@ -176,7 +176,7 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(tmp_path: Pat
     endpoint = free_endpoint()
     with (
         Daemon(tmp_path, keys.section, endpoint=endpoint),
-        Graspd(endpoint, keys=Keys.load(keys.server, keys.own)) as graspd,
+        Client(endpoint, keys=Keys.load(keys.server, keys.own)) as graspd,
     ):
         assert graspd.verdict(1.5).reasons == ("no-message",)
         keys.admit()
@@ -186,11 +186,11 @@ def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(tmp_path: Pat
 
 def test_an_endpoint_that_is_none_leaves_nothing_behind() -> None:
     with pytest.raises(zmq.ZMQError):
-        Graspd("nowhere")
+        Client("nowhere")
 
 
 def test_waiting_ends_when_it_is_told_to(tmp_path: Path) -> None:
-    with Graspd(f"ipc://{tmp_path}/nobody") as graspd:
+    with Client(f"ipc://{tmp_path}/nobody") as graspd:
         began_s = time.monotonic()
         assert graspd.verdict(0.2).reasons == ("no-message",)
         assert 0.2 <= time.monotonic() - began_s < PATIENCE_S

@@ -15,7 +15,13 @@ from typing import Any
 import pytest
 import zmq
 
-from deploy.clients.python.graspd_client import Graspd, Outcome, OutcomeAnswer, Verdict
+from deploy.clients.python.graspd_client import (
+    Client,
+    Decision,
+    Outcome,
+    OutcomeAnswer,
+    Verdict,
+)
 from tests.clients.messages import ADDED, TOPIC, verdict
 from tests.threads import at_work
 
@@ -95,10 +101,10 @@ def test_only_an_answer_that_fits_allows_a_lift(
 ) -> None:
     with (
         false_daemon(tmp_path, answer),
-        Graspd(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask") as graspd,
+        Client(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask") as graspd,
     ):
         said = graspd.may_i_lift(100.0 if expected != "unknown" else DEADLINE_S)
-    assert (bool(said), said.verdict.verdict) == (expected == "stable", expected)
+    assert (bool(said), said.verdict.decision) == (expected == "stable", expected)
 
 
 @pytest.mark.parametrize(("answer", "expected"), ANSWERS.values(), ids=ANSWERS)
@@ -135,7 +141,7 @@ def test_a_person_who_watches_lets_both_lift_what_is_unproven_and_nothing_else(
     more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
     with (
         false_daemon(tmp_path, answer, "unknown", **more),
-        Graspd(places[0], ask_endpoint=places[2]) as graspd,
+        Client(places[0], ask_endpoint=places[2]) as graspd,
     ):
         said = graspd.may_i_lift(float(places[1]), supervised=True)
         assert (bool(said), said.supervised, bool(said.verdict)) == (may, may, False)
@@ -190,7 +196,7 @@ def test_who_wants_the_hand_to_have_been_still_lifts_only_when_the_daemon_says_s
     lift_gate: Path, tmp_path: Path, says: dict[str, Any], may: bool, may_at_once: bool
 ) -> None:
     out = f"ipc://{tmp_path}/out"
-    with false_daemon(tmp_path, told(), **says), Graspd(out) as graspd:
+    with false_daemon(tmp_path, told(), **says), Client(out) as graspd:
         for still_ms, allowed in ((240.0, may), (None, may_at_once)):
             deadline_s = 100.0 if allowed else DEADLINE_S
             answer = graspd.may_i_lift(deadline_s, still_ms=still_ms)
@@ -211,7 +217,7 @@ def test_both_answer_and_newest_message_must_have_been_still(
     deadline_s = 100.0 if may else DEADLINE_S
     with (
         false_daemon(tmp_path, told(still_ms=answer_ms), still_ms=newest_ms),
-        Graspd(places[0], ask_endpoint=places[1]) as graspd,
+        Client(places[0], ask_endpoint=places[1]) as graspd,
     ):
         assert bool(graspd.may_i_lift(deadline_s, still_ms=240.0)) is may
         words = ["--still", "240", places[0], str(deadline_s), places[1]]
@@ -222,7 +228,7 @@ def test_a_supervised_lift_must_have_been_still_as_any(lift_gate: Path, tmp_path
     out = f"ipc://{tmp_path}/out"
     more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
     with false_daemon(tmp_path, told(), "unknown", **more | {"still_ms": 130.0}):
-        with Graspd(out) as graspd:
+        with Client(out) as graspd:
             assert graspd.may_i_lift(100.0, supervised=True, still_ms=100)
             assert not graspd.may_i_lift(DEADLINE_S, supervised=True, still_ms=240)
         asked = [str(lift_gate), "--supervised", "--still"]
@@ -240,7 +246,7 @@ def test_a_stillness_that_is_no_time_is_refused(
     still_ms: Any,  # noqa: ANN401
 ) -> None:
     out = f"ipc://{tmp_path}/out"
-    with Graspd(out) as graspd, pytest.raises((ValueError, TypeError)):
+    with Client(out) as graspd, pytest.raises((ValueError, TypeError)):
         graspd.may_i_lift(DEADLINE_S, still_ms=still_ms)
     if isinstance(still_ms, float):
         asked = [str(lift_gate), "--still", str(still_ms), out, str(DEADLINE_S)]
@@ -252,7 +258,7 @@ def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome
     places = [f"ipc://{tmp_path}/out", str(DEADLINE_S), f"ipc://{tmp_path}/ask"]
     with (
         false_daemon(tmp_path, of("stable"), outcome),
-        Graspd(places[0], ask_endpoint=places[2]) as graspd,
+        Client(places[0], ask_endpoint=places[2]) as graspd,
     ):
         assert not graspd.may_i_lift(DEADLINE_S)
         assert (
@@ -261,7 +267,7 @@ def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome
 
 
 BOOT = "0f0e0d0c0b0a09080706050403020100"
-LIFTED_ON = Verdict("stable", grasp=42, boot_id=BOOT)
+LIFTED_ON = Verdict(Decision.STABLE, grasp=42, boot_id=BOOT)
 
 
 @contextmanager
@@ -285,7 +291,7 @@ def heard(folder: Path, frames: Sequence[bytes]) -> Iterator[list[bytes]]:
 
 
 def told_in_python(folder: Path, name: str | None) -> OutcomeAnswer:
-    with Graspd(f"ipc://{folder}/out", ask_endpoint=f"ipc://{folder}/ask") as graspd:
+    with Client(f"ipc://{folder}/out", ask_endpoint=f"ipc://{folder}/ask") as graspd:
         return graspd.tell(LIFTED_ON, Outcome.SLIPPED, name)
 
 
@@ -375,12 +381,12 @@ def test_a_name_that_is_no_word_of_an_outcome_is_not_sent(
 
 
 def test_an_outcome_needs_a_grasp_somebody_to_tell_and_an_open_client(tmp_path: Path) -> None:
-    asking = Graspd(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask")
+    asking = Client(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask")
     with asking as graspd, pytest.raises(ValueError, match="of no grasp"):
-        graspd.outcome(graspd.verdict(), True)
-    assert asking.outcome(LIFTED_ON, True).why == "closed"
-    with Graspd(f"ipc://{tmp_path}/out") as graspd, pytest.raises(ValueError, match="ask_endpoint"):
-        graspd.outcome(LIFTED_ON, True)
+        graspd.tell(graspd.verdict(), Outcome.SLIPPED)
+    assert asking.tell(LIFTED_ON, Outcome.SLIPPED).why == "closed"
+    with Client(f"ipc://{tmp_path}/out") as graspd, pytest.raises(ValueError, match="ask_endpoint"):
+        graspd.tell(LIFTED_ON, Outcome.SLIPPED)
 
 
 def test_in_cpp_a_lift_that_was_never_told_is_counted_and_warned_of(

@@ -57,7 +57,7 @@ def said(newest: Newest, now_ns: int) -> str:
     verdict = newest.at(now_ns)
     place = [-1 if number is None else number for number in (verdict.grasp, verdict.seq)]
     age_ns = round((-1.0 if verdict.age_ms is None else verdict.age_ms) * 1e6)
-    words = [verdict.verdict, len(verdict.reasons), *verdict.reasons, *place]
+    words = [verdict.decision, len(verdict.reasons), *verdict.reasons, *place]
     words += [verdict.boot_id or "-", age_ns, fixed(verdict.p_slip), fixed(verdict.p_slip_model)]
     words += [verdict.outcomes, int(verdict.supervised), int(bool(verdict))]
     if risk := verdict.risk:

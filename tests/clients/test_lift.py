@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Graspd, Outcome, Verdict
+from deploy.clients.python.graspd_client import Client, Decision, Outcome, Verdict
 from tests.clients.messages import ADDED, MS, Event, events, frames, supervised, verdict
 from tests.clients.oracle import has_been_still, is_stable, is_to_be_watched, newest, told
 
@@ -98,13 +98,13 @@ class World:
 
 
 @contextmanager
-def client(world: World, ask: bool = False) -> Iterator[Graspd]:
+def client(world: World, ask: bool = False) -> Iterator[Client]:
     """A client in that world."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(graspd_client, "_Link", lambda *_: world)
         clocks = {"monotonic_ns": world.monotonic_ns, "clock_gettime_ns": world.boot_ns}
         patch.setattr(graspd_client, "time", SimpleNamespace(**clocks, CLOCK_BOOTTIME=7))
-        with Graspd("ipc:///nowhere", ask_endpoint=ASK if ask else None) as made:
+        with Client("ipc:///nowhere", ask_endpoint=ASK if ask else None) as made:
             yield made
 
 
@@ -141,7 +141,7 @@ def test_slip_is_a_no_at_once() -> None:
     with client(World(stream("unknown", "slip", "stable"))) as graspd:
         answer = graspd.may_i_lift(0.5)
     assert not answer
-    assert (answer.verdict.verdict, answer.verdict.seq) == ("slip", 1)
+    assert (answer.verdict.decision, answer.verdict.seq) == ("slip", 1)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_slip_is_a_no_at_once_however_short_a_time_the_hand_has_been_still() -> 
     world = World([(START_NS, frames(verdict(0, START_NS - MS, "slip", still_ms=110.0)))])
     with client(world) as graspd:
         answer = graspd.may_i_lift(0.5, still_ms=240.0)
-    assert (bool(answer), answer.verdict.verdict) == (False, "slip")
+    assert (bool(answer), answer.verdict.decision) == (False, "slip")
     assert answer.waited_s < 1e-3
 
 
@@ -194,7 +194,7 @@ def test_a_deadline_that_is_none_is_refused(deadline_s: float) -> None:
 @pytest.mark.parametrize("max_age_ms", [0.0, float("nan"), float("inf")])
 def test_an_age_that_is_none_is_refused(max_age_ms: float) -> None:
     with pytest.raises(ValueError, match="max_age_ms"):
-        Graspd("ipc:///nowhere", max_age_ms=max_age_ms)
+        Client("ipc:///nowhere", max_age_ms=max_age_ms)
 
 
 def test_a_closed_client_says_no_without_waiting() -> None:
@@ -237,7 +237,7 @@ def test_an_answer_that_is_slip_is_a_no_at_once() -> None:
     world = World(stream(*["stable"] * 20), [(3 * MS, payload(1, "slip"))])
     with client(world, ask=True) as graspd:
         answer = graspd.may_i_lift(0.1)
-    assert (bool(answer), answer.verdict.verdict) == (False, "slip")
+    assert (bool(answer), answer.verdict.decision) == (False, "slip")
     assert answer.waited_s == pytest.approx(0.003, abs=1e-3)
 
 
@@ -261,7 +261,7 @@ def test_while_an_outcome_is_answered_what_comes_is_read() -> None:
     world = World(stream("unknown", *["stable"] * 9), acknowledged=[(45 * MS, TAKEN)])
     with client(world, ask=True) as graspd:
         before_ns = world.now_ns
-        assert graspd.outcome(Verdict("stable", grasp=1, boot_id="a"), slipped=False)
+        assert graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), Outcome.HELD)
         assert 45 * MS <= world.now_ns - before_ns < 47 * MS
         assert graspd.counts.messages == 5
         assert graspd.verdict().seq == 4
@@ -288,7 +288,7 @@ def test_a_lift_under_supervision_is_none_unless_it_is_asked_for(outcome: str, a
     with client(World(watched(outcome), list(answers)), ask) as graspd:
         answer = graspd.may_i_lift(0.1, supervised=True)
         assert (bool(answer), bool(answer.verdict), answer.supervised) == (True, False, True)
-        assert answer.verdict.verdict == outcome
+        assert answer.verdict.decision == outcome
         assert answer.waited_s < 0.02
 
 
@@ -391,27 +391,25 @@ def test_an_outcome_has_time_to_be_written() -> None:
     """To a disk that takes a second."""
     world = World(stream("stable"), acknowledged=[(1900 * MS, TAKEN)])
     with client(world, ask=True) as graspd:
-        assert graspd.tell(Verdict("stable", grasp=1, boot_id="a"), Outcome.HELD)
+        assert graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), Outcome.HELD)
 
 
 @pytest.mark.parametrize("word", ["held", "stable", Outcome.HELD])
 @pytest.mark.parametrize("bad", ["slipped", "slip", Outcome.SLIPPED])
 def test_an_outcome_has_a_name(word: str | Outcome, bad: str | Outcome) -> None:
     world = World(stream("stable"))
-    lifted_on = Verdict("stable", grasp=1, boot_id="a")
+    lifted_on = Verdict(Decision.STABLE, grasp=1, boot_id="a")
     with client(world, ask=True) as graspd:
         graspd.tell(lifted_on, word, wait_s=0.0)
         graspd.tell(lifted_on, bad, "mug", wait_s=0.0)
-        graspd.outcome(lifted_on, False, wait_s=0.0)
-        graspd.outcome(lifted_on, True, "mug", wait_s=0.0)
-    assert world.telling.said == [b"outcome a 1 stable", b"outcome a 1 slip mug"] * 2
+    assert world.telling.said == [b"outcome a 1 stable", b"outcome a 1 slip mug"]
 
 
 @pytest.mark.parametrize("nothing", [True, False, None, 0, "", "Slip", "unknown", "true"])
 def test_what_is_no_outcome_is_not_told(nothing: object) -> None:
     world = World(stream("stable"))
     with client(world, ask=True) as graspd, pytest.raises(ValueError, match="Outcome"):
-        graspd.tell(Verdict("stable", grasp=1, boot_id="a"), nothing)  # type: ignore[arg-type]
+        graspd.tell(Verdict(Decision.STABLE, grasp=1, boot_id="a"), nothing)  # type: ignore[arg-type]
     assert world.telling.said == []
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from deploy.clients.python.graspd_client import Graspd, Newest
+from deploy.clients.python.graspd_client import Client, Newest
 from tests.clients.messages import MS, TOPIC
 from tests.clients.oracle import MAX_AGE_NS
 from tests.clients.refused import CASES, NAMES, came, well
@@ -62,4 +62,4 @@ def test_a_daemon_with_a_higher_threshold_is_believed_as_far_as_the_client_is_to
     assert told(unsure, max_p_slip=0.7).at(NOW_NS)
     for wrong in (0.0, 1.1, float("nan")):
         with pytest.raises(ValueError, match="max_p_slip"):
-            Graspd("ipc:///nowhere", max_p_slip=wrong)
+            Client("ipc:///nowhere", max_p_slip=wrong)

@@ -16,7 +16,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deploy.clients.python import graspd_client
-from deploy.clients.python.graspd_client import Newest, Risk, Verdict, is_same_computer
+from deploy.clients.python.graspd_client import (
+    Decision,
+    Newest,
+    Risk,
+    Verdict,
+    is_same_computer,
+)
 from tests.clients.messages import (
     ADDED,
     MS,
@@ -151,7 +157,7 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
         now_ns = message["t_mono_ns"] + round(message["age_ms"] * 1e6)
         found.take(frames(message), now_ns, now_ns)
         seen = found.at(now_ns)
-        assert (seen.verdict, seen.reasons) == (message["verdict"], tuple(message["reasons"]))
+        assert (seen.decision, seen.reasons) == (message["verdict"], tuple(message["reasons"]))
         assert msgspec.json.decode(frames(message)[1], type=Former) == msgspec.convert(
             former, Former
         )
@@ -204,7 +210,7 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
 def test_what_was_added_and_contradicts_itself_is_malformed(
     outcome: str, change: dict[str, object]
 ) -> None:
-    assert said(verdict(0, START_NS, outcome, **ADDED)).verdict == outcome
+    assert said(verdict(0, START_NS, outcome, **ADDED)).decision == outcome
     found = said(verdict(0, START_NS, outcome, **ADDED | change))
     assert (found.reasons, found.supervised) == (("malformed",), False)
 
@@ -259,7 +265,7 @@ def test_a_lift_under_supervision_gets_old_as_any(later_ms: int) -> None:
     newest.take(frames(supervised(0, START_NS)), START_NS, START_NS)
     assert newest.at(START_NS + 99 * MS).supervised
     found = newest.at(START_NS + MS + later_ms * MS)
-    assert (found.verdict, found.supervised) == ("unknown", False)
+    assert (found.decision, found.supervised) == ("unknown", False)
 
 
 def test_another_version_is_unknown_until_this_one_comes_again() -> None:
@@ -368,6 +374,17 @@ def test_what_waited_while_nobody_read_has_no_time_of_arrival() -> None:
 )
 def test_only_endpoints_of_this_computer_share_its_clock(endpoint: str, same: bool) -> None:
     assert is_same_computer(endpoint) is same
+
+
+@pytest.mark.parametrize("word", ["stable", "slip", "unknown"])
+def test_a_decision_is_the_word_of_the_wire_and_printed_as_it(word: str) -> None:
+    decision = Decision(word)
+    assert (decision == word, str(decision), f"{decision}", json.dumps(decision)) == (
+        True,
+        word,
+        word,
+        f'"{word}"',
+    )
 
 
 def test_the_file_is_python_3_9() -> None:

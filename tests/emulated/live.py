@@ -28,7 +28,11 @@ UNREAD_MAX = 16_384
 
 
 class LiveBoard:
-    """A board whose emulated time follows the real one; never ahead of it."""
+    """A board whose emulated time follows the real one, never ahead of it.
+
+    What the host says is heard no sooner than it was said, however far the emulation is behind: to
+    the host a stall is an answer that is late, not a clock that stood.
+    """
 
     def __init__(self, board: Board, link: Path) -> None:
         self.behind_ms = 0.0
@@ -44,6 +48,7 @@ class LiveBoard:
         self._poll.register(self._master, select.POLLIN)
         self._unread = bytearray()
         self._is_open = False
+        self._began_ns = 0
 
     def warm_up(self) -> None:
         """Sweep for a while, then stop."""
@@ -56,20 +61,23 @@ class LiveBoard:
 
     def run(self) -> None:
         """Run until a signal or the end of standard input."""
-        began_ns = time.monotonic_ns() - round(self._board.now_ns)
+        self._began_ns = time.monotonic_ns() - round(self._board.now_ns)
         self._link.symlink_to(self._path)
         try:
             while not select.select([sys.stdin], [], [], 0)[0]:
-                now_ns = time.monotonic_ns() - began_ns
-                self.behind_ms = max(self.behind_ms, (now_ns - self._board.now_ns) / MS)
-                self._unread += self._board.run_until(now_ns)
-                self._board.frames.clear()
+                self._catch_up()
                 self._give()
                 self._take()
                 time.sleep(STEP_S)
         finally:
             self._link.unlink()
             os.close(self._master)
+
+    def _catch_up(self) -> None:
+        now_ns = time.monotonic_ns() - self._began_ns
+        self.behind_ms = max(self.behind_ms, (now_ns - self._board.now_ns) / MS)
+        self._unread += self._board.run_until(now_ns)
+        self._board.frames.clear()
 
     def _give(self) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -84,6 +92,7 @@ class LiveBoard:
             self._is_open = is_open
         if happened & select.POLLIN:
             said = os.read(self._master, 4096)
+            self._catch_up()
             if frame(START) in said:
                 self._board.do("rewind")
             self._board.send(said)

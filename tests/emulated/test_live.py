@@ -97,11 +97,11 @@ def test_the_doctor_and_the_daemon_take_it_for_a_board(live: Live, tmp_path: Pat
     at = [rows[np.array(reading.counts, dtype=np.uint16).tobytes()] for reading in found]
     steps = np.diff(at) % len(once)
     assert not any(any(map(any, reading.faults)) for reading in found)
-    times_ns = [reading.t_mono_ns for reading in found]
+    # The chip's clock is right however far its emulation is behind.
+    assert clock_faults == 0
+    intervals_ns = np.diff([reading.t_mono_ns for reading in found])
+    assert (intervals_ns > 0).all()
     if behind_ms < ON_TIME_MS:
         assert (steps == 1).all()
         assert report["readings"] > 250
-        # A clock that is distrusted is not believed what it said before, either.
-        assert np.count_nonzero(np.diff(times_ns) < 0) <= clock_faults
-        if not clock_faults:
-            assert float(np.median(np.diff(times_ns))) == pytest.approx(10e6, rel=0.01)
+        assert float(np.median(intervals_ns)) == pytest.approx(10e6, rel=0.01)

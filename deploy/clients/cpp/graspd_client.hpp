@@ -68,13 +68,17 @@ constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
 constexpr std::size_t LIFTS_MAX = 256;  // that are remembered: as many as graspd takes outcomes of
 constexpr std::int64_t WARN_EVERY = 10;  // lifts whose outcome was never told
 
-// Of a grasp, as `verdict_code`; and of its lift.
-enum class Outcome { unknown = 0, stable = 1, slip = 2, held = stable, slipped = slip };
+// What graspd decided about a grasp; the numbers are those of `verdict_code`.
+enum class Decision { unknown = 0, stable = 1, slip = 2 };
 
-inline const char* name(Outcome outcome) {
+// The wire's word for it.
+inline const char* name(Decision decision) {
     constexpr const char* names[] = {"unknown", "stable", "slip"};
-    return names[static_cast<int>(outcome)];
+    return names[static_cast<int>(decision)];
 }
+
+// How a lift ended.
+enum class Outcome { held, slipped };
 
 // What lifts of `stable` verdicts came to: of `lifts` that were told, so many `slips`.
 struct Risk {
@@ -87,7 +91,7 @@ struct Risk {
 
 // What is known of the grasp. True in an `if` exactly when it is stable, and nobody need watch.
 struct Verdict {
-    Outcome outcome = Outcome::unknown;
+    Decision decision = Decision::unknown;
     // Why it is unknown: the daemon's reasons, or one of those in deploy/clients/README.md.
     std::vector<std::string> reasons;
     std::optional<double> p_slip;        // probability of slip; none when unknown
@@ -109,12 +113,12 @@ struct Verdict {
     std::map<std::string, std::optional<double>> motion;
     std::map<std::string, double> motion_limits;
 
-    explicit operator bool() const { return outcome == Outcome::stable && !supervised; }
+    explicit operator bool() const { return decision == Decision::stable && !supervised; }
 
     // The same, but unknown, and not to be lifted.
     Verdict unknown(std::vector<std::string> why) const {
         Verdict same = *this;
-        same.outcome = Outcome::unknown;
+        same.decision = Decision::unknown;
         same.reasons = std::move(why);
         same.p_slip = same.p_slip_model = std::nullopt;
         same.supervised = false;
@@ -149,22 +153,27 @@ struct Counts {
     std::int64_t former = 0;     // messages of a start that is over
 };
 
-// The value of `public-key` or `secret-key` in a file that `graspd keys` made.
-// Throws `std::runtime_error`.
-inline std::string load_key(const std::string& path, const std::string& which) {
-    std::ifstream file(path);
-    for (std::string line; std::getline(file, line);) {
-        const auto at = line.find(which + " = \"");
-        const auto from = line.find('"') + 1;
-        const auto to = line.rfind('"');
-        if (at != std::string::npos && to > from) return line.substr(from, to - from);
-    }
-    throw std::runtime_error(path + ": no " + which);
-}
-
 // CURVE keys, Z85: the daemon's public one, and one's own two.
 struct Keys {
-    std::string server, public_key, secret;
+    std::string server_key, public_key, secret_key;
+
+    // From the daemon's `.key` and one's own `.key_secret` file (`graspd keys`).
+    // Throws `std::runtime_error`.
+    static Keys load(const std::string& server, const std::string& own) {
+        return {value(server, "public-key"), value(own, "public-key"), value(own, "secret-key")};
+    }
+
+private:
+    static std::string value(const std::string& path, const std::string& which) {
+        std::ifstream file(path);
+        for (std::string line; std::getline(file, line);) {
+            const auto at = line.find(which + " = \"");
+            const auto from = line.find('"') + 1;
+            const auto to = line.rfind('"');
+            if (at != std::string::npos && to > from) return line.substr(from, to - from);
+        }
+        throw std::runtime_error(path + ": no " + which);
+    }
 };
 
 struct Options {
@@ -307,10 +316,10 @@ inline Message message(const json& told) {
     Message all;
     Verdict& found = all.verdict;
     const auto code = integer(told, "verdict_code");
-    if (code > 2 || text(field(told, "verdict")) != name(static_cast<Outcome>(code)))
+    if (code > 2 || text(field(told, "verdict")) != name(static_cast<Decision>(code)))
         throw Malformed{};
-    found.outcome = static_cast<Outcome>(code);
-    const bool known = found.outcome != Outcome::unknown;
+    found.decision = static_cast<Decision>(code);
+    const bool known = found.decision != Decision::unknown;
     const json& valid = field(told, "valid");
     if (!valid.is_boolean() || valid.get<bool>() != known) throw Malformed{};
     found.p_slip = maybe(told, "p_slip", 1.0);
@@ -361,7 +370,7 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
         Message found = message(told);
         Verdict& said = found.verdict;
         // What more likely slips is not stable.
-        if (said.outcome == Outcome::stable && *said.p_slip >= max_p_slip)
+        if (said.decision == Decision::stable && *said.p_slip >= max_p_slip)
             said = said.unknown({"p-slip"});
         return {std::move(found), ""};
     } catch (const Malformed&) {
@@ -370,22 +379,20 @@ inline std::pair<std::optional<Message>, std::string> read(std::string_view payl
 }
 
 // An outcome as it is sent. Throws `std::invalid_argument`.
-inline std::string telling(const Verdict& lifted_on, Outcome how, const std::string& object) {
-    if (how != Outcome::held && how != Outcome::slipped)
-        throw std::invalid_argument("a lift is held or slipped");
+inline std::string telling(const Verdict& lifted_on, Outcome how, const std::string& object_name) {
     if (lifted_on.boot_id.empty() || lifted_on.grasp.value_or(0) == 0)
         throw std::invalid_argument("nothing was lifted on a verdict that is of no grasp");
     const auto told = "outcome " + lifted_on.boot_id + ' ' + std::to_string(*lifted_on.grasp) +
-                      ' ' + name(how);
-    if (object.empty()) return told;
-    const auto fits = [&object](const char& c) {
+                      (how == Outcome::held ? " stable" : " slip");
+    if (object_name.empty()) return told;
+    const auto fits = [&object_name](const char& c) {
         const bool plain = (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') ||
                            (c >= '0' && c <= '9') || c == '_';
-        return plain || (&c != object.data() && (c == '-' || c == '.'));
+        return plain || (&c != object_name.data() && (c == '-' || c == '.'));
     };
-    if (object.size() > OBJECT_MAX || !std::all_of(object.begin(), object.end(), fits))
-        throw std::invalid_argument("no name of an object: " + object);
-    return told + ' ' + object;
+    if (object_name.size() > OBJECT_MAX || !std::all_of(object_name.begin(), object_name.end(), fits))
+        throw std::invalid_argument("no name of an object: " + object_name);
+    return told + ' ' + object_name;
 }
 
 // The answer to an outcome; none if it is not understood.
@@ -451,7 +458,7 @@ public:
         const Nanoseconds reading_age_ns = age_ns + message_->published_ns - message_->read_ns;
         Verdict said = message_->verdict;
         said.age_ms = static_cast<double>(reading_age_ns) / 1e6;
-        const bool counts_on_it = said.outcome != Outcome::unknown || said.supervised;
+        const bool counts_on_it = said.decision != Decision::unknown || said.supervised;
         if (!published_ns_) return said.unknown({"joining"});
         if (age_ns < -CLOCK_SLACK_NS) return said.unknown({"clock"});
         if (age_ns > message_->silence_ns) return said.unknown({"silent"});
@@ -590,9 +597,9 @@ private:
         made.set(zmq::sockopt::rcvhwm, QUEUE_MAX);
         made.set(zmq::sockopt::maxmsgsize, static_cast<std::int64_t>(MESSAGE_MAX_BYTES));
         if (options_.keys) {
-            made.set(zmq::sockopt::curve_serverkey, options_.keys->server);
+            made.set(zmq::sockopt::curve_serverkey, options_.keys->server_key);
             made.set(zmq::sockopt::curve_publickey, options_.keys->public_key);
-            made.set(zmq::sockopt::curve_secretkey, options_.keys->secret);
+            made.set(zmq::sockopt::curve_secretkey, options_.keys->secret_key);
         }
         if (endpoint.rfind("tcp://", 0) == 0) {
             made.set(zmq::sockopt::heartbeat_ivl, HEARTBEAT_MS);
@@ -633,7 +640,7 @@ public:
 
     // Whether there is no need to wait.
     bool is_over(const Verdict& said) const {
-        return said.outcome == Outcome::slip || permits(said);
+        return said.decision == Decision::slip || permits(said);
     }
 
     // The newest message, if it confirms the answer; nothing to lift on otherwise. Asks.
@@ -645,7 +652,7 @@ public:
             answer_ = newest_.answered(*payload);
             if (answer_) answer_ = if_still(*std::move(answer_));
             const bool permitted = answer_ && permits(*answer_);
-            if (answer_ && answer_->outcome == Outcome::slip && !permitted) return *answer_;
+            if (answer_ && answer_->decision == Decision::slip && !permitted) return *answer_;
             if (!permitted) answer_.reset();
         }
         if (answer_ && !is_behind(newest, *answer_)) {
@@ -658,7 +665,7 @@ public:
             link_.ask(link_.asking, "judge");
             asked_ = true;
         }
-        if (newest.outcome == Outcome::unknown && !permits(newest)) return newest;
+        if (newest.decision == Decision::unknown && !permits(newest)) return newest;
         return newest.unknown(newest.reasons.empty() ? std::vector<std::string>{"no-answer"}
                                                      : newest.reasons);
     }
@@ -744,12 +751,12 @@ public:
     //
     // Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
     // comes later is taken in by later calls; without one, tell it again. Throws
-    // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, for
-    // `Outcome::unknown`, and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`,
-    // or begins with one of the last two.
-    OutcomeAnswer tell(const Verdict& lifted_on, Outcome how, const std::string& object = {},
-                       double wait_s = 2.0) {
-        const std::string telling = detail::telling(lifted_on, how, object);
+    // `std::invalid_argument` without an ask endpoint, for a verdict that is of no grasp, and for a
+    // name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins with one of the last
+    // two.
+    OutcomeAnswer tell(const Verdict& lifted_on, Outcome how,
+                       const std::string& object_name = {}, double wait_s = 2.0) {
+        const std::string telling = detail::telling(lifted_on, how, object_name);
         if (!asks_) throw std::invalid_argument("an outcome needs an ask_endpoint");
         const Nanoseconds due_ns = detail::now_ns() + duration_ns(wait_s);
         link_.telling.hang_up();
@@ -759,12 +766,6 @@ public:
         drain();
         while (!told_ && wait(due_ns)) drain();
         return told_.value_or(OutcomeAnswer{"no-answer"});
-    }
-
-    // Former name of `tell`, which took a bool.
-    OutcomeAnswer outcome(const Verdict& lifted_on, bool slipped, const std::string& object = {},
-                          double wait_s = 2.0) {
-        return tell(lifted_on, slipped ? Outcome::slipped : Outcome::held, object, wait_s);
     }
 
 private:

@@ -15,7 +15,7 @@
 namespace {
 
 void print(const graspd::Verdict& verdict, const graspd::Counts& counts) {
-    std::cout << graspd::name(verdict.outcome) << " [";
+    std::cout << graspd::name(verdict.decision) << " [";
     for (const std::string& reason : verdict.reasons) std::cout << ' ' << reason;
     std::cout << " ] grasp " << verdict.grasp.value_or(0) << " boot " << verdict.boot_id << " lost "
               << counts.lost << std::endl;
@@ -25,7 +25,7 @@ int watch(const graspd::Options& options) {
     graspd::Client client(options);
     for (graspd::Verdict former, now;; former = now) {
         now = client.verdict(0.02);
-        if (now.outcome != former.outcome || now.reasons != former.reasons ||
+        if (now.decision != former.decision || now.reasons != former.reasons ||
             now.boot_id != former.boot_id)
             print(now, client.counts());
     }
@@ -76,10 +76,7 @@ int main(int count, char** given) {
         }
         if (!words.empty() && words[0] == "--watch" && (words.size() == 2 || words.size() == 4)) {
             options.endpoint = words[1];
-            if (words.size() == 4)
-                options.keys = graspd::Keys{graspd::load_key(words[2], "public-key"),
-                                            graspd::load_key(words[3], "public-key"),
-                                            graspd::load_key(words[3], "secret-key")};
+            if (words.size() == 4) options.keys = graspd::Keys::load(words[2], words[3]);
             return watch(options);
         }
         if (!words.empty() && words[0] == "--tell" && (words.size() == 6 || words.size() == 7))

@@ -3,9 +3,9 @@
 One file to copy: it needs Linux, Python 3.9 or newer and pyzmq, and nothing of graspd itself. The
 messages are those of deploy/wire/README.md, version 1.
 
-    with Graspd("ipc:///run/graspd/right.ipc", ask_endpoint=ASK) as graspd:
-        if answer := graspd.may_i_lift(0.5):
-            graspd.tell(answer.verdict, Outcome.HELD if lift() else Outcome.SLIPPED)
+    with Client("ipc:///run/graspd/right.ipc", ask_endpoint=ASK) as client:
+        if answer := client.may_i_lift(0.5):
+            client.tell(answer.verdict, Outcome.HELD if lift() else Outcome.SLIPPED)
 
 Nothing here runs by itself but ZeroMQ's own thread, and an object belongs to the thread that made
 it. Only `verdict(wait_s)`, `may_i_lift(deadline_s)` and `tell(..., wait_s)` wait, and no longer
@@ -29,11 +29,19 @@ from typing import Any, NamedTuple
 import zmq
 from zmq.auth import load_certificate
 
+__all__ = [
+    "Client",
+    "Counts",
+    "Decision",
+    "Keys",
+    "LiftAnswer",
+    "Outcome",
+    "OutcomeAnswer",
+    "Risk",
+    "Verdict",
+]
+
 VERSION = 1  # of the messages; what has another is not understood
-STABLE, SLIP, UNKNOWN = "stable", "slip", "unknown"
-CODES = {UNKNOWN: 0, STABLE: 1, SLIP: 2}
-# The only reasons of a grasp that may be lifted under supervision: [risk] alone is against it.
-WITHHELD = {"unproven", "low-confidence"}
 INTEGER_MAX = 2**60  # of a message: as a time, 36 years in ns
 REAL_MAX = 1e12  # of a message: as a time, thirty years in ms
 # A verdict has 0.7 kB, at most 3; a peer that sends more is no daemon and is disconnected.
@@ -57,19 +65,34 @@ DRIFT = 1e-3
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
 # On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-# Name of an object, as the daemon takes it.
-OBJECT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+OBJECT_MAX = 64  # characters of an object's name
 LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
 WARN_EVERY = 10  # lifts whose outcome was never told
 
+# The only reasons of a grasp that may be lifted under supervision: [risk] alone is against it.
+_WITHHELD = {"unproven", "low-confidence"}
+# Name of an object, as the daemon takes it.
+_OBJECT = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{OBJECT_MAX - 1}}}")
+
 log = logging.getLogger("graspd_client")
+
+
+class Decision(str, Enum):  # noqa: UP042 - StrEnum needs Python 3.11
+    """What graspd decided about a grasp; equal to the wire's word and printed as it."""
+
+    UNKNOWN = "unknown"
+    STABLE = "stable"
+    SLIP = "slip"
+
+    def __str__(self) -> str:
+        return str(self.value)
 
 
 class Outcome(Enum):
     """How a lift ended; `Outcome("held")` is understood as `Outcome("stable")`, a bool is not."""
 
-    HELD = STABLE
-    SLIPPED = SLIP
+    HELD = "stable"
+    SLIPPED = "slip"
 
     @classmethod
     def _missing_(cls, value: object) -> Outcome | None:
@@ -92,7 +115,7 @@ class Risk:
 class Verdict:
     """What is known of the grasp. True in an `if` exactly when it is stable, nobody need watch.
 
-    `verdict` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
+    `decision` is `stable`, `slip` or `unknown`. `reasons` say why it is unknown: the daemon's, or
     one of those in deploy/clients/README.md. `p_slip` is the probability of slip, None when
     unknown, and rests on so many `outcomes`; the network alone says `p_slip_model`. `grasp` is the
     number of the contact episode, `age_ms` the time since the reading's last byte, ms, at least.
@@ -104,7 +127,7 @@ class Verdict:
     message, or not told by the daemon, is None.
     """
 
-    verdict: str
+    decision: Decision
     reasons: tuple[str, ...] = ()
     p_slip: float | None = None
     grasp: int | None = None
@@ -121,11 +144,11 @@ class Verdict:
     motion_limits: dict[str, float] | None = field(default=None, hash=False)
 
     def __bool__(self) -> bool:
-        return self.verdict == STABLE and not self.supervised
+        return self.decision == Decision.STABLE and not self.supervised
 
     def unknown(self, *reasons: str) -> Verdict:
         """The same, but unknown, and not to be lifted."""
-        held_back = replace(self, verdict=UNKNOWN, reasons=reasons, supervised=False)
+        held_back = replace(self, decision=Decision.UNKNOWN, reasons=reasons, supervised=False)
         return replace(held_back, p_slip=None, p_slip_model=None)
 
 
@@ -169,9 +192,9 @@ class Counts:
 class Keys(NamedTuple):
     """CURVE keys, Z85: the daemon's public one, and one's own two."""
 
-    server: bytes
-    public: bytes
-    secret: bytes
+    server_key: bytes
+    public_key: bytes
+    secret_key: bytes
 
     @classmethod
     def load(cls, server: Path, own: Path) -> Keys:
@@ -185,7 +208,7 @@ class Keys(NamedTuple):
         return cls(load_certificate(server)[0], public, secret)
 
 
-class Graspd:
+class Client:
     """Subscribes to the verdicts of one hand. Use it in one thread, and close it."""
 
     def __init__(
@@ -246,12 +269,12 @@ class Graspd:
     def verdict(self, wait_s: float = 0.0) -> Verdict:
         """The newest verdict; waits at most `wait_s` seconds for a new message."""
         if self._closed:
-            return Verdict(UNKNOWN, ("closed",))
+            return Verdict(Decision.UNKNOWN, ("closed",))
         due_ns = time.monotonic_ns() + round(wait_s * 1e9)
         while not self._drain() and self._wait(due_ns):
             pass
         if self._behind:
-            return Verdict(UNKNOWN, ("behind",))
+            return Verdict(Decision.UNKNOWN, ("behind",))
         return self._newest.at(time.monotonic_ns())
 
     def may_i_lift(
@@ -319,17 +342,6 @@ class Graspd:
             self._drain()
         return self._told
 
-    def outcome(
-        self,
-        lifted_on: Verdict,
-        slipped: bool | str,
-        object_name: str | None = None,
-        wait_s: float = 2.0,
-    ) -> OutcomeAnswer:
-        """Former name of `tell`, with a bool for how it ended."""
-        how = slipped if isinstance(slipped, str) else SLIP if slipped else STABLE
-        return self.tell(lifted_on, how, object_name, wait_s)
-
     def close(self) -> None:
         """Close the sockets. May be called again; every verdict is unknown from then on."""
         if not self._closed:
@@ -337,7 +349,7 @@ class Graspd:
             self._link.close()
             self._allow(("", 0))
 
-    def __enter__(self) -> Graspd:
+    def __enter__(self) -> Client:
         return self
 
     def __exit__(self, *_details: object) -> None:
@@ -477,7 +489,7 @@ class Newest:
         """What is known at a time (own clock)."""
         message = self._message
         if message is None:
-            return Verdict(UNKNOWN, (self._why,))
+            return Verdict(Decision.UNKNOWN, (self._why,))
         age_ns = 0 if self._published_ns is None else now_ns - self._published_ns
         reading_age_ns = age_ns + message.published_ns - message.read_ns
         said = replace(message.verdict, age_ms=reading_age_ns / 1e6)
@@ -487,7 +499,8 @@ class Newest:
             return said.unknown("clock")
         if age_ns > message.silence_ns:
             return said.unknown("silent")
-        if (said.verdict != UNKNOWN or said.supervised) and reading_age_ns > self._max_age_ns:
+        counts_on_it = said.decision != Decision.UNKNOWN or said.supervised
+        if counts_on_it and reading_age_ns > self._max_age_ns:
             return said.unknown("stale")
         return said
 
@@ -506,7 +519,8 @@ class Newest:
     def _if_sure(self, found: _Message) -> _Message:
         """A message, unknown if it calls stable what more likely slips."""
         said = found.verdict
-        if said.verdict == STABLE and said.p_slip is not None and said.p_slip >= self._max_p_slip:
+        slips = said.p_slip is not None and said.p_slip >= self._max_p_slip
+        if said.decision == Decision.STABLE and slips:
             return found._replace(verdict=said.unknown("p-slip"))
         return found
 
@@ -567,7 +581,7 @@ class _Question:
 
     def is_over(self, said: Verdict) -> bool:
         """Whether there is no need to wait."""
-        return said.verdict == SLIP or self.permits(said)
+        return said.decision == Decision.SLIP or self.permits(said)
 
     def decided(self, newest: Verdict) -> Verdict:
         """The newest message, if it confirms the answer; nothing to lift on otherwise. Asks."""
@@ -578,8 +592,10 @@ class _Question:
         if payload is not None:
             self._asked = False
             answer = self._newest.read(payload)
-            said = Verdict(UNKNOWN) if isinstance(answer, str) else self._if_still(answer.verdict)
-            if said.verdict == SLIP and not self.permits(said):
+            said = Verdict(Decision.UNKNOWN)
+            if not isinstance(answer, str):
+                said = self._if_still(answer.verdict)
+            if said.decision == Decision.SLIP and not self.permits(said):
                 return said
             self._answer = said if self.permits(said) else None
         if self._answer is not None and _reaches(newest, self._answer):
@@ -593,7 +609,7 @@ class _Question:
         if not self._asked and self._answer is None:
             self._asking.ask(b"judge")
             self._asked = True
-        if newest.verdict == UNKNOWN and not self.permits(newest):
+        if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
         return newest.unknown(*(newest.reasons or ("no-answer",)))
 
@@ -717,11 +733,11 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _message(told: dict[str, Any]) -> _Message:
-    verdict, reasons, supervised = told["verdict"], told["reasons"], told.get("supervised", False)
-    known = verdict in (STABLE, SLIP)
+    reasons, supervised = told["reasons"], told.get("supervised", False)
+    decision = Decision(told["verdict"])
+    known = decision != Decision.UNKNOWN
     fits = (
-        isinstance(verdict, str)
-        and _number(told, "verdict_code") == CODES.get(verdict)
+        _number(told, "verdict_code") == list(Decision).index(decision)
         and told["valid"] is known
         and (told["p_slip"] is not None) is known
         and (known or told.get("p_slip_model") is None)
@@ -737,8 +753,8 @@ def _message(told: dict[str, Any]) -> _Message:
     read_ns, seq, grasp, outcomes = _numbers(told, "t_mono_ns", "seq", "grasp", "outcomes")
     age_ms, silence_ms = _real(told, "age_ms"), _real(told, "silence_ms")
     p_slip, p_model = (_maybe(told, name, 1) for name in ("p_slip", "p_slip_model"))
-    said = Verdict(verdict, tuple(reasons), p_slip, grasp, seq, told["boot_id"])
-    supervised = supervised and WITHHELD.issuperset(reasons)
+    said = Verdict(decision, tuple(reasons), p_slip, grasp, seq, told["boot_id"])
+    supervised = supervised and _WITHHELD.issuperset(reasons)
     said = replace(said, p_slip_model=p_model, outcomes=outcomes, supervised=supervised)
     said = replace(said, risk=None if told["risk"] is None else _risk(told["risk"]))
     said = _with_stillness(said, told)
@@ -784,7 +800,7 @@ def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes
         raise ValueError("nothing was lifted on a verdict that is of no grasp")
     words = ["outcome", boot_id, str(grasp), how.value]
     if object_name is not None:
-        if OBJECT.fullmatch(object_name) is None:
+        if _OBJECT.fullmatch(object_name) is None:
             raise ValueError(f"{object_name!r} is no name of an object")
         words.append(object_name)
     return " ".join(words).encode()

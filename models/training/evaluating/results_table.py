@@ -55,7 +55,8 @@ def _head(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
     yield (
         "F1 in % with slip as the positive class, unless a column says otherwise. `+-` is the "
         "standard deviation over the folds (`unknown`: over the trainings), s.e. the standard "
-        "error over the split seeds."
+        "error over the split seeds. A model's card (`graspd models NAME`) has the first seed "
+        "alone."
     )
     if made.quick:
         yield "**Made with `--quick`: hardly trained, on few grasps. The figures mean nothing.**"

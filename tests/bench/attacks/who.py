@@ -14,7 +14,7 @@ from pathlib import Path
 import zmq
 
 from daemon.publish.keys import load_pair, make
-from deploy.clients.python.graspd_client import Graspd
+from deploy.clients.python.graspd_client import Client
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.clients.bench import Daemon, free_endpoint
 from tests.clients.messages import TOPIC
@@ -195,13 +195,13 @@ def rogue_publisher(plan: Plan) -> Outcome:
 
 
 @contextmanager
-def _rogue(path: Path) -> Iterator[tuple[zmq.Socket[bytes], Graspd]]:
+def _rogue(path: Path) -> Iterator[tuple[zmq.Socket[bytes], Client]]:
     """A publisher, and a client that hears it."""
     endpoint = f"ipc://{path}"
     with zmq.Context() as context, context.socket(zmq.XPUB) as publisher:
         publisher.linger = 0
         publisher.bind(endpoint)
-        with Graspd(endpoint) as graspd:
+        with Client(endpoint) as graspd:
             if not publisher.poll(round(HEARD_S * 1e3)):
                 raise TimeoutError("the client does not subscribe")
             publisher.recv()

@@ -1,0 +1,133 @@
+"""The C++ client is installed, and found by CMake and by pkg-config, by its README's own lines."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.clients.building import CPP, skip_unless_it_can_be_compiled
+
+README = (CPP.parent / "README.md").read_text()
+PROGRAM = "lift_gate"
+
+
+def block(language: str, first: str) -> list[str]:
+    """Lines of the one code block in this language that begins so."""
+    (code,) = re.findall(rf"```{language}\n({first}.*?)```", README, re.DOTALL)
+    return str(code).splitlines()
+
+
+def run(*words: str | Path, **variables: str) -> str:
+    done = subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+        env=os.environ | variables,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the client is installed."""
+    skip_unless_it_can_be_compiled()
+    missing = [tool for tool in ("cmake", "pkg-config") if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"no package of the client without it: apt install {' '.join(missing)}")
+    folder = tmp_path_factory.mktemp("installed")
+    made = folder / "build"
+    run("cmake", "-S", CPP, "-B", made, f"-DCMAKE_INSTALL_PREFIX={folder}")
+    run("cmake", "--install", made)
+    return folder
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A program that has no header of the client beside it."""
+    shutil.copy(CPP / f"{PROGRAM}.cpp", tmp_path)
+    return tmp_path
+
+
+def works(program: Path, folder: Path) -> None:
+    """Where no daemon is, it may not lift, and says why."""
+    asked = subprocess.run(
+        [program, f"ipc://{folder}/nobody", "0.1"],
+        capture_output=True,
+        text=True,
+        timeout=100,
+        check=False,
+    )
+    assert asked.returncode == 1, asked.stderr
+    assert asked.stdout.startswith("unknown [ no-message ]")
+
+
+def test_cmake_finds_the_installed_client(prefix: Path, project: Path) -> None:
+    (project / "CMakeLists.txt").write_text("\n".join(block("cmake", "cmake_minimum")))
+    run("cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={prefix}")
+    run("cmake", "--build", project / "build")
+    works(project / "build" / PROGRAM, project)
+
+
+def test_cmake_takes_the_sources_of_the_client(prefix: Path, project: Path) -> None:
+    del prefix  # skips where there is no compiler
+    lines = [
+        f'add_subdirectory("{CPP}" client)' if line.startswith("find_package") else line
+        for line in block("cmake", "cmake_minimum")
+    ]
+    (project / "CMakeLists.txt").write_text("\n".join(lines))
+    run("cmake", "-S", project, "-B", project / "build")
+    run("cmake", "--build", project / "build")
+    works(project / "build" / PROGRAM, project)
+
+
+def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> None:
+    (described,) = prefix.glob("lib*/**/graspd_client.pc")
+    line = block("sh", "cmake -S")[1]
+    run("sh", "-c", f"cd {project} && {line}", PKG_CONFIG_PATH=str(described.parent))
+    works(project / PROGRAM, project)
+
+
+def test_the_program_of_the_readme_says_not_to_lift_where_nobody_answers(
+    prefix: Path, project: Path
+) -> None:
+    """In both languages."""
+    said = {}
+    endpoint = f"ipc://{project}/nobody"
+    programs = {each: "\n".join(block(each, "")) for each in ("python", "cpp")}
+    assert all(code.count("ipc:///run/graspd/right") == 2 for code in programs.values())
+    cpp, python = (
+        programs[each].replace("ipc:///run/graspd/right", endpoint) for each in ("cpp", "python")
+    )
+    (project / "program.cpp").write_text(f"{cpp}\nbool lift() {{ return true; }}\n")
+    words = ["g++", "-std=c++17", "-Wall", "-Wextra", "-Werror", f"-I{prefix}/include"]
+    run(*words, project / "program.cpp", "-lzmq", "-o", project / "program")
+    said["cpp"] = run(project / "program")
+    path = str(CPP.parent / "python")
+    said["python"] = run(sys.executable, "-c", python, PYTHONPATH=path)
+    assert said == {
+        "cpp": "do not lift: unknown\n",
+        "python": "do not lift: unknown ('no-message',)\n",
+    }
+
+
+def test_another_minor_version_is_not_taken_for_this_one(prefix: Path, project: Path) -> None:
+    lines = "\n".join(block("cmake", "cmake_minimum")).replace("0.1", "0.2")
+    (project / "CMakeLists.txt").write_text(lines)
+    found = subprocess.run(
+        ["cmake", "-S", project, "-B", project / "build", f"-DCMAKE_PREFIX_PATH={prefix}"],
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert found.returncode != 0
+    assert "version: 0.1.0" in found.stderr

@@ -1,0 +1,210 @@
+"""One figure for one thing: what README, MEASURED and RESULTS say of a model is on its card."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from models import zoo
+
+ROOT = Path(__file__).parents[1]
+PAGES = {name: (ROOT / name).read_text() for name in ("README.md", "deploy/MEASURED.md")}
+RESULTS = (ROOT / "models" / "RESULTS.md").read_text()
+CARDS = {name: zoo.card(name) for name in zoo.names()}
+PUBLISHED = "published: loops, Keras predict"
+"""The published code around the weights of `cnn1`, which judge as they do in graspd."""
+PROTOCOLS = {
+    "known objects": ("cv",),
+    "other objects": ("objects", "objects-whole"),
+    "another day": ("session",),
+}
+"""By title of a column."""
+UNCALIBRATED = "on another day without session calibration"
+CALIBRATED_BY = {
+    "none": "none",
+    **{f"n{grasps}": str(grasps) for grasps in (5, 10, 20, 50)},
+    "all": "all",
+    "running": "running",
+    "running-sorted": "running, sorted",
+}
+"""Titles of the columns of RESULTS.md, section 3, by their name on a card."""
+METRICS = ("accuracy", "precision", "recall", "f1")
+FIGURE = r"(\d+(?:\.\d+)?)(?: \+- (\d+(?:\.\d+)?))?"
+Cells = Mapping[str, str]
+Spread = Mapping[str, float]
+
+
+def tables(text: str) -> Iterator[list[Cells]]:
+    """The tables of a page: their rows by title of the column, the first one's as ''."""
+    for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        head, _, *rows = (
+            [cell.strip() for cell in line.split("|")[1:-1]] for line in table.split("\n")[:-1]
+        )
+        yield [dict(zip(["", *head[1:]], row, strict=False)) for row in rows]
+
+
+def section(number: int) -> list[list[Cells]]:
+    """The tables of a section of RESULTS.md."""
+    text = RESULTS.partition(f"\n## {number}. ")[2].partition("\n## ")[0]
+    assert text
+    return list(tables(text))
+
+
+def model_of(cell: str) -> str | None:
+    """The model that a row is of."""
+    if cell == PUBLISHED:
+        return "cnn1"
+    named = re.match(r"`([\w-]+)`", cell)
+    return named[1] if named and named[1] in CARDS else None
+
+
+def on_card(model: str, column: str) -> Spread | None:
+    """F1, 0..1, of the model's card: mean and standard deviation over the folds."""
+    protocols = CARDS[model]["protocols"]
+    if column == UNCALIBRATED:
+        session = protocols["session"]
+        return cast("Spread", session["calibrated_by"].get("none", session["spreads"]["f1"]))
+    for protocol in PROTOCOLS[column]:
+        if protocol in protocols:
+            return cast("Spread", protocols[protocol]["spreads"]["f1"])
+    return None
+
+
+def agrees(said: str, spread: Spread) -> bool:
+    """Whether a cell's figure in % is this one, as far as it is printed."""
+    figure = re.match(FIGURE, said)
+    assert figure, said
+    return all(
+        text is None or text == f"{100 * value:.{len(text.partition('.')[2])}f}"
+        for text, value in zip(figure.groups(), (spread["mean"], spread["std"]), strict=True)
+    )
+
+
+def told_of_models(page: str) -> list[tuple[str, str, str]]:
+    """Model, title of the column, and what a page says there."""
+    return [
+        (model, column, row[column])
+        for table in tables(PAGES[page])
+        for row in table
+        if (model := model_of(row[""])) is not None
+        for column in (*PROTOCOLS, UNCALIBRATED)
+        if row.get(column, "-") != "-"
+    ]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_tables_of_models_say_what_the_cards_say(page: str) -> None:
+    told = told_of_models(page)
+    assert len({model for model, _, _ in told}) >= 3
+    wrong = [
+        f"{model}, {column}: {said}, on the card {spread}"
+        for model, column, said in told
+        if (spread := on_card(model, column)) is None or not agrees(said, spread)
+    ]
+    assert wrong == []
+
+
+def test_broken_electrodes_cost_what_the_card_says() -> None:
+    study = CARDS["small-session"]["broken"]
+    expected = {
+        "unnoticed": {each["number"]: each["unnoticed"] for each in study["broken"][:5]},
+        "repaired": {each["number"]: each["known"] for each in study["broken"][:5]},
+    }
+    assert {each["reads"] for each in study["broken"][:5]} == {"at 0"}
+    every = (table for text in PAGES.values() for table in tables(text))
+    (table,) = (table for table in every if any("unnoticed" in row[""] for row in table))
+    for kind, found in expected.items():
+        (row,) = (row for row in table if kind in row[""])
+        said = {int(number): cell for number, cell in row.items() if number}
+        assert said == {
+            each: f"{100 * f1:.1f}" for each, f1 in {0: study["sound"], **found}.items()
+        }
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_an_f1_in_prose_is_on_some_card(page: str) -> None:
+    known = {
+        f"{100 * spread['mean']:.1f}"
+        for card in CARDS.values()
+        for figures in card["protocols"].values()
+        for spread in (figures["spreads"]["f1"], *figures["calibrated_by"].values())
+    }
+    known |= {f"{100 * each['every']['f1']:.1f}" for card in CARDS.values() for each in days(card)}
+    prose = " ".join(line for line in PAGES[page].splitlines() if not line.startswith("|"))
+    said = set(re.findall(r"\bF1 (\d+\.\d)\b", prose))
+    assert said <= known
+
+
+def days(card: Mapping[str, Any]) -> list[Any]:
+    found = card["protocols"].get("days", {}).get("days", {})
+    return list(found.values())
+
+
+def of_both() -> list[tuple[str, str, Cells]]:
+    """Rows of every figure in RESULTS.md that are of the card's own splits."""
+    (table,) = section(6)
+    return [
+        (model, protocol, row)
+        for row in table
+        if (model := model_of(row[""])) is not None
+        and (protocol := row["protocol"].strip("`")) in (card := CARDS[model]["protocols"])
+        and int(row["seeds"]) == card[protocol]["spreads"]["f1"]["seeds"]
+    ]
+
+
+def test_results_of_the_same_splits_are_those_of_the_cards() -> None:
+    rows = of_both()
+    assert {"cnn1", "cnn1-session", "small-session"} <= {model for model, _, _ in rows}
+    wrong = [
+        f"{model} {protocol} {metric}: {said}"
+        for model, protocol, row in rows
+        for metric in METRICS
+        if not agrees(
+            said := row["F1" if metric == "f1" else metric],
+            CARDS[model]["protocols"][protocol]["spreads"][metric],
+        )
+    ]
+    assert wrong == []
+
+
+def test_results_of_other_days_and_sessions_are_those_of_the_cards() -> None:
+    calibrated = {model: row for row in section(3)[0] if (model := model_of(row[""]))}
+    for model in ("cnn1-session", "small-session"):
+        found = CARDS[model]["protocols"]["session"]["calibrated_by"]
+        assert set(found) == set(CALIBRATED_BY)
+        assert all(agrees(calibrated[model][CALIBRATED_BY[each]], found[each]) for each in found)
+    by_day = {
+        model: row for row in section(4)[0] if (model := model_of(row[""])) and days(CARDS[model])
+    }
+    assert set(by_day) == {"cnn1-session", "small-session"}
+    for model, row in by_day.items():
+        for group, figures in CARDS[model]["protocols"]["days"]["days"].items():
+            every = figures["every"]
+            said = f"{100 * every['f1']:.1f} / {100 * every['slips_among_stable']:.1f}"
+            assert row[group] == said
+
+
+def test_results_say_each_figure_once() -> None:
+    """All sections of RESULTS.md have the F1 of a system in a protocol as its last one has it."""
+    (last,) = section(6)
+    every = {(row[""], row["protocol"]): row["F1"] for row in last}
+    (paper,), (systems,) = section(1), section(2)
+    assert all(
+        every[row[""], row["protocol"]] == row["ours"] for row in paper if row["figure"] == "F1"
+    )
+    for row in systems:
+        for title, said in row.items():
+            if title.startswith("`") and said != "-":
+                assert every[row[""], title] == said.partition(" (s.e.")[0]
+
+
+def test_a_wrong_figure_is_noticed() -> None:
+    spread = CARDS["small-session"]["protocols"]["cv"]["spreads"]["f1"]
+    assert agrees("92.3 +- 1.5", spread)
+    assert agrees("92", spread)
+    assert not agrees("92.4 +- 1.5", spread)
+    assert not agrees("92.3 +- 1.4", spread)

@@ -1,0 +1,100 @@
+"""What the project says of itself in several places agrees: version, tools of CI, links."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from drivers.spi.messages import FIRMWARE
+
+ROOT = Path(__file__).parents[1]
+VERSION: str = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+MINOR = VERSION.rpartition(".")[0]
+PLACES = {
+    "CITATION.cff": r"^version: (\S+)$",
+    "deploy/clients/cpp/CMakeLists.txt": r"^project\(graspd_client VERSION (\S+) ",
+}
+"""Where the version stands once more, and how."""
+
+
+def found(name: str, pattern: str) -> list[str]:
+    return re.findall(pattern, (ROOT / name).read_text(), re.MULTILINE)
+
+
+def test_the_installed_package_has_the_version() -> None:
+    assert version("graspd") == VERSION
+
+
+@pytest.mark.parametrize(("name", "pattern"), PLACES.items())
+def test_the_version_is_the_same_everywhere(name: str, pattern: str) -> None:
+    assert found(name, pattern) == [VERSION]
+
+
+def test_the_line_that_finds_the_client_asks_for_this_version() -> None:
+    assert found("deploy/clients/README.md", r"find_package\(graspd_client (\S+) ") == [MINOR]
+
+
+def test_the_changelog_begins_with_what_is_not_released_or_with_this_version() -> None:
+    headings = found("deploy/CHANGELOG.md", r"^## \[(.*?)\]")
+    released = [heading for heading in headings if heading != "Unreleased"]
+    assert headings[0] == "Unreleased"
+    if released:
+        assert released[0] == VERSION
+    else:
+        assert f"becomes {VERSION}." in (ROOT / "deploy/CHANGELOG.md").read_text()
+
+
+def test_the_firmware_has_one_version() -> None:
+    told = f"{FIRMWARE >> 8}.{FIRMWARE & 0xFF}"
+    assert found("deploy/bridge/library.properties", r"^version=(\d+\.\d+)\.\d+$") == [told]
+    assert found("deploy/CHANGELOG.md", r"^\| firmware of the bridge \| (\S+) \|$") == [told]
+
+
+def test_the_hooks_run_what_ci_runs() -> None:
+    hooks = found(".pre-commit-config.yaml", r"entry: \.venv/bin/(.*)$")
+    (checks,) = re.findall(r"step \"lint\"\n(.*?)\n\)", (ROOT / ".ci/run").read_text(), re.DOTALL)
+    checked = re.findall(r"^    \.venv/bin/(.*)$", checks, re.MULTILINE)
+    options = r" (--force-exclude|--check|\.(?= |$))"
+    assert [re.sub(options, "", each) for each in hooks] == [
+        re.sub(options, "", each) for each in checked
+    ]
+    assert len(hooks) == 4
+
+
+PAGES = [ROOT / "README.md", *ROOT.glob(".github/*.md"), *ROOT.glob("models/*.md")]
+PAGES += ROOT.glob("deploy/**/*.md")
+
+
+def heading_anchors(page: Path) -> set[str]:
+    """How a link names the headings of a page."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    links = re.findall(r"\]\((?!https?://)([^)\s]+)\)", page.read_text())
+    lost = []
+    for link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        if not target.exists() or (anchor and anchor not in heading_anchors(target)):
+            lost.append(link)
+    assert lost == []
+
+
+def test_files_that_contributors_are_sent_to_are_there() -> None:
+    named = found(
+        ".github/CONTRIBUTING.md", r"[` ]((?:daemon|drivers|models|tests|deploy)/[^`\s]*)`"
+    )
+    assert len(named) > 10
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_the_hooks_need_no_revision_of_their_own() -> None:
+    assert found(".pre-commit-config.yaml", r"repo: (\S+)") == ["local"]
+    assert found(".pre-commit-config.yaml", r"^\s+(rev|additional_dependencies):") == []
