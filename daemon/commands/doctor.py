@@ -160,9 +160,11 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
 
 
 def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
-    findings = [model_finding(wanted)]
-    findings += _listen(wanted, report, listen_s)
-    return roots([*findings, *socket_findings(wanted), *realtime_findings(wanted)])
+    findings = [model_finding(wanted), *_listen(wanted, report, listen_s)]
+    advised = {finding.advice for finding in findings if finding.advice}
+    # The graspd that holds the port holds the sockets as well: that is said once.
+    sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]
+    return [*findings, *sockets, *realtime_findings(wanted)]
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
