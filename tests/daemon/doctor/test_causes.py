@@ -354,6 +354,10 @@ def test_an_address_of_another_computer_is_told(
     text = '[tactile]\ndriver = "palm"\nsource = "udp://192.0.2.1:9870"\n'
     (told,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
     assert told["cause"] == "address"
+    text += '[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:25878"\n'
+    _, joints = look(tmp_path, capsys, text + MODEL + published(tmp_path))
+    assert joints["what"] == "joints: link greeting"
+    assert joints["cause"] == "silent"
 
 
 def test_an_interface_that_is_missing_is_told_with_those_that_there_are(
