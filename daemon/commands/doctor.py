@@ -95,28 +95,27 @@ def run(args: argparse.Namespace) -> int:
 
 
 def examine(
-    drivers: Sequence[Driver], statistics: ElectrodeStatistics, seconds: float
-) -> list[list[Finding]]:
-    """What is wrong with open drivers, driver by driver, the tactile one first: only what does
-    not follow from something else. `statistics` are of what came in so many `seconds`."""
-    found = []
-    for driver in drivers:
-        device, counters = driver.describe(), driver.counters.as_dict()
-        told = device_findings(driver.name, device, counters)
-        readings = statistics.readings if driver is drivers[0] else None
-        if device.get("link", "up") == "up":
-            causes = {finding.cause for finding in told}
-            more = counter_findings(driver.name, counters)
-            told += [finding for finding in more if finding.cause not in causes]
-            if readings is not None:
-                told.append(rate_finding(driver.name, readings, seconds, driver.period_ns))
-        elif readings == 0:
-            what = f"{told[0].what}; no reading in {seconds:.1f} s"
-            told[0] = dataclasses.replace(told[0], what=what)
-        if readings:
-            told = _with_electrodes(told, statistics)
-        found.append(roots(told))
-    return found
+    driver: Driver, statistics: ElectrodeStatistics | None, seconds: float
+) -> list[Finding]:
+    """What is wrong with an open driver, without what follows from something else of it.
+
+    `statistics` are of what it brought in so many `seconds`; None for joint angles.
+    """
+    device, counters = driver.describe(), driver.counters.as_dict()
+    told = device_findings(driver.name, device, counters)
+    readings = None if statistics is None else statistics.readings
+    if device.get("link", "up") == "up":
+        causes = {finding.cause for finding in told}
+        more = counter_findings(driver.name, counters)
+        told += [finding for finding in more if finding.cause not in causes]
+        if readings is not None:
+            told.append(rate_finding(driver.name, readings, seconds, driver.period_ns))
+    elif readings == 0:
+        what = f"{told[0].what}; no reading in {seconds:.1f} s"
+        told[0] = dataclasses.replace(told[0], what=what)
+    if statistics is not None and readings:
+        told = _with_electrodes(told, statistics)
+    return roots(told)
 
 
 def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
@@ -160,9 +159,11 @@ def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
 
 
 def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
-    findings = [model_finding(wanted)]
-    findings += _listen(wanted, report, listen_s)
-    return roots([*findings, *socket_findings(wanted), *realtime_findings(wanted)])
+    findings = [model_finding(wanted), *_listen(wanted, report, listen_s)]
+    advised = {finding.advice for finding in findings if finding.advice}
+    # The graspd that holds the port holds the sockets as well: that is said once.
+    sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]
+    return [*findings, *sockets, *realtime_findings(wanted)]
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
@@ -181,12 +182,11 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
                 closed = {"link": "closed", "why": str(error)}
                 (finding,) = device_findings(driver.name, closed)
                 findings += explained(finding, section)
-        listening = [driver for driver, _ in opened]
-        seconds = _collect(listening, statistics, listen_s)
-        for (driver, section), told in zip(
-            opened, examine(listening, statistics, seconds), strict=True
-        ):
-            findings += [other for finding in told for other in explained(finding, section)]
+        seconds = _collect([driver for driver, _ in opened], statistics, listen_s)
+        for driver, section in opened:
+            felt = statistics if driver is drivers[0] else None
+            for finding in examine(driver, felt, seconds):
+                findings += explained(finding, section)
             counted = driver.counters.as_dict()
             report[driver.name] = {"device": driver.describe(), "counters": counted}
     finally:

@@ -85,7 +85,6 @@ EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
     Cause.PALM_MODE: _LOSS,
     Cause.JOINTS: frozenset({Cause.FRAMES_LOST}),
     Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
-    Cause.PORT_HELD: _LOSS | {Cause.DAMAGED, Cause.SOCKET_HELD},
 }
 """What follows from a cause, and is not named beside it."""
 

@@ -196,7 +196,7 @@ DEVICE_TROUBLES = {
         "by chip select, since its reset: look again; of one, and growing: its wires",
     ),
     ("sweep", "too long"): Trouble(
-        Cause.SLOW, "set a longer period or a shorter sequence, and flash it"
+        Cause.SETTINGS, "set a longer period or a shorter sequence, and flash it"
     ),
     ("clock", "not trusted"): Trouble(Cause.CLOCK, CLOCK_ADVICE),
 }

@@ -154,11 +154,6 @@ def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatisti
 
 def faults_told(driver: Driver, statistics: ElectrodeStatistics, seconds: float) -> list[Finding]:
     """What the doctor says after that is wrong."""
-    if driver.name == "joints":  # it is the second driver of a scene, without electrodes
-        readings = driver.counters.readings
-        assert readings or driver.describe()["link"] != "up"
-        other = JointStreamDriver("udp://127.0.0.1:0")
-        told = examine([other, driver], ElectrodeStatistics(FINGERS), seconds)[1]
-    else:
-        (told,) = examine([driver], statistics, seconds)
+    felt = None if driver.name == JointStreamDriver.name else statistics
+    told = examine(driver, felt, seconds)
     return [finding for finding in told if finding.level is not Level.OK]

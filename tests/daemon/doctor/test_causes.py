@@ -111,6 +111,22 @@ def test_a_fault_of_a_link_is_told_by_its_name_and_nothing_else_is(
         assert Level.ERROR in {finding.level for finding in told}
 
 
+@pytest.mark.parametrize(
+    ("attribute", "value", "cause"),
+    [("FIRMWARE", FIRMWARE - 1, Cause.FIRMWARE_OLD), ("TICK_HZ", 1_050_000, Cause.CLOCK)],
+    ids=["older firmware", "a clock that is wrong"],
+)
+def test_a_bridge_that_is_not_what_it_says_is_told(
+    attribute: str, value: int, cause: Cause, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    statistics = ElectrodeStatistics(FINGERS)
+    with LINKS["spi"](Hand(100.0), tmp_path, LinkFaults()) as (driver, step):
+        monkeypatch.setattr(spi_twin, attribute, value)  # its ticks stay what they were
+        listen(driver, step, 2000 if cause is Cause.CLOCK else 300, statistics)
+        told = faults_told(driver, statistics, statistics.readings / 100.0)
+    assert [finding.cause for finding in told] == [cause], told
+
+
 def test_a_hand_that_repeats_itself_is_told(tmp_path: Path) -> None:
     once = next(moment.counts for moment in synthetic_grasps())
 
@@ -338,6 +354,10 @@ def test_an_address_of_another_computer_is_told(
     text = '[tactile]\ndriver = "palm"\nsource = "udp://192.0.2.1:9870"\n'
     (told,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
     assert told["cause"] == "address"
+    text += '[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:25878"\n'
+    _, joints = look(tmp_path, capsys, text + MODEL + published(tmp_path))
+    assert joints["what"] == "joints: link greeting"
+    assert joints["cause"] == "silent"
 
 
 def test_an_interface_that_is_missing_is_told_with_those_that_there_are(
@@ -452,21 +472,6 @@ def test_what_the_kernel_says_of_controllers_is_read(tmp_path: Path) -> None:
     assert [interface.is_down for interface in found] == [False, True, False]
     without = computer.can_interfaces(tmp_path / "net", ("no-such-command",))
     assert [interface.state for interface in without] == ["up", "down", "up"]
-
-
-def test_older_firmware_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(spi_twin, "FIRMWARE", FIRMWARE - 1)
-    counts, done = (moment.counts for moment in synthetic_grasps(loop=True)), threading.Event()
-    with spi_twin.SpiTwin(tmp_path / "bridge", counts) as twin:
-        thread = threading.Thread(target=twin.serve, args=(done.is_set,))
-        thread.start()
-        text = SPI.format(twin.path) + MODEL + published(tmp_path)
-        told = look(tmp_path, capsys, text)
-        done.set()
-        thread.join()
-    assert "firmware-old" in {finding["cause"] for finding in told}
 
 
 SURROUNDINGS: dict[str, tuple[str, str, str]] = {
