@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import select
 import sys
@@ -19,6 +20,7 @@ from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
 from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import View
+from daemon.watch.watching import Watched
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Where the daemon publishes unless its scene says otherwise."""
@@ -29,6 +31,8 @@ TICK_S = 0.02
 """Between two looks at what has come for viewers, s."""
 NICENESS = 10
 """Drawing takes a tenth of a processor, and a daemon on the same one comes first."""
+HANDS_MAX = 8
+"""Hands in one page or terminal; more are seen by another `watch`."""
 FAILED, WRONG = 1, 2
 
 
@@ -47,9 +51,20 @@ class Target(NamedTuple):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("scene", type=Path, nargs="?", help="scene file of the daemon (TOML)")
     where.add_argument(
-        "--connect", metavar="ENDPOINT", help=f"where it publishes (default: {ENDPOINT})"
+        "scenes",
+        type=Path,
+        nargs="*",
+        default=[],
+        metavar="scene",
+        help="scene file of a daemon (TOML); with several, all their hands are seen",
+    )
+    where.add_argument(
+        "--connect",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help=f"where a daemon publishes; may be repeated (default: {ENDPOINT})",
     )
     parser.add_argument(
         "--keys", type=Path, metavar="FILE", help="own .key_secret file, for a daemon with [curve]"
@@ -76,17 +91,25 @@ def run(args: argparse.Namespace) -> int:
     """Show until stopped; 2 for a wrong command line, 1 if the page's port is not to be had."""
     os.nice(NICENESS)
     try:
-        target = _target(args)
-        with Feed(target.endpoint, _keys(args, target)) as feed:
-            view = View(target.endpoint, target.hand)
+        with contextlib.ExitStack() as stack:
+            hands = []
+            for target in _targets(args):
+                feed = stack.enter_context(_feed(target, _keys(args, target)))
+                hands.append(Watched(feed, View(target.endpoint, target.hand)))
             if args.foxglove:
-                return _foxglove(feed, args.port or FOXGLOVE_PORT)
-            return _page(feed, view, args.port or PORT) if args.web else _terminal(feed, view)
+                return _foxglove(hands, args.port or FOXGLOVE_PORT)
+            return _page(hands, args.port or PORT) if args.web else _terminal(hands)
     except (SceneError, KeysError, UsageError) as error:
         complain(error)
-    except zmq.ZMQError as error:
-        complain(f"{args.connect}: cannot connect there: {error.strerror}")
     return WRONG
+
+
+def _feed(target: Target, keys: tuple[bytes, bytes, bytes] | None) -> Feed:
+    try:
+        return Feed(target.endpoint, keys)
+    except zmq.ZMQError as error:
+        problem = f"{target.endpoint}: cannot connect there: {error.strerror}"
+        raise UsageError(problem) from error
 
 
 def _port(text: str) -> int:
@@ -95,14 +118,18 @@ def _port(text: str) -> int:
     return int(text)
 
 
-def _target(args: argparse.Namespace) -> Target:
-    if args.scene is None:
-        return Target(args.connect or ENDPOINT, None, args.server_key)
-    wanted = scene.load(args.scene)
-    server = args.server_key
-    if server is None and wanted.curve is not None:
-        server = wanted.curve.secret_key.with_suffix(".key")
-    return Target(wanted.endpoint, wanted.hand.name, server)
+def _targets(args: argparse.Namespace) -> list[Target]:
+    endpoints = args.connect or ([] if args.scenes else [ENDPOINT])
+    found = [Target(endpoint, None, args.server_key) for endpoint in endpoints]
+    for path in args.scenes:
+        wanted = scene.load(path)
+        server = args.server_key
+        if server is None and wanted.curve is not None:
+            server = wanted.curve.secret_key.with_suffix(".key")
+        found.append(Target(wanted.endpoint, wanted.hand.name, server))
+    if len(found) > HANDS_MAX:
+        raise UsageError(f"{len(found)} hands are more than the {HANDS_MAX} that can be watched")
+    return found
 
 
 def _keys(args: argparse.Namespace, target: Target) -> tuple[bytes, bytes, bytes] | None:
@@ -113,7 +140,7 @@ def _keys(args: argparse.Namespace, target: Target) -> tuple[bytes, bytes, bytes
     return load_keys(args.keys, target.server_key)
 
 
-def _terminal(feed: Feed, view: View) -> int:
+def _terminal(hands: list[Watched]) -> int:
     if not sys.stdout.isatty():
         raise UsageError("watch draws on a terminal; see --web, or `graspd run --print` for a pipe")
     try:
@@ -123,22 +150,22 @@ def _terminal(feed: Feed, view: View) -> int:
         raise UsageError(f"{advice}; or watch --web, which needs none") from None
     if not can_draw():
         raise UsageError("watch cannot draw on this terminal (TERM); see --web")
-    show(feed, view)
+    show(hands)
     return 0
 
 
-def _page(feed: Feed, view: View, port: int) -> int:
+def _page(hands: list[Watched], port: int) -> int:
     from daemon.watch.web import serve
 
     try:
-        serve(feed, view, port)
+        serve(hands, port)
     except OSError as error:
         complain(f"cannot serve a page on port {port}: {error.strerror}")
         return FAILED
     return 0
 
 
-def _foxglove(feed: Feed, port: int) -> int:
+def _foxglove(hands: list[Watched], port: int) -> int:
     try:
         from daemon.record.live import LiveServer
     except ModuleNotFoundError as error:
@@ -152,7 +179,8 @@ def _foxglove(feed: Feed, port: int) -> int:
         sys.stdout.write(f"ws://127.0.0.1:{server.port} (Ctrl-C ends)\n")
         sys.stdout.flush()
         while stop.received is None:
-            for topic, payload in feed.take():
-                server.send(topic, payload)
+            for hand in hands:
+                for topic, payload in hand.feed.take():
+                    server.send(topic, payload)
             select.select([stop.fileno()], [], [], TICK_S)
     return 0

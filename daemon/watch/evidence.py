@@ -68,17 +68,18 @@ def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
     lifts, learner = (None, None) if status is None else (status.lifts, status.learner)
     found = []
     if lifts is not None:
-        found.append(Line("never told", str(lifts.unreported)))
+        found.append(Line("never told", _number(lifts.unreported, "lift")))
     if risk is not None:
-        found.append(Line("warm-up left", str(risk.warm_up_left)))
-        found.append(Line("still out", str(risk.outstanding)))
+        found.append(Line("warm-up left", _number(risk.warm_up_left, "outcome")))
+        found.append(Line("still out", _number(risk.outstanding, "lift")))
     if learner is not None:
         found.append(Line("learner", "on" if learner.enabled else "off"))
         found.append(Line("learned from", _number(learner.outcomes, "outcome")))
         found.append(Line("uncertainty", _percent(learner.uncertainty)))
     if risk is not None and risk.target is not None:
         most = "no bound" if risk.bound is None else f"at most {risk.bound:.1f}"
-        found.append(Line("slips of `stable`", f"{risk.slips} of {risk.lifts}, {most}"))
+        told_lifts = _number(risk.lifts, "lift")
+        found.append(Line("slips of `stable`", f"{risk.slips} of {told_lifts}, {most}"))
     told = {} if learner is None else learner.told
     return found + [Line(f"outcomes {kind.value}", str(count)) for kind, count in told.items()]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rich.color import Color
@@ -12,7 +13,7 @@ from rich.style import Style
 from rich.text import Text
 
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerImage, FingerMotion
-from daemon.watch.snapshot import TONE_CODE, Tone
+from daemon.watch.snapshot import Tone
 
 COLOURS = {
     Tone.STABLE: "#2da44e",
@@ -31,14 +32,19 @@ PLAIN = {
     Tone.SLIP: "X",
     Tone.WAITING: ".",
     Tone.TROUBLE: "?",
-    Tone.SILENT: " ",
+    Tone.SILENT: "~",
 }
-"""The same in a strip without colour."""
-ALARM = (
-    *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
-    *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
-)
-"""Of several moments in one column, the first of these is shown."""
+"""Signs of the same in a timeline."""
+WORDS = {
+    Tone.SLIP: "slip",
+    Tone.STABLE: "stable",
+    Tone.LEANS: "leans",
+    Tone.LEARNING: "watched",
+    Tone.TROUBLE: "wrong",
+    Tone.WAITING: "waiting",
+    Tone.SILENT: "silent",
+}
+"""Words for the same."""
 _RISEN, _REST = (59, 125, 216), (38, 44, 54)
 _PRESSED = ((11, (92, 44, 104)), (30, (158, 47, 98)), (55, (229, 92, 48)), (80, (251, 180, 26)))
 _DEEPEST = (252, 255, 190)
@@ -97,7 +103,7 @@ class Canvas:
         """A share of 0..1 as a bar; empty without one."""
         full, empty = ("#", "-") if self.ascii_only else ("█", "░")
         number = 0 if share is None else round(share * width)
-        text = Text(full * number, self.style(tone))
+        text = Text().append(full * number, self.style(tone))
         return text.append(empty * (width - number), "dim")
 
     @property
@@ -108,37 +114,57 @@ class Canvas:
     def motion(self, motion: FingerMotion, width: int) -> Text:
         """How a finger moves: up to the mark it is still, and at the end it is twice as much."""
         if motion.now is None:
-            return Text("?" * width, self.style(Tone.TROUBLE))
+            return Text().append("?" * width, self.style(Tone.TROUBLE))
         full, empty = ("#", "-") if self.ascii_only else ("█", "░")
         share, below = min(motion.now / motion.limit, 2.0), width // 2
         above = width - below - 1
         still = min(round(share * below), below)
         moving = min(math.ceil(max(share - 1.0, 0.0) * below), above)
         style: Style | str = self.style(Tone.TROUBLE) if moving else ""
-        text = Text(full * still, style).append(empty * (below - still), "dim")
+        text = Text().append(full * still, style).append(empty * (below - still), "dim")
         text.append(self.limit, "bold").append(full * moving, style)
         return text.append(empty * (above - moving), "dim")
 
-    def strip(self, history: str, moments: int, width: int) -> Text:
-        """Tones of the last `moments` snapshots, the newest at the right."""
-        tones = {code: tone for tone, code in TONE_CODE.items()}
-        padded = history.rjust(moments)
+    @property
+    def sigma(self) -> str:
+        """The unit of motion, one character wide; blank where it cannot be written."""
+        return " " if self.ascii_only else "\u03c3"
+
+    @property
+    def point(self) -> str:
+        """A point of a plot."""
+        return "*" if self.ascii_only else "\u25cf"
+
+    @property
+    def rule(self) -> str:
+        """What a plot is where it has no point."""
+        return "." if self.ascii_only else "\u00b7"
+
+    def moments(self, tones: Sequence[Tone | None]) -> Text:
+        """A part of the timeline: a sign for each moment, on its colour where there is colour."""
         text = Text()
-        for column in range(width):
-            part = padded[column * moments // width : (column + 1) * moments // width]
-            seen = {tones[code] for code in part if code in tones}
-            tone = next((each for each in ALARM if each in seen), None)
+        for tone, run in itertools.groupby(tones):
+            number = sum(1 for _ in run)
             if tone is None:
-                text.append(" ")
-            elif self.colour and not self.ascii_only:
-                text.append("█", self.style(tone))
+                text.append(" " * number)
             else:
-                text.append(PLAIN[tone])
+                text.append(PLAIN[tone] * number, self._on_colour(tone))
         return text
+
+    def legend(self) -> list[Text]:
+        """The signs of the timeline, each with its word."""
+        return [
+            Text.assemble((PLAIN[tone], self._on_colour(tone)), (f" {word}", "dim"))
+            for tone, word in WORDS.items()
+        ]
+
+    def _on_colour(self, tone: Tone) -> Style:
+        return _moment(tone) if self.colour and not self.ascii_only else Style()
 
     def style(self, tone: Tone) -> Style:
         """Letters in the colour of a tone."""
-        return Style(color=COLOURS[tone], bold=True) if self.colour else Style(bold=True)
+        named = self.colour and tone is not Tone.WAITING  # grey letters are hard to read
+        return Style(color=COLOURS[tone], bold=True) if named else Style(bold=True)
 
     def banner(self, tone: Tone) -> Style:
         """Letters on the colour of a tone."""
@@ -166,6 +192,11 @@ def _between(one: tuple[int, int, int], other: tuple[int, int, int], share: floa
 def _style(upper: int, lower: int) -> Style:
     """Of two pixels in one character; made once, because that takes longer than all else."""
     return Style(color=_colour(upper), bgcolor=_colour(lower))
+
+
+@functools.cache
+def _moment(tone: Tone) -> Style:
+    return Style(color="#ffffff", bgcolor=COLOURS[tone])
 
 
 def _colour(level: int) -> Color:

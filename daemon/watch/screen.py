@@ -10,7 +10,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import FrameType
 from typing import Self
 
@@ -18,11 +18,9 @@ from rich.console import Console
 from rich.live import Live
 
 from daemon.process.signals import StopSignal
-from daemon.watch.feed import Feed
 from daemon.watch.pixels import Canvas
 from daemon.watch.terminal import draw
-from daemon.watch.view import View
-from daemon.watch.watching import TICK_S, snapshots
+from daemon.watch.watching import TICK_S, Watched, snapshots
 
 SIGNALS_MAX = 64
 """Bytes that a look takes out of the pipe of signals."""
@@ -34,7 +32,7 @@ def can_draw() -> bool:
     return console.is_terminal and not console.is_dumb_terminal
 
 
-def show(feed: Feed, view: View) -> None:
+def show(hands: Sequence[Watched]) -> None:
     """Draw on standard output until told to stop; needs a terminal there."""
     console = Console()
     canvas = Canvas(
@@ -42,15 +40,12 @@ def show(feed: Feed, view: View) -> None:
         ascii_only=console.options.ascii_only,
     )
     with StopSignal() as stop, Pause() as pause:
+        keys = Keys(stop)
         while True:
-            with (
-                _keyboard() as keyboard,
-                Live(console=console, screen=True, auto_refresh=False) as live,
-            ):
-                for seen in snapshots(
-                    feed, view, lambda: _asked_to_stop(stop, keyboard) or pause.asked
-                ):
-                    live.update(draw(seen, console.width, console.height, canvas), refresh=True)
+            with keys.unseen(), Live(console=console, screen=True, auto_refresh=False) as live:
+                for seen in snapshots(hands, lambda: keys.wait() or pause.asked):
+                    size = console.width, console.height
+                    live.update(draw(seen, *size, canvas, keys.tabs % len(hands)), refresh=True)
             if stop.received is not None or not pause.asked:
                 return
             now = time.strftime("%H:%M:%S")
@@ -91,29 +86,41 @@ class Pause:
         self.asked = True
 
 
-def _asked_to_stop(stop: StopSignal, keyboard: int | None) -> bool:
-    """Wait for a tick; true for a signal and for `q`."""
-    waited = [stop.fileno()] if keyboard is None else [stop.fileno(), keyboard]
-    ready, _, _ = select.select(waited, [], [], TICK_S)
-    if stop.fileno() in ready:
-        os.read(stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
-    if stop.received is not None:
-        return True
-    if keyboard is None or keyboard not in ready:
-        return False
-    return os.read(keyboard, 64)[:1] in {b"q", b"Q", b""}
+class Keys:
+    """What is typed: `q` ends, Tab shows the next hand."""
 
+    def __init__(self, stop: StopSignal) -> None:
+        """Without a keyboard yet; signals are waited for too."""
+        self.tabs = 0
+        """How often Tab was typed."""
+        self._stop = stop
+        self._keyboard: int | None = None
 
-@contextlib.contextmanager
-def _keyboard() -> Iterator[int | None]:
-    """Descriptor whose keys come at once and unseen; None where standard input is no terminal."""
-    if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
-        yield None
-        return
-    descriptor = sys.stdin.fileno()
-    former = termios.tcgetattr(descriptor)
-    try:
-        tty.setcbreak(descriptor)
-        yield descriptor
-    finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, former)
+    def wait(self) -> bool:
+        """Wait for a tick; true for a signal and for `q`."""
+        keyboard = self._keyboard
+        waited = [self._stop.fileno()] if keyboard is None else [self._stop.fileno(), keyboard]
+        ready, _, _ = select.select(waited, [], [], TICK_S)
+        if self._stop.fileno() in ready:
+            os.read(self._stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
+        if self._stop.received is not None:
+            return True
+        if keyboard is None or keyboard not in ready:
+            return False
+        typed = os.read(keyboard, 64)
+        self.tabs += typed.count(b"\t")
+        return typed[:1] in {b"q", b"Q", b""}
+
+    @contextlib.contextmanager
+    def unseen(self) -> Iterator[None]:
+        """Have keys come at once and unseen, where standard input is a terminal."""
+        if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
+            yield
+            return
+        self._keyboard = sys.stdin.fileno()
+        former = termios.tcgetattr(self._keyboard)
+        try:
+            tty.setcbreak(self._keyboard)
+            yield
+        finally:
+            termios.tcsetattr(self._keyboard, termios.TCSADRAIN, former)

@@ -36,6 +36,13 @@ TONE_CODE = {
     Tone.SILENT: ".",
 }
 """In `Snapshot.history`."""
+WORST_FIRST = (
+    *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
+    *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
+)
+"""Of several moments in one column, the first of these is shown."""
+MOMENTS = 300
+"""Seconds that the timeline goes back: five minutes."""
 
 
 class Line(msgspec.Struct, frozen=True):
@@ -96,6 +103,8 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     hand: str | None
     t: float
     """Wall-clock seconds since 1970 here."""
+    last_t: float | None
+    """The same of the last verdict's arrival: of a silent hand, all figures are of then."""
     tone: Tone
     verdict: str
     """`stable`, `slip` or `unknown`; unknown too when no message comes."""
@@ -126,11 +135,12 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     state: str | None
     """Of the daemon: `running`, `silent` or `stopping`."""
     counts: dict[str, int]
-    """Verdicts since the daemon's start, by outcome."""
+    """Grasps seen here, by the verdict that each had last."""
     drivers: dict[str, dict[str, int]]
     model: str | None
     versions: dict[str, str]
-    history: str
-    """Tones of the last half minute, oldest first, ten per second; see `TONE_CODE`."""
+    history: list[str]
+    """Tones of each second of the last five minutes, the oldest second and the worst tone first;
+    see `TONE_CODE`."""
     history_p: list[int]
-    """The same for the probability of slip, %; -1 where there is none."""
+    """The same for the highest probability of slip, %; -1 where there is none."""

@@ -1,277 +1,237 @@
-"""One snapshot as text for a terminal, from 80 x 24 characters on."""
+"""Snapshots as text for a terminal: one hand from 60 columns on, several beside each other."""
 
 from __future__ import annotations
 
-import math
+import textwrap
 import time
+from collections.abc import Sequence
 
-from rich.console import Group, RenderableType
-from rich.style import Style
-from rich.table import Table
+from rich.console import Group
 from rich.text import Text
 
 from daemon.process.text import printable
-from daemon.watch.fingers import FingerImage
+from daemon.watch.blocks import (
+    BOLD,
+    DIM,
+    GAP,
+    JOINT,
+    Items,
+    aside,
+    beside,
+    columns,
+    figures,
+    flow,
+    grasps_and_joints,
+    images,
+    images_end,
+    line,
+    percent,
+)
+from daemon.watch.lanes import AXIS_LINES, LANES, PLOT_LINES, lanes, plot, strip
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Snapshot, Tone
-from daemon.watch.view import HISTORY
 
-LARGE = (100, 34)
-"""Columns and lines from which on the images are large."""
-LINES, LINES_LARGE = 23, 30
-"""Lines of all but what is not well, with small and with large images."""
-WHY_MAX = 3
-"""Reasons that are shown; a reading seldom has more."""
-BANNER_LINES, BANNER = 5, 24
+LARGE = (96, 33)
+"""Columns and lines of a hand from which on its images are large."""
+WIDE = 150
+"""Columns from which on the reasons stand beside the verdict, and the figures in tables."""
+NARROW = 70
+"""Columns below which the field of the verdict is narrow, and there are more lines for reasons."""
+HIGH = 26
+"""Lines from which on there are three for reasons."""
+BANNER_LINES, BANNER, BANNER_NARROW = 5, 24, 20
 """Lines and columns of the coloured field that has the verdict in its middle."""
+LIST_LINES = 6
+"""Of the last grasps and the joints where they stand below the images."""
+FACTS = 45
+"""Columns beside the field of the verdict below which words are left out."""
+HAND_COLUMNS, HAND_LINES = 80, 24
+"""What a hand needs for a place of its own where several are shown."""
 NAME_MAX = 40
 """Characters of a name that came in a message."""
-GAP = 2
-"""Columns between fingers."""
-JOINT = 15
-"""Columns of a joint."""
-GRASPS = 26
-"""Columns of the list of the last grasps."""
-DIM = Style(dim=True)
-BOLD = Style(bold=True)
 
 
-def draw(seen: Snapshot, width: int, height: int, canvas: Canvas) -> RenderableType:
-    """The snapshot for a terminal of `width` x `height` characters, cut to what fits."""
+def draw(
+    hands: Sequence[Snapshot], width: int, height: int, canvas: Canvas, chosen: int = 0
+) -> Group:
+    """The snapshots for a terminal of `width` x `height` characters, cut to what fits.
+
+    Hands have places beside or below each other; where there is no room, `chosen` is the index of
+    the one that is shown, and of the others there is a line each.
+    """
+    number, several = len(hands), len(hands) > 1
+    signs = canvas.legend() if height >= HAND_LINES else []
+    footer = _footer(width, signs)
+    left = height - len(footer)
+    rows: list[Text] = []
+    if several and width // number < HAND_COLUMNS and left // number < HAND_LINES:
+        footer = _footer(width, signs, "  tab next hand")
+        rows = [_one_line(seen, canvas) for seen in hands if seen is not hands[chosen]]
+        rows += _hand(hands[chosen], width, height - len(rows) - len(footer), canvas)
+    elif several and width // number < HAND_COLUMNS:
+        share = left // number
+        for seen in hands:
+            rows += _padded(_hand(seen, width, share, canvas), share)
+    else:
+        share = (width + GAP) // number - GAP
+        for at, seen in enumerate(hands):
+            rows = beside(rows, at * (share + GAP), _hand(seen, share, left, canvas))
+    return Group(*rows, *footer)
+
+
+def _padded(rows: list[Text], number: int) -> list[Text]:
+    return rows[:number] + [Text()] * (number - len(rows))
+
+
+def _hand(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]:
+    """At most `height` lines; what matters less goes first where there is no room."""
     large = width >= LARGE[0] and height >= LARGE[1]
-    rows: list[RenderableType] = [
-        _header(seen),
-        _verdict(seen, canvas, width),
-        _line((seen.evidence, BOLD)),
-        _why(seen, canvas),
-        _hand(seen, canvas, large=large, width=width),
-        _strip(seen, canvas, width),
-        *_numbers(seen),
-        _session(seen, width),
-    ]
-    left = height - (LINES_LARGE if large else LINES)
-    return Group(*rows, *_health(seen, canvas, max(left, 1)), _footer(seen))
-
-
-def _line(*parts: tuple[str, str | Style]) -> Text:
-    text = Text.assemble(*parts)
-    text.no_wrap, text.overflow = True, "ellipsis"
-    return text
+    verdict = _verdict(seen, width, height, canvas)
+    pictures = images(seen, width, canvas, large=large)
+    known = figures(seen, NAME_MAX)
+    below = aside(known, width, dim=seen.tone is Tone.SILENT)
+    first = "".join(f"{each.what}: {each.advice}" for each in seen.health[:1])
+    health = 2 if len(first) > width else 1
+    left = height - 1 - len(verdict) - len(pictures) - AXIS_LINES - health
+    if left < 0:
+        left += len(pictures)
+        pictures = []
+    below = below[: max(left, 0)]
+    left -= len(below)
+    if width - images_end(seen, width, large=large) < JOINT and left > LIST_LINES:
+        pictures += grasps_and_joints(seen, width, LIST_LINES)
+        left -= LIST_LINES + 1
+    timeline = strip(seen, width, canvas)
+    if left >= LANES - 1:
+        timeline = lanes(seen, width, canvas)
+        left -= LANES - 1
+        if left >= PLOT_LINES:
+            timeline = plot(seen, width, canvas) + timeline
+            left -= PLOT_LINES
+    if width >= WIDE:
+        tables = columns(known, width, dim=seen.tone is Tone.SILENT)
+        if left >= len(tables) - len(below):
+            left -= len(tables) - len(below)
+            below = tables
+    rows = [_header(seen), *verdict, *pictures, *timeline, *below]
+    return [*rows, *_health(seen, width, canvas, max(left, 0) + health)][: max(height, 0)]
 
 
 def _header(seen: Snapshot) -> Text:
-    return _line(
+    return line(
         ("graspd ", BOLD),
-        (_name(seen.hand or "-"), BOLD),
+        (name(seen.hand or "-"), BOLD),
         # Of the picture: an operator sees it stand still where nothing is drawn any more.
         (time.strftime("  %H:%M:%S", time.localtime(seen.t)), BOLD),
-        (f"  {_name(seen.model or 'no model yet')}", DIM),
         (f"  {seen.state or '-'}", BOLD),
+        (f"  {name(seen.model or 'no model yet')}", DIM),
     )
 
 
-def _footer(seen: Snapshot) -> Text:
-    return _line(("q", BOLD), (f" ends   {_name(seen.endpoint, 2 * NAME_MAX)} {seen.link}", DIM))
+def _footer(width: int, signs: list[Text], keys: str = "") -> list[Text]:
+    rows = [line(("q ", BOLD), (f"ends{keys}", DIM))]
+    for sign in signs:
+        if len(rows[-1]) + GAP + len(sign) > width:
+            rows.append(line())
+        rows[-1].append(" " * GAP if len(rows[-1]) else "").append_text(sign)
+    return rows
 
 
-def _verdict(seen: Snapshot, canvas: Canvas, width: int) -> Table:
-    lines = [" " * BANNER] * BANNER_LINES
-    lines[BANNER_LINES // 2] = seen.headline.upper().center(BANNER)
+def _one_line(seen: Snapshot, canvas: Canvas) -> Text:
+    said = f" {seen.headline.upper()}{percent(seen.p_slip)} "
+    why = f" {seen.why[0].what}" if seen.why else ""
+    hand = name(seen.hand or "-")
+    return line((f"{hand} ", BOLD), (said, canvas.banner(seen.tone)), (why, ""))
+
+
+def _verdict(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]:
+    banner = BANNER if width >= NARROW else BANNER_NARROW
+    room = width - banner - 2
+    facts = _facts(seen, canvas, min(room, 60) if width >= WIDE else room)
+    number = max(BANNER_LINES, len(facts))
+    words = [""] * number
+    words[BANNER_LINES // 2] = seen.headline.upper()
+    words[BANNER_LINES // 2 + 1] = _former(seen)
+    style = canvas.banner(seen.tone)
+    rows = [line((word.center(banner)[:banner], style)) for word in words]
+    rows = beside(rows, banner + 2, facts)
+    if width >= WIDE:
+        at = banner + 2 + 60
+        said = [line((seen.evidence, BOLD)), *_why(seen, width - at, number - 1, canvas)]
+        return beside(rows, at, said)
+    evidence = [line((part, BOLD)) for part in textwrap.wrap(seen.evidence, width)[:2]]
+    lines = 2 if height < HIGH else 3 if width >= NARROW else 4
+    return [*rows, *(evidence or [Text()]), *_why(seen, width, lines, canvas)]
+
+
+def _former(seen: Snapshot) -> str:
+    """What the grasp was judged to be before, where that does not stand any more."""
     last = seen.judged
-    same = last is not None and last.verdict != "unknown" and last.grasp == seen.grasp
-    if last is not None and same and seen.verdict == "unknown" and seen.tone is not Tone.SILENT:
-        was = f"({'judged' if last.held else 'past:'} {last.verdict}{_share(last.p_slip)})"
-        lines[BANNER_LINES // 2 + 1] = was.center(BANNER)
-    banner = Text("\n".join(lines), canvas.banner(seen.tone))
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column(width=BANNER, no_wrap=True)
-    grid.add_column(no_wrap=True, overflow="ellipsis")
-    grid.add_row(banner, _facts(seen, canvas, max(width - BANNER - 2, 10)))
-    return grid
+    if last is None or last.verdict == "unknown" or last.grasp != seen.grasp:
+        return ""
+    if seen.verdict != "unknown" or seen.tone is Tone.SILENT:
+        return ""
+    return f"({'judged' if last.held else 'past:'} {last.verdict}{percent(last.p_slip)})"
 
 
-def _facts(seen: Snapshot, canvas: Canvas, width: int) -> Text:
-    p_slip = "-" if seen.p_slip is None else f"{100 * seen.p_slip:.0f} %"
-    text = Text.assemble(
-        ("grasp ", DIM),
-        ("-" if seen.grasp is None else str(seen.grasp), BOLD),
-        ("   gate ", DIM),
-        (seen.gate or "-", BOLD),
-        ("\ntouches ", DIM),
-        ("not known" if seen.contact is None else " ".join(seen.contact) or "nothing", BOLD),
-        ("   still ", DIM),
-        (seen.still, BOLD),
-        ("\nslip probability ", DIM),
-        (f"{p_slip:6}", BOLD),
-    )
-    text.append_text(canvas.bar(seen.p_slip, max(min(width - 24, 30), 5), seen.tone))
-    text.append("\nlast judged ", DIM)
-    last = seen.judged
+def _facts(seen: Snapshot, canvas: Canvas, width: int) -> list[Text]:
+    dim = seen.tone is Tone.SILENT
+    touches = "not known" if seen.contact is None else " ".join(seen.contact) or "nothing"
+    rows: list[Items] = [
+        [("grasp", "-" if seen.grasp is None else str(seen.grasp)), ("gate", seen.gate or "-")],
+        [("touches", touches), ("still", seen.still)],
+    ]
+    found = [row for items in rows for row in flow(items, width, gap=3, bold=True, dim=dim)]
+    share = "-" if seen.p_slip is None else f"{100 * seen.p_slip:.0f} %"
+    bar = canvas.bar(seen.p_slip, max(min(width - 24, 30), 5), seen.tone)
+    found.append(line(("slip probability ", DIM), (f"{share:6}", BOLD)).append_text(bar))
+    last, judged = seen.judged, "last judged" if width >= FACTS else "judged"
     if last is None:
-        return text.append("-")
-    text.append(f"{last.verdict}{_share(last.p_slip)}", BOLD)
-    text.append(f", {last.ago_s:.0f} s ago{'' if last.held else ', past'}", DIM)
-    text.append("\nits lift ", DIM).append(last.lift, BOLD)
-    return text.append(", supervised" if last.supervised else "", DIM)
+        return [*found, line((f"{judged} ", DIM), ("-", BOLD))]
+    past = "" if last.held else ", past"
+    said = f"{last.verdict}{percent(last.p_slip)}"
+    style = DIM if dim else BOLD
+    return [
+        *found,
+        line((f"{judged} ", DIM), (said, style), (f", {last.ago_s:.0f} s ago{past}", DIM)),
+        line(
+            *(("its lift ", DIM), (last.lift, style)),
+            (", supervised" if last.supervised else "", DIM),
+        ),
+    ]
 
 
-def _share(p_slip: float | None) -> str:
-    return "" if p_slip is None else f" {100 * p_slip:.0f} %"
-
-
-def _why(seen: Snapshot, canvas: Canvas) -> Group:
+def _why(seen: Snapshot, width: int, number: int, canvas: Canvas) -> list[Text]:
     """Always as many lines, so that what is below does not jump."""
-    shown = [
-        _line((line.what, canvas.style(seen.tone)), (f": {line.advice}", ""))
-        for line in seen.why[:WHY_MAX]
-    ]
-    return Group(*shown, *[Text() for _ in range(WHY_MAX - len(shown))])
+    pairs = [(each.what, each.advice) for each in seen.why]
+    return _padded(_advice(pairs, width, number, canvas, seen.tone), number)
 
 
-def _hand(seen: Snapshot, canvas: Canvas, *, large: bool, width: int) -> RenderableType:
-    lines, columns = (12, 22) if large else (6, 11)
-    if not seen.fingers:
-        return Text("no readings to see" + "\n" * (lines + (2 if large else 1)), DIM)
-    grid = Table.grid(padding=(0, GAP, 0, 0))
-    cells: list[RenderableType] = []
-    for finger in seen.fingers:
-        known = {True: "touches", False: "free", None: ""}[finger.touches]
-        title = Text.assemble((f"{finger.name} ", BOLD), (known, canvas.style(seen.tone)))
-        below = _depth_and_motion(finger, canvas, large=large)
-        cells.append(Group(title, canvas.picture(finger, large=large), *below))
-        grid.add_column(width=columns, no_wrap=True)
-    left = max(width - len(cells) * (columns + GAP), 1)
-    grid.add_column(width=left, no_wrap=True)
-    grid.add_row(*cells, Group(_beside(seen, left, lines), _legend(seen, canvas, large)))
-    return grid
+def _advice(
+    pairs: list[tuple[str, str]], width: int, number: int, canvas: Canvas, tone: Tone
+) -> list[Text]:
+    """At most `number` lines: wrapped if that is enough for all, else each in a line."""
+    style = canvas.style(tone)
+    found = []
+    for what, advice in pairs[:number]:
+        wrapped = textwrap.wrap(f"{what}: {advice}", width) or [""]
+        first = line((wrapped[0][: len(what)], style), (wrapped[0][len(what) :], ""))
+        found += [first, *[line((f"{part}", "")) for part in wrapped[1:]]]
+    if len(found) <= number:
+        return found
+    return [line((what, style), (f": {advice}", "")) for what, advice in pairs[:number]]
 
 
-def _depth(finger: FingerImage) -> str:
-    return "fall" if finger.from_rest else "span"
-
-
-def _depth_and_motion(finger: FingerImage, canvas: Canvas, *, large: bool) -> list[Text]:
-    """Two lines where there is room for them, one where not."""
-    motion = finger.motion
-    depth = Text(f"{_depth(finger)} {finger.deepest}", DIM)
-    if motion is None:
-        return [depth, Text()] if large else [depth]
-    if not large:
-        return [Text(f"{finger.deepest:4} ", DIM).append_text(canvas.motion(motion, 6))]
-    moves = _line(("moves ", DIM), (f"{'' if motion.now is None else f'{motion.now:.1f}':5}", ""))
-    return [depth, moves.append_text(canvas.motion(motion, 11))]
-
-
-def _beside(seen: Snapshot, width: int, lines: int) -> RenderableType:
-    """A title and so many lines: joints, and the last grasps where there is room."""
-    if not seen.grasps or width < GRASPS:
-        return Group(*_joints(seen, width, lines))
-    if width < GRASPS + JOINT - 1:
-        half = lines // 2
-        rows = (lines - half - 1, half) if seen.joints else (0, lines)
-        joints = _joints(seen, width, rows[0]) if seen.joints else []
-        return Group(*_grasps(seen, rows[1]), *joints)
-    grid = Table.grid()
-    grid.add_column(width=GRASPS + 1, no_wrap=True)
-    grid.add_column(width=width - GRASPS - 1, no_wrap=True)
-    joints = _joints(seen, width - GRASPS - 1, lines)
-    grid.add_row(Group(*_grasps(seen, lines)), Group(*joints))
-    return grid
-
-
-def _grasps(seen: Snapshot, lines: int) -> list[Text]:
-    """A title and so many lines, the newest grasp first."""
-    rows = [
-        f"{last.grasp:4} {last.verdict:7}{_share(last.p_slip):>5} {last.lift}"
-        f"{'*' if last.supervised else ''}"
-        for last in seen.grasps[:lines]
-    ]
-    rows += [""] * (lines - len(rows))
-    return [Text("last grasps (* watched)", DIM), *[_line((row, "")) for row in rows]]
-
-
-def _joints(seen: Snapshot, width: int, lines: int) -> list[Text]:
-    """A title and so many lines."""
-    named = sorted(seen.joints.items())
-    columns = max(1, min(width // JOINT, math.ceil(len(named) / lines)))
-    cells = [f"{_name(name, 5):5}{math.degrees(angle):6.1f}°".ljust(JOINT) for name, angle in named]
-    rows = ["".join(cells[row : lines * columns : lines]).rstrip() for row in range(lines)]
-    return [Text("joints" if named else "no joints", DIM), *[_line((row, "")) for row in rows]]
-
-
-def _legend(seen: Snapshot, canvas: Canvas, large: bool) -> Text:
-    first = seen.fingers[0]
-    what, width = ", below rest" if first.from_rest else ", below the median", 12
-    if first.motion is not None and not large:
-        what, width = f"; {_depth(first)}, motion to {canvas.limit}", 8
-    text = Text.assemble(("risen ", DIM), canvas.scale(width), (f" pressed{what}", DIM))
-    text.no_wrap, text.overflow = True, "ellipsis"
-    return text
-
-
-def _strip(seen: Snapshot, canvas: Canvas, width: int) -> Text:
-    text = Text.assemble(("30 s ", DIM), canvas.strip(seen.history, HISTORY, max(width - 9, 10)))
-    return text.append(" now", DIM)
-
-
-def _numbers(seen: Snapshot) -> list[Text]:
-    timing = seen.timing
-    first = _line(
-        ("readings ", DIM),
-        (f"{_number(timing.readings_hz)}/s", ""),
-        ("  verdicts ", DIM),
-        (f"{timing.verdicts_hz:.0f}/s", ""),
-        ("  age ", DIM),
-        (f"{_number(timing.age_ms, 1)} ms", ""),
-        ("  latency p50 p99 ", DIM),
-        (f"{_number(timing.p50_us)} {_number(timing.p99_us)} us", ""),
-    )
-    lost = Style(bold=True) if timing.lost or timing.not_understood else Style()
-    second = _line(
-        ("late ", DIM),
-        (f"{_number(timing.late)}", ""),
-        ("  worst age ", DIM),
-        (f"{_number(timing.worst_age_ms)} ms", ""),
-        ("  lost here ", DIM),
-        (f"{timing.lost}", lost),
-        ("  not understood ", DIM),
-        (f"{timing.not_understood}", lost),
-        ("  repaired ", DIM),
-        (_name(", ".join(seen.repaired) or "nothing"), ""),
-    )
-    return [first, second]
-
-
-def _session(seen: Snapshot, width: int) -> Text:
-    session = seen.session
-    if session is None:
-        known = "this model needs none"
-    else:
-        known = f"{session.grasps} grasps, {'' if session.calibrated else 'not '}calibrated"
-    text = _line(("session ", DIM), (known, ""))
-    for line in seen.learning:
-        more = _line((f"  {line.what} ", DIM), (line.advice, ""))
-        if len(text) + len(more) > width:
-            break
-        text.append_text(more)
-    return text
-
-
-def _health(seen: Snapshot, canvas: Canvas, lines: int) -> list[Text]:
+def _health(seen: Snapshot, width: int, canvas: Canvas, lines: int) -> list[Text]:
     if not seen.health:
-        return [_line(("health ", DIM), ("all is well" if seen.state else "not known", ""))]
+        return [line(("health ", DIM), ("all is well" if seen.state else "not known", ""))]
     shown = seen.health[: lines if len(seen.health) <= lines else lines - 1]
-    found = [
-        _line((_name(line.what), canvas.style(Tone.TROUBLE)), (f": {line.advice}", ""))
-        for line in shown
-    ]
+    pairs = [(name(each.what), each.advice) for each in shown]
+    found = _advice(pairs, width, lines - (len(shown) < len(seen.health)), canvas, Tone.TROUBLE)
     more = len(seen.health) - len(shown)
-    return [*found, _line((f"and {more} more that is not well", BOLD))] if more else found
+    return [*found, line((f"and {more} more that is not well", BOLD))] if more else found
 
 
-def _number(value: float | None, digits: int = 0) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"
-
-
-def _name(text: str, length: int = NAME_MAX) -> str:
+def name(text: str, length: int = NAME_MAX) -> str:
+    """A name that came in a message, harmless for a terminal."""
     return printable(text, length)

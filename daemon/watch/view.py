@@ -23,22 +23,20 @@ from daemon.publish.messages import (
     decode_tactile,
     decode_verdict,
 )
-from daemon.watch.evidence import WATCHED, doubt, learning, lift, rests_on, stillness
+from daemon.watch.evidence import WATCHED, doubt, learning, rests_on, stillness
 from daemon.watch.fingers import FingerImage, FingerMotion, Rest, image
-from daemon.watch.snapshot import TONE_CODE, Judged, Line, Session, Snapshot, Timing, Tone
+from daemon.watch.grasps import OPEN, Grasps
+from daemon.watch.snapshot import Line, Session, Snapshot, Timing, Tone
+from daemon.watch.timeline import Timeline
 from models.contract import Finger
 from models.layout import ELECTRODES
 
 SNAPSHOTS_HZ = 10
 """How often a snapshot is taken, 1/s."""
-HISTORY = 30 * SNAPSHOTS_HZ
-"""Snapshots that are remembered: half a minute, longer than a grasp takes."""
 RATE_OVER = SNAPSHOTS_HZ
 """Snapshots that a rate is taken over: a second."""
 TACTILE_OLD_NS = 1_000_000_000
 """Images older than this are not shown: they would look alive."""
-GRASPS_MAX = 8
-"""Grasps that are shown after they were judged."""
 AS_IT_SHOULD_BE = {
     Reason.NO_CONTACT,
     Reason.MOVING,
@@ -78,14 +76,11 @@ class View:
         self._tactile: Tactile | None = None
         self._tactile_ns = 0
         self._status: Status | None = None
-        self._grasps: dict[tuple[str, int], tuple[Verdict, int]] = {}
-        """What each was judged to be last, and when, ns; the newest last."""
-        self._ended: dict[tuple[str, int], str] = {}
-        """How their lifts ended, of those that were told."""
+        self._grasps = Grasps()
         self._rests: dict[str, Rest] = {}
         self._received = self._lost = self._not_understood = 0
         self._rate_marks: deque[tuple[int, int]] = deque(maxlen=RATE_OVER + 1)
-        self._history: deque[tuple[str, int]] = deque(maxlen=HISTORY)
+        self._timeline = Timeline()
 
     def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
         """Take one message that arrived at `now_ns`, monotonic ns of this computer."""
@@ -107,9 +102,7 @@ class View:
             case Tactile():
                 self._take_tactile(message, now_ns)
             case OutcomeMessage():
-                key = message.grasp_boot_id or message.boot_id, message.grasp
-                if key in self._grasps:
-                    self._ended[key] = message.outcome
+                self._grasps.end(message)
             case Status():
                 self._status = message
 
@@ -121,18 +114,7 @@ class View:
             self._lost += verdict.seq - last.seq - 1
         self._received += 1
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
-        stands = verdict.valid and (verdict.boot_id, verdict.grasp) in self._grasps
-        if stands or (verdict.judged and (verdict.valid or verdict.gate is not None)):
-            self._keep(verdict, now_ns)
-
-    def _keep(self, verdict: Verdict, now_ns: int) -> None:
-        key = verdict.boot_id, verdict.grasp
-        self._grasps.pop(key, None)
-        self._grasps[key] = verdict, now_ns
-        if len(self._grasps) > GRASPS_MAX:
-            oldest = next(iter(self._grasps))
-            del self._grasps[oldest]
-            self._ended.pop(oldest, None)
+        self._grasps.take(verdict, now_ns)
 
     def _take_tactile(self, tactile: Tactile, now_ns: int) -> None:
         if not len(tactile.fingers) == len(tactile.counts) == len(tactile.faults):
@@ -154,20 +136,23 @@ class View:
         stands = verdict is not None and tone in {Tone.STABLE, Tone.LEANS, Tone.SLIP}
         p_slip = verdict.p_slip if verdict is not None and stands else None
         said = verdict.verdict.value if verdict is not None and stands else "unknown"
-        self._history.append((TONE_CODE[tone], -1 if p_slip is None else round(100 * p_slip)))
-        self._rate_marks.append((now_ns, self._received))
+        self._timeline.add(now_ns, tone, p_slip)
+        if tone is not Tone.SILENT or not self._rate_marks:
+            self._rate_marks.append((now_ns, self._received))
         silent = tone is Tone.SILENT
         status = self._status
-        grasps = self._last_grasps(now_ns, silent=silent)
+        grasps = self._grasps.last(now_ns, None if silent else self._held())
+        wall_t = self._wall()
         return Snapshot(
             endpoint=self._endpoint,
             link=self.link,
             hand=self._hand,
-            t=self._wall(),
+            t=wall_t,
+            last_t=None if verdict is None else wall_t - (now_ns - self._verdict_ns) / 1e9,
             tone=tone,
             verdict=said,
             headline="leans to stable" if tone is Tone.LEANS else said,
-            evidence="" if verdict is None else rests_on(verdict),
+            evidence="" if verdict is None or silent else rests_on(verdict),
             learning=learning(verdict, status),
             p_slip=p_slip,
             why=why,
@@ -184,12 +169,12 @@ class View:
             session=_session(status),
             timing=self._timing(),
             state=None if status is None or silent else status.state.value,
-            counts={} if status is None else {k.value: n for k, n in status.verdicts.items()},
+            counts=self._grasps.counts(),
             drivers={} if status is None else status.drivers,
             model=None if verdict is None else f"{verdict.model} {verdict.model_sha}",
             versions={} if status is None else status.versions,
-            history="".join(code for code, _ in self._history),
-            history_p=[p for _, p in self._history],
+            history=self._timeline.tones,
+            history_p=self._timeline.shares,
         )
 
     def _finding(self, now_ns: int) -> tuple[Tone, list[Line]]:
@@ -242,24 +227,9 @@ class View:
             )
         return images
 
-    def _last_grasps(self, now_ns: int, *, silent: bool) -> list[Judged]:
-        now = self._verdict
-        held = None if silent or now is None else (now.boot_id, now.grasp)
-        if self._gate in {GateState.IDLE, GateState.RELEASED}:
-            held = None
-        return [
-            Judged(
-                verdict=verdict.verdict.value,
-                p_slip=verdict.p_slip,
-                grasp=verdict.grasp,
-                ago_s=(now_ns - judged_ns) / 1e9,
-                ended=self._ended.get(key),
-                lift=lift(verdict, self._ended.get(key)),
-                supervised=verdict.supervised,
-                held=key == held,
-            )
-            for key, (verdict, judged_ns) in reversed(self._grasps.items())
-        ]
+    def _held(self) -> tuple[str, int] | None:
+        verdict = self._verdict
+        return None if verdict is None or self._gate in OPEN else (verdict.boot_id, verdict.grasp)
 
     def _timing(self) -> Timing:
         verdict, status = self._verdict, self._status

@@ -1,9 +1,10 @@
-"""Hands the messages of a feed to a view, and takes snapshots of it at a steady rate."""
+"""Hands the messages of feeds to their views, and takes snapshots of them at a steady rate."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 from daemon.process.sleep import boottime_ns
 from daemon.watch.feed import Feed
@@ -14,13 +15,21 @@ TICK_S = 0.02
 """Between two looks at what has come: how exactly silence is timed, s."""
 
 
-def snapshots(feed: Feed, view: View, is_over: Callable[[], bool]) -> Iterator[Snapshot]:
-    """Yield a snapshot ten times a second until `is_over()` is true; it must wait `TICK_S` s."""
+class Watched(NamedTuple):
+    """A hand, where its messages come from and what they come to."""
+
+    feed: Feed
+    view: View
+
+
+def snapshots(hands: Sequence[Watched], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
+    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits `TICK_S`."""
     due_s = 0.0
     while not is_over():
-        for topic, payload in feed.take():
-            view.take(topic, payload, feed.empty_ns)  # what has waited is old
-        view.link = feed.link
+        for feed, view in hands:
+            for topic, payload in feed.take():
+                view.take(topic, payload, feed.empty_ns)  # what has waited is old
+            view.link = feed.link
         if time.monotonic() >= due_s:
             due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
-            yield view.snapshot(boottime_ns())
+            yield [view.snapshot(boottime_ns()) for _, view in hands]

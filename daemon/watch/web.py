@@ -12,6 +12,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -20,9 +21,7 @@ from typing import Any, Final
 import msgspec
 
 from daemon.process.signals import StopSignal
-from daemon.watch.feed import Feed
-from daemon.watch.view import View
-from daemon.watch.watching import TICK_S, snapshots
+from daemon.watch.watching import TICK_S, Watched, snapshots
 
 log = logging.getLogger("graspd.watch")
 
@@ -229,18 +228,19 @@ def _refusal(command: str, headers: Any) -> HTTPStatus | None:  # noqa: ANN401
 
 def load_page() -> tuple[bytes, str]:
     """The page, and the policy that lets it run its own script and style and nothing else."""
-    text = resources.files("daemon.watch").joinpath("page.html").read_text("utf-8")
-    script, style = _digest(text, "script"), _digest(text, "style")
+    folder = resources.files("daemon.watch")
+    text = folder.joinpath("page.html").read_text("utf-8")
+    digests = []
+    for element, file in (("script", "page.js"), ("style", "page.css")):
+        content = folder.joinpath(file).read_text("utf-8")
+        text = text.replace(f"<{element}></{element}>", f"<{element}>{content}</{element}>")
+        digest = hashlib.sha256(content.encode()).digest()
+        digests.append(f"{element}-src 'sha256-{base64.b64encode(digest).decode()}'; ")
     policy = (
-        f"default-src 'none'; script-src '{script}'; style-src '{style}'; connect-src 'self'; "
+        f"default-src 'none'; {''.join(digests)}connect-src 'self'; "
         "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     )
     return text.encode(), policy
-
-
-def _digest(page: str, element: str) -> str:
-    (content,) = re.findall(rf"<{element}>(.*?)</{element}>", page, re.DOTALL)
-    return "sha256-" + base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
 
 
 def _cut_off(request: socket.socket) -> None:
@@ -250,7 +250,7 @@ def _cut_off(request: socket.socket) -> None:
         log.debug("a browser had gone already")
 
 
-def serve(feed: Feed, view: View, port: int) -> None:
+def serve(hands: Sequence[Watched], port: int) -> None:
     """Serve the page until SIGINT or SIGTERM. Raises `OSError` if the port is not to be had."""
     newest = Newest()
     with StopSignal() as stop, Server(port, newest) as server:
@@ -259,7 +259,7 @@ def serve(feed: Feed, view: View, port: int) -> None:
         try:
             sys.stdout.write(f"http://{ADDRESS}:{server.server_port}/ (Ctrl-C ends)\n")
             sys.stdout.flush()
-            for seen in snapshots(feed, view, lambda: _asked_to_stop(stop)):
+            for seen in snapshots(hands, lambda: _asked_to_stop(stop)):
                 newest.put(msgspec.json.encode(seen))
         finally:
             server.shutdown()

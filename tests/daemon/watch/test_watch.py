@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import random
+import re
 import time
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec import structs
-from rich.console import Console
 
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
@@ -24,10 +23,20 @@ from daemon.watch.evidence import WATCHED
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerMotion, Rest, image
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Line, Snapshot, Tone
-from daemon.watch.terminal import draw
-from daemon.watch.view import HISTORY, View
+from daemon.watch.view import View
 from models.layout import D1
-from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, status, tactile, verdict
+from tests.daemon.watch.watch_fakes import (
+    BOOT,
+    MS,
+    RESTING,
+    RISK,
+    a_view,
+    after,
+    status,
+    tactile,
+    text_of,
+    verdict,
+)
 
 GOLDEN = sorted((Path(__file__).parents[1] / "publish" / "golden").glob("*.json"))
 ODD: tuple[object, ...] = (
@@ -47,20 +56,7 @@ ODD: tuple[object, ...] = (
     True,
 )
 """Values where others belong."""
-ENDPOINT = "ipc:///tmp/any"
-RESTING = [3000] * 24
 SOUND = np.ones(24, dtype=np.bool_)
-
-
-def a_view(hand: str | None = None) -> View:
-    return View(ENDPOINT, hand, wall=lambda: 1790000000.0)
-
-
-def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
-    seen = a_view()
-    for topic, payload in messages:
-        seen.take(topic, payload, at_ns)
-    return seen
 
 
 def rested(view: View, readings: int = 30) -> None:
@@ -69,13 +65,6 @@ def rested(view: View, readings: int = 30) -> None:
     for seq in range(readings):
         view.take(b"verdict.right", verdict(seq), 0)
         view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
-
-
-def text_of(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[str]:
-    file = io.StringIO()
-    console = Console(file=file, width=width, height=height, color_system=None)
-    console.print(draw(seen, width, height, canvas))
-    return file.getvalue().splitlines()
 
 
 def test_before_the_first_message_it_is_unknown_and_says_what_may_be_wrong() -> None:
@@ -281,11 +270,12 @@ def test_the_terminal_shows_each_finger_s_motion_below_its_image() -> None:
         text_of(seen, *size, Canvas(colour=False, ascii_only=True))
         for size in ((80, 24), (120, 40))
     )
-    assert "1379 ##-|--     0 ??????" in small[17]  # by hand: 1.2 / 1.5 of 3 are 2.4
-    assert "fall, motion to |" in small[17]
-    assert "fall 1379" in large[23]
+    assert "1379 ##-|--     0 ??????" in small[16]  # by hand: 1.2 / 1.5 of 3 are 2.4
+    assert "fall, motion to |: counts, sigma" in small[16]
+    assert "fall 1379 counts" in large[23]
     assert large[24].rstrip() == "moves 1.2  ####-|-----  moves      ???????????"
-    assert "-" not in text_of(a_grasp(), 80, 24, Canvas(colour=False, ascii_only=True))[17]
+    assert "-" not in text_of(a_grasp(), 80, 24, Canvas(colour=False, ascii_only=True))[16]
+    assert "moves 1.2\u03c3" in "\n".join(text_of(seen, 120, 40, Canvas()))
 
 
 def test_messages_of_before_there_were_outcomes_are_never_a_promise() -> None:
@@ -348,19 +338,20 @@ def test_how_learning_goes_is_seen_what_nobody_told_first() -> None:
         (b"verdict.right", verdict(0, Decision.STABLE)),
     ).snapshot(0)
     assert seen.learning == [
-        Line("never told", "3"),
-        Line("warm-up left", "0"),
-        Line("still out", "1"),
+        Line("never told", "3 lifts"),
+        Line("warm-up left", "0 outcomes"),
+        Line("still out", "1 lift"),
         Line("learner", "on"),
         Line("learned from", "57 outcomes"),
         Line("uncertainty", "41 %"),
-        Line("slips of `stable`", "2 of 41, at most 9.5"),
+        Line("slips of `stable`", "2 of 41 lifts, at most 9.5"),
         Line("outcomes taken", "57"),
         Line("outcomes contradicts", "1"),
     ]
     text = "\n".join(text_of(seen, 80, 24, Canvas()))
-    assert "never told 3  warm-up left 0" in text
-    assert "slips of `stable` 2 of 41, at most 9.5" in "\n".join(text_of(seen, 200, 60, Canvas()))
+    assert "never told 3 lifts  warm-up left 0 outcomes" in text
+    large = "\n".join(text_of(seen, 200, 60, Canvas()))
+    assert re.search(r"slips of `stable` +2 of 41 lifts, at most 9\.5", large)
 
 
 def test_the_verdict_stays_in_view_until_the_next_grasp_and_is_marked_as_past() -> None:
@@ -438,16 +429,18 @@ def test_a_grasp_that_is_judged_again_is_in_the_list_once() -> None:
     assert len(view.snapshot(0).grasps) == 1
 
 
-def test_rates_and_the_last_half_minute_are_of_what_arrived() -> None:
+def test_rates_and_the_last_five_minutes_are_of_what_arrived() -> None:
     view = a_view()
-    for moment in range(400):
-        now_ns = moment * 100 * MS
+    for moment in range(4 * 320):  # by hand: 320 s, of which 300 are kept
+        now_ns = moment * 250 * MS
         for part in range(5):
             view.take(b"verdict.right", verdict(moment * 5 + part, Decision.STABLE), now_ns)
         seen = view.snapshot(now_ns)
-    assert seen.timing.verdicts_hz == pytest.approx(50.0)
-    assert HISTORY == 300
-    assert seen.history == "s" * 300
+    assert seen.timing.verdicts_hz == pytest.approx(20.0)
+    silent = view.snapshot(now_ns + 60_000 * MS)
+    assert silent.tone is Tone.SILENT
+    assert silent.timing.verdicts_hz == pytest.approx(20.0)  # as all figures, of then
+    assert seen.history == ["s"] * 300
     assert seen.history_p == [25] * 300
 
 

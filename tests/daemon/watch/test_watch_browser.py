@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 import time
@@ -13,21 +14,23 @@ import msgspec
 import pytest
 
 from daemon.judge.reasons import Decision
+from daemon.publish.messages import LearnerHealth, Lifts
+from daemon.trust.ledger import Told
 from daemon.watch.feed import Feed
 from daemon.watch.view import View
-from daemon.watch.watching import TICK_S, snapshots
+from daemon.watch.watching import TICK_S, Watched, snapshots
 from daemon.watch.web import Newest, Server
 from tests.daemon.watch.browser import CHROMIUM, Browser
-from tests.daemon.watch.watch_fakes import Talker, verdict
+from tests.daemon.watch.watch_fakes import Talker, status, tactile, verdict
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 
 COLOURS = {
     "light": {"stable": "rgb(26, 127, 55)", "slip": "rgb(207, 34, 46)"},
-    "dark": {"stable": "rgb(35, 139, 67)", "slip": "rgb(218, 63, 69)"},
+    "dark": {"stable": "rgb(31, 128, 64)", "slip": "rgb(208, 53, 60)"},
 }
 """Green and red of both themes, as the page's style has them."""
-BANNER = "document.getElementById('banner')"
+BANNER = "document.querySelector('.banner')"
 
 
 class Page:
@@ -51,8 +54,8 @@ class Page:
 
     def _publish(self) -> None:
         with Feed(self._endpoint) as feed:
-            view = View(self._endpoint)
-            for seen in snapshots(feed, view, lambda: self._over.wait(TICK_S)):
+            hands = [Watched(feed, View(self._endpoint))]
+            for seen in snapshots(hands, lambda: self._over.wait(TICK_S)):
                 self._server.newest.put(msgspec.json.encode(seen))
 
     def stop(self) -> None:
@@ -88,7 +91,7 @@ def see(browser: Browser, tone: str) -> None:
 
 
 def text(browser: Browser, element: str) -> str:
-    return str(browser.value(f"document.getElementById('{element}').innerText"))
+    return str(browser.value(f"document.querySelector('.{element}').innerText"))
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
@@ -176,14 +179,19 @@ def test_each_finger_s_motion_is_a_bar_and_what_is_not_known_is_none(
         "motion": {"ff": 1.0, "th": None},
         "motion_limits": {"ff": 1.25, "th": 1.0},
     }
-    browser.wait_for("document.getElementById('still').innerText == '130 ms, may slide'")
-    known = ["still", "40%", False, "moves 1.0, still to 1.3"]  # by hand: half of 1 / 1.25
+    browser.wait_for("document.querySelector('.still').innerText == '130 ms, may slide'")
+    known = [
+        "still",
+        "40%",
+        False,
+        "moves 1.0 / 1.3 \u03c3",
+    ]  # by hand: half of 1 / 1.25
     assert bars() == [known, ["unknown", "0%", False, "motion unknown"]]
     talker.more |= {"still_ms": 0.0, "motion": {"ff": 2.0, "th": 9.0}}
-    browser.wait_for("document.getElementById('still').innerText == '0 ms'")
+    browser.wait_for("document.querySelector('.still').innerText == '0 ms'")
     assert bars() == [
-        ["moving", "80%", False, "moves 2.0, still to 1.3"],
-        ["moving", "100%", False, "moves 9.0, still to 1.0"],
+        ["moving", "80%", False, "moves 2.0 / 1.3 \u03c3"],
+        ["moving", "100%", False, "moves 9.0 / 1.0 \u03c3"],
     ]
     talker.decision = None
     see(browser, "silent")
@@ -205,15 +213,15 @@ def test_past_grasps_stay_and_so_does_the_verdict_until_the_next_one(
     assert text(browser, "was") == "past: stable 25 %"
     assert ", past; its lift not told" in text(browser, "judged")
     talker.more = {"grasp": 8}
-    browser.wait_for("document.getElementById('was').innerText == ''")
+    browser.wait_for("document.querySelector('.was').innerText == ''")
     talker.more = {"grasp": 8, "supervised": True}
     talker.decision = Decision.SLIP
     see(browser, "slip")
     assert text(browser, "grasps").split("\n") == [
-        "8\tslip 75 %\tsupervised\tnot told",
-        "7\tstable 25 %\t\tnot told",
+        "8\t✕slip 75 %\tsupervised\tnot told",
+        "7\t●stable 25 %\t\tnot told",
     ]
-    assert "slips of `stable`\t2 of 41, at most 9.5" in text(browser, "learning")
+    assert "slips of `stable`\t2 of 41 lifts, at most 9.5" in text(browser, "learning")
     assert browser.complaints == []
 
 
@@ -236,6 +244,130 @@ def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
     assert why.startswith("no connection: graspd watch does not answer; no message from graspd ")
     page.start()
     see(browser, "slip")
+
+
+def test_figures_of_a_dead_daemon_are_dimmed_and_have_their_time(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.decision = Decision.STABLE
+    browser.look(1280, 800)
+    browser.go(f"http://localhost:{page.port}/")
+    see(browser, "stable")
+    browser.wait_for("document.querySelector('.timing').innerText.includes('250 us')")
+    figure = "getComputedStyle(document.querySelector('.timing td'))"
+    assert text(browser, "old") == ""
+    assert browser.value(f"{figure}.fontStyle") == "normal"
+    talker.decision = None
+    see(browser, "silent")
+    died = time.time()
+    assert browser.value(f"{figure}.fontStyle") == "italic"
+    assert browser.value(f"{figure}.color") == "rgb(91, 101, 112)"  # --faint
+    assert "250 us" in text(browser, "timing")
+    said = re.fullmatch(r"figures are of (\d\d:\d\d:\d\d), the last message", text(browser, "old"))
+    assert said
+    assert said[1] in {time.strftime("%H:%M:%S", time.localtime(died - ago)) for ago in range(5)}
+    page.stop()
+    browser.wait_for("document.querySelector('.why').innerText.startsWith('no connection')")
+    assert text(browser, "old") == said[0]
+    page.start()
+
+
+def test_the_timeline_is_there_again_when_the_page_is_loaded_anew(
+    page: Page, talker: Talker, browser: Browser
+) -> None:
+    talker.decision = Decision.SLIP
+    browser.look(1280, 800)
+    browser.go(f"http://localhost:{page.port}/")
+    see(browser, "slip")
+    time.sleep(2.0)  # of which three seconds of the clock are seen, or two
+    talker.decision = Decision.STABLE
+    see(browser, "stable")
+    browser.go("about:blank")
+    browser.go(f"http://localhost:{page.port}/")
+    see(browser, "stable")
+    seconds = browser.value("document.querySelector('.timeline').ariaLabel")
+    found = re.search(r"slip (\d+) s", seconds)
+    assert found
+    assert int(found[1]) >= 2
+    # It is drawn: below the first lane's name and the minutes there is something of its colour.
+    assert browser.value(
+        "(c => { const all = c.getContext('2d').getImageData(0, 0, c.width, 12).data; let n = 0;"
+        " for (let i = 0; i < all.length; i += 4)"
+        " n += all[i] === 207 && all[i + 1] === 34 && all[i + 2] === 46; return n; })"
+        "(document.querySelector('.timeline'))"
+    )
+
+
+FIVE = ["ff", "mf", "rf", "lf", "th"]
+FULL = {
+    "fingers": FIVE,
+    "counts": [[3000] * 24] * 5,
+    "faults": [[0] * 24] * 5,
+    "joints": {
+        f"{finger}J{joint}": 0.1 for finger in ("FF", "MF", "RF", "TH") for joint in range(6)
+    },
+}
+"""A reading of a whole hand, with as many joints as there are."""
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize(
+    ("names", "width", "fits"),
+    [(["right"], 1280, True), (["left", "right"], 1280, False), (["left", "right"], 400, False)],
+)
+def test_all_of_a_hand_is_in_one_window_and_several_are_in_one_page(
+    browser: Browser, names: list[str], width: int, fits: bool, theme: Literal["light", "dark"]
+) -> None:
+    server, over = Server(0, Newest()), threading.Event()
+    views = [View(f"ipc:///tmp/{name}") for name in names]
+    lifts = Lifts(reported=41, outstanding=1, unreported=3)
+    learner = LearnerHealth(enabled=True, outcomes=5, told={Told.TAKEN: 5}, uncertainty=0.4)
+    whole = json.dumps(json.loads(tactile(0)) | FULL).encode()
+    motion = dict.fromkeys(FIVE, 1.2)
+    more = {"contact": FIVE, "still_ms": 130.0, "motion": motion}
+
+    def put() -> None:
+        seq = 0
+        while not over.wait(0.05):
+            for view, decision in zip(views, (Decision.STABLE, Decision.SLIP), strict=False):
+                hand = view.snapshot(0).endpoint.rpartition("/")[2].encode()
+                said = status(seq, lifts=lifts, learner=learner)
+                view.take(b"status." + hand, said, 0)
+                view.take(b"tactile." + hand, whole, 0)
+                told = verdict(seq, decision, motion_limits=motion, grasp=seq // 9, **more)
+                view.take(b"verdict." + hand, told, 0)
+            server.newest.put(msgspec.json.encode([view.snapshot(0) for view in views]))
+            seq += 1
+
+    threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]
+    for thread in threads:
+        thread.start()
+    try:
+        browser.look(width, 800, theme)
+        browser.go(f"http://127.0.0.1:{server.server_port}/")
+        browser.wait_for("document.querySelectorAll('.grasps tr').length >= 8")
+        browser.wait_for(f"document.querySelectorAll('.hand').length == {len(names)}")
+        assert browser.value("document.documentElement.scrollWidth <= innerWidth")
+        inside = browser.value("document.documentElement.scrollHeight <= innerHeight")
+        assert inside or not fits
+        tones = browser.value("[...document.querySelectorAll('.banner')].map(b => b.dataset.tone)")
+        assert tones == ["stable", "slip"][: len(names)]
+        several = {1: "stable - graspd", 2: "left stable, right slip - graspd"}
+        assert browser.value("document.title") == several[len(names)]
+        heads = browser.value("[...document.querySelectorAll('.who')].map(b => b.innerText)")
+        assert heads == [f"graspd {name}" for name in names]
+        cut = (
+            "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div, h2')]"
+            ".filter(e => e.scrollWidth > e.clientWidth + 1 && e.clientWidth).map(e => e.innerText)"
+        )
+        assert browser.value(cut) == []
+        assert browser.complaints == []
+    finally:
+        over.set()
+        server.shutdown()
+        for thread in threads:
+            thread.join()
+        server.server_close()
 
 
 def note_tones(browser: Browser) -> None:
@@ -303,7 +435,7 @@ def test_the_page_has_a_clock_that_goes_on(page: Page, talker: Talker, browser: 
     see(browser, "waiting")
     first = text(browser, "clock")
     assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
-    browser.wait_for(f"document.getElementById('clock').innerText > '{first}'")
+    browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
 
 
 def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
@@ -315,7 +447,7 @@ def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> N
         seq = 0
         while not over.wait(0.05):
             view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
-            server.newest.put(msgspec.json.encode(view.snapshot(0)))
+            server.newest.put(msgspec.json.encode([view.snapshot(0)]))
             seq += 1
 
     threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]

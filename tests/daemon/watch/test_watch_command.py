@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import json
 import os
 import pty
 import re
@@ -265,6 +266,64 @@ def test_a_scene_says_where_and_which_hand(tmp_path: Path, endpoint: str) -> Non
         terminal.read_until(rb"judged to hold")
         press_q(terminal)
         assert terminal.end() == 0
+
+
+def two_scenes(tmp_path: Path) -> list[str]:
+    paths = []
+    for hand in ("left", "right"):
+        path = tmp_path / f"{hand}.toml"
+        path.write_text(
+            f'[hand]\nname = "{hand}"\n[tactile]\ndriver = "palm"\n'
+            'source = "udp://127.0.0.1:9870"\n'
+            f'[publish]\nendpoint = "ipc://{tmp_path}/{hand}"\n'
+        )
+        paths.append(str(path))
+    return paths
+
+
+def test_several_scenes_are_seen_in_one_terminal(tmp_path: Path) -> None:
+    scenes = two_scenes(tmp_path)
+    with Talker(f"ipc://{tmp_path}/right") as talker, Terminal(*scenes) as terminal:
+        talker.decision = Decision.SLIP
+        terminal.read_until(rb"right .*SLIP 75 % .*do not lift.*graspd .*left.*no message has come")
+        terminal.type(b"\t")
+        terminal.read_until(rb"left .*UNKNOWN .*graspd .*right.*it is judged to slip")
+        press_q(terminal)
+        assert terminal.end() == 0
+
+
+@pytest.mark.parametrize("by", ["scenes", "endpoints"])
+def test_several_hands_are_one_page_of_one_process(tmp_path: Path, by: str) -> None:
+    where = two_scenes(tmp_path)
+    if by == "endpoints":
+        ends = [f"ipc://{tmp_path}/{hand}" for hand in ("left", "right")]
+        where = ["--connect", ends[0], "--connect", ends[1]]
+    with (
+        Talker(f"ipc://{tmp_path}/right") as talker,
+        start("watch", "--web", *where, "--port", PORT) as page,
+    ):
+        talker.decision = Decision.STABLE
+        assert page.stdout is not None
+        page.stdout.readline()
+        with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as link:
+            link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            with link.makefile("rb") as lines:
+                for line in lines:
+                    if b'"stable"' not in line:
+                        continue
+                    first, second = json.loads(line.removeprefix(b"data: "))
+                    if second["tone"] == "stable":
+                        break
+        assert (first["tone"], first["verdict"]) == ("silent", "unknown")
+        assert (second["hand"], second["endpoint"]) == ("right", f"ipc://{tmp_path}/right")
+        page.send_signal(signal.SIGTERM)
+        assert page.wait(PATIENCE_S) == 0
+
+
+def test_more_hands_than_can_be_watched_are_refused() -> None:
+    result = graspd("watch", *[word for _ in range(9) for word in ("--connect", "ipc:///tmp/x")])
+    assert result.returncode == 2
+    assert "9 hands are more than the 8 that can be watched" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -1,20 +1,29 @@
-"""Messages to watch, and somebody who publishes them for as long as he is asked to."""
+"""Messages to watch, views of them, and somebody who publishes them as long as he is asked to."""
 
 from __future__ import annotations
 
+import io
 import threading
 from typing import Any, Self
+
+from rich.console import Console
 
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
 from daemon.publish.publisher import Publisher
 from daemon.trust.risk import RiskReport
+from daemon.watch.pixels import Canvas
+from daemon.watch.snapshot import Snapshot
+from daemon.watch.terminal import draw
+from daemon.watch.view import View
 
 RISK = RiskReport(target=0.1, lifts=41, slips=2, outstanding=1, bound=9.5, warm_up_left=0)
 """Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 MS = 1_000_000
 PERIOD_S = 0.02
+ENDPOINT = "ipc:///tmp/any"
+RESTING = [3000] * 24
 
 
 def verdict(seq: int, decision: Decision = Decision.UNKNOWN, **other: Any) -> bytes:  # noqa: ANN401
@@ -86,6 +95,27 @@ def status(seq: int, **other: Any) -> bytes:  # noqa: ANN401
         "versions": {"graspd": "0.1.0"},
     }
     return encode(Status(**{**content, **other}))
+
+
+def a_view(hand: str | None = None) -> View:
+    return View(ENDPOINT, hand, wall=lambda: 1790000000.0)
+
+
+def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
+    seen = a_view()
+    for topic, payload in messages:
+        seen.take(topic, payload, at_ns)
+    return seen
+
+
+def text_of(
+    seen: Snapshot | list[Snapshot], width: int, height: int, canvas: Canvas, chosen: int = 0
+) -> list[str]:
+    hands = seen if isinstance(seen, list) else [seen]
+    file = io.StringIO()
+    console = Console(file=file, width=width, height=height, color_system=None)
+    console.print(draw(hands, width, height, canvas, chosen))
+    return file.getvalue().splitlines()
 
 
 class Talker:

@@ -1,0 +1,320 @@
+"use strict";
+const STATES = ["idle", "closing", "settled", "judged", "released"];
+const TONES = {s: "stable", l: "leans", x: "slip", u: "learning", w: "waiting", t: "trouble", ".": "silent"};
+const LANES = [["x", "slip"], ["s", "stable"], ["l", "leans"], ["u", "watched"], ["t", "wrong"], ["w", "waiting"], [".", "silent"]];
+const MARKS = {slip: "\u2715", stable: "\u25cf", unknown: "?"};
+const ROWS = 12, COLUMNS = 11, FULL = 100, MOMENTS = 300, MINUTES = 5;
+const QUIET_MS = 1000;  // the server sends ten times a second
+const LOOK_MS = 100, AGAIN_MS = 1000;  // between two looks at the clock; between two tries
+const PRESSED = [[11, "#6b3a78"], [30, "#a8326a"], [55, "#e2582e"], [80, "#f9b01c"], [100, "#fdf7a8"]];
+const hands = [];
+let gone = false, source = null, again = 0;
+let lost = "connecting";  // why there is no connection; null while there is one
+let came = now(), looked = now();
+let fastest = Infinity;  // way of a snapshot on this connection, with the difference of the clocks, ms
+
+function text(node, value) { if (node.textContent !== value) node.textContent = value; }
+function number(value, unit = "", digits = 0) { return value === null ? "-" : value.toFixed(digits) + unit; }
+function percent(share) { return number(100 * share, " %"); }
+function clock(seconds) { return new Date(1000 * seconds).toTimeString().slice(0, 8); }
+function called(grasp) { return grasp.verdict + (grasp.p_slip === null ? "" : " " + percent(grasp.p_slip)); }
+function rgb(hex) { return [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 16)); }
+function mix(one, other, share) {
+  return `rgb(${one.map((value, at) => Math.round(value + (other[at] - value) * share)).join()})`;
+}
+
+let colours = {};
+function readColours() {
+  const style = getComputedStyle(document.documentElement);
+  for (const name of ["rest", "risen", "mark", "track", "text", "faint", "bad", ...Object.values(TONES)])
+    colours[name] = style.getPropertyValue("--" + name).trim();
+}
+function colour(level) {
+  const rest = rgb(colours.rest);
+  if (level < 0) return mix(rest, rgb(colours.risen), -level / FULL);
+  let low = 0, from = rest;
+  for (const [high, hex] of PRESSED) {
+    if (level <= high) return mix(from, rgb(hex), (level - low) / (high - low));
+    low = high; from = rgb(hex);
+  }
+  return PRESSED.at(-1)[1];
+}
+
+function sized(canvas) {
+  const ratio = window.devicePixelRatio || 1;
+  const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  const context = canvas.getContext("2d");
+  context.clearRect(0, 0, width, height);
+  return context;
+}
+
+function children(parent, items, make, fill) {
+  while (parent.children.length > items.length) parent.lastChild.remove();
+  while (parent.children.length < items.length) parent.append(make());
+  items.forEach((item, at) => fill(parent.children[at], item));
+}
+function element(name, ...inside) { const made = document.createElement(name); made.append(...inside); return made; }
+function lines(parent, items) {
+  children(parent, items, () => element("li", element("b"), element("span")), (node, line) => {
+    text(node.children[0], line.what); text(node.children[1], ": " + line.advice);
+  });
+}
+function rows(table, pairs) {
+  children(table, pairs, () => element("tr", element("td"), element("td")), (node, [name, value]) => {
+    text(node.children[0], name); text(node.children[1], String(value));
+  });
+}
+
+function drawFinger(canvas, finger) {
+  const context = sized(canvas), wide = canvas.width / COLUMNS, high = canvas.height / ROWS;
+  finger.levels.forEach((level, at) => {
+    const x = at % COLUMNS * wide, y = Math.floor(at / COLUMNS) * high;
+    context.fillStyle = colour(level);
+    const left = Math.round(x), top = Math.round(y);
+    context.fillRect(left, top, Math.round(x + wide) - left - 1, Math.round(y + high) - top - 1);
+  });
+  context.strokeStyle = colours.mark; context.lineWidth = Math.max(wide / 7, 1.5);
+  for (const at of finger.marked) {
+    const x = at % COLUMNS * wide, y = Math.floor(at / COLUMNS) * high, in_ = .22;
+    context.beginPath();
+    context.moveTo(x + wide * in_, y + high * in_); context.lineTo(x + wide * (1 - in_), y + high * (1 - in_));
+    context.moveTo(x + wide * (1 - in_), y + high * in_); context.lineTo(x + wide * in_, y + high * (1 - in_));
+    context.stroke();
+  }
+}
+
+// Up to the mark in the middle a finger is still; at the right end it moves twice as much.
+function drawMotion(bar, words, motion) {
+  bar.hidden = words.hidden = motion === null;
+  if (motion === null) return;
+  const {now, limit} = motion;
+  bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
+  bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
+  text(words, now === null ? "motion unknown" : `moves ${number(now, "", 1)} / ${number(limit, " \u03c3", 1)}`);
+}
+
+// A lane for each kind of verdict, below it the probability of slip, and the minutes before now.
+function drawTimeline(canvas, history, probability) {
+  const context = sized(canvas), ratio = window.devicePixelRatio || 1;
+  const left = 62 * ratio, lane = 12 * ratio, bottom = canvas.height - 16 * ratio, top = LANES.length * lane + 10 * ratio;
+  const step = (canvas.width - left - 4 * ratio) / MOMENTS, start = MOMENTS - history.length;
+  const size = 2.8 * ratio, level = share => bottom - (bottom - top) * share / 100;
+  context.font = `${11 * ratio}px system-ui, sans-serif`; context.textBaseline = "middle";
+  for (let minute = 0; minute <= MINUTES; minute++) {
+    const x = left + minute * MOMENTS / MINUTES * step;
+    const unit = minute && canvas.width < 560 * ratio ? "" : " min";
+    const label = minute === MINUTES ? "now" : `\u2212${MINUTES - minute}${unit}`;
+    context.fillStyle = colours.track; context.fillRect(x, 0, ratio, bottom + 4 * ratio);
+    context.fillStyle = colours.faint; context.textAlign = minute === MINUTES ? "right" : minute ? "center" : "left";
+    context.fillText(label, x, canvas.height - 6 * ratio);
+  }
+  context.textAlign = "right";
+  for (const share of [0, 50, 100]) {
+    context.fillStyle = colours.track; context.fillRect(left, level(share), canvas.width - left, ratio);
+    context.fillStyle = colours.faint; context.fillText(`${share} %`, left - 6 * ratio, level(share));
+  }
+  LANES.forEach(([code, name], row) => {
+    const y = row * lane;
+    context.fillStyle = colours.faint; context.fillText(name, left - 6 * ratio, y + lane / 2);
+    context.fillStyle = code === "w" ? colours.faint : colours[TONES[code]];
+    for (let at = 0; at < history.length; at++)
+      if (history[at].includes(code)) context.fillRect(left + (start + at) * step, y + 2 * ratio, step + .6, lane - 4 * ratio);
+  });
+  context.lineWidth = 1.5 * ratio;
+  probability.forEach((share, at) => {
+    if (share < 0) return;
+    const x = left + (start + at + .5) * step, y = level(share), slip = history[at].includes("x");
+    context.beginPath();
+    context.strokeStyle = context.fillStyle = slip ? colours.bad : colours.leans;
+    if (slip) {
+      context.moveTo(x - size, y - size); context.lineTo(x + size, y + size);
+      context.moveTo(x + size, y - size); context.lineTo(x - size, y + size);
+    } else context.arc(x, y, size, 0, 2 * Math.PI);
+    if (history[at].includes("s")) context.fill(); else context.stroke();
+  });
+  const seconds = LANES.map(([code, name]) => [name, history.filter(each => each.includes(code)).length]);
+  canvas.ariaLabel = "verdicts by second: " + seconds.filter(([, count]) => count).map(([name, count]) => `${name} ${count} s`).join(", ");
+}
+
+class Hand {
+  constructor() {
+    this.seen = null;
+    this.root = document.getElementById("hand").content.firstElementChild.cloneNode(true);
+    this.parts = {};
+    document.getElementById("hands").append(this.root);
+  }
+  part(name) { return this.parts[name] ??= this.root.querySelector("." + name); }
+  say(name, value) { text(this.part(name), value); }
+
+  draw(quiet) {
+    const seen = this.seen, none = gone || seen === null, tone = none ? "silent" : seen.tone;
+    this.say("clock", clock(Date.now() / 1000));
+    this.part("banner").dataset.tone = tone;
+    this.say("verdict", this.headline());
+    const p = none ? null : seen.p_slip, last = none ? null : seen.judged;
+    const was = last !== null && tone !== "silent" && seen.verdict === "unknown" && last.verdict !== "unknown";
+    this.say("was", was && last.grasp === seen.grasp ? `${last.held ? "judged" : "past:"} ${called(last)}` : "");
+    this.say("evidence", none ? "" : seen.evidence);
+    this.say("p", p === null ? "no probability" : `slip probability ${percent(p)}`);
+    this.part("gauge").ariaValueNow = p === null ? null : (100 * p).toFixed(0);
+    this.part("gauge").firstElementChild.style.width = `${p === null ? 0 : 100 * p}%`;
+    lines(this.part("why"), none ? [trouble(quiet)] : seen.why);
+    const old = tone === "silent";
+    this.root.classList.toggle("gone", old);
+    this.say("old", !old || seen === null || seen.last_t === null ? "" :
+      `figures are of ${clock(seen.last_t)}, the last message`);
+    if (seen === null) return;
+    this.say("who", `graspd ${seen.hand ?? ""}`);
+    this.root.ariaLabel = `hand ${seen.hand ?? ""}`;
+    this.say("state", none ? "-" : seen.state ?? "-");
+    this.say("model", seen.model ?? "no model yet");
+    this.say("where", none ? seen.endpoint : `${seen.endpoint} ${seen.link}`);
+    this.drawGrasp(none, quiet);
+    this.drawFingers(none ? [] : seen.fingers);
+    const missed = Math.min(Math.floor(quiet / 1000), MOMENTS);  // it moves on where nothing comes
+    drawTimeline(this.part("timeline"), [...seen.history, ...Array(missed).fill(".")].slice(-MOMENTS),
+      [...seen.history_p, ...Array(missed).fill(-1)].slice(-MOMENTS));
+    const joints = Object.entries(none ? {} : seen.joints).sort();
+    this.say("joints-title", joints.length ? "Joints" : "No joints");
+    children(this.part("joints"), joints, () => element("div", element("span"), element("b")), (node, [name, angle]) => {
+      text(node.children[0], name); text(node.children[1], `${(angle * 180 / Math.PI).toFixed(1)}\u00b0`);
+    });
+    lines(this.part("health"), seen.health.length ? seen.health :
+      [{what: seen.state === null ? "not known" : "well", advice: seen.state === null ? "no status comes" : "nothing to be done"}]);
+    this.drawTables();
+  }
+  headline() { return gone || this.seen === null ? "unknown" : this.seen.headline; }
+
+  drawGrasp(none, quiet) {
+    const seen = this.seen, gate = none ? null : seen.gate, newest = seen.judged;
+    this.say("grasp", String(seen.grasp ?? "-"));
+    children(this.part("gate"), STATES, () => element("li"), (node, state) => {
+      text(node, state); node.className = state === gate ? "now" : "";
+      node.ariaCurrent = state === gate ? "step" : null;
+    });
+    const ago = newest === null ? 0 : newest.ago_s + quiet / 1000;
+    this.say("judged", newest === null ? "-" :
+      `${called(newest)}, ${ago.toFixed(0)} s ago${newest.held && !none ? "" : ", past"}; its lift ${newest.lift}`);
+    this.say("still", none ? "-" : seen.still);
+  }
+
+  drawFingers(fingers) {
+    children(this.part("fingers"), fingers,
+      () => element("figure", element("figcaption", element("b"), element("span"), element("span")), element("canvas"), element("div"), element("span")),
+      (node, finger) => {
+        const [name, touch, depth] = node.children[0].children, [, canvas, bar, words] = node.children;
+        text(name, finger.name);
+        text(touch, finger.touches === null ? "" : finger.touches ? "touches" : "free");
+        touch.className = finger.touches ? "touch" : "faint";
+        text(depth, finger.from_rest ? `${finger.deepest} counts` : "");
+        canvas.role = "img"; canvas.ariaLabel = `tactile image of ${finger.name}: ${touch.textContent} ${depth.textContent}`;
+        drawFinger(canvas, finger);
+        bar.className = "moves"; words.className = "faint";
+        drawMotion(bar, words, finger.motion);
+      });
+    const canvas = this.part("legend").querySelector("canvas"), context = sized(canvas);
+    for (let x = 0; x < canvas.width; x++) {
+      context.fillStyle = colour(-25 + 125 * x / canvas.width);
+      context.fillRect(x, 0, 1, canvas.height);
+    }
+    const rest = fingers.length === 0 || fingers[0].from_rest;
+    this.say("scale", fingers.length === 0 ? "no readings to see" :
+      `pressed, ${rest ? "to 1600 counts below rest" : "below the finger's own median"}; \u2715 faulty or repaired`);
+  }
+
+  drawTables() {
+    const {timing: time, session, counts} = this.seen;
+    this.say("counts", Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", "));
+    children(this.part("grasps"), this.seen.grasps,
+      () => element("tr", element("td"), element("td", element("i"), element("span")), element("td"), element("td")),
+      (node, grasp) => {
+        text(node.children[0], String(grasp.grasp));
+        const [mark, word] = node.children[1].children;
+        mark.dataset.verdict = grasp.verdict; text(mark, MARKS[grasp.verdict]);
+        text(word, called(grasp));
+        text(node.children[2], grasp.supervised ? "supervised" : "");
+        text(node.children[3], grasp.lift);
+        node.children[3].className = grasp.ended === null ? "faint" : grasp.verdict === "stable" && grasp.ended === "slip" ? "bad" : "";
+      });
+    rows(this.part("learning"), this.seen.learning.map(line => [line.what, line.advice]));
+    rows(this.part("timing"), [
+      ["readings, verdicts", `${number(time.readings_hz, " /s")}, ${number(time.verdicts_hz, " /s")}`],
+      ["age of the last", number(time.age_ms, " ms", 1)],
+      ["latency p50, p99", `${number(time.p50_us, " us")}, ${number(time.p99_us, " us")}`],
+      ["longest latency", number(time.max_us, " us")],
+      ["jitter p99", number(time.jitter_p99_us, " us")],
+      ["late", number(time.late, " readings")],
+      ["worst age", number(time.worst_age_ms, " ms")],
+      ["lost here", number(time.lost, " messages")],
+      ["not understood", number(time.not_understood, " messages")],
+    ]);
+    rows(this.part("session"), [
+      ["session", session === null ? "not needed" : `${session.grasps} grasps, ${session.calibrated ? "" : "not yet "}calibrated`],
+      ["repaired now", this.seen.repaired.join(", ") || "nothing"],
+    ]);
+    rows(this.part("drivers"), [
+      ...Object.entries(this.seen.drivers).flatMap(([driver, counters]) =>
+        Object.entries(counters).filter(([, count]) => count).map(([name, count]) => [`${driver} ${name}`, count])),
+      ...Object.entries(this.seen.versions),
+    ]);
+  }
+}
+
+// Two clocks: the first stands still while the computer sleeps, the second may be set.
+function now() { return [performance.now(), Date.now()]; }
+function since(moment) { const [steady, wall] = now(); return Math.max(steady - moment[0], wall - moment[1]); }
+function trouble(quiet) {
+  if (document.hidden) return {what: "not looked at", advice: "this page is in the background"};
+  const why = lost === null ? "" : `${lost}; `;
+  return {what: "no connection", advice: `${why}no message from graspd watch for ${quiet.toFixed(0)} ms`};
+}
+
+function draw() {
+  const quiet = since(came);
+  gone = lost !== null || document.hidden || quiet > QUIET_MS;
+  for (const hand of hands) hand.draw(quiet);
+  const said = hands.map(hand => (hands.length > 1 ? `${hand.seen.hand ?? "?"} ` : "") + hand.headline());
+  document.title = `${said.join(", ")} - graspd`;
+}
+
+function lose(why) {
+  if (lost === null || hands[0].seen === null) lost = why;
+  draw();
+}
+function connect() {
+  clearTimeout(again);
+  if (source !== null) source.close();
+  source = new EventSource("/events");
+  source.onopen = () => { fastest = Infinity; };
+  source.onerror = () => {
+    lose("graspd watch does not answer");
+    if (source.readyState === EventSource.CLOSED) { clearTimeout(again); again = setTimeout(connect, AGAIN_MS); }
+  };
+  source.onmessage = event => {
+    if (!look()) return;  // it waited: what comes on the new connection counts
+    const snapshots = JSON.parse(event.data), way = Date.now() - 1000 * snapshots[0].t;
+    fastest = Math.min(fastest, way);
+    if (way - fastest > QUIET_MS) { lose("old messages come"); connect(); return; }
+    while (hands.length > snapshots.length) hands.pop().root.remove();
+    snapshots.forEach((snapshot, at) => { (hands[at] ??= new Hand()).seen = snapshot; });
+    came = now(); lost = null;
+    draw();
+  };
+}
+// Whether this page was awake since the last look; if not, nothing that it shows or that waits holds.
+function look() {
+  const awake = since(looked) <= QUIET_MS;
+  looked = now();
+  if (!awake) { lose("this page slept"); connect(); }
+  return awake;
+}
+
+readColours();
+hands.push(new Hand());
+connect();
+setInterval(() => { if (look() && (lost !== null || since(came) > QUIET_MS)) draw(); }, LOOK_MS);
+document.addEventListener("visibilitychange", () => { look(); draw(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColours(); draw(); });
+addEventListener("resize", draw);
+draw();
