@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
                 feed = stack.enter_context(_feed(target, _keys(args, target)))
                 hands.append(Watched(feed, View(target.endpoint, target.hand)))
             if args.foxglove:
-                return _foxglove([hand.feed for hand in hands], args.port or FOXGLOVE_PORT)
+                return _foxglove(hands, args.port or FOXGLOVE_PORT)
             return _page(hands, args.port or PORT) if args.web else _terminal(hands)
     except (SceneError, KeysError, UsageError) as error:
         complain(error)
@@ -165,7 +165,7 @@ def _page(hands: list[Watched], port: int) -> int:
     return 0
 
 
-def _foxglove(feeds: list[Feed], port: int) -> int:
+def _foxglove(hands: list[Watched], port: int) -> int:
     try:
         from daemon.record.live import LiveServer
     except ModuleNotFoundError as error:
@@ -179,8 +179,8 @@ def _foxglove(feeds: list[Feed], port: int) -> int:
         sys.stdout.write(f"ws://127.0.0.1:{server.port} (Ctrl-C ends)\n")
         sys.stdout.flush()
         while stop.received is None:
-            for feed in feeds:
-                for topic, payload in feed.take():
+            for hand in hands:
+                for topic, payload in hand.feed.take():
                     server.send(topic, payload)
             select.select([stop.fileno()], [], [], TICK_S)
     return 0
