@@ -4,45 +4,49 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import grp
 import json
-import os
-import resource
+import logging
 import select
+import shutil
 import sys
+import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.commands.arguments import within
-from daemon.commands.diagnosis import (
-    ElectrodeStatistics,
-    Finding,
-    Level,
-    counter_findings,
-    device_findings,
-    rate_finding,
+from daemon.doctor import computer
+from daemon.doctor.electrodes import ElectrodeStatistics
+from daemon.doctor.finding import Cause, Finding, Level, fine, roots
+from daemon.doctor.link import counter_findings, device_findings, rate_finding
+from daemon.doctor.surroundings import (
+    can_finding,
+    explained,
+    model_finding,
+    realtime_findings,
+    socket_findings,
 )
 from daemon.process.text import complain, printable
-from drivers.base import Driver, LinkError, TactileReading
-from models.contract import ModelError
+from drivers.base import Driver, DriverError, LinkError, TactileReading
 
 LISTEN_S = 3.0
 LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
 WAIT_S = 0.02
 """Longest sleep between two looks at a driver, s."""
-ARPHRD_CAN = "280"
-"""Type of a CAN interface in `/sys/class/net/*/type`."""
-GROUPS = {"spi": "dialout"}
-"""Group that a driver's device belongs to on Debian and Ubuntu."""
 BRIDGE_NAME = "graspd"
 BRIDGE_VENDOR = 0x2E8A
 """Raspberry Pi, whose Pico the bridge's sketch is for. Only ports of this vendor, or with the name
 above in their description, are greeted unasked: other devices may not like it."""
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
+NARROWEST = 40
+"""Columns of a terminal that lines are broken for."""
+WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
+"""Of a device, these explain that no finger is felt."""
+FINGER_COLUMNS, USUAL_COLUMNS = 25, 80
+"""Of a finger in the table of electrodes, and of that where there is no terminal."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,112 +61,137 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="listen so long (default: 3)",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    parser.add_argument("--all", action="store_true", help="a table of all electrodes too")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="one JSON object on stdout; a finding that is not ok has a cause and advice",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Examine; 0 if nothing is wrong, 1 if something is, 2 if the scene or its files are wrong."""
     report: dict[str, Any] = {}
-    findings: list[Finding] = []
+    logging.disable(logging.WARNING)  # what drivers warn of is among the findings
     try:
         if args.scene is None:
-            findings += _computer(report, args.listen)
+            findings = _computer(report, args.listen)
         else:
-            findings += _scene(scene.load(args.scene), report, args.listen)
-    except scene.SceneError as error:
+            findings = _scene(scene.load(args.scene), report, args.listen)
+    except (scene.SceneError, DriverError) as error:
         complain(error)
         return 2
+    finally:
+        logging.disable(logging.NOTSET)
     if args.json:
         report["findings"] = [dataclasses.asdict(finding) for finding in findings]
         sys.stdout.write(json.dumps(report) + "\n")
     else:
-        _print(report, findings)
+        columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+        sys.stdout.writelines(f"{line}\n" for line in in_words(findings, columns))
+        if args.all and report.get("readings"):
+            sys.stdout.writelines(f"{line}\n" for line in _table(report, columns or USUAL_COLUMNS))
     return int(any(finding.level is Level.ERROR for finding in findings))
+
+
+def examine(
+    driver: Driver, statistics: ElectrodeStatistics | None, seconds: float
+) -> list[Finding]:
+    """What is wrong with an open driver, without what follows from something else of it.
+
+    `statistics` are of what it brought in so many `seconds`; None for joint angles.
+    """
+    device, counters = driver.describe(), driver.counters.as_dict()
+    told = device_findings(driver.name, device, counters)
+    readings = None if statistics is None else statistics.readings
+    if device.get("link", "up") == "up":
+        causes = {finding.cause for finding in told}
+        more = counter_findings(driver.name, counters)
+        told += [finding for finding in more if finding.cause not in causes]
+        if readings is not None:
+            told.append(rate_finding(driver.name, readings, seconds, driver.period_ns))
+    elif readings == 0:
+        what = f"{told[0].what}; no reading in {seconds:.1f} s"
+        told[0] = dataclasses.replace(told[0], what=what)
+    if statistics is not None and readings:
+        told = _with_electrodes(told, statistics)
+    return roots(told)
+
+
+def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
+    """The findings for people, in lines of so many columns; with None a line for each."""
+    for finding in findings:
+        what, mark = printable(finding.what), MARKS[finding.level]
+        advice = printable(finding.advice or "")
+        if columns is None:
+            yield f"{mark}{what}  -> {advice}" if advice else f"{mark}{what}"
+            continue
+        width = max(columns, NARROWEST)
+        yield from _wrapped(what, mark, "   ", width)
+        yield from _wrapped(advice, "   -> ", "      ", width)
+    wrong, warnings = (
+        sum(finding.level is level for finding in findings)
+        for level in (Level.ERROR, Level.WARNING)
+    )
+    yield ""
+    yield f"{wrong} wrong, {warnings} to look at"
 
 
 def _computer(report: dict[str, Any], listen_s: float) -> list[Finding]:
     """Look for bridges and CAN interfaces on this computer."""
-    from serial.tools import list_ports
-
+    ports = [port for port in computer.serial_ports() if port.vendor is not None]
+    interfaces = computer.can_interfaces()
+    report["ports"] = [dataclasses.asdict(port) for port in ports]
+    report["interfaces"] = [dataclasses.asdict(interface) for interface in interfaces]
     findings = []
-    ports = [port for port in list_ports.comports() if port.vid is not None]
     for port in ports:
-        named = BRIDGE_NAME in f"{port.product} {port.manufacturer}".lower()
-        if named or port.vid == BRIDGE_VENDOR:
-            findings += _port(port.device, report, listen_s)
+        if BRIDGE_NAME in port.product.lower() or port.vendor == BRIDGE_VENDOR:
+            tactile = {"tactile": {"driver": "spi", "port": port.device}}
+            findings += _listen(scene.parse(tactile, Path(port.device)), report, listen_s)
         else:
-            what = f"serial port {port.device}: {port.description}"
-            findings.append(Finding(Level.OK, what, "not greeted: to ask it, name it in a scene"))
-    interfaces = can_interfaces(Path("/sys/class/net"))
-    findings += interfaces
-    if not ports and not interfaces:
+            findings.append(fine(f"{port}; not greeted: to ask it, name it in a scene"))
+    findings += [can_finding(interface) for interface in interfaces]
+    if not findings:
         what = "no USB serial port and no CAN interface"
-        findings.append(Finding(Level.WARNING, what, "plug the bridge in, or bring up can0"))
-    return findings + _privileges()
-
-
-def can_interfaces(folder: Path) -> list[Finding]:
-    """State of every CAN interface below `/sys/class/net`."""
-    findings = []
-    for interface in sorted(folder.glob("*")):
-        try:
-            kind = (interface / "type").read_text().strip()
-            state = (interface / "operstate").read_text().strip()
-        except OSError:
-            continue
-        if kind != ARPHRD_CAN:
-            continue
-        if state == "down":
-            name = interface.name
-            advice = f"ip link set {name} up type can bitrate 1000000"
-            findings.append(Finding(Level.WARNING, f"CAN interface {name} is down", advice))
-        else:
-            findings.append(Finding(Level.OK, f"CAN interface {interface.name} is up"))
+        advice = "plug the bridge or the CAN adapter in; no hardware: graspd twin"
+        findings.append(Finding(Level.WARNING, what, Cause.PORT_MISSING, advice))
     return findings
 
 
-def _port(device: str, report: dict[str, Any], listen_s: float) -> list[Finding]:
-    wanted = scene.parse({"tactile": {"driver": "spi", "port": device}}, Path(device))
-    return _listen(wanted, report, listen_s)
-
-
 def _scene(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
-    findings = []
-    try:
-        model = assembly.load_model(wanted)
-        assembly.build_pipeline(wanted, model)
-        what = f"model {model.contract.name} ({model.sha256[:12]}) fits the hand"
-        findings.append(Finding(Level.OK, what))
-    except ModelError as error:
-        findings.append(Finding(Level.ERROR, str(error), "choose a model that fits the hand"))
-    findings += _listen(wanted, report, listen_s)
-    return findings + _privileges(wanted.tactile.driver, wanted.realtime)
+    findings = [model_finding(wanted), *_listen(wanted, report, listen_s)]
+    advised = {finding.advice for finding in findings if finding.advice}
+    # The graspd that holds the port holds the sockets as well: that is said once.
+    sockets = [finding for finding in socket_findings(wanted) if finding.advice not in advised]
+    return [*findings, *sockets, *realtime_findings(wanted)]
 
 
 def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> list[Finding]:
     """Open the scene's drivers and listen to them for a while."""
-    drivers = assembly.build_drivers(wanted)
+    sections = [section for section in (wanted.tactile, wanted.joints) if section is not None]
     statistics = ElectrodeStatistics(wanted.hand.fingers)
+    findings: list[Finding] = []
+    drivers = assembly.build_drivers(wanted)
     try:
-        for driver in drivers:
-            assembly.open_driver(driver)
-        seconds = _collect(drivers, statistics, listen_s)
-        described = {driver.name: driver.describe() for driver in drivers}
-    except LinkError as error:
-        return [Finding(Level.ERROR, str(error))]
+        opened = []
+        for driver, section in zip(drivers, sections, strict=False):
+            try:
+                assembly.open_driver(driver)
+                opened.append((driver, section))
+            except LinkError as error:
+                closed = {"link": "closed", "why": str(error)}
+                (finding,) = device_findings(driver.name, closed)
+                findings += explained(finding, section)
+        seconds = _collect([driver for driver, _ in opened], statistics, listen_s)
+        for driver, section in opened:
+            felt = statistics if driver is drivers[0] else None
+            for finding in examine(driver, felt, seconds):
+                findings += explained(finding, section)
+            counted = driver.counters.as_dict()
+            report[driver.name] = {"device": driver.describe(), "counters": counted}
     finally:
         for driver in drivers:
             driver.close()
-    findings = []
-    for driver in drivers:
-        device = described[driver.name]
-        report[driver.name] = {"device": device, "counters": driver.counters.as_dict()}
-        findings += device_findings(driver.name, device)
-    tactile = drivers[0]
-    findings.append(rate_finding(tactile.name, statistics.readings, seconds, tactile.period_ns))
-    for driver in drivers:
-        findings += counter_findings(driver.name, driver.counters.as_dict())
-    findings += statistics.findings()
     report["electrodes"] = {
         finger: {
             "mean_counts": statistics.mean[index].round(1).tolist(),
@@ -178,7 +207,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
     """Feed the statistics for so long; seconds from the first reading to the last."""
     start_s = first_s = last_s = time.monotonic()
-    while time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
+    while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         descriptors = [driver.fileno() for driver in drivers]
         select.select([fd for fd in descriptors if fd is not None], [], [], WAIT_S)
         for driver in drivers:
@@ -192,42 +221,43 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     return (last_s - first_s) * statistics.readings / (statistics.readings - 1)
 
 
-def _privileges(driver: str | None = None, realtime: scene.Realtime | None = None) -> list[Finding]:
-    findings = []
-    group = GROUPS.get(driver or "")
-    if group is not None and os.geteuid() != 0 and not _in_group(group):
-        advice = f"sudo usermod -aG {group} $USER, then log in again"
-        findings.append(Finding(Level.WARNING, f"you are not in the group {group}", advice))
-    may = 98 if os.geteuid() == 0 else resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    wanted = 0 if realtime is None or realtime.priority is None else realtime.priority
-    level = Level.OK if wanted <= may else Level.WARNING
-    advice = "" if wanted <= may else f"as a service: LimitRTPRIO={wanted}; else limits.conf(5)"
-    findings.append(Finding(level, f"realtime priority up to {may} may be asked for", advice))
-    return findings
+def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:
+    """What was told of a device, and what its electrodes say; where no finger is felt and the
+    device as a whole explains it, that is the error, and not every finger."""
+    found = statistics.findings()
+    absent = [finding for finding in found if finding.cause is Cause.SENSOR_ABSENT]
+    whole = [finding for finding in told if finding.cause in WHOLE_DEVICE]
+    if not whole or len(absent) < len(statistics.fingers):
+        return told + found
+    raised = [
+        dataclasses.replace(finding, level=Level.ERROR) if finding in whole else finding
+        for finding in told
+    ]
+    return raised + [finding for finding in found if finding not in absent]
 
 
-def _in_group(name: str) -> bool:
-    try:
-        return grp.getgrnam(name).gr_gid in os.getgroups()
-    except KeyError:
-        return False
+def _wrapped(text: str, first: str, further: str, width: int) -> list[str]:
+    return textwrap.wrap(
+        text,
+        width,
+        initial_indent=first,
+        subsequent_indent=further,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
 
 
-def _print(report: dict[str, Any], findings: list[Finding]) -> None:
-    for finding in findings:
-        advice = f"  -> {finding.advice}" if finding.advice else ""
-        sys.stdout.write(f"{MARKS[finding.level]}{printable(finding.what + advice)}\n")
-    electrodes = report.get("electrodes", {})
-    if report.get("readings"):
-        heads = "".join(f"{finger + ': mean, sd, faulty':>26}" for finger in electrodes)
-        sys.stdout.write(f"\n    {heads}\n")
-        columns = [zip(*values.values(), strict=True) for values in electrodes.values()]
-        for number, cells in enumerate(zip(*columns, strict=True), start=1):
-            row = "".join(f"{mean:12.1f}{sd:7.1f}{faulty:7d}" for mean, sd, faulty in cells)
-            sys.stdout.write(f"{number:<4d}{row}\n")
-    wrong = sum(finding.level is Level.ERROR for finding in findings)
-    sys.stdout.write(f"\n{wrong} wrong, {_warnings(findings)} to look at\n")
-
-
-def _warnings(findings: list[Finding]) -> int:
-    return sum(finding.level is Level.WARNING for finding in findings)
+def _table(report: dict[str, Any], columns: int) -> Iterator[str]:
+    """Mean, deviation and faulty readings of every electrode, as many fingers abreast as fit."""
+    abreast = max(1, (columns - 4) // FINGER_COLUMNS)
+    electrodes = report["electrodes"]
+    fingers = list(electrodes)
+    for first in range(0, len(fingers), abreast):
+        shown = fingers[first : first + abreast]
+        yield ""
+        heads = (f"{finger}: mean, sd, faulty" for finger in shown)
+        yield "    " + "".join(f"{head:>{FINGER_COLUMNS}}" for head in heads)
+        cells = [zip(*electrodes[finger].values(), strict=True) for finger in shown]
+        for number, row in enumerate(zip(*cells, strict=True), start=1):
+            text = "".join(f"{mean:11.1f}{sd:7.1f}{faulty:7d}" for mean, sd, faulty in row)
+            yield f"{number:<4d}{text}"

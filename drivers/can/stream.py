@@ -106,8 +106,10 @@ class CanStream:
         return self._silent_at_ns if self.link.state is LinkState.UP else None
 
     def describe(self) -> dict[str, str]:
-        """Bus, link, and whose frames are taken, for people."""
+        """Bus, link and why it is not up, and whose frames are taken, for people."""
         known = {"bus": self._where, "link": str(self.link.state)}
+        if self.link.reason is not None:
+            known["why"] = self.link.reason
         if self.last_error is not None:
             known["last error"] = self.last_error
         if self._decoder.arbitration_id is not None:

@@ -16,8 +16,7 @@ from drivers.twins.grasps.grasps import (
 )
 
 WARM_UP_S = 300.0
-"""Drift stops here, s. Not measured: the recordings are shorter. It keeps an endless stream within
-the range of a sensor: 210 counts in all."""
+"""Drift stops here, s. Not measured: the recordings are shorter. 210 counts in all."""
 
 
 class TactileNoise(Protocol):
@@ -34,15 +33,23 @@ class MeasuredNoise:
     spikes at most, and never twice in a row; the recordings show no other kind.
     """
 
-    def __init__(self, fingers: int, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        fingers: int,
+        rng: np.random.Generator,
+        drift_max: NDArray[np.float64] | float = np.inf,
+    ) -> None:
+        """`drift_max`: counts by which electrodes drift at most, shape () or (fingers, 24)."""
         self._rng = rng
+        self._drift_max = drift_max
         self._fingers = np.arange(fingers)
         self._spiked = rng.integers(0, ELECTRODES, fingers)
 
     def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `TactileNoise`."""
         noise = self._rng.normal(0.0, NOISE_COUNTS, (self._fingers.size, ELECTRODES))
-        noise += DRIFT_COUNTS_PER_S * np.minimum(t_s, WARM_UP_S)
+        drift = DRIFT_COUNTS_PER_S * np.minimum(t_s, WARM_UP_S)
+        noise += np.minimum(drift, self._drift_max)
         spiking = self._rng.random(self._fingers.size) < SPIKE_PROBABILITY * ELECTRODES
         steps = self._rng.integers(1, ELECTRODES, self._fingers.size)
         self._spiked = (self._spiked + steps) % ELECTRODES

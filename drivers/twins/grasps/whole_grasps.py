@@ -47,6 +47,9 @@ POSITION_NOISE_RAD = 0.0003
 """Standard deviation of a joint angle that stands still, rad."""
 REST_QUANTILE = 0.98
 """See `rest_above`."""
+WARM_REST_MAX = COUNT_MAX - 50
+"""No electrode drifts above this, counts: one of the synthetic first finger rests at 3975 and would
+drift to the end of a sensor's range in three minutes."""
 DEMO_GRASPS = 12
 DEMO_SEED = 0
 DEMO_DURATIONS = Durations(
@@ -105,16 +108,16 @@ class WholeGrasps:
         *,
         sampling: Sampling = Sampling.FRESH,
         rate_hz: float = RATE_HZ,
-        noise: Callable[[int, np.random.Generator], TactileNoise] = MeasuredNoise,
+        noise: Callable[[int, np.random.Generator], TactileNoise] | None = None,
         durations: Durations = Durations(),  # noqa: B008 (immutable)
         loop: bool = False,
         seed: int = 0,
     ) -> None:
         """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points for ever.
 
-        `noise` is made of the number of fingers and a source of chance. Raises `ValueError` for
-        shapes that do not fit, for no end points, and for a rate that is not positive or, held,
-        not 100 Hz.
+        `noise` is made of the number of fingers and a source of chance, `MeasuredNoise` unless
+        given. Raises `ValueError` for shapes that do not fit, for no end points, and for a rate
+        that is not positive or, held, not 100 Hz.
         """
         check_rest(rest)
         if not end_points:
@@ -129,7 +132,7 @@ class WholeGrasps:
         self._end_points = end_points
         self._sampling = sampling
         self._rate_hz = rate_hz
-        self._noise = noise
+        self._noise = noise or self._measured_noise
         self._durations = durations
         self._loop = loop
         self._seed = seed
@@ -167,6 +170,9 @@ class WholeGrasps:
             script = GraspScript(end_point, self._rest, index + 1, start_s, self._durations, rng)
             yield script
             start_s = script.timetable.end_s
+
+    def _measured_noise(self, fingers: int, rng: np.random.Generator) -> MeasuredNoise:
+        return MeasuredNoise(fingers, rng, np.maximum(WARM_REST_MAX - self._rest, 0.0))
 
     def _sampler(self, rng: np.random.Generator) -> FreshSampler:
         kind = HeldSampler if self._sampling is Sampling.HELD else FreshSampler

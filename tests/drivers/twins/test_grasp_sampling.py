@@ -93,6 +93,18 @@ def test_drift_ends_with_the_warm_up() -> None:
     assert np.median(noise.sweep(np.asarray(1e7))) == pytest.approx(210.0, abs=3.0)
 
 
+def test_no_electrode_drifts_out_of_its_range() -> None:
+    rest, after_s = REST.copy(), Durations(first_rest_s=(1e4, 1e4))
+    rest[0, 2] = 3975.0  # where the third electrode of the synthetic first finger rests
+    unpressed = EndPoint(rest.astype(np.uint16), False, "nothing")
+    grasps = WholeGrasps(rest, [unpressed], rate_hz=0.1, durations=after_s)
+    counts = counts_of(list(itertools.islice(grasps, 900)))
+    assert counts.max() < 4094, "cut off"
+    assert counts[100:, 0, 2].std() > 2.9
+    assert np.median(counts[100:, 0, 2]) == pytest.approx(4045.0, abs=1.0)
+    assert np.median(counts[100:, 1]) == pytest.approx(3210.0, abs=1.0)
+
+
 def test_a_palms_own_rate_can_be_played_fresh() -> None:
     grasps = synthetic_grasps(rate_hz=1000 / 14, loop=True)
     moments = list(itertools.islice(grasps, 200))

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.commands.diagnosis import (
-    ElectrodeStatistics,
-    Level,
-    counter_findings,
-    device_findings,
-    rate_finding,
-)
-from daemon.commands.doctor import can_interfaces
+from daemon.doctor.computer import can_interfaces
+from daemon.doctor.electrodes import ElectrodeStatistics
+from daemon.doctor.finding import Cause, Level
+from daemon.doctor.link import counter_findings, device_findings, rate_finding
+from daemon.doctor.surroundings import can_finding
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.link import LinkState
 
@@ -111,6 +108,40 @@ def test_a_fault_is_found_and_named(
     assert finding.advice
 
 
+def at_a_rail_with_noise(counts: Counts, _faults: object, number: int) -> None:
+    counts[1, 7] = 4085.0 + 3.0 * (number % 3)
+
+
+def touched(counts: Counts, _faults: object, number: int) -> None:
+    counts[1, 3:12] -= 300.0 * np.sin(number / 10.0)
+
+
+def all_at_a_rail(counts: Counts, _faults: object, _number: int) -> None:
+    counts[1] = 0.0
+
+
+def all_frozen(counts: Counts, _faults: object, _number: int) -> None:
+    counts[1] = 2500.0
+
+
+@pytest.mark.parametrize(
+    ("spoil", "level", "cause", "says"),
+    [
+        (at_a_rail_with_noise, Level.WARNING, Cause.ELECTRODE_RAIL, "mf_8 near the end"),
+        (touched, Level.OK, None, "mf is touched or moves: 9 of its electrodes do"),
+        (all_at_a_rail, Level.ERROR, Cause.SENSOR_ABSENT, "mf: no electrode can be read"),
+        (all_frozen, Level.ERROR, Cause.REPEATED, "mf: all counts are frozen"),
+    ],
+)
+def test_hardware_is_accused_by_two_signs_only(
+    spoil: Callable[[Counts, Faults, int], None], level: Level, cause: Cause | None, says: str
+) -> None:
+    (finding,) = statistics(spoil).findings()
+    assert (finding.level, finding.cause) == (level, cause)
+    assert finding.what.startswith(says)
+    assert "replace" not in (finding.advice or "")
+
+
 def test_no_readings_is_no_electrode_finding() -> None:
     assert statistics(nothing, readings=0).findings() == []
 
@@ -146,10 +177,10 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
         (tmp_path / name / "operstate").write_text(f"{state}\n")
-    up, down = can_interfaces(tmp_path)
+    up, down = map(can_finding, can_interfaces(tmp_path))
     assert up.what == "CAN interface can0 is up"
     assert (down.level, down.what) == (Level.WARNING, "CAN interface can1 is down")
-    assert "ip link set can1 up" in down.advice
+    assert "ip link set can1 up" in (down.advice or "")
 
 
 @pytest.mark.parametrize(
@@ -171,15 +202,15 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
         ("sweep", "10.42 ms is too long for 10.00 ms", Level.WARNING, "longer period"),
         ("clock", "trusted", Level.OK, ""),
         ("clock", "not trusted", Level.WARNING, "flash"),
-        ("last error", "no buffer space", Level.WARNING, ""),
+        ("last error", "no buffer space", Level.WARNING, "terminators"),
     ],
 )
 def test_what_a_device_says_is_judged(key: str, value: str, level: Level, advice: str) -> None:
     up, finding = device_findings("spi", {"link": "up", key: value})
     assert (up.level, up.what) == (Level.OK, "spi: link up")
     assert (finding.level, finding.what) == (level, f"spi: {key} {value}")
-    assert advice in finding.advice
-    assert bool(advice) == bool(finding.advice)
+    assert advice in (finding.advice or "")
+    assert bool(advice) == bool(finding.advice) == bool(finding.cause)
 
 
 @pytest.mark.parametrize("state", sorted({*LinkState} - {LinkState.UP}))

@@ -1,0 +1,190 @@
+"""What this computer has: serial ports, CAN interfaces, and who holds a file or a port of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import subprocess
+from collections.abc import Collection, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+PROC = Path("/proc")
+NETWORK = Path("/sys/class/net")
+ARPHRD_CAN = "280"
+"""Type of a CAN interface in `/sys/class/net/*/type`."""
+LISTENING = {"tcp": {"0A"}, "udp": {"01", "07"}}
+"""States in `/proc/net` of a socket that has a port for itself."""
+IP_TIMEOUT_S = 5.0
+COMMAND_MAX = 120
+"""Characters of a command that are shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class SerialPort:
+    """A serial port that there is."""
+
+    device: str
+    description: str
+    serial_number: str | None
+    vendor: int | None
+    """USB vendor, None for a port that is not on USB."""
+    product: str
+    """What it calls itself, and who made it."""
+
+    def __str__(self) -> str:
+        number = f", serial number {self.serial_number}" if self.serial_number else ""
+        description = "" if self.description == "n/a" else f": {self.description}"
+        return f"serial port {self.device}{description}{number}"
+
+
+@dataclass(frozen=True, slots=True)
+class CanInterface:
+    """A CAN interface of the kernel."""
+
+    name: str
+    state: str
+    """`up`, `down`, or what its controller says, such as `error-active` or `bus-off`."""
+    bitrate: int | None
+    """Bit/s, None where it is not known."""
+
+    def __str__(self) -> str:
+        rate = "" if self.bitrate is None else f", {self.bitrate} bit/s"
+        return f"CAN interface {self.name} is {self.state}{rate}"
+
+    @property
+    def is_down(self) -> bool:
+        """Whether nothing can come over it."""
+        return self.state in ("down", "stopped")
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether its controller has nothing to complain of."""
+        return self.state in ("up", "error-active")
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """Another process."""
+
+    pid: int
+    command: str
+
+    def __str__(self) -> str:
+        return f"PID {self.pid}, {self.command}"
+
+    @property
+    def is_graspd(self) -> bool:
+        """Whether it is one of graspd's commands."""
+        words = self.command.split()
+        return "-m daemon" in self.command or any(Path(word).name == "graspd" for word in words[:3])
+
+
+def serial_ports() -> list[SerialPort]:
+    """All serial ports of this computer."""
+    from serial.tools import list_ports
+
+    return [
+        SerialPort(
+            port.device,
+            port.description,
+            port.serial_number,
+            port.vid,
+            f"{port.product} {port.manufacturer}",
+        )
+        for port in sorted(list_ports.comports())
+    ]
+
+
+def can_interfaces(
+    folder: Path = NETWORK, ip: Sequence[str] = ("ip", "-json", "-details", "link")
+) -> list[CanInterface]:
+    """Every CAN interface below `/sys/class/net`; its controller as the command `ip` tells it."""
+    found = {}
+    for interface in sorted(folder.glob("*")):
+        with suppress(OSError):
+            if (interface / "type").read_text().strip() == ARPHRD_CAN:
+                state = (interface / "operstate").read_text().strip()
+                # Of an interface without a carrier (vcan), the kernel knows no more than that.
+                found[interface.name] = "up" if state == "unknown" else state
+    details = _details(ip) if found else {}
+    return [
+        CanInterface(name, state, None) if name not in details else _controlled(name, details[name])
+        for name, state in found.items()
+    ]
+
+
+def _controlled(name: str, info: dict[str, object]) -> CanInterface:
+    timing = info.get("bittiming")
+    bitrate = timing.get("bitrate") if isinstance(timing, dict) else None
+    return CanInterface(name, str(info["state"]).lower(), bitrate)
+
+
+def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
+    """What `ip` tells of CAN controllers, by interface; nothing where it is missing or old."""
+    try:
+        answer = subprocess.run(ip, capture_output=True, timeout=IP_TIMEOUT_S, check=True).stdout
+        links = [(link["ifname"], link.get("linkinfo", {})) for link in json.loads(answer)]
+        return {
+            name: info["info_data"]
+            for name, info in links
+            if info.get("info_kind") == "can" and "state" in info.get("info_data", {})
+        }
+    except (OSError, subprocess.SubprocessError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
+    """Other processes that have locked a file, or else have it open, as far as we may know it."""
+    try:
+        there = os.stat(path)
+    except OSError:
+        return []
+    device = f"{os.major(there.st_dev):02x}:{os.minor(there.st_dev):02x}:{there.st_ino}"
+    locked = set()
+    with suppress(OSError):
+        for line in (proc / "locks").read_text().splitlines():
+            words = line.split()  # 1: FLOCK ADVISORY WRITE 123 00:1a:3 0 EOF
+            if len(words) > 5 and words[5] == device:
+                locked.add(int(words[4]))
+    opened = locked or _with_open({(there.st_dev, there.st_ino)}, proc)
+    return _processes(opened, proc)
+
+
+def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
+    """Other processes that listen on a port of `udp` or `tcp`, as far as we may know it."""
+    inodes = set()
+    for table in (protocol, f"{protocol}6"):
+        with suppress(OSError):
+            for line in (proc / "net" / table).read_text().splitlines()[1:]:
+                words = line.split()
+                is_mine = int(words[1].rpartition(":")[2], 16) == port
+                if is_mine and words[3] in LISTENING[protocol]:
+                    inodes.add(int(words[9]))
+    return _processes(_with_open(inodes, proc), proc)
+
+
+def _with_open(wanted: Collection[object], proc: Path) -> set[int]:
+    """Processes with one of these files, (device, inode), or sockets, inode, open."""
+    found = set()
+    for descriptor in proc.glob("[0-9]*/fd/*"):
+        with suppress(OSError):
+            opened = descriptor.stat()
+            identity: object = (opened.st_dev, opened.st_ino)
+            if stat.S_ISSOCK(opened.st_mode):
+                identity = opened.st_ino
+            if identity in wanted:
+                found.add(int(descriptor.parts[-3]))
+    return found
+
+
+def _processes(pids: Collection[int], proc: Path) -> list[Process]:
+    found = []
+    for pid in sorted(set(pids) - {os.getpid()}):
+        with suppress(OSError):
+            command = (proc / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
+            text = command.decode(errors="replace").strip()
+            found.append(Process(pid, text[:COMMAND_MAX] or "(unnamed)"))
+    return found

@@ -1,0 +1,196 @@
+"""What readings say about the health of every electrode, and which of it is a fault."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.doctor.finding import Cause, Finding, Level, fine
+from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+
+RAIL_COUNTS = 20
+"""A mean this near to 0 or 4095 is a rail; 0.3 % of loaded electrodes come this low."""
+QUIET_COUNTS = 40.0
+"""An untouched electrode's standard deviation is 3 to 12 counts; beyond this something moves."""
+TOUCH_ELECTRODES = 5
+"""A touch moves this many electrodes of a finger; fewer that jump from reading to reading, while
+the others keep still, are not touched but restless."""
+STILL_READINGS = 10
+"""So many equal counts in a row do not happen with 3 counts of noise."""
+RESTLESS_READINGS = 30
+"""In fewer a spike or two of a sound electrode weigh too much."""
+FAULTY_FRACTION = 0.5
+"""An electrode with more faulty readings than this is missing, with fewer it is unreliable."""
+NAMED_MAX = 6
+"""More electrodes than this are counted instead of named."""
+WORDS = ElectrodeFault.PARITY | ElectrodeFault.ERROR_WORD | ElectrodeFault.NOT_A_COUNT
+
+Mask = NDArray[np.bool_]
+
+
+class ElectrodeStatistics:
+    """Running mean, spread and faults of every electrode, in constant memory (Welford)."""
+
+    def __init__(self, fingers: Sequence[str]) -> None:
+        self.fingers = tuple(fingers)
+        shape = (len(fingers), ELECTRODES)
+        self.readings = 0
+        self.faulty = np.zeros(shape, dtype=np.int64)
+        """Readings with a fault, shape (fingers, 24)."""
+        self.fault_bits = np.zeros(shape, dtype=np.uint8)
+        self.mean = np.zeros(shape)
+        """Counts, over readings without a fault."""
+        self._sound = np.zeros(shape, dtype=np.int64)
+        self._squares = np.zeros(shape)
+        self._previous = np.full(shape, np.nan)
+        """Counts of the last reading, NaN where that had a fault."""
+        self._steps = np.zeros(shape, dtype=np.int64)
+        self._step_squares = np.zeros(shape)
+
+    def add(self, reading: TactileReading) -> None:
+        """Take in one reading of these fingers."""
+        self.readings += 1
+        faulty = reading.faults != 0
+        self.faulty += faulty
+        self.fault_bits |= reading.faults
+        self._sound += ~faulty
+        step = np.where(faulty, 0.0, reading.counts - self.mean)
+        self.mean += step / np.maximum(self._sound, 1)
+        self._squares += step * np.where(faulty, 0.0, reading.counts - self.mean)
+        counts = np.where(faulty, np.nan, reading.counts)
+        change = counts - self._previous
+        self._steps += ~np.isnan(change)
+        self._step_squares += np.nan_to_num(change * change)
+        self._previous = counts
+
+    @property
+    def deviation(self) -> NDArray[np.float64]:
+        """Standard deviation, counts, shape (fingers, 24)."""
+        deviation: NDArray[np.float64] = np.sqrt(self._squares / np.maximum(self._sound, 1))
+        return deviation
+
+    @property
+    def noise(self) -> NDArray[np.float64]:
+        """Standard deviation from one reading to the next, counts, shape (fingers, 24): a slow
+        touch is none of it."""
+        noise: NDArray[np.float64] = np.sqrt(self._step_squares / np.maximum(self._steps, 1) / 2.0)
+        return noise
+
+    def findings(self) -> list[Finding]:
+        """What is wrong with the electrodes, finger by finger."""
+        if not self.readings:
+            return []
+        return [
+            found for finger, name in enumerate(self.fingers) for found in self._of(finger, name)
+        ]
+
+    def _of(self, finger: int, name: str) -> list[Finding]:
+        missing = self.faulty[finger] > FAULTY_FRACTION * self.readings
+        faults = ElectrodeFault(int(np.bitwise_or.reduce(self.fault_bits[finger])))
+        mean, deviation = self.mean[finger], self.deviation[finger]
+        enough = self._sound[finger] >= STILL_READINGS
+        rail = ~missing & ((mean <= RAIL_COUNTS) | (mean >= COUNT_MAX - RAIL_COUNTS))
+        still = ~missing & enough & (deviation == 0.0)
+        if (missing | rail & still).all():
+            return [_absent(name, missing, faults)]
+        if still.all():
+            advice = "reset the board; does a relay or a recording repeat old data?"
+            what = f"{name}: all counts are frozen"
+            return [Finding(Level.ERROR, what, Cause.REPEATED, advice)]
+        # A dead electrode is at a rail and has no noise: one of the two alone is no such sign.
+        found = [_missing(name, missing, faults)] if missing.any() else []
+        found += _named(name, rail & still, Level.ERROR, *_DEAD)
+        found += _named(name, still & ~rail, Level.ERROR, *_FROZEN)
+        found += _named(name, rail & ~still & enough, Level.WARNING, *_NEAR_RAIL)
+        unreliable = (self.faulty[finger] > 0) & ~missing
+        if unreliable.any():
+            found.append(_unreliable(name, unreliable, faults))
+        moving = ~missing & (deviation > QUIET_COUNTS)
+        if np.count_nonzero(moving) >= TOUCH_ELECTRODES:
+            moved = np.count_nonzero(moving)
+            found.append(fine(f"{name} is touched or moves: {moved} of its electrodes do"))
+        elif self.readings >= RESTLESS_READINGS:
+            jumping = moving & (self.noise[finger] > QUIET_COUNTS)
+            found += _named(name, jumping, Level.WARNING, *_RESTLESS)
+        return found
+
+
+_DEAD = (
+    "stuck at a rail",
+    Cause.ELECTRODE_DEAD,
+    "it is at the end of its range and has no noise: a dead electrode; refill or replace the "
+    "sensor, if it is so on another day too",
+)
+_FROZEN = (
+    "frozen",
+    Cause.ELECTRODE_FROZEN,
+    "its count never changes and others do: look longer (--listen 20); if it stays so, power-cycle "
+    "the sensor",
+)
+_NEAR_RAIL = (
+    "near the end of the range",
+    Cause.ELECTRODE_RAIL,
+    "alive, for it has noise: let go of what the hand holds, and look again",
+)
+_RESTLESS = (
+    "restless",
+    Cause.ELECTRODE_RESTLESS,
+    "it jumps while its neighbours keep still: look again with the hand untouched and its motors "
+    "off; a loose contact stays",
+)
+
+
+def _absent(name: str, missing: Mask, faults: ElectrodeFault) -> Finding:
+    if missing.any() and faults == ElectrodeFault.HELD:
+        advice = "the board sends old values: reset it, and see whether its clock runs"
+        return Finding(Level.ERROR, f"{name}: old values repeat", Cause.REPEATED, advice)
+    why = _in_words(faults) if missing.any() else "each is at the end of its range, without noise"
+    advice = "check the finger's plug, its chip select and its supply"
+    what = f"{name}: no electrode can be read ({why})"
+    return Finding(Level.ERROR, what, Cause.SENSOR_ABSENT, advice)
+
+
+def _missing(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
+    advice = "does the board's sequence have it? if frames are lost, see there"
+    what = f"{_names(name, which)} never or rarely sampled ({_in_words(faults)})"
+    if faults & WORDS:
+        return Finding(Level.ERROR, what, Cause.SENSOR_WORDS, _WORDS_ADVICE)
+    return Finding(Level.ERROR, what, Cause.ELECTRODE_UNREAD, advice)
+
+
+def _unreliable(name: str, which: Mask, faults: ElectrodeFault) -> Finding:
+    what = f"{_names(name, which)} now and then faulty ({_in_words(faults)})"
+    if faults & WORDS:
+        return Finding(Level.WARNING, what, Cause.SENSOR_WORDS, _WORDS_ADVICE)
+    if faults & ElectrodeFault.HELD:
+        advice = "the board repeats values now and then: see how long its sweep takes"
+        return Finding(Level.WARNING, what, Cause.REPEATED, advice)
+    advice = "samples are lost on the way: see the load of the bus and of this computer"
+    return Finding(Level.WARNING, what, Cause.ELECTRODE_UNREAD, advice)
+
+
+_WORDS_ADVICE = (
+    "words are damaged between sensor and board: look longer (--listen 20); if it stays one "
+    "sensor, its cable and the edges of the clock"
+)
+
+
+def _named(
+    name: str, which: Mask, level: Level, what: str, cause: Cause, advice: str
+) -> list[Finding]:
+    return [Finding(level, f"{_names(name, which)} {what}", cause, advice)] if which.any() else []
+
+
+def _in_words(bits: ElectrodeFault) -> str:
+    names = [fault.name or "" for fault in ElectrodeFault if fault & bits]
+    return ", ".join(name.lower().replace("_", " ") for name in names) or "no fault"
+
+
+def _names(finger: str, which: Mask) -> str:
+    """Electrodes of a finger by name, such as `ff_7`, or their number where they are many."""
+    numbers = np.flatnonzero(which) + 1
+    if len(numbers) > NAMED_MAX:
+        return f"{finger}: {len(numbers)} electrodes"
+    return ", ".join(f"{finger}_{number}" for number in numbers)

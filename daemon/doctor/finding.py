@@ -1,0 +1,128 @@
+"""One thing that the doctor found: how bad it is, what causes it, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+
+class Level(StrEnum):
+    """How bad a finding is."""
+
+    OK = "ok"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class Cause(StrEnum):
+    """What is at fault. Programs may rely on these names."""
+
+    PORT_MISSING = "port-missing"
+    PORT_DENIED = "port-denied"
+    PORT_HELD = "port-held"
+    INTERFACE_MISSING = "interface-missing"
+    INTERFACE_DOWN = "interface-down"
+    ADDRESS = "address"
+    """To be listened on, and not of this computer."""
+    SILENT = "silent"
+    LINK_LOST = "link-lost"
+    LINK_DOWN = "link-down"
+    """For a reason that is not known here; the finding quotes it."""
+    NOT_A_BRIDGE = "not-a-bridge"
+    """Something else answers, or at another baud rate."""
+    BITRATE = "bitrate"
+    BUS_ERRORS = "bus-errors"
+    VERSION = "protocol-version"
+    FIRMWARE_OLD = "firmware-old"
+    SETTINGS = "settings"
+    """Scene and board do not agree."""
+    FOREIGN_SENDER = "foreign-sender"
+    DAMAGED = "damaged-bytes"
+    FRAMES_LOST = "frames-lost"
+    OUT_OF_ORDER = "out-of-order"
+    RESTARTED = "restarted"
+    """The board began anew."""
+    COMPUTER_BUSY = "computer-busy"
+    SLOW = "slow"
+    CLOCK = "clock"
+    REPEATED = "repeated"
+    """Old data comes again."""
+    PALM_MODE = "palm-mode"
+    JOINTS = "joints"
+    RECORDING = "recording"
+    SENSOR_ABSENT = "sensor-absent"
+    SENSOR_TWICE = "sensor-twice"
+    SENSOR_WORDS = "sensor-words"
+    """Words between a sensor and its board are damaged."""
+    ELECTRODE_DEAD = "electrode-dead"
+    ELECTRODE_FROZEN = "electrode-frozen"
+    ELECTRODE_RESTLESS = "electrode-restless"
+    ELECTRODE_RAIL = "electrode-rail"
+    ELECTRODE_UNREAD = "electrode-unread"
+    MODEL_MISSING = "model-missing"
+    MODEL_MISFIT = "model-misfit"
+    SOCKET_FOLDER = "socket-folder"
+    SOCKET_DENIED = "socket-denied"
+    SOCKET_HELD = "socket-held"
+    SOCKET_GROUP = "socket-group"
+    REALTIME = "realtime"
+
+
+_LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD, Cause.SILENT})
+_NOISE = frozenset({Cause.SENSOR_WORDS, Cause.REPEATED, Cause.ELECTRODE_RESTLESS})
+EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
+    Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED, Cause.RESTARTED},
+    Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
+    Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},
+    Cause.COMPUTER_BUSY: _LOSS | {Cause.CLOCK, Cause.OUT_OF_ORDER, Cause.RESTARTED},
+    Cause.SENSOR_WORDS: frozenset({Cause.RESTARTED, Cause.ELECTRODE_UNREAD}),
+    Cause.CLOCK: frozenset({Cause.REPEATED, Cause.RESTARTED}),
+    Cause.OUT_OF_ORDER: _LOSS | {Cause.RESTARTED},
+    Cause.REPEATED: _LOSS | {Cause.RESTARTED},
+    Cause.RESTARTED: _LOSS,
+    Cause.SETTINGS: _LOSS,
+    Cause.PALM_MODE: _LOSS,
+    Cause.JOINTS: frozenset({Cause.FRAMES_LOST}),
+    Cause.FRAMES_LOST: frozenset({Cause.SLOW, Cause.ELECTRODE_UNREAD}),
+}
+"""What follows from a cause, and is not named beside it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What is fine has neither cause nor advice; whatever is not has both."""
+
+    level: Level
+    what: str
+    cause: Cause | None = None
+    advice: str | None = None
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for a fault without cause and advice, or said to be fine."""
+        is_fine = self.level is Level.OK
+        if is_fine != (self.cause is None) or is_fine != (not self.advice):
+            raise ValueError(f"{self.what!r} is {self.level}, {self.cause}, {self.advice!r}")
+
+
+def fine(what: str) -> Finding:
+    """A finding that needs nothing done."""
+    return Finding(Level.OK, what)
+
+
+def roots(findings: Iterable[Finding]) -> list[Finding]:
+    """The findings without those that follow from another one's cause.
+
+    A cause is as bad as what follows from it.
+    """
+    findings = list(findings)
+    causes = {finding.cause for finding in findings}
+    follows = {effect for cause in causes for effect in EXPLAINS.get(cause, ())}
+    errors = {finding.cause for finding in findings if finding.level is Level.ERROR}
+    return [
+        replace(finding, level=Level.ERROR)
+        if errors & EXPLAINS.get(finding.cause, frozenset())
+        else finding
+        for finding in findings
+        if finding.cause not in follows
+    ]

@@ -1,0 +1,289 @@
+"""What a driver says of its device and counts on its link, and which of it is a fault."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from daemon.doctor.finding import Cause, Finding, Level, fine
+
+RATE_FRACTION = 0.9
+"""Readings per nominal rate below which the link is slow."""
+JOINING, JOINING_MAX = "unsynchronised", 108
+"""A listener that joins in mid-sweep takes nothing up to two sweeps of 54 samples: no trouble."""
+
+FLASH = "flash the firmware of this graspd: deploy/bridge/BUILD.md"
+AGAIN = "look longer (--listen 20); if it goes on"
+CLOCK_ADVICE = f"it stands, was reset, or is wrong: {FLASH}"
+VERSION_ADVICE = (
+    "the board sends another version of the frame: flash the firmware that fits this graspd "
+    "(deploy/can/PROTOCOL.md)"
+)
+
+
+class Trouble(NamedTuple):
+    """What something means, and what to do about it."""
+
+    cause: Cause
+    advice: str
+    level: Level = Level.WARNING
+
+
+LINK_TROUBLES = {
+    "no such file": Trouble(
+        Cause.PORT_MISSING,
+        "plug it in, or name one that there is; a Pico that is a drive has no firmware yet",
+    ),
+    "another program|in use|exclusively lock": Trouble(
+        Cause.PORT_HELD,
+        "sudo fuser -v and the port names it (of UDP: sudo ss -ulpn); a daemon: systemctl stop "
+        "'graspd@*'",
+    ),
+    "permission denied": Trouble(
+        Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
+    ),
+    "speaks version|has layout": Trouble(Cause.VERSION, FLASH),
+    "has . sensors|sweeps once|changed what": Trouble(
+        Cause.SETTINGS, f"let the scene and the settings of the bridge agree: {FLASH}"
+    ),
+    "other sensors": Trouble(
+        Cause.SENSOR_WORDS, "serial numbers are misread: see supply, ground, MISO and its pull-up"
+    ),
+    "no sweep|nothing from the board|nothing good": Trouble(
+        Cause.LINK_LOST,
+        "it began and stopped: see its supply and cable, and how busy this computer is",
+    ),
+    "went away|was reset": Trouble(
+        Cause.LINK_LOST, "plug, cable, hub and supply: it was unplugged, or lost power"
+    ),
+    "no interface with this name|No such device": Trouble(
+        Cause.INTERFACE_MISSING, "plug its adapter in"
+    ),
+    "Network is down": Trouble(Cause.INTERFACE_DOWN, "bring it up"),
+    "assign requested address": Trouble(
+        Cause.ADDRESS, "ip -brief address has those of this computer: listen on one of them"
+    ),
+    "bus-off": Trouble(
+        Cause.BITRATE, "let the interface have the board's bit rate; it has: then the terminators"
+    ),
+    "no answer": Trouble(
+        Cause.SILENT, f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
+    ),
+    "^greeting$": Trouble(
+        Cause.SILENT, "it has said nothing yet: is it on and connected? longer: --listen 10"
+    ),
+    "": Trouble(Cause.LINK_DOWN, "is it powered, connected, and the one that the scene names?"),
+}
+"""Why a link is not up, by the first pattern that is found in what it says of itself."""
+NOT_OURS = {
+    ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
+    ("bad_lengths",): Trouble(
+        Cause.VERSION,
+        "no palm that graspd knows sends these: its firmware is another one, or the relay adds "
+        "bytes",
+    ),
+    ("bad_messages",): Trouble(
+        Cause.JOINTS, "what comes are no joint angles: deploy/wire/JOINTS.md"
+    ),
+    ("foreign_datagrams",): Trouble(
+        Cause.FOREIGN_SENDER, "only_from names another sender than this one"
+    ),
+    ("error_frames", "bus_off"): Trouble(
+        Cause.BITRATE, "the board has another bit rate than the interface: set that of the board"
+    ),
+    ("bad_cobs", "bad_crc", "too_long", "unknown_frames"): Trouble(
+        Cause.NOT_A_BRIDGE,
+        f"damaged or foreign bytes: is the baud rate the bridge's? not a bridge yet: {FLASH}",
+    ),
+    ("service_packets", "empty_packets", "nonsense_packets"): Trouble(
+        Cause.PALM_MODE,
+        "the palm is in a service mode or starting: let the hand's own driver start it",
+    ),
+    (
+        *("wrong_length_frames", "unknown_commands", "malformed_frames", "unexpected_channels"),
+        *("foreign_frames", "frames"),
+    ): Trouble(
+        Cause.SETTINGS,
+        "let format, arbitration_id, sequence and data_length be those of the board (candump shows "
+        "what it sends); are sensors connected to it?",
+    ),
+}
+"""What comes over a link that is silent for us, by counters."""
+COUNTERS = {
+    ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
+    ("link_losses",): Trouble(
+        Cause.LINK_LOST, f"it went away and came back: {AGAIN}, plug, hub and supply"
+    ),
+    ("restarts",): Trouble(
+        Cause.RESTARTED, f"the board began anew: {AGAIN}, its supply and reset line"
+    ),
+    ("error_frames", "bus_off"): Trouble(
+        Cause.BUS_ERRORS,
+        f"frames are cut on the bus: {AGAIN}, bit rates, and terminators of 120 Ohm at both ends",
+    ),
+    (
+        *("bad_cobs", "bad_crc", "too_long", "bad_frames", "unknown_frames", "malformed_frames"),
+        *("wrong_length_frames", "unknown_commands", "nonsense_packets", "bad_lengths"),
+        "not_counts",
+    ): Trouble(
+        Cause.DAMAGED,
+        f"damaged or foreign bytes: {AGAIN}, cable and hub, and who else sends there",
+    ),
+    ("kernel_drops", "untimed_frames", "host_tx_dropped"): Trouble(
+        Cause.COMPUTER_BUSY,
+        "this computer was too late to read: top shows why; [realtime] puts graspd first",
+    ),
+    ("stuck_ticks", "clock_faults"): Trouble(Cause.CLOCK, CLOCK_ADVICE),
+    (
+        *("duplicates", "duplicate_frames", "duplicate_packets", "conflicting_packets"),
+        *("contradicting_frames", "old_messages"),
+    ): Trouble(
+        Cause.REPEATED,
+        "the same comes twice: is there a second sender, or does the board stand still?",
+    ),
+    ("foreign_datagrams",): Trouble(
+        Cause.FOREIGN_SENDER,
+        "two send to one port, and one of them is listened to: name it with only_from",
+    ),
+    ("unexpected_channels",): Trouble(
+        Cause.SETTINGS,
+        "the board samples what the scene's sequence does not have: let them agree",
+    ),
+    (
+        *("missed_readings", "lost_frames", "lost_packets", "cut_sweeps", "interrupted_sweeps"),
+        *("interrupted_rounds", "controller_overflows"),
+        *("unsynchronised_frames", "unsynchronised_packets"),
+    ): Trouble(
+        Cause.FRAMES_LOST,
+        f"lost or late on the way: {AGAIN}, see the load of bus, hub and this computer",
+    ),
+    (
+        *("reordered", "reordered_frames", "reordered_packets", "late_frames", "late_packets"),
+    ): Trouble(
+        Cause.OUT_OF_ORDER,
+        f"frames overtake each other: {AGAIN}, what lies between board and computer (relay, hub)",
+    ),
+    ("service_packets", "empty_packets"): Trouble(
+        Cause.PALM_MODE,
+        "the palm is in a service mode, or too late: let the hand's own driver start it",
+    ),
+    ("bad_messages", "unknown_names", "bad_angles"): Trouble(
+        Cause.JOINTS, "what is no joint or no angle is left out: deploy/wire/JOINTS.md"
+    ),
+    ("cut_off", "malformed"): Trouble(
+        Cause.RECORDING, "the recording is damaged or ends in the middle: record it again"
+    ),
+}
+"""Counters that are trouble on a link that is up. Others are told by the electrodes that they
+befell, or are no trouble, and are not shown."""
+DEVICE_TROUBLES = {
+    ("last error", ""): COUNTERS["error_frames", "bus_off"],
+    ("newer firmware", ""): Trouble(Cause.FIRMWARE_OLD, FLASH),
+    ("sensors", "^none(, none)*$"): Trouble(
+        Cause.SENSOR_ABSENT,
+        "see what all share: 3.3 V, ground, SCK, MOSI, MISO and its pull-up",
+        Level.ERROR,
+    ),
+    ("sensors", r"(^|, )(?!none)([^,]+),(.*,)? \2(,|$)"): Trouble(
+        Cause.SENSOR_TWICE, "two chip selects lead to one sensor, or touch", Level.ERROR
+    ),
+    ("sensors", r"\bnone\b"): Trouble(
+        Cause.SENSOR_ABSENT, "they stand in the order of the chip selects"
+    ),
+    ("spi errors", "[1-9]"): Trouble(
+        Cause.SENSOR_WORDS,
+        "by chip select, since its reset: look again; of one, and growing: its wires",
+    ),
+    ("sweep", "too long"): Trouble(
+        Cause.SETTINGS, "set a longer period or a shorter sequence, and flash it"
+    ),
+    ("clock", "not trusted"): Trouble(Cause.CLOCK, CLOCK_ADVICE),
+}
+"""What a device says of itself that is not fine: by key and pattern of the value."""
+
+
+def device_findings(
+    driver: str, device: Mapping[str, str], counters: Mapping[str, int] | None = None
+) -> list[Finding]:
+    """What a driver says of its device, key by key; of a link that is not up, only why."""
+    told = dict(device)
+    link, why = told.pop("link", "up"), told.pop("why", None)
+    if link != "up":
+        return [_of_link(driver, link if why is None else f"{link}: {why}", counters or {})]
+    found = [fine(f"{driver}: link up")] if "link" in device else []
+    if told.get("last error", "").startswith("nothing from"):
+        del told["last error"]  # a silence that is over: counted among the losses of the link
+    if "spi errors" in told:
+        told["spi errors"] = _of_present(told["spi errors"], told.get("sensors", ""))
+    for key, value in told.items():
+        what = f"{driver}: {key} {value}"
+        troubles = (
+            trouble
+            for (which, part), trouble in DEVICE_TROUBLES.items()
+            if which == key and re.search(part, value)
+        )
+        found.append(next((_finding(what, trouble) for trouble in troubles), fine(what)))
+    return found
+
+
+def counter_findings(driver: str, counters: Mapping[str, int]) -> list[Finding]:
+    """A warning for everything that counters of a link that is up say is going wrong."""
+    return [
+        _finding(f"{driver}: {counted}", trouble)
+        for names, trouble in COUNTERS.items()
+        if (counted := _counted(names, counters))
+    ]
+
+
+def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | None) -> Finding:
+    """Whether readings come, and as often as they should."""
+    rate_hz = readings / seconds
+    if not readings:
+        advice = "is it powered, connected, and the one that the scene names?"
+        what = f"{driver}: no reading in {seconds:.1f} s"
+        return _finding(what, Trouble(Cause.SILENT, advice, Level.ERROR))
+    if period_ns is None:
+        return fine(f"{driver}: {rate_hz:.1f} readings/s")
+    nominal_hz = 1e9 / period_ns
+    what = f"{driver}: {rate_hz:.1f} readings/s of {nominal_hz:.1f}"
+    if rate_hz < RATE_FRACTION * nominal_hz:
+        advice = "none was lost on the way: the board is late, or this computer is busy (top)"
+        return _finding(what, Trouble(Cause.SLOW, advice))
+    return fine(what)
+
+
+def _of_link(driver: str, link: str, counters: Mapping[str, int]) -> Finding:
+    """Why a link is not up, by what it says and by what came nevertheless."""
+    what = f"{driver}: link {link}"
+    trouble = next(
+        trouble for part, trouble in LINK_TROUBLES.items() if re.search(part, link, re.IGNORECASE)
+    )
+    if trouble.cause is Cause.SILENT and not counters.get("link_losses"):
+        for names, other in NOT_OURS.items():
+            if counted := _counted(names, counters):
+                what, trouble = f"{what}, but {counted}", other
+                break
+    return Finding(Level.ERROR, what, trouble.cause, trouble.advice)
+
+
+def _finding(what: str, trouble: Trouble) -> Finding:
+    return Finding(trouble.level, what, trouble.cause, trouble.advice)
+
+
+def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:
+    """Those of these counters that count something, such as `2 bad crc, 1 too long`."""
+    return ", ".join(
+        f"{number} {name.replace('_', ' ')}"
+        for name in names
+        if (number := counters.get(name, 0)) > JOINING_MAX * name.startswith(JOINING)
+    )
+
+
+def _of_present(errors: str, sensors: str) -> str:
+    """SPI errors by chip select, without those where no sensor is: there they are no news."""
+    names = sensors.split(", ") if sensors else [""] * len(errors.split(", "))
+    return ", ".join(
+        "-" if name == "none" else error
+        for error, name in zip(errors.split(", "), names, strict=False)
+    )

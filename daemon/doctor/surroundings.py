@@ -1,0 +1,216 @@
+"""What of this computer stands in the way of a scene: model, port, interface, sockets, rights."""
+
+from __future__ import annotations
+
+import errno
+import grp
+import os
+import socket
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from daemon.assembly import assembly
+from daemon.doctor import computer
+from daemon.doctor.finding import Cause, Finding, Level, fine
+from daemon.run.realtime import RealtimeMode
+from daemon.scene import Scene
+from daemon.scene.drivers import CanTactile, PalmTactile, Section, SpiTactile, StreamJoints
+from drivers.udp.receiver import Endpoint
+from models.contract import ModelError
+
+BITRATE, DATA_BITRATE = 1_000_000, 5_000_000
+"""Of the boards in deploy/can/PROTOCOL.md, bit/s, unless the scene says otherwise."""
+NOT_HEARD = frozenset(
+    {Cause.INTERFACE_MISSING, Cause.INTERFACE_DOWN, Cause.LINK_DOWN, Cause.SILENT, Cause.BITRATE}
+)
+"""Where nothing comes over an interface, the kernel knows more of it."""
+HELD_BY_GRASPD = (
+    "graspd itself runs: graspd watch shows what it sees; to look from here end it first "
+    "(systemctl stop 'graspd@*')"
+)
+
+
+def model_finding(wanted: Scene) -> Finding:
+    """Whether the scene's model is there and fits the hand."""
+    try:
+        path = assembly.model_path(wanted)
+    except ModelError as error:
+        advice = "graspd models lists those that there are"
+        return Finding(Level.ERROR, str(error), Cause.MODEL_MISSING, advice)
+    if not path.exists():
+        advice = "[model] path is relative to the scene; graspd models lists those of the zoo"
+        return Finding(Level.ERROR, f"no model at {path}", Cause.MODEL_MISSING, advice)
+    try:
+        model = assembly.load_model(wanted)
+        assembly.build_pipeline(wanted, model)
+    except ModelError as error:
+        advice = "choose a model that fits the hand: graspd models"
+        return Finding(Level.ERROR, str(error), Cause.MODEL_MISFIT, advice)
+    return fine(f"model {model.contract.name} ({model.sha256[:12]}) fits the hand")
+
+
+def explained(finding: Finding, section: Section) -> list[Finding]:
+    """A finding on a link with what this computer knows of its cause, and what else there is.
+
+    `section` is the one of the scene that names the link's driver.
+    """
+    match section, finding.cause:
+        case CanTactile(interface="socketcan"), cause if cause in NOT_HEARD:
+            return _on_socketcan(finding, section)
+        case SpiTactile() | CanTactile(), Cause.PORT_MISSING:
+            ports = [fine(str(port)) for port in computer.serial_ports()]
+            return [finding, *(ports or [fine("no serial port is there")])]
+        case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_DENIED:
+            return [_denied(finding, port)]
+        case SpiTactile(port=port) | CanTactile(channel=port), Cause.PORT_HELD:
+            return [_held(finding, computer.file_holders(port))]
+        case PalmTactile(source=source) | StreamJoints(source=source), Cause.PORT_HELD:
+            number = Endpoint.parse(source).port
+            return [_held(finding, computer.port_holders("udp", number))]
+        case _:
+            return [finding]
+
+
+def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
+    """The state of a CAN interface, and how to bring it up for this section of a scene."""
+    if interface.is_fine:
+        return fine(str(interface))
+    line = ip_link(interface.name, tactile)
+    if interface.is_down:
+        return Finding(Level.WARNING, str(interface), Cause.INTERFACE_DOWN, line)
+    advice = f"is its bit rate the board's? sudo ip link set {interface.name} down; {line}"
+    return Finding(Level.WARNING, str(interface), Cause.BUS_ERRORS, advice)
+
+
+def ip_link(name: str, tactile: CanTactile | None) -> str:
+    """The command that brings a CAN interface up with the bit rates of a scene."""
+    bitrate = BITRATE if tactile is None or tactile.bitrate is None else tactile.bitrate
+    line = f"sudo ip link set {name} up type can bitrate {bitrate}"
+    if tactile is not None and tactile.format == "sweep_fd":
+        line += f" dbitrate {tactile.data_bitrate or DATA_BITRATE} fd on"
+    return f"{line} restart-ms 100"
+
+
+def socket_findings(wanted: Scene) -> list[Finding]:
+    """Whether the daemon can publish and be asked where the scene says; each cause once."""
+    ask = wanted.ask_endpoint
+    sockets = [("publish", wanted.endpoint, wanted.publish.group)]
+    sockets += [] if ask is None else [("ask", ask, wanted.ask_group)]
+    found: dict[Cause | None, Finding] = {}
+    for name, endpoint, group in sockets:
+        scheme, _, address = endpoint.partition("://")
+        if scheme == "ipc":
+            told = (*_of_socket(name, Path(address)), *_of_group(name, group))
+        else:
+            told = tuple(_of_port(name, address))
+        for finding in told:
+            found.setdefault(finding.cause, finding)
+    return list(found.values())
+
+
+def realtime_findings(wanted: Scene) -> list[Finding]:
+    """What of `[realtime]` this user may not have; tried for a moment."""
+    if wanted.realtime is None:
+        return []
+    with RealtimeMode(wanted.realtime) as mode:
+        lacking = [what.partition(" (") for what in mode.lacking]
+    return [
+        Finding(Level.WARNING, what, Cause.REALTIME, advice.rstrip(")"))
+        for what, _, advice in lacking
+    ] or [fine("realtime as the scene wants it may be had")]
+
+
+def _denied(finding: Finding, port: str) -> Finding:
+    try:
+        group = grp.getgrgid(os.stat(port).st_gid).gr_name
+    except (OSError, KeyError):
+        return finding
+    if group == "root":  # whose groups are nobody's to join
+        advice = "install deploy/udev/70-graspd.rules, and plug it in anew"
+        return replace(finding, advice=advice)
+    return replace(finding, advice=f"sudo usermod -aG {group} $USER, then log in again")
+
+
+def _held(finding: Finding, holders: Sequence[computer.Process]) -> Finding:
+    if not holders:
+        return finding
+    what = f"{finding.what}: {'; '.join(map(str, holders))}"
+    if any(process.is_graspd for process in holders):
+        return replace(finding, what=what, advice=HELD_BY_GRASPD)
+    return replace(finding, what=what, advice=f"end it: kill {holders[0].pid}")
+
+
+def _on_socketcan(finding: Finding, tactile: CanTactile) -> list[Finding]:
+    """What the kernel says of the interface, which is sure, goes before what was guessed."""
+    interfaces = {interface.name: interface for interface in computer.can_interfaces()}
+    here, line = interfaces.get(tactile.channel), ip_link(tactile.channel, tactile)
+    if here is None:
+        others = [can_finding(other, tactile) for other in interfaces.values()]
+        missing = replace(finding, cause=Cause.INTERFACE_MISSING)
+        advice = f"plug its adapter in, then: {line}"
+        names = [fine(finding.what) for finding in others] or [fine("no CAN interface is there")]
+        return [replace(missing, advice=advice), *names]
+    what = f"{finding.what}; {here}"
+    if here.is_down:
+        return [replace(finding, what=what, cause=Cause.INTERFACE_DOWN, advice=line)]
+    wrong_rate = here.bitrate not in (None, tactile.bitrate or BITRATE)
+    if wrong_rate or finding.cause is Cause.BITRATE:
+        advice = f"sudo ip link set {here.name} down; {line}"
+        return [replace(finding, what=what, cause=Cause.BITRATE, advice=advice)]
+    return [finding]
+
+
+def _of_socket(name: str, path: Path) -> Iterator[Finding]:
+    warning, folder = Level.WARNING, path.parent
+    if not folder.is_dir():
+        what = f"{name}: there is no folder {folder}"
+        advice = f"the service makes it; without: sudo install -d -o $USER {folder}"
+        yield Finding(warning, what, Cause.SOCKET_FOLDER, advice)
+        return
+    holders = computer.file_holders(f"{path}.lock")
+    if holders:
+        what = f"{name}: {path} is in use: {'; '.join(map(str, holders))}"
+        yield Finding(warning, what, Cause.SOCKET_HELD, HELD_BY_GRASPD)
+    elif path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+        advice = f"name another one, or move it away: mv {path} {path}.old"
+        yield Finding(Level.ERROR, f"{name}: {path} is no socket", Cause.SOCKET_HELD, advice)
+    elif not os.access(folder, os.W_OK | os.X_OK):
+        what = f"{name}: you may not make {path}"
+        owner = folder.owner()
+        yield Finding(warning, what, Cause.SOCKET_DENIED, f"as its owner: sudo -u {owner} graspd")
+
+
+def _of_port(name: str, address: str) -> Iterator[Finding]:
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]")
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, int(port)))
+        except OSError as error:
+            what = f"{name}: tcp://{address}: {error.strerror}"
+            if error.errno != errno.EADDRINUSE:
+                advice = "ip -brief address has those of this computer: name one of them"
+                yield Finding(Level.ERROR, what, Cause.ADDRESS, advice)
+                return
+            advice = f"sudo ss -tlpn 'sport = {port}' names who has it"
+            held = Finding(Level.WARNING, what, Cause.SOCKET_HELD, advice)
+            yield _held(held, computer.port_holders("tcp", int(port)))
+
+
+def _of_group(name: str, group: str | None) -> Iterator[Finding]:
+    if group is None:
+        return
+    try:
+        number = grp.getgrnam(group).gr_gid
+    except KeyError:
+        what, advice = f"{name}: there is no group {group}", f"sudo groupadd --system {group}"
+        yield Finding(Level.ERROR, what, Cause.SOCKET_GROUP, advice)
+        return
+    if os.geteuid() != 0 and number not in {os.getegid(), *os.getgroups()}:
+        what = f"{name}: you are not in the group {group} and cannot give the socket to it"
+        advice = f"sudo usermod -aG {group} $USER, then log in again"
+        yield Finding(Level.WARNING, what, Cause.SOCKET_GROUP, advice)

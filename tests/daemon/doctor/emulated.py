@@ -1,0 +1,159 @@
+"""Drivers and twins of every link in one thread and on one clock, as the doctor listens to them.
+
+The hand's own time may pass faster than that of the link: `skip` leaves out what it felt.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from daemon.commands.doctor import examine
+from daemon.doctor.electrodes import ElectrodeStatistics
+from daemon.doctor.finding import Finding, Level
+from drivers.base import Driver, TactileReading
+from drivers.can.driver import CanBridgeDriver
+from drivers.joints.driver import JointStreamDriver
+from drivers.palm.driver import PalmDriver
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.twins.faults import LinkFaults
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.whole_grasps import synthetic_grasps
+from drivers.twins.joints import JointTwin
+from drivers.twins.palm import PalmTwin
+from drivers.twins.spi import SpiTwin
+from tests.drivers.can.can_standin import StampingTwin, channel
+from tests.drivers.can.can_words import Clock
+
+MS = 1_000_000
+FINGERS = ("ff", "mf", "th")
+NO_FAULTS = LinkFaults()
+
+
+class Hand:
+    """What the sensors feel: whole grasps, without end."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._counts = (moment.counts for moment in synthetic_grasps(rate_hz=rate_hz, loop=True))
+
+    def __iter__(self) -> Iterator[Counts]:
+        return self._counts
+
+    def skip(self, moments: int) -> None:
+        """Nobody listens for so long."""
+        next(itertools.islice(self._counts, moments, moments), None)
+
+
+Step = Callable[[], None]
+"""One period of a link passes: its clock moves, and the twin sends."""
+Link = contextlib.AbstractContextManager[tuple[Driver, Step]]
+
+
+@contextlib.contextmanager
+def spi(hand: Hand, folder: Path, faults: LinkFaults = NO_FAULTS) -> Iterator[tuple[Driver, Step]]:
+    """A bridge on a pseudo-terminal, at 100 Hz."""
+    clock, port = Clock(), folder / "bridge"
+    driver = SpiBridgeDriver(str(port), FINGERS, clock=clock)
+    with SpiTwin(port, hand, faults=faults, clock=clock) as twin, driver:
+
+        def step() -> None:
+            clock.now_ns += 10 * MS
+            twin.run_once()
+
+        yield driver, step
+
+
+def can(frame_format: str) -> Callable[[Hand, Path, LinkFaults], Link]:
+    """A board on a virtual bus, at 100 Hz."""
+
+    @contextlib.contextmanager
+    def link(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
+        clock, where = Clock(), channel()
+        driver = CanBridgeDriver(
+            "virtual",
+            where,
+            FINGERS,
+            format=frame_format,
+            sequence="electrodes",
+            clock=clock,
+            wall_clock=clock,
+        )
+        twin = StampingTwin(
+            "virtual",
+            where,
+            iter(hand),
+            format=frame_format,
+            sequence="electrodes",
+            faults=faults,
+            clock=clock,
+        )
+        with driver, twin:
+
+            def step() -> None:
+                clock.now_ns += 10 * MS
+                twin.send_sweep()
+
+            yield driver, step
+
+    return link
+
+
+@contextlib.contextmanager
+def palm(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
+    """Packets over UDP, one a millisecond."""
+    clock = Clock()
+    cycles = PalmTwin(hand, faults=faults).cycles()
+    driver = PalmDriver("udp://127.0.0.1:0", clock=clock)
+    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+
+        def step() -> None:
+            clock.now_ns += MS
+            for datagram in next(cycles):
+                sender.sendto(datagram, ("127.0.0.1", driver.link.port or 0))
+
+        yield driver, step
+
+
+@contextlib.contextmanager
+def joints(_hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver, Step]]:
+    """Joint angles over UDP, at 100 Hz."""
+    clock = Clock()
+    cycles = JointTwin(faults=faults).cycles()
+    driver = JointStreamDriver("udp://127.0.0.1:0", clock=clock)
+    with driver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+
+        def step() -> None:
+            clock.now_ns += 10 * MS
+            for datagram in next(cycles):
+                sender.sendto(datagram, ("127.0.0.1", driver.link.port or 0))
+
+        yield driver, step
+
+
+LINKS: dict[str, Callable[[Hand, Path, LinkFaults], Link]] = {
+    "spi": spi,
+    "can": can("syntouch"),
+    "can fd": can("sweep_fd"),
+    "palm": palm,
+    "joints": joints,
+}
+STEPS_PER_S = {"spi": 100, "can": 100, "can fd": 100, "palm": 1000, "joints": 100}
+
+
+def listen(driver: Driver, step: Step, steps: int, statistics: ElectrodeStatistics) -> None:
+    """Let so many periods of the link pass, and take in what comes."""
+    for _ in range(steps):
+        step()
+        for reading in driver.read_ready():
+            if isinstance(reading, TactileReading):
+                statistics.add(reading)
+
+
+def faults_told(driver: Driver, statistics: ElectrodeStatistics, seconds: float) -> list[Finding]:
+    """What the doctor says after that is wrong."""
+    felt = None if driver.name == JointStreamDriver.name else statistics
+    told = examine(driver, felt, seconds)
+    return [finding for finding in told if finding.level is not Level.OK]
