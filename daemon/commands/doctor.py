@@ -29,7 +29,7 @@ from daemon.doctor.surroundings import (
     realtime_findings,
     socket_findings,
 )
-from daemon.process.text import complain, printable
+from daemon.process.text import Colour, coloured, complain, printable
 from drivers.base import Driver, DriverError, LinkError, TactileReading
 
 LISTEN_S = 3.0
@@ -41,6 +41,8 @@ BRIDGE_VENDOR = 0x2E8A
 """Raspberry Pi, whose Pico the bridge's sketch is for. Only ports of this vendor, or with the name
 above in their description, are greeted unasked: other devices may not like it."""
 MARKS = {Level.OK: "ok ", Level.WARNING: "!  ", Level.ERROR: "!! "}
+COLOURS = {"ok ": Colour.GREEN, "!  ": Colour.YELLOW, "!! ": Colour.RED}
+"""Of a mark at the beginning of a line."""
 NARROWEST = 40
 """Columns of a terminal that lines are broken for."""
 WHOLE_DEVICE = frozenset({Cause.SENSOR_ABSENT, Cause.REPEATED, Cause.CLOCK})
@@ -88,10 +90,15 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(report) + "\n")
     else:
         columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-        sys.stdout.writelines(f"{line}\n" for line in in_words(findings, columns))
+        sys.stdout.writelines(f"{_coloured(line)}\n" for line in in_words(findings, columns))
         if args.all and report.get("readings"):
             sys.stdout.writelines(f"{line}\n" for line in _table(report, columns or USUAL_COLUMNS))
     return int(any(finding.level is Level.ERROR for finding in findings))
+
+
+def _coloured(line: str) -> str:
+    mark, rest = line[:3], line[3:]
+    return coloured(mark, COLOURS[mark]) + rest if mark in COLOURS else line
 
 
 def examine(

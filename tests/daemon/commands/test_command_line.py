@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ import zmq
 from daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from daemon.commands.arguments import Parser
 from daemon.commands.manual import page
+from drivers.recordings.csv_player import DEMO_RECORDING
 from models import zoo
 from tests.daemon.processes import GRASPD, graspd
 
@@ -204,27 +206,46 @@ def test_the_manual_page_is_shown_without_a_warning() -> None:
     assert "graspd export-grasps Make a grasp table of what was recorded" in shown
 
 
-@pytest.mark.parametrize(
-    ("setting", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
-)
-def test_verdicts_are_coloured_on_a_terminal_that_wants_it(
-    setting: dict[str, str], is_coloured: bool
-) -> None:
+def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:
+    """What a command writes there, with these variables in its environment."""
     own, terminal = os.openpty()
     environment = {**os.environ, "TERM": "xterm", "NO_COLOR": "", **setting}
     with subprocess.Popen(
-        [*GRASPD, "replay", "--verbose"], stdout=terminal, stderr=terminal, env=environment
+        [*GRASPD, *arguments], stdout=terminal, stderr=terminal, env=environment
     ) as process:
         os.close(terminal)
         text = b""
-        try:
+        with contextlib.suppress(OSError):  # the end of a terminal that nobody holds any more
             while part := os.read(own, 1 << 16):
                 text += part
-        except OSError:  # the end of a terminal that nobody holds any more
-            pass
     os.close(own)
     assert process.returncode == 0
+    return text
+
+
+SETTINGS = pytest.mark.parametrize(
+    ("setting", "is_coloured"), [({}, True), ({"NO_COLOR": "1"}, False), ({"TERM": "dumb"}, False)]
+)
+
+
+@SETTINGS
+def test_verdicts_are_coloured_on_a_terminal_that_wants_it(
+    setting: dict[str, str], is_coloured: bool
+) -> None:
+    text = on_a_terminal(setting, "replay", "--verbose")
     assert (b"\x1b[32mstable" in text) == is_coloured
+    assert (b"\x1b" in text) == is_coloured
+
+
+@SETTINGS
+def test_so_is_what_the_doctor_finds(
+    setting: dict[str, str], is_coloured: bool, tmp_path: Path
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_RECORDING}"]\n')
+    text = on_a_terminal(setting, "doctor", "--listen", "0.3", str(scene))
+    assert b"ok " in text
+    assert (b"\x1b[32mok \x1b[0m" in text) == is_coloured
     assert (b"\x1b" in text) == is_coloured
 
 

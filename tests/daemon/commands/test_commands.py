@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -15,6 +16,8 @@ import zmq
 from daemon.publish.messages import Verdict, decode_verdict, schema
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
+
+DEPLOY = Path(__file__).parents[3] / "deploy"
 
 
 def test_run_publishes_until_it_is_told_to_stop(tmp_path: Path) -> None:
@@ -242,12 +245,39 @@ def test_the_schema_is_printed() -> None:
     assert json.loads(graspd("schema").stdout) == schema()
 
 
-def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> None:
+def loop_scene(folder: Path) -> Path:
+    """The scene to try the whole loop with, and all that it makes, in this folder."""
     pytest.importorskip("mcap", reason="the record extra is not installed")
-    scene = tmp_path / "loop.toml"
-    text = (Path(__file__).parents[3] / "deploy/clients/loop.toml").read_text()
-    text = text.replace("/tmp/graspd-demo", f"{tmp_path}/demo")
+    text = (DEPLOY / "clients/loop.toml").read_text().replace("/tmp/graspd-", f"{folder}/")
+    scene = folder / "loop.toml"
     scene.write_text(text.replace("../../drivers/recordings/demo", str(DEMO_TABLE.parent)))
+    return scene
+
+
+def test_the_controller_in_the_page_of_the_service_asks_and_tells(tmp_path: Path) -> None:
+    scene = loop_scene(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (DEPLOY / "README.md").read_text(), re.DOTALL)
+    assert "/tmp/graspd-demo.ipc" in code
+    with start("run", scene) as process:
+        controller = subprocess.run(
+            [sys.executable, "-c", code.replace("/tmp/graspd-", f"{tmp_path}/")],
+            env={**os.environ, "PYTHONPATH": str(DEPLOY / "clients/python")},
+            input="n\ny\n",  # and then nobody is there any more
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=TIMEOUT_S)
+    assert controller.stderr.endswith("EOFError: EOF when reading a line\n"), controller.stderr
+    assert re.search(r"^grasp \d+: (slip|stable), p_slip 0\.\d\d Risk\(", controller.stdout)
+    assert "0 outcomes told. Did it hold? y/n told\n" in controller.stdout
+    assert "1 outcomes told." in controller.stdout
+
+
+def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> None:
+    scene = loop_scene(tmp_path)
     with (
         start("run", scene) as process,
         zmq.Context() as context,
