@@ -41,10 +41,11 @@ def clash() -> str | None:
         if not is_ours or _was_replaced(init, name):
             others = set(packages_distributions().get(name, ())) - {"graspd"}
         if others or not is_ours:
-            whose = f" but of the package {', '.join(sorted(others))}" if others else ""
+            if not others:
+                return f"{init.parent} is not graspd's: leave {init.parent.parent} off PYTHONPATH"
             return (
-                f"{init.parent} is not graspd's{whose}: install graspd in an environment of its "
-                "own (pipx, uv tool, python3 -m venv), and leave that folder off PYTHONPATH"
+                f"{init.parent} is not graspd's but of the package {', '.join(sorted(others))}: "
+                "install graspd in an environment of its own (pipx, uv tool, python3 -m venv)"
             )
     return None
 

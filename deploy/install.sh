@@ -21,7 +21,8 @@ Run it again to bring an installation up to date; where there is nothing to do i
   --python PROGRAM  the Python to use, 3.11 or newer (python3)
   --can             also have systemd-networkd bring up can0; an update keeps it
   --rebuild         make the virtual environment anew even if graspd has not changed
-  --enable NAME     start graspd@NAME now and at boot, with the scene /etc/graspd/NAME.toml
+  --enable NAME     start graspd@NAME now and at boot, with the scene /etc/graspd/NAME.toml; where
+                    systemd does not run, as in a chroot or the build of an image, at boot
   --root DIR        put all files below DIR as if it were /, for a package or an image:
                     no user is made and no service touched
   --uninstall       stop all hands and remove what was installed, but not the scenes in /etc/graspd
@@ -44,6 +45,7 @@ network_file=/usr/local/lib/systemd/network/80-graspd-can.network
 
 prefix='' root='' wheelhouse='' extras='' python=python3 enable=''
 can='' rebuild='' uninstall='' purge=''
+live='' # systemd runs here
 changed=''
 new='' # the environment that is being made; gone unless it is complete
 scratch=''
@@ -176,9 +178,11 @@ find_extras() {
 check_host() {
     if [ -z "$root" ]; then
         [ "$(id -u)" = 0 ] || fail "must run as root: sudo $0"
-        [ -d /run/systemd/system ] || fail "systemd does not run here (see --root)"
+        [ ! -d /run/systemd/system ] || live=1
     fi
     [ -z "$uninstall" ] || return 0
+    [ -n "$root" ] || command -v systemd-sysusers >/dev/null ||
+        fail "there is no systemd-sysusers: apt install systemd"
     check_prefix
     command -v "$python" >/dev/null || fail "there is no $python"
     "$python" -I -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
@@ -215,8 +219,9 @@ install_all() {
     else
         say "nothing to change in $prefix"
     fi
-    [ -n "$root" ] || advise
+    [ -z "$live" ] || advise
     [ -z "$enable" ] || start
+    [ -n "$root$live" ] || say "systemd does not run here: no service is reloaded or started"
 }
 
 each_file() {
@@ -224,6 +229,7 @@ each_file() {
     "$1" sysusers.d/graspd.conf /usr/local/lib/sysusers.d/graspd.conf
     "$1" tmpfiles.d/graspd.conf /usr/local/lib/tmpfiles.d/graspd.conf
     "$1" udev/70-graspd.rules /usr/local/lib/udev/rules.d/70-graspd.rules
+    "$1" man/graspd.1 /usr/local/share/man/man1/graspd.1
 }
 
 did() {
@@ -350,11 +356,13 @@ activate() {
         usermod -aG can graspd
         did "added graspd to the group can"
     fi
-    systemd-tmpfiles --create graspd.conf
+    # A chroot may lack /proc, which this needs; the boot makes the folders then.
+    systemd-tmpfiles --create graspd.conf || [ -z "$live" ] || fail "the folders cannot be made"
     reload
 }
 
 reload() {
+    [ -n "$live" ] || return 0
     systemctl daemon-reload
     case $changed in
         *70-graspd.rules*)
@@ -371,6 +379,7 @@ reload() {
 }
 
 running() {
+    [ -n "$live" ] || return 0
     systemctl list-units --plain --no-legend --state=active,reloading,activating \
         'graspd@*.service' | cut -d ' ' -f 1
 }
@@ -392,6 +401,11 @@ start() {
         cat "$scratch/check" >&2
         fail "graspd@$enable is not enabled"
     }
+    if [ -z "$live" ]; then
+        systemctl -q enable "graspd@$enable"
+        say "graspd@$enable is enabled: it runs after every boot"
+        return
+    fi
     if systemctl -q is-enabled "graspd@$enable" 2>/dev/null &&
         systemctl -q is-active "graspd@$enable"; then
         say "graspd@$enable is enabled and runs"
@@ -429,7 +443,7 @@ drop() {
     rm -- "$root$2"
     did "removed $2"
     folder=${2%/*}
-    while [ "$folder" != /usr/local/lib ] && rmdir -- "$root$folder" 2>/dev/null; do
+    while [ "${folder%/*}" != /usr/local ] && rmdir -- "$root$folder" 2>/dev/null; do
         folder=${folder%/*}
     done
 }
@@ -442,7 +456,7 @@ stop() {
     for enabled in /etc/systemd/system/*.wants/graspd@*.service; do
         if [ -L "$enabled" ]; then systemctl -q disable "${enabled##*/}"; fi
     done
-    systemctl reset-failed 'graspd@*.service' 2>/dev/null || true
+    [ -z "$live" ] || systemctl reset-failed 'graspd@*.service' 2>/dev/null || true
 }
 
 purge() {

@@ -42,6 +42,8 @@ class RecordedRun:
         """Of the first file."""
         self._paths = tuple(paths)
         self._driver: McapReplayDriver | None = None
+        self._same_grasps = True
+        """Whether grasps are told apart as they were then; else outcomes are of none of them."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
             if (header.boot_id, header.file) != (former.boot_id, former.file + 1):
                 log.warning("%s: does not go on where the file before it ends", path)
@@ -56,6 +58,14 @@ class RecordedRun:
         sections = {name: dict(recorded.get(name, {})) for name in SECTIONS if name in recorded}
         if sections.get("model", {}).pop("min_accuracy", None) is not None:
             log.warning("%s: was judged with min_accuracy, which is not known here", self._paths[0])
+        was = sections.get("gate", {}).get("mode")
+        self._same_grasps = mode is None or (mode == "every") == (was == "every")
+        if not self._same_grasps:
+            log.warning(
+                "%s: was judged with gate mode %s: its outcomes are of other grasps, and left out",
+                self._paths[0],
+                was,
+            )
         sections["tactile"] = {
             "driver": "replay",
             "recordings": [path.absolute() for path in self._paths],
@@ -92,10 +102,11 @@ class RecordedRun:
                 Topic.SKIPPED: pipeline.skip,
             }
             driver.on_exchange = lambda told: _exchange(pipeline, told)
-            driver.on_outcome = lambda told: pipeline.outcome(
-                GraspId(told.grasp_boot_id or header.boot_id, told.grasp),
-                slipped=told.outcome == "slip",
-            )
+            if self._same_grasps:
+                driver.on_outcome = lambda told: pipeline.outcome(
+                    GraspId(told.grasp_boot_id or header.boot_id, told.grasp),
+                    slipped=told.outcome == "slip",
+                )
         pipeline.boot_id = header.boot_id
         return pipeline
 

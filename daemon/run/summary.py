@@ -258,6 +258,8 @@ class Summary:
         else:
             lines = [f"{total} verdicts in {wall_s:.2f} s: {self.tally.counts()}"]
         lines += self.tally.lines()
+        if not self.tally.labelled:
+            lines.append("no outcome of a lift is known, so there is no score")
         if self.repaired:
             lines.append(f"{self.repaired} of them with repaired electrodes")
         for how, tally in self._compared(trust):

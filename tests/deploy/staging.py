@@ -49,6 +49,26 @@ def install(root: Path, wheels: Path, *arguments: str) -> str:
     return done.stdout
 
 
+IN_A_CHROOT = """
+mount -t tmpfs tmpfs "$1"
+mkdir "$1/upper" "$1/work" "$1/root"
+mount -t overlay overlay -o "lowerdir=/,upperdir=$1/upper,workdir=$1/work" "$1/root"
+mount --rbind /dev "$1/root/dev"
+mount --rbind /proc "$1/root/proc"
+exec chroot "$1/root" sh -euc "$2"
+"""
+"""Makes a copy of this computer's files, in which no systemd runs, and runs a script there."""
+
+
+def in_a_chroot(folder: Path, script: str) -> subprocess.CompletedProcess[str]:
+    """Run a shell script as root on a copy of this computer's files, which is then gone.
+
+    `folder` is where the copy is put, and is left empty.
+    """
+    command = ["unshare", "--mount", "sh", "-euc", IN_A_CHROOT, "sh", str(folder), script]
+    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=TIMEOUT_S)
+
+
 def content(root: Path) -> dict[str, str]:
     """Every file and link below `root`: its path, with what it holds or where it leads."""
     return {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from tests.deploy.staging import (
     DEPLOY,
     INSTALLER,
     content,
+    in_a_chroot,
     install,
     installer,
     version_below,
@@ -28,6 +30,7 @@ FILES = {
     "/usr/local/lib/sysusers.d/graspd.conf",
     "/usr/local/lib/tmpfiles.d/graspd.conf",
     "/usr/local/lib/udev/rules.d/70-graspd.rules",
+    "/usr/local/share/man/man1/graspd.1",
     "/etc/graspd/right.toml",
 }
 """Installed everywhere, outside the prefix."""
@@ -222,6 +225,51 @@ def test_a_prefix_where_others_may_write_is_refused(
     done = installer("--root", root, "--wheelhouse", wheels, "--prefix", prefix)
     assert (done.returncode, sorted(root.rglob("*"))) == (1, before), done.stdout
     assert why in done.stderr
+
+
+def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) -> None:
+    (tmp_path / "copy").mkdir()
+    if os.geteuid() != 0 or in_a_chroot(tmp_path / "copy", ":").returncode != 0:
+        pytest.skip("only root can make a chroot of this computer's files, and not everywhere")
+    python = "/mnt/python{}.{}".format(*sys.version_info[:2])  # a service sees nothing of /root
+    install = f"sh {INSTALLER} --python {python} --wheelhouse {wheels} --enable right"
+    script = f"""
+        [ ! -e /run/systemd/system ]
+        rm -rf /etc/graspd
+        mkdir /mnt/base
+        mount --bind {sys.base_prefix} /mnt/base
+        ln -s base/bin/{Path(python).name} {python}
+        {install}
+        id -gn graspd
+        systemctl is-enabled graspd@right
+        stat -c '%U %a' /var/lib/graspd
+        test -f {DEPLOY.parent}/pyproject.toml -a -f /usr/local/share/man/man1/graspd.1
+        graspd
+        echo again
+        {install}
+        echo purge
+        sh {INSTALLER} --uninstall --purge
+        ls -d /usr/local/share /usr/local/lib
+        systemctl is-enabled graspd@right && exit 4
+        id graspd && exit 5
+        find /etc /usr/local /var/lib /run /opt/graspd -name '*graspd*' 2>/dev/null || true
+    """
+    done = in_a_chroot(tmp_path / "copy", script)
+    assert done.returncode == 0, done.stdout + done.stderr
+    first, again, purge = re.split("again\n|purge\n", done.stdout)
+    assert first.splitlines()[-8:] == [
+        "graspd: installed in /opt/graspd",
+        "graspd: graspd@right is enabled: it runs after every boot",
+        "graspd: systemd does not run here: no service is reloaded or started",
+        "graspd",
+        "enabled",
+        "graspd 750",
+        "graspd 0.1.0",
+        "graspd 0.1.0",
+    ], done.stdout + done.stderr
+    assert again.startswith("graspd: nothing to change in /opt/graspd\n")
+    assert purge.splitlines()[-3:] == ["graspd: uninstalled", "/usr/local/lib", "/usr/local/share"]
+    assert content(tmp_path) == {}
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder away")

@@ -85,6 +85,10 @@ def test_the_unit_keeps_what_the_daemon_needs() -> None:
     assert Path("/var/lib") / state == STATE_DIRECTORY
     assert unit["RestartPreventExitStatus"] == ["2"]
     assert unit["ExecStart"][0].endswith(" run /etc/graspd/%i.toml")
+    # The dash: systemd heeds RestartPreventExitStatus= of the main process only.
+    (before,) = unit["ExecStartPre"]
+    assert before.startswith("-/opt/graspd/")
+    assert before.endswith(" check /etc/graspd/%i.toml")
 
 
 def test_every_priority_that_a_scene_may_name_is_granted() -> None:

@@ -10,8 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import zmq
 
-from daemon.publish.messages import decode_verdict, schema
+from daemon.publish.messages import Verdict, decode_verdict, schema
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start
 
@@ -239,3 +240,41 @@ def test_check_refuses_a_hand_that_the_model_does_not_know(tmp_path: Path) -> No
 
 def test_the_schema_is_printed() -> None:
     assert json.loads(graspd("schema").stdout) == schema()
+
+
+def test_the_scene_of_the_whole_loop_asks_learns_and_records(tmp_path: Path) -> None:
+    pytest.importorskip("mcap", reason="the record extra is not installed")
+    scene = tmp_path / "loop.toml"
+    text = (Path(__file__).parents[3] / "deploy/clients/loop.toml").read_text()
+    text = text.replace("/tmp/graspd-demo", f"{tmp_path}/demo")
+    scene.write_text(text.replace("../../drivers/recordings/demo", str(DEMO_TABLE.parent)))
+    with (
+        start("run", scene) as process,
+        zmq.Context() as context,
+        context.socket(zmq.DEALER) as controller,
+    ):
+        controller.linger = 0
+        controller.connect(f"ipc://{tmp_path}/demo.ask.ipc")
+        verdict = asked(controller)
+        while verdict.p_slip is None:
+            verdict = asked(controller)
+        assert (verdict.outcomes, verdict.risk and verdict.risk.warm_up_left) == (0, 5)
+        controller.send(b"outcome %b %d slip mug" % (verdict.boot_id.encode(), verdict.grasp))
+        assert controller.poll(TIMEOUT_S * 1000)
+        assert json.loads(controller.recv())["ok"] is True
+        told = asked(controller)
+        assert (told.outcomes, told.risk and told.risk.warm_up_left) == (1, 4)
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=TIMEOUT_S)
+    assert process.returncode == 0
+    replayed = graspd("replay", *(tmp_path / "demo-record").glob("*.mcap"), "--json")
+    summary = json.loads(replayed.stderr.splitlines()[-1])
+    assert (summary["labelled"], summary["outcomes"]) == (1, 1)
+    assert summary["scores"]["f1"] == float(verdict.verdict == "slip")
+
+
+def asked(controller: zmq.Socket[bytes]) -> Verdict:
+    """What graspd answers to a controller that asks."""
+    controller.send(b"judge")
+    assert controller.poll(TIMEOUT_S * 1000)
+    return decode_verdict(controller.recv())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -161,6 +162,20 @@ def test_the_summary_of_a_replay_counts_the_outcomes_in_the_recording(rotated: L
     assert without["labelled"] == summary["labelled"]
     assert "unproven" not in without["reasons"]
     assert graspd("replay", "--outcomes", *rotated.files).returncode == 2
+
+
+def test_people_are_told_the_score_of_a_recording_against_its_outcomes(rotated: Lab) -> None:
+    text = graspd("replay", *rotated.files).stdout
+    score = (
+        r"^against [1-9] recorded outcomes \(slip positive\): accuracy [0-9.]+ %, .*f1 [0-9.]+ %$"
+    )
+    assert re.search(rf"{score}\ncoverage [0-9.]+ %, ", text, re.MULTILINE), text
+
+
+def test_outcomes_are_not_those_of_grasps_that_are_told_apart_otherwise(rotated: Lab) -> None:
+    result = graspd("replay", *rotated.files, "--gate", "every")
+    assert result.stderr.count("was judged with gate mode settled") == 1
+    assert "no outcome of a lift is known, so there is no score" in result.stdout
 
 
 def test_each_file_of_a_run_is_judged_as_then_without_those_before_it(rotated: Lab) -> None:
