@@ -81,4 +81,5 @@ def levels_of(fall: NDArray[np.float64], *, from_rest: bool) -> NDArray[np.int64
         share = np.sign(pixels) * np.sqrt(np.abs(pixels) / FULL_COUNTS)
     else:
         share = pixels / max(FULL_DEVIATIONS * float(fall.std()), 1.0)
-    return np.clip(np.rint(FULL * share), -FULL, FULL).astype(np.int64)
+    levels: NDArray[np.int64] = np.clip(np.rint(FULL * share), -FULL, FULL).astype(np.int64)
+    return levels

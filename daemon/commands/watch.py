@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import select
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +13,7 @@ import zmq
 
 from daemon import scene
 from daemon.process.extras import needs
+from daemon.process.signals import StopSignal
 from daemon.process.text import complain
 from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
@@ -21,6 +23,10 @@ from daemon.watch.view import View
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Where the daemon publishes unless its scene says otherwise."""
 PORT = 8377
+FOXGLOVE_PORT = 8765
+"""Where viewers look unless they are told otherwise."""
+TICK_S = 0.02
+"""Between two looks at what has come for viewers, s."""
 NICENESS = 10
 """Drawing takes a tenth of a processor, and a daemon on the same one comes first."""
 FAILED, WRONG = 1, 2
@@ -54,8 +60,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the daemon's .key file (default: as the scene has it)",
     )
-    parser.add_argument("--web", action="store_true", help="serve a page on this computer instead")
-    parser.add_argument("--port", type=_port, default=PORT, help=f"of the page (default: {PORT})")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--web", action="store_true", help="serve a page on this computer instead")
+    how.add_argument(
+        "--foxglove",
+        action="store_true",
+        help="serve Lichtblick and Foxglove on this computer instead (extra: foxglove)",
+    )
+    parser.add_argument(
+        "--port", type=_port, help=f"of the page ({PORT}), or for viewers ({FOXGLOVE_PORT})"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,7 +79,9 @@ def run(args: argparse.Namespace) -> int:
         target = _target(args)
         with Feed(target.endpoint, _keys(args, target)) as feed:
             view = View(target.endpoint, target.hand)
-            return _page(feed, view, args.port) if args.web else _terminal(feed, view)
+            if args.foxglove:
+                return _foxglove(feed, args.port or FOXGLOVE_PORT)
+            return _page(feed, view, args.port or PORT) if args.web else _terminal(feed, view)
     except (SceneError, KeysError, UsageError) as error:
         complain(error)
     except zmq.ZMQError as error:
@@ -119,4 +135,24 @@ def _page(feed: Feed, view: View, port: int) -> int:
     except OSError as error:
         complain(f"cannot serve a page on port {port}: {error.strerror}")
         return FAILED
+    return 0
+
+
+def _foxglove(feed: Feed, port: int) -> int:
+    try:
+        from daemon.record.live import LiveServer
+    except ModuleNotFoundError as error:
+        raise UsageError(needs("watch --foxglove", "foxglove", error)) from None
+    try:
+        server = LiveServer(port)
+    except RuntimeError as error:
+        complain(f"cannot serve viewers on port {port}: {error}")
+        return FAILED
+    with StopSignal() as stop, server:
+        sys.stdout.write(f"ws://127.0.0.1:{server.port} (Ctrl-C ends)\n")
+        sys.stdout.flush()
+        while stop.received is None:
+            for topic, payload in feed.take():
+                server.send(topic, payload)
+            select.select([stop.fileno()], [], [], TICK_S)
     return 0

@@ -6,13 +6,11 @@ A file that was cut off has no summary at its end, so the reader looks for none.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from io import BytesIO
 from itertools import count
 from pathlib import Path
@@ -28,9 +26,8 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
 from daemon.record.files import create
-from daemon.record.flat import schema_of
 from daemon.record.header import RecordingHeader
-from daemon.record.topics import Topic
+from daemon.record.topics import schemas
 from drivers.base import RecordingError
 from drivers.recordings.csv_rows import open_recording
 
@@ -45,27 +42,12 @@ RATIO_MAX: Final = 100
 """How many times as large as packed all chunks may be, beyond the first `CHUNK_MAX_BYTES`. Held
 grasps pack to a twelfth, a sensor that says nothing but zeros to a thirty-sixth."""
 
-_FAMILY = {Topic.IMAGE: "foxglove", Topic.LOG: "foxglove"}
-"""Whose schema a topic has, if it is not ours: viewers know it by its name."""
-
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
 )
 """What the library raises for a file that is no MCAP, damaged or cut off; the last two for lengths
 beyond all memory."""
-
-
-@cache
-def schemas() -> dict[str, tuple[str, bytes]]:
-    """By topic: name and JSON Schema of its messages."""
-    return {
-        topic.value: (
-            f"{_FAMILY.get(topic, 'graspd')}.{topic.message.__name__}",
-            json.dumps(schema_of(topic.message)).encode(),
-        )
-        for topic in Topic
-    }
 
 
 class McapWriter:

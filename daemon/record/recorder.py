@@ -27,7 +27,7 @@ from daemon.record.flat import flat
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
-from daemon.record.viewers import Journal, Painter
+from daemon.record.viewers import ForPeople
 from daemon.scene import Record
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ class Recorder(Companion):
         self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
         self._asked = False
         """Whether somebody has asked since the last reading; the next one says so."""
-        self._journal, self._painter = Journal(), Painter(options.images_hz)
+        self._for_people = ForPeople(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
         self._open: _Open | None = None
@@ -333,11 +333,8 @@ class Recorder(Companion):
             message = msgspec.json.decode(cast(bytes, content))
         files.messages.write(topic, msgspec.json.encode(flat(message)), at_ns)
         kind, wall_ns = topic.partition(b".")[0].decode(), at_ns + files.offset_ns
-        for line in self._journal.of(kind, message, wall_ns):
-            files.messages.write(self._names[Topic.LOG], msgspec.json.encode(line), at_ns)
-        image = self._painter.of(kind, message, wall_ns)
-        if image is not None:
-            files.messages.write(self._names[Topic.IMAGE], msgspec.json.encode(image), at_ns)
+        for made, payload in self._for_people.of(kind, message, wall_ns):
+            files.messages.write(self._names[Topic(made)], payload, at_ns)
 
     def _flush(self, files: _Open, now_ns: int) -> None:
         try:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from enum import StrEnum
+from functools import cache
 from typing import Annotated, Any, Final, Literal, Self
 
 import msgspec
@@ -19,7 +21,7 @@ from daemon.publish.messages import (
     Tactile,
     Verdict,
 )
-from daemon.record.flat import table
+from daemon.record.flat import schema_of, table
 from daemon.record.viewers import Log, RawImage
 from daemon.trust.learner import LearnerState
 from drivers.base import ELECTRODES, JointReading, TactileReading
@@ -131,12 +133,27 @@ class Topic(StrEnum):
     LOG = "log", Log
 
 
+_FAMILY: Final = {Topic.IMAGE: "foxglove", Topic.LOG: "foxglove"}
+"""Whose schema a topic has, if it is not ours: viewers know it by its name."""
+
 EVENTS: Final = frozenset(topic for topic in Topic if topic.message is Event)
 EVENT: Final = b"{}"
 """Payload of an event."""
 
 decode_exchanged = msgspec.json.Decoder(Exchanged).decode
 _decode = msgspec.json.Decoder(dict[str, Any]).decode
+
+
+@cache
+def schemas() -> dict[str, tuple[str, bytes]]:
+    """By topic: name and JSON Schema of its messages."""
+    return {
+        topic.value: (
+            f"{_FAMILY.get(topic, 'graspd')}.{topic.message.__name__}",
+            json.dumps(schema_of(topic.message)).encode(),
+        )
+        for topic in Topic
+    }
 
 
 def decode_judged(payload: bytes) -> Judged:

@@ -229,3 +229,19 @@ class Painter:
         pixels = _PALETTE[levels_of(fall, from_rest=rest.counts is not None) + FULL]
         pixels[np.array(PIXELS)[~sound]] = _MARK
         return pixels.reshape(HEIGHT, WIDTH, 3)
+
+
+class ForPeople:
+    """What the messages of one hand come to, on topics `log` and `image`."""
+
+    def __init__(self, images_hz: float) -> None:
+        """`images_hz` as in `Painter`."""
+        self._journal, self._painter = Journal(), Painter(images_hz)
+
+    def of(self, kind: str, content: object, wall_ns: int) -> Iterator[tuple[str, bytes]]:
+        """Kind and payload of what is said and drawn of a message, as JSON has it."""
+        for line in self._journal.of(kind, content, wall_ns):
+            yield "log", msgspec.json.encode(line)
+        image = self._painter.of(kind, content, wall_ns)
+        if image is not None:
+            yield "image", msgspec.json.encode(image)

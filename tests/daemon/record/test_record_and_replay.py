@@ -58,8 +58,8 @@ def again(*arguments: object) -> list[dict[str, Any]]:
 def test_a_recording_has_all_that_was_published_and_the_joints(lab: Lab) -> None:
     (path,) = lab.files
     kinds = [kind for kind, _ in messages(path)]
-    published = {"tactile", "verdict", "gate", "outcome", "status"}
-    assert set(kinds) == published | {"joints", "judged", "image", "log"}
+    sent = {"tactile", "verdict", "gate", "outcome", "status"}
+    assert set(kinds) == sent | {"joints", "judged", "image", "log"}
     assert kinds.count("tactile") == kinds.count("joints") == len(of_readings(path)) > 0
     recorded = {content["seq"]: content for content in of_kind(path, "verdict")}
     published = {verdict.seq: json.loads(encode(verdict)) for verdict in lab.verdicts}

@@ -21,8 +21,9 @@ from daemon import scene
 from daemon.record import recorder as recorder_module
 from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapReader, McapWriter, schemas
+from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
+from daemon.record.topics import schemas
 from daemon.scene import Record, SceneError
 from drivers.base import JointReading
 from drivers.recordings.csv_player import DEMO_RECORDING

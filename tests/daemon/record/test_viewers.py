@@ -16,10 +16,10 @@ from daemon.publish.messages import Tactile, encode
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
 from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapReader, McapWriter, schemas
+from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.player import McapReplayDriver
 from daemon.record.recorder import Recorder
-from daemon.record.topics import EVENT, Event, Exchanged, Topic
+from daemon.record.topics import EVENT, Event, Exchanged, Topic, schemas
 from daemon.record.viewers import INFO, SCALE, WARNING, Journal, Painter, RawImage
 from daemon.scene import Record
 from daemon.trust.learner import LearnerState
