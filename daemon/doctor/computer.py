@@ -18,7 +18,7 @@ ARPHRD_CAN = "280"
 LISTENING = {"tcp": {"0A"}, "udp": {"01", "07"}}
 """States in `/proc/net` of a socket that has a port for itself."""
 IP_TIMEOUT_S = 5.0
-COMMAND_MAX = 120
+COMMAND_MAX = 400
 """Characters of a command that are shown."""
 
 

@@ -75,15 +75,21 @@ def compared(verdict: dict[str, Any]) -> dict[str, Any]:
 def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given(
     tmp_path: Path,
 ) -> None:
-    recording, log = record("spi", tmp_path)
+    for attempt in range(3):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        recording, log = record("spi", folder)
+        kept = messages(recording)
+        # A machine that stalls leaves readings out, which the log has.
+        if not any(content["skipped_readings"] for what, content in kept if what == "status"):
+            break
     assert log.suffix == ".serial"
-    kept = messages(recording)
     times = {content["t_mono_ns"] for what, content in kept if what == "tactile"}
     before: dict[int, dict[str, Any]] = {}
     for what, content in kept:
         if what == "verdict" and content["t_mono_ns"] in times:
             before.setdefault(content["t_mono_ns"], content)
-    result = graspd("replay", "--json", log, "--scene", tmp_path / "scene.toml")
+    result = graspd("replay", "--json", log, "--scene", folder / "scene.toml")
     assert result.returncode == 0, result.stderr
     now = [json.loads(line) for line in result.stdout.splitlines()]
     assert len(before) > 400
