@@ -77,6 +77,7 @@ def _summary(found: Export) -> str:
             (sum(grasp.object_name is None for grasp in grasps), "grasps without an object"),
             (found.without_outcome, "left out without an outcome"),
             (found.repaired, "left out with repaired electrodes"),
+            (found.repeated, "left out with the very counts of one before"),
             (found.unjoined, "outcomes of grasps that are not in the recordings"),
             (found.cut_off, "files that were cut off"),
         )

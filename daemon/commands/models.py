@@ -93,6 +93,8 @@ def run(args: argparse.Namespace) -> int:
         complain(error)
         return WRONG
     except OSError as error:
+        if error.filename is None and args.what not in (ADD, REMOVE):
+            raise  # of standard output
         complain(f"{error.filename or args.which}: {error.strerror or error}")
         return FAILED
 

@@ -237,7 +237,11 @@ def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> Non
     again = _judge(wanted, pipeline)
     unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
     if 2 * unlike > len(again):
-        raise DriverError(f"{unlike} of {len(again)} readings are unlike all grasps")
+        name = model.contract.name
+        raise DriverError(
+            f"{unlike} of {len(again)} readings are unlike all grasps that {name} was trained on: "
+            "nothing is written"
+        )
 
 
 def _on_recordings(wanted: scene.Scene, recordings: list[Path]) -> scene.Scene:

@@ -45,6 +45,8 @@ class Export:
     """Left out: grasps that were judged and have no outcome."""
     repaired: int = 0
     """Left out: grasps with an outcome of which electrodes were repaired to judge them."""
+    repeated: int = 0
+    """Left out: grasps with the very counts of one before, as a recording played in a loop has."""
     unjoined: int = 0
     """Outcomes of grasps without judged counts before them in the recordings."""
     cut_off: int = 0
@@ -75,7 +77,17 @@ def collect(paths: Sequence[Path]) -> Export:
                     raise RecordingError(path, f"{message.kind} message: {error}") from error
             found.cut_off += recording.cut_off
     found.without_outcome = len(joining.judged.keys() - joining.told)
+    leave_out_repeats(found)
     return found
+
+
+def leave_out_repeats(found: Export) -> None:
+    """Keep the first of the grasps that have the same counts, and count the others."""
+    first: dict[bytes, GraspId] = {}
+    for grasp, row in found.grasps.items():
+        first.setdefault(row.counts.tobytes(), grasp)
+    found.repeated = len(found.grasps) - len(first)
+    found.grasps = {grasp: found.grasps[grasp] for grasp in first.values()}
 
 
 class _Joining:

@@ -64,6 +64,22 @@ def test_a_session_is_seeded_shown_used_and_forgotten(scene: Path, bts3_dir: Pat
         assert (reset.returncode, says in reset.stdout) == (0, True)
 
 
+@pytest.mark.parametrize("keep", [None, False, True])
+def test_check_says_that_the_file_of_a_session_that_is_not_kept_is_not_read(
+    keep: bool | None, tmp_path: Path
+) -> None:
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n[session]\nfile = "kept.json"\n'
+        + ("" if keep is None else f"keep = {str(keep).lower()}\n")
+    )
+    checked = graspd("check", path)
+    assert checked.returncode == 0, checked.stderr
+    assert ("not kept and its file not read" in checked.stdout) is (keep is not True)
+    assert (f"kept in {tmp_path}/kept.json" in checked.stdout) is (keep is True)
+
+
 def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3_dir: Path) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(

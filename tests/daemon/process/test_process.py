@@ -179,6 +179,8 @@ WRITERS = [
     ["run", "--print", DEMO_SCENE],
     ["doctor", DEMO_SCENE, "--listen", "0.1"],
     ["schema"],
+    ["models"],
+    ["models", "--json"],
     ["--help"],
     ["--version"],
 ]

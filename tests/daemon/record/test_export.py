@@ -211,6 +211,26 @@ def test_what_is_left_out_is_counted(tmp_path: Path) -> None:
     assert (found.without_outcome, found.repaired, found.unjoined) == (2, 1, 1)
 
 
+def test_of_grasps_with_the_same_counts_the_first_is_kept(tmp_path: Path) -> None:
+    writer = Writer(tmp_path / "a.mcap")
+    mug, bowl = sweeps(2)
+    for grasp, counts in enumerate((mug, bowl, mug)):
+        writer.judged(grasp, counts)
+    writer.outcome(0, "slip")
+    writer.outcome(1, "stable")
+    writer.outcome(2, "stable")
+    writer.close()
+    found = collect([tmp_path / "a.mcap"])
+    assert [(number, row.slipped) for (_, number), row in found.grasps.items()] == [
+        (0, True),
+        (1, False),
+    ]
+    assert found.repeated == 1
+    result = graspd("export-grasps", tmp_path / "a.mcap", "--out", tmp_path / "a.csv")
+    assert "1 left out with the very counts of one before" in result.stdout
+    assert len(read_table(tmp_path / "a.csv").slipped) == 2
+
+
 def test_each_row_has_the_object_that_was_told_and_the_option_names_the_others(
     tmp_path: Path,
 ) -> None:
