@@ -17,6 +17,7 @@ Run it again to bring an installation up to date; where there is nothing to do i
                     but root may write there, nor in a folder above it
   --wheelhouse DIR  install from the wheels in DIR and from nowhere else; graspd's own must be among
                     them. On a computer with network and the same Python: pip wheel -w DIR .
+                    (with extras: pip wheel -w DIR '.[record]')
   --extras LIST     optional parts of graspd, such as record (those that are there already; none: -)
   --python PROGRAM  the Python to use, 3.11 or newer (python3)
   --can             also have systemd-networkd bring up can0; an update keeps it
