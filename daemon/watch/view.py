@@ -181,10 +181,11 @@ class View:
         """What holds now, by the rule for subscribers: silence means unknown."""
         verdict = self._verdict
         if verdict is None:
-            return Tone.SILENT, [Line("unknown", NOTHING_CAME), Line("link", self.link)]
+            return Tone.SILENT, [Line("silent", NOTHING_CAME), Line("link", self.link)]
         silent_ms = (now_ns - self._verdict_ns) / 1e6
         if silent_ms > verdict.silence_ms:
-            silence = Line("unknown", f"no message for {silent_ms:.0f} ms")
+            long = f"{silent_ms:.0f} ms" if silent_ms < 1e4 else f"{silent_ms / 1e3:.0f} s"
+            silence = Line("silent", f"no message for {long}")
             return Tone.SILENT, [silence, Line("link", self.link)]
         if verdict.verdict is Decision.UNKNOWN:
             why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]

@@ -86,8 +86,14 @@ def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
     assert (seen.tone, seen.verdict, seen.p_slip) == (tone, outcome.value, p_slip)
     seen = view.snapshot(101 * MS)
     assert (seen.tone, seen.verdict, seen.p_slip) == (Tone.SILENT, "unknown", None)
-    assert seen.why[0] == Line("unknown", "no message for 101 ms")
+    assert seen.why[0] == Line("silent", "no message for 101 ms")
     assert (seen.gate, seen.contact, seen.fingers, seen.state) == (None, None, [], None)
+
+
+def test_a_long_silence_is_told_in_seconds() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE)))
+    assert view.snapshot(9_999 * MS).why[0].advice == "no message for 9999 ms"
+    assert view.snapshot(124_385 * MS).why[0].advice == "no message for 124 s"
 
 
 def test_a_message_that_is_repeated_for_somebody_else_is_no_sign_of_life() -> None:

@@ -235,7 +235,7 @@ def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
     talker.decision = None
     see(browser, "silent")
     assert text(browser, "verdict") == "UNKNOWN"
-    assert "unknown: no message for " in text(browser, "why")
+    assert "silent: no message for " in text(browser, "why")
     talker.decision = Decision.SLIP
     see(browser, "slip")
     page.stop()
