@@ -153,9 +153,8 @@ class SpiTwin(Opened):
 
     def plug(self) -> None:
         """Make a pseudo-terminal, point the path at it, and say HELLO as after a reset."""
-        if self.path.exists() and not self.path.is_symlink():
-            raise FileExistsError(f"{self.path} is in the way: it is no link of a twin's")
         self.unplug()
+        self._refuse_to_replace()
         self._replug_ns = None
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
@@ -169,9 +168,21 @@ class SpiTwin(Opened):
         self._write(DELIMITER)
         self._send(self._hello(0), waits=False)
 
+    def _refuse_to_replace(self) -> None:
+        """Raise `FileExistsError` unless the path is free; a link to nothing was left by a twin."""
+        if not self.path.exists():
+            return
+        if not self.path.is_symlink():
+            raise FileExistsError(f"{self.path} is in the way: it is no link of a twin's")
+        raise FileExistsError(
+            f"{self.path} is in the way: it leads to {self.path.readlink()}; if that is another"
+            " twin, end it or give this one another path"
+        )
+
     def unplug(self) -> None:
         """Take the pseudo-terminal away: whoever has it open is told by the system."""
-        if self.path.is_symlink():
+        ours = None if self._slave is None else os.ttyname(self._slave)
+        if self.path.is_symlink() and str(self.path.readlink()) == ours:
             self.path.unlink()
         for descriptor in (self._master, self._slave):
             if descriptor is not None:

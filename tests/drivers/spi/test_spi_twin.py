@@ -250,6 +250,23 @@ def test_a_file_in_the_way_of_the_link_is_left_alone(tmp_path: Path) -> None:
     assert path.read_text() == "precious"
 
 
+def test_a_link_that_leads_somewhere_is_left_alone_and_one_that_leads_nowhere_is_not(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "bridge"
+    path.symlink_to("/dev/pts/of-a-twin-that-was-killed")
+    with SpiTwin(path, generated(1)) as first:
+        terminal = path.readlink()
+        second = SpiTwin(path, generated(1))
+        with pytest.raises(FileExistsError, match=f"leads to {terminal}; .* another twin"):
+            second.open()
+        second.close()
+        assert path.readlink() == terminal
+        first.plug()
+        assert path.exists()
+    assert not path.is_symlink()
+
+
 def test_a_source_without_counts_and_a_rate_of_nothing_are_refused(tmp_path: Path) -> None:
     empty: Iterator[Counts] = iter(())
     with pytest.raises(ValueError, match="no counts"):
