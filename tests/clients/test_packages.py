@@ -45,8 +45,9 @@ def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip(f"no package of the client without it: apt install {' '.join(missing)}")
     folder = tmp_path_factory.mktemp("installed")
     made = folder / "build"
-    run("cmake", "-S", CPP, "-B", made, f"-DCMAKE_INSTALL_PREFIX={folder}")
-    run("cmake", "--install", made)
+    # What is moved after it was configured, as by a packager, is found too.
+    run("cmake", "-S", CPP, "-B", made, f"-DCMAKE_INSTALL_PREFIX={folder / 'configured'}")
+    run("cmake", "--install", made, "--prefix", folder)
     return folder
 
 
@@ -90,7 +91,7 @@ def test_cmake_takes_the_sources_of_the_client(prefix: Path, project: Path) -> N
 
 
 def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> None:
-    (described,) = prefix.glob("lib*/**/graspd_client.pc")
+    (described,) = prefix.glob("share/**/graspd_client.pc")
     line = block("sh", "cmake -S")[1]
     run("sh", "-c", f"cd {project} && {line}", PKG_CONFIG_PATH=str(described.parent))
     works(project / PROGRAM, project)
