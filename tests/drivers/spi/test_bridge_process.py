@@ -130,10 +130,12 @@ def test_a_sensor_that_is_plugged_in_again_comes_back(start_bridge: StartBridge)
     host = start_bridge("--unplug", "1:50:600", "--period-us", 3000)
     host.hello()
     host.send(frame(START))
-    present = [sweep[20] for sweep in host.next_of(SWEEP, 1200)]
+    sweeps = host.next_of(SWEEP, 1200)  # on a busy machine some are lost before
+    present = [sweep[20] for sweep in sweeps]
     changes = [now for before, now in zip([0, *present], present, strict=False) if now != before]
     assert changes == [0b111, 0b101, 0b111]
-    assert 50 < present.index(0b101) < 600 < len(present) - present[::-1].index(0b101)
+    gone = [seq_of(sweep) for sweep in sweeps if sweep[20] == 0b101]
+    assert 50 < gone[0] < 600 <= gone[-1]
 
 
 def test_garbage_from_the_host_is_counted_and_survived(start_bridge: StartBridge) -> None:
