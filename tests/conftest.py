@@ -46,8 +46,10 @@ def bts3_dir() -> Path:
     return folder / "bts3"
 
 
-def pytest_collection_finish() -> None:
-    """Take what the imports made out of the garbage collector's sight: it runs after every test."""
+@pytest.fixture(autouse=True, scope="module")
+def what_is_there_is_kept() -> None:
+    """Take what is alive out of the garbage collector's sight: it runs after every test, and what
+    all modules before have left would cost most of the time."""
     gc.collect()
     gc.freeze()
 
