@@ -209,9 +209,9 @@ class Gate:
         self.skip(t_ns)
         memory.last_ns = t_ns
         self._follow_question(t_ns)
-        self.motion.add(t_ns, counts, usable)
         touches = touching.tolist()
         in_contact = all(touches[finger] for finger in self._required)
+        self.motion.add(t_ns, counts, usable, wanted=in_contact or any(touches))
         if in_contact and not memory.in_contact:
             memory.touched_ns = t_ns
         memory.in_contact = in_contact

@@ -60,6 +60,8 @@ class Grip:
         must_touch = np.array([finger in required for finger in fingers])
         self._gate = Gate(must_touch, limits.gate, on_request=limits.on_request)
         self.memory = GripMemory()
+        nobody: dict[Finger, float | None] = dict.fromkeys(fingers)
+        self._not_looked = nobody, dict.fromkeys(fingers, 1.0)
 
     @property
     def state(self) -> GateState:
@@ -221,6 +223,8 @@ class Grip:
         found: dict[Finger, float | None] = {}
         limits: dict[Finger, float] = {}
         now = self._gate.motion
+        if not now.looked:
+            return self._not_looked
         windows = now.fast, now.fast_limits, now.slow, now.slow_limits
         for finger, moves, limit, slides, its_limit in zip(self._fingers, *windows, strict=True):
             if slides < math.inf and slides * limit > moves * its_limit:

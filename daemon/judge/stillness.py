@@ -166,6 +166,8 @@ class Motion:
         infinite where that is not known."""
         self.fast_limits = self.slow_limits = self._no_limits
         """What it may be at most for a finger that is still, in the same units."""
+        self.looked = False
+        """Whether that was worked out for the last step; else nobody wanted to know."""
         self.early = False
         """Whether fast motion is excluded."""
         self.sure = False
@@ -209,10 +211,18 @@ class Motion:
         self.memory.block_number = 0
         self._noise = None
 
-    def add(self, t_ns: int, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
+    def add(
+        self,
+        t_ns: int,
+        counts: NDArray[np.uint16],
+        usable: NDArray[np.bool_],
+        *,
+        wanted: bool = True,
+    ) -> None:
         """Take in the sweep of `t_ns`, shape (fingers, 24), and which electrodes are usable.
 
-        Times must not go back; call `reset` where they do, and after a gap.
+        How the fingers move is not worked out, and not known, where it is not `wanted`. Times must
+        not go back; call `reset` where they do, and after a gap.
         """
         memory, sweep = self.memory, counts.astype(np.float32)
         if memory.last_ns is None:
@@ -241,12 +251,17 @@ class Motion:
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
         if memory.number and t_ns - memory.last_ns < STEP_NS:
+            if wanted and not self.looked:
+                self._decide()
             return
         self._remember(memory.last_ns + memory.total_ns // memory.sweeps)
         memory.sweeps = memory.total_ns = 0
         memory.last_ns = t_ns
         self._learn_noise()
-        self._decide()
+        if wanted:
+            self._decide()
+        else:
+            self._say_unknown()
 
     def _clean(self, counts: NDArray[np.float32]) -> None:
         """Leave out what has jumped for one sweep alone, or is held for a few."""
@@ -340,6 +355,7 @@ class Motion:
         memory = self.memory
         number, end = memory.number, memory.first + memory.number
         self._say_unknown()
+        self.looked = True
         if memory.block_number < BLOCKS_MIN or number <= STEPS_MIN:
             return
         times_ns = memory.times_ns[memory.first : end]
@@ -390,4 +406,4 @@ class Motion:
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown
         self.fast_limits = self.slow_limits = self._no_limits
-        self.early = self.sure = False
+        self.looked = self.early = self.sure = False

@@ -110,7 +110,7 @@ class Verdict(_Message, frozen=True, kw_only=True):
     a null `gate`."""
     motion: Motion | None = None
     """How each finger moves, in units of its own noise (1 where only noise moves it); null where it
-    is not known, and with a null `gate`."""
+    is not known, while nothing touches, and with a null `gate`."""
     motion_limits: Annotated[dict[Finger, Duration], _HAND] | None = None
     """What it is at most for a finger that is still."""
 

@@ -274,3 +274,19 @@ def test_where_sweeps_come_slowly_a_line_has_three_of_them_and_one_lies_before()
         motion.add(index * 100_000_000, counts[index], FINGER)
         known.append(motion.known)
     assert known[109:] == [True, False, False, False, True, True]
+
+
+@pytest.mark.parametrize("rate_hz", [1000 / 14, 100.0, 1000.0])
+def test_who_looks_late_sees_what_who_always_looked_sees(rate_hz: float) -> None:
+    always, late = Motion(1, 0.05), Motion(1, 0.05)
+    counts = np.rint(wavering(6.0, rate_hz, 4.0, 5)).astype(np.uint16)
+    for index, sweep in enumerate(counts):
+        t_ns, looked = round(index / rate_hz * 1e9), index > len(counts) // 2 and index % 7 < 3
+        always.add(t_ns, sweep, FINGER)
+        late.add(t_ns, sweep, FINGER, wanted=looked)
+        if looked:
+            assert late.known
+            assert (late.fast, late.slow) == (always.fast, always.slow)
+            assert (late.early, late.sure) == (always.early, always.sure)
+        elif rate_hz < 200.0:  # else it is what it was at the last step
+            assert (late.known, late.early, late.sure) == (False, False, False)
