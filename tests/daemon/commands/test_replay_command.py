@@ -404,6 +404,13 @@ def test_a_bad_recording_is_one_clear_line(tmp_path: Path, name: str) -> None:
     assert says in message
 
 
+def test_a_published_table_that_is_not_there_is_said_to_come_with_data(tmp_path: Path) -> None:
+    absent = graspd("replay", tmp_path / "palm_45.csv")
+    assert absent.returncode == 2
+    assert "no such file or directory; `graspd data` gets it" in absent.stderr
+    assert "graspd data" not in graspd("replay", tmp_path / "other.csv").stderr
+
+
 def test_the_end_of_the_reader_ends_the_replay_quietly() -> None:
     with start("replay") as process:
         assert process.stdout is not None
