@@ -86,6 +86,8 @@ def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift()
     # The bound of the rule, 0.05 N + 4.75, and nothing bought by silence.
     stable, slips = int(whole["own_stable"]), int(whole["own_slips"])
     assert slips <= 0.05 * stable + 4.75
+    most = int(0.05 * stable + 4.75)
+    assert f"at most {most} can, whatever drifts: 5 % of them, and 4.75 more" in text
     assert max(int(block["kept"]) for block in blocks) > 50
     # The verdicts are those that programs get.
     verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
