@@ -25,12 +25,8 @@ if TYPE_CHECKING:
     from daemon.judge.limits import GateLimits, GripLimits
     from daemon.measure.cost.tables import Footprint
 
-TACTILE_SECTIONS = (
-    scene_drivers.ReplayTactile,
-    scene_drivers.SpiTactile,
-    scene_drivers.CanTactile,
-    scene_drivers.PalmTactile,
-)
+TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
+"""Of each tactile driver, as a scene may name it."""
 
 WRONG, FAILED = 2, 1
 USUAL_PERIOD_NS = 10_000_000

@@ -36,6 +36,9 @@ LISTEN_S = 3.0
 LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
 WAIT_S = 0.02
 """Longest sleep between two looks at a driver, s."""
+SHORTEST_WAIT_S = 0.001
+"""Shortest one, s, where a driver should have been looked at already: it may ask for that on and
+on."""
 BRIDGE_NAME = "graspd"
 BRIDGE_VENDOR = 0x2E8A
 """Raspberry Pi, whose Pico the bridge's sketch is for. Only ports of this vendor, or with the name
@@ -216,7 +219,7 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         descriptors = [driver.fileno() for driver in drivers]
-        select.select([fd for fd in descriptors if fd is not None], [], [], WAIT_S)
+        select.select([fd for fd in descriptors if fd is not None], [], [], _sleep_s(drivers))
         for driver in drivers:
             for reading in driver.read_ready():
                 if isinstance(reading, TactileReading):
@@ -226,6 +229,13 @@ def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_
     if statistics.readings < 2:
         return listen_s
     return (last_s - first_s) * statistics.readings / (statistics.readings - 1)
+
+
+def _sleep_s(drivers: Sequence[Driver]) -> float:
+    """How long to wait for bytes, s: a recording has none, but a time for its next reading."""
+    dues_ns = [due_ns for driver in drivers if (due_ns := driver.due_ns()) is not None]
+    wait_s = min(((due_ns - time.monotonic_ns()) / 1e9 for due_ns in dues_ns), default=WAIT_S)
+    return min(max(wait_s, SHORTEST_WAIT_S), WAIT_S)
 
 
 def _with_electrodes(told: list[Finding], statistics: ElectrodeStatistics) -> list[Finding]:

@@ -30,12 +30,12 @@ from daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, Summary
 from daemon.scene import Scene, SceneError
 from daemon.scene.endpoints import check_endpoint, is_private
 from daemon.session.file import SessionFileError, load, statistics_of
-from drivers.base import Driver, DriverError
+from drivers.base import Driver, DriverError, RecordingError
 from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_DAY
 from drivers.recordings.csv_rows import columns_of
 from models import zoo
-from models.bts3 import FINGERS
+from models.bts3 import FINGERS, TABLES
 from models.contract import ModelError
 from models.runtime import TactileModel
 
@@ -161,11 +161,19 @@ def run(args: argparse.Namespace) -> int:
             return _replay(args, stop)
     except (SceneError, ModelError, DriverError, SessionFileError) as error:
         sys.stdout.flush()
-        complain(error)
+        complain(f"{error}{_where_from(error)}")
         return 2
     except PublishError as error:
         complain(error)
         return 1
+
+
+def _where_from(error: Exception) -> str:
+    """Where a recording comes from that is not there, if it is one of the published ones."""
+    if not isinstance(error, RecordingError) or error.path.exists():
+        return ""
+    published = error.path.name in {f"{table.name}.csv" for table in TABLES}
+    return "; `graspd data` gets it" if published else ""
 
 
 def _replay(args: argparse.Namespace, stop: StopSignal) -> int:

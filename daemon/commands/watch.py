@@ -160,7 +160,7 @@ def _page(hands: list[Watched], port: int) -> int:
     try:
         serve(hands, port)
     except OSError as error:
-        complain(f"cannot serve a page on port {port}: {error.strerror}")
+        complain(f"cannot serve a page on port {port}: {error.strerror}; --port takes another")
         return FAILED
     return 0
 

@@ -47,12 +47,16 @@ def socket_file(endpoint: str, binding: Binding) -> SocketFile | None:
     """The file of an `ipc://` endpoint, taken; None for others. Raises `PublishError`."""
     if not endpoint.startswith("ipc://"):
         return None  # for TCP the kernel refuses a second bind
+    path = Path(endpoint.removeprefix("ipc://"))
     try:
-        return SocketFile(Path(endpoint.removeprefix("ipc://")), binding.file_mode, binding.group)
+        return SocketFile(path, binding.file_mode, binding.group)
     except (OccupiedError, LookupError) as error:
         raise PublishError(f"cannot publish on {endpoint}: {error}") from None
     except OSError as error:
-        raise PublishError(f"cannot publish on {endpoint}: {error.strerror or error}") from error
+        why = error.strerror or str(error)
+        if isinstance(error, FileNotFoundError) and not path.parent.exists():
+            why = f"there is no folder {path.parent}; `graspd doctor SCENE` says who makes it"
+        raise PublishError(f"cannot publish on {endpoint}: {why}") from error
 
 
 class Peer(Protocol):

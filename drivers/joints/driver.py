@@ -53,14 +53,6 @@ class JointStreamDriver(DatagramDriver):
         self._reset()
         self.link.open(self.counters)
 
-    def fileno(self) -> int | None:
-        """The socket."""
-        return self.link.fileno()
-
-    def due_ns(self) -> int | None:
-        """When silence is to be noticed."""
-        return self.link.due_ns()
-
     def read_ready(self) -> Sequence[Reading]:
         """One reading per message that has arrived, oldest first."""
         readings: list[Reading] = []

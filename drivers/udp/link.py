@@ -224,6 +224,14 @@ class DatagramDriver(Opened):
         """Source, link, what is heard from whom; after `close` as it was then."""
         return self.link.describe()
 
+    def fileno(self) -> int | None:
+        """The socket."""
+        return self.link.fileno()
+
+    def due_ns(self) -> int | None:
+        """When silence is to be noticed."""
+        return self.link.due_ns()
+
     def close(self) -> None:
         """Release the socket."""
         self.link.close()

@@ -373,10 +373,10 @@ def test_a_name_that_is_no_word_of_an_outcome_is_not_sent(
     lift_gate: Path, tmp_path: Path, name: str
 ) -> None:
     with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
-        with pytest.raises(ValueError, match="no name of an object"):
+        with pytest.raises(ValueError, match="no name of an object: 1 to 64 ASCII letters, "):
             told_in_python(tmp_path, name)
         code, text = told_in_cpp(lift_gate, tmp_path, BOOT, "42", "slip", name)
-        assert (code, "no name of an object" in text) == (2, True)
+        assert (code, "no name of an object" in text, "1 to 64 ASCII" in text) == (2, True, True)
     assert found == []
 
 

@@ -391,7 +391,8 @@ inline std::string telling(const Verdict& lifted_on, Outcome how, const std::str
         return plain || (&c != object_name.data() && (c == '-' || c == '.'));
     };
     if (object_name.size() > OBJECT_MAX || !std::all_of(object_name.begin(), object_name.end(), fits))
-        throw std::invalid_argument("no name of an object: " + object_name);
+        throw std::invalid_argument("no name of an object: 1 to 64 ASCII letters, digits, _, -, ., the "
+                                    "first no - and no .: " + object_name);
     return told + ' ' + object_name;
 }
 

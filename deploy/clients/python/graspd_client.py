@@ -73,6 +73,7 @@ WARN_EVERY = 10  # lifts whose outcome was never told
 _WITHHELD = {"unproven", "low-confidence"}
 # Name of an object, as the daemon takes it.
 _OBJECT = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{OBJECT_MAX - 1}}}")
+_OBJECT_IS = f"1 to {OBJECT_MAX} ASCII letters, digits, _, -, ., the first no - and no ."
 
 log = logging.getLogger("graspd_client")
 
@@ -801,7 +802,7 @@ def _telling(lifted_on: Verdict, how: Outcome, object_name: str | None) -> bytes
     words = ["outcome", boot_id, str(grasp), how.value]
     if object_name is not None:
         if _OBJECT.fullmatch(object_name) is None:
-            raise ValueError(f"{object_name!r} is no name of an object")
+            raise ValueError(f"{object_name!r} is no name of an object: {_OBJECT_IS}")
         words.append(object_name)
     return " ".join(words).encode()
 

@@ -180,6 +180,12 @@ def test_the_doctor_says_that_a_port_is_not_there(tmp_path: Path) -> None:
     assert str(tmp_path / "bridge") in result.stdout
 
 
+def test_the_doctor_takes_a_recording_at_its_own_rate() -> None:
+    scene = Path(__file__).parents[3] / "deploy" / "scenes" / "demo.toml"
+    report = json.loads(graspd("doctor", scene, "--listen", 2, "--json").stdout)
+    assert report["readings"] > 150, "of 200 that the demo has in two seconds"
+
+
 def test_the_doctor_without_a_scene_looks_at_the_computer() -> None:
     result = graspd("doctor", "--listen", 0.3, "--json")
     assert result.returncode in (0, 1)

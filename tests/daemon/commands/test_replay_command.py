@@ -86,6 +86,8 @@ def test_the_demo_shows_what_stable_is_worth_by_both_methods_on_a_day_of_drift()
     # The bound of the rule, 0.05 N + 4.75, and nothing bought by silence.
     stable, slips = int(whole["own_stable"]), int(whole["own_slips"])
     assert slips <= 0.05 * stable + 4.75
+    most = int(0.05 * stable + 4.75)
+    assert f"at most {most} can, whatever drifts: 5 % of them, and 4.75 more" in text
     assert max(int(block["kept"]) for block in blocks) > 50
     # The verdicts are those that programs get.
     verdicts = [decode_verdict(line.encode()) for line in program.stdout.splitlines()]
@@ -402,6 +404,13 @@ def test_a_bad_recording_is_one_clear_line(tmp_path: Path, name: str) -> None:
     (message,) = result.stderr.splitlines()
     assert message.startswith(f"graspd: {recording}")
     assert says in message
+
+
+def test_a_published_table_that_is_not_there_is_said_to_come_with_data(tmp_path: Path) -> None:
+    absent = graspd("replay", tmp_path / "palm_45.csv")
+    assert absent.returncode == 2
+    assert "no such file or directory; `graspd data` gets it" in absent.stderr
+    assert "graspd data" not in graspd("replay", tmp_path / "other.csv").stderr
 
 
 def test_the_end_of_the_reader_ends_the_replay_quietly() -> None:

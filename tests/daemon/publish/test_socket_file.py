@@ -136,7 +136,7 @@ def test_a_lock_file_that_is_not_ours_is_left_as_it_is(tmp_path: Path, kind: str
 @pytest.mark.parametrize(
     ("path", "says"),
     [
-        ("absent/v", "No such file or directory"),
+        ("absent/v", "there is no folder .*/absent; `graspd doctor SCENE` says who makes it"),
         ("file/v", "Not a directory"),
         (".", "is there and is no socket"),
         ("x" * 200, "AF_UNIX path too long"),

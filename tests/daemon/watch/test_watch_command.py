@@ -370,7 +370,9 @@ def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
         port = taken.getsockname()[1]
         result = graspd("watch", "--connect", endpoint, "--web", "--port", port)
     assert result.returncode == 1
-    assert f"cannot serve a page on port {port}: Address already in use" in result.stderr
+    assert f"cannot serve a page on port {port}: Address already in use; --port takes another" in (
+        result.stderr
+    )
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
