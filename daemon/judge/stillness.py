@@ -186,16 +186,6 @@ class Motion:
             for moves, limit in zip(self.slow, self.slow_limits, strict=True)
         )
 
-    @property
-    def motion(self) -> NDArray[np.float64]:
-        """`fast` and `slow`, shape (2, fingers)."""
-        return np.array((self.fast, self.slow))
-
-    @property
-    def limits(self) -> NDArray[np.float64]:
-        """Their limits, shape (2, fingers)."""
-        return np.array((self.fast_limits, self.slow_limits))
-
     def reset(self) -> None:
         """Forget the motion: what comes next does not continue what came before."""
         memory = self.memory

@@ -36,6 +36,11 @@ def fed(motion: Motion, counts: NDArray[np.float64], rate_hz: float, begin_ns: i
     return begin_ns + round(len(counts) / rate_hz * 1e9)
 
 
+def moves(motion: Motion) -> NDArray[np.float64]:
+    """How each finger moves in the short and in the long window, shape (2, fingers)."""
+    return np.array((motion.fast, motion.slow))
+
+
 @pytest.mark.parametrize("share", [0.4, 0.05, 0.017, 0.0017, 1e-6])
 def test_tails_are_those_of_a_gaussian(share: float) -> None:
     assert upper_tail(share) == pytest.approx(norm.isf(share), abs=0.0005)
@@ -61,9 +66,9 @@ def test_motion_is_slope_and_spread_over_what_noise_makes_of_them(
     slopes = np.polyfit(times[short], counts[short, 0], 1)[0]
     extent = ((times[short] - times[short].mean()) ** 2).sum()
     by_noise = np.sqrt(2 / np.pi) * sigma / np.sqrt(extent)
-    assert motion.motion[0, 0] == pytest.approx(np.abs(slopes).mean() / by_noise, rel=0.07)
+    assert motion.fast[0] == pytest.approx(np.abs(slopes).mean() / by_noise, rel=0.07)
     spread = np.sqrt(counts[long, 0].var(axis=0, ddof=1).mean())
-    assert motion.motion[1, 0] == pytest.approx(spread / sigma, rel=0.07)
+    assert motion.slow[0] == pytest.approx(spread / sigma, rel=0.07)
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.1, 61), (0.05, 66), (0.01, 77)])
@@ -79,7 +84,7 @@ def test_the_limit_is_the_quantile_of_the_slopes_of_real_held_touches(
     fed(motion, counts, 100.0)
     windows = np.lib.stride_tricks.sliding_window_view(counts[:, 0], 10, axis=0)
     noise = np.abs(np.polyfit(0.01 * np.arange(10), windows.reshape(-1, 10).T, 1)[0]).mean()
-    assert motion.limits[0, 0] * noise == pytest.approx(expected, rel=0.12)
+    assert motion.fast_limits[0] * noise == pytest.approx(expected, rel=0.12)
 
 
 def shares(sliding: list[bool], sampling: Sampling) -> tuple[float, float]:
@@ -133,7 +138,7 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     known = []
     for index, sweep in enumerate(np.rint(counts).astype(np.uint16)):
         motion.add(index * 10_000_000, sweep, FINGER)
-        known.append(bool(np.isfinite(motion.motion).all()))
+        known.append(bool(np.isfinite(moves(motion)).all()))
     # Four blocks of 24 differences over three sweeps.
     assert known.index(True) == 4 * 24 + 3 - 1
     motion.reset()
@@ -142,25 +147,25 @@ def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_
     fast = []
     for index in range(30):
         motion.add(10**10 + index * 10_000_000, np.rint(counts[index]).astype(np.uint16), FINGER)
-        fast.append(tuple(np.isfinite(motion.motion[:, 0]).tolist()))
+        fast.append(tuple(np.isfinite((motion.fast[0], motion.slow[0])).tolist()))
         assert motion.known == fast[-1][0]
     # The first sweep that is 100 ms older than another is the 11th; that is 240 ms older, the 25th.
     assert fast == [(False, False)] * 10 + [(True, False)] * 14 + [(True, True)] * 6
     motion.forget()
     fed(motion, counts[:90], 100.0, 2 * 10**10)
-    assert not np.isfinite(motion.motion).any()
+    assert not np.isfinite(moves(motion)).any()
 
 
 def test_fast_motion_is_no_noise_and_is_excluded_soon_after_it_ends() -> None:
     motion, rate_hz = Motion(1, 0.05, early=True), 100.0
     begin_ns = fed(motion, wavering(2.0, rate_hz, 3.5, 5), rate_hz)
-    before = motion.limits.copy()
+    before = motion.fast_limits, motion.slow_limits
     closing = wavering(0.5, rate_hz, 3.5, 6) - 900.0 * np.linspace(0, 1, 50)[:, None, None]
     begin_ns = fed(motion, closing, rate_hz, begin_ns)
     assert not motion.early
     assert not motion.sure
-    assert (motion.motion[:, 0] > 20.0).all()
-    np.testing.assert_allclose(motion.limits, before, rtol=0.1)
+    assert min(motion.fast[0], motion.slow[0]) > 20.0
+    np.testing.assert_allclose((motion.fast_limits, motion.slow_limits), before, rtol=0.1)
     begin_ns = fed(motion, wavering(0.09, rate_hz, 3.5, 7) - 900.0, rate_hz, begin_ns)
     assert motion.early
     assert not motion.sure
@@ -182,18 +187,18 @@ def test_motion_after_long_stillness_is_seen_by_the_short_window_first() -> None
 def test_a_spike_is_no_motion_though_it_is_held(repeats: int) -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(2.5, 100.0, 3.5, 11)
     fed(motion, counts, 100.0)
-    expected = motion.motion.copy()
+    expected = moves(motion)
     motion = Motion(1, 0.05, early=True)
     spiked = counts.copy()
     spiked[-1 - repeats : -1, 0, :3] = counts[-1 - repeats, 0, :3] - 120.0
     fed(motion, spiked, 100.0)
     # Three of 24 electrodes read for one sweep or two what they read before.
-    np.testing.assert_allclose(motion.motion, expected, rtol=0.12)
+    np.testing.assert_allclose(moves(motion), expected, rtol=0.12)
     # What stays down has fallen.
     spiked[-6:, 0] -= 120.0
     motion = Motion(1, 0.05, early=True)
     fed(motion, spiked, 100.0)
-    assert (motion.motion > 5.0).all()
+    assert (moves(motion) > 5.0).all()
 
 
 def test_an_electrode_that_jumps_and_stays_has_moved_however_constant_it_is() -> None:
@@ -214,8 +219,8 @@ def test_electrodes_that_are_lost_for_longer_tell_nothing_until_a_window_has_pas
             usable[0, :13] = False
             sweep[0, :13] = 4095
         motion.add(index * 10_000_000, sweep, usable)
-        known.append(tuple(np.isfinite(motion.motion[:, 0]).tolist()))
-        assert not known[-1][1] or motion.motion[1, 0] < 1.5
+        known.append(tuple(np.isfinite((motion.fast[0], motion.slow[0])).tolist()))
+        assert not known[-1][1] or motion.slow[0] < 1.5
     # Three sweeps in a row are bridged, a fourth is not: eleven electrodes are too few to know that
     # a finger is still, for as long as a window goes back to it.
     assert set(known[110:203]) == {(True, True)}
@@ -230,7 +235,7 @@ def test_each_finger_is_measured_by_its_own_noise() -> None:
         sweep = np.rint(2000.0 + random.normal(0.0, sigmas, (3, 24))).astype(np.uint16)
         motion.add(index * 10_000_000, sweep, HAND)
         if index > 500:
-            found.append(motion.motion)
+            found.append(moves(motion))
     # Noise alone makes 1 of all of them.
     np.testing.assert_allclose(np.mean(found, axis=0), 1.0, atol=0.035)
 
@@ -247,7 +252,7 @@ def test_a_finger_that_is_lost_as_a_whole_is_not_known_and_no_error() -> None:
     motion, counts = Motion(1, 0.05), np.rint(wavering(2.0, 100.0, 3.5, 15)).astype(np.uint16)
     for index, sweep in enumerate(counts):
         motion.add(index * 10_000_000, sweep, FINGER if index < 150 else ~FINGER)
-    assert np.isinf(motion.motion).all()
+    assert np.isinf(moves(motion)).all()
     assert not motion.sure
 
 
@@ -261,7 +266,7 @@ def test_no_finger_may_waver_so_much_that_motion_passes_for_noise() -> None:
     motion = Motion(1, 0.05)
     fed(motion, wavering(4.0, 100.0, 20.0, 16), 100.0)
     # Twice the 10 counts that are believed to be noise.
-    assert motion.motion[1, 0] == pytest.approx(2.0, rel=0.15)
+    assert motion.slow[0] == pytest.approx(2.0, rel=0.15)
     assert not motion.sure
 
 

@@ -40,7 +40,9 @@ def seen(counts_per_s: float, rate_hz: float, *, early: bool, false_alarms: floa
         for index, counts in enumerate(stream):
             motion.add(round(index / rate_hz * 1e9), counts, FINGER)
             if index / rate_hz > rest_s + 0.3 and index % 5 == 0:
-                found.append(motion.motion[:, 0] > motion.limits[:, 0])
+                found.append(
+                    (motion.fast[0] > motion.fast_limits[0], motion.slow[0] > motion.slow_limits[0])
+                )
     shares: list[float] = np.mean(found, axis=0).tolist()
     return shares
 
