@@ -435,3 +435,16 @@ def test_motion_is_told_as_soon_as_one_window_knows_it_and_of_the_one_nearer_to_
     assert known[0.15][0] > 2.0 * known[0.15][1]
     assert 1.0 < known[0.79][1] < 1.4
     assert known[1.12][1] > 1.4
+
+
+def test_nobody_looks_for_motion_while_nothing_touches() -> None:
+    firm, none = Scenario("firm", GRASPED, UP), Watched((), ~ALL)
+    grip, touched, looked = Grip(FINGERS, LIMITS), [], []
+    for _, reading in readings(firm):
+        grip.observe(reading, none)
+        felt = grip.felt(None)
+        assert felt.motion is not None
+        touched.append(bool(grip.touching))
+        looked.append(any(now is not None for now in felt.motion.values()))
+    assert looked == touched
+    assert {*looked} == {False, True}
