@@ -6,10 +6,8 @@ and `models` are names that others have too, and what is imported is the first t
 
 from __future__ import annotations
 
+import gc
 import sys
-from base64 import urlsafe_b64encode
-from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, distribution, packages_distributions
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -20,6 +18,7 @@ WRONG = 2
 
 def main() -> int:
     """Run the command line; 2 and one line on stderr if another package is in the way of ours."""
+    gc.disable()  # until all is loaded: see `daemon.__main__`
     problem = clash()
     if problem is not None:
         sys.stderr.write(f"graspd: {problem}\n")
@@ -31,6 +30,8 @@ def main() -> int:
 
 def clash() -> str | None:
     """Which package is in the way of one of ours, and what to do; None if all is well."""
+    from importlib.metadata import packages_distributions
+
     for name, file in OURS.items():
         spec = find_spec(name)
         if spec is None or spec.origin is None:
@@ -52,6 +53,10 @@ def clash() -> str | None:
 
 def _was_replaced(init: Path, name: str) -> bool:
     """Whether an `__init__.py` is another than was installed; of a checkout nobody knows."""
+    from base64 import urlsafe_b64encode
+    from hashlib import sha256
+    from importlib.metadata import PackageNotFoundError, distribution
+
     try:
         record = distribution("graspd").read_text("RECORD") or ""
     except PackageNotFoundError:

@@ -1,6 +1,6 @@
 """Sections of a scene that name a driver: `[tactile]` and `[joints]`."""
 
-from __future__ import annotations
+# Annotations are no texts here: pydantic would evaluate each anew, at every start.
 
 import ipaddress
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """The scene: one TOML file that says what this hand has and how to judge with it."""
 
-from __future__ import annotations
+# Annotations are no texts here, as in `daemon.scene.drivers`.
 
 from collections.abc import Mapping
 from pathlib import Path
