@@ -21,6 +21,7 @@ from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Reason
 from daemon.process.extras import needs
 from daemon.process.text import complain, printable
+from daemon.run.replaying import trained_on
 from daemon.scene import drivers as scene_drivers
 from daemon.session.file import (
     KeptSession,
@@ -206,6 +207,11 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         f"{printable(str(wanted.session_path))}: {grasps} grasps of {read} readings taken in, "
         f"{outcomes} outcomes learned\n"
     )
+    if known := trained_on(recordings, model):
+        complain(
+            f"warning: the model was trained on {', '.join(known)}: it judges other grasps worse, "
+            "so what these outcomes taught promises too much; better seed with other grasps"
+        )
 
 
 def _learned_before(file: SessionFile) -> TrustState | None:

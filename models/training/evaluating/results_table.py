@@ -103,7 +103,9 @@ def _systems(found: Found) -> Iterator[str]:
     yield "## 2. All systems, all protocols"
     yield (
         f"In `session`, systems with session calibration have seen {HEADLINE[1:]} unlabelled "
-        "grasps of other objects of that session, the others none."
+        "grasps of other objects of that session, the others none. `parameters` are those of the "
+        "protocol where they are most: a support vector machine, a forest or boosting has as many "
+        "as its grasps ask for, so a run of fewer protocols may show fewer."
     )
     rows = []
     for name in SYSTEMS:

@@ -12,6 +12,7 @@ import msgspec
 from models.bts3 import CITATIONS, LICENCE, REPOSITORY
 from models.contract import Dataset, ModelContract
 from models.training.data.datasets import Grasps, lab_table_names, unpublished
+from models.training.data.lab_tables import ENOUGH_GRASPS
 from models.training.estimators.graphs import OPSET
 from models.training.evaluating.broken import Study
 from models.training.evaluating.day_figures import DayFigures
@@ -192,3 +193,9 @@ def _own_data(grasps: Grasps, own: Sequence[str], summaries: Sequence[Summary]) 
         yield "The figures of another day are of the published tables alone."
     else:
         yield "What it is worth on another day than those of its data was not measured."
+    if len(grasps) < ENOUGH_GRASPS:
+        yield (
+            f"{len(grasps)} grasps, {int(grasps.slipped.sum())} of which slipped, are few: the "
+            "daemon takes many others for unlike the training, and calls them unknown; "
+            f"{ENOUGH_GRASPS} are enough."
+        )

@@ -225,6 +225,7 @@ def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
         "The data is of 2 objects in 1 table, of which lab is not published.",
         "What it is worth on another day than those of its data was not measured.",
     ]
+    assert card["weak_points"][3].startswith("20 grasps, 10 of which slipped, are few: the daemon")
     assert capsys.readouterr().err.startswith("graspd train: warning: 20 grasps are few")
 
 
