@@ -73,7 +73,7 @@ class Annotation:
     """How the lift ended: True slip, False stable, None not recorded."""
 
 
-class TactileReading(msgspec.Struct, frozen=True, eq=False):
+class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """One sweep over all electrodes of all fingers of a hand."""
 
     t_ns: int
@@ -102,7 +102,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False):
             raise ValueError(f"faults {self.faults.shape} do not fit counts {self.counts.shape}")
 
 
-class JointReading(msgspec.Struct, frozen=True, eq=False):
+class JointReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Joint angles of a hand at one time."""
 
     t_ns: int

@@ -93,8 +93,10 @@ class SweepDecoder:
         self._source = np.full((len(sensors), ELECTRODES), samples, dtype=np.intp)
         for row, sensor in enumerate(sensors):
             self._source[row, columns[:, 1]] = columns[:, 0] * hello.sensors + sensor
-        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.uint16)
+        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.intp)
         self._is_sampled = self._source < samples
+        self._sound = bytes(self._source.size)
+        """Faults of a reading without any."""
         self._shape = (hello.slots, hello.sensors)
         self._all_present = sum(1 << sensor for sensor in set(sensors))
 
@@ -124,7 +126,8 @@ class SweepDecoder:
             return None
         if not self._is_next(sweep):
             return None
-        self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
+        if sweep.tick_end - sweep.tick_start > self.longest_ticks:
+            self.longest_ticks = sweep.tick_end - sweep.tick_start
         faults, fallbacks = self.clock.faults, self.clock.fallbacks
         t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
         self._counters.clock_faults += self.clock.faults - faults
@@ -167,7 +170,7 @@ class SweepDecoder:
         counters = self._counters
         counters.readings += 1
         counters.absent_sensors += len(absent)
-        if not np.count_nonzero(faults):
+        if faults.tobytes() == self._sound:
             return
         counters.faulty_readings += 1
         read = self._is_sampled.copy()
