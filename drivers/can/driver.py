@@ -190,7 +190,9 @@ class CanBridgeDriver(Opened):
         self.stream.lost(why, self._clock())
 
     def _count(self, stamped: Sequence[Stamped]) -> None:
-        frames = sum(not frame.flags & LOST for frame, _, _ in stamped)
+        frames = len(stamped)
+        if self._bus.kernel_drops:
+            frames -= sum(frame.flags == LOST for frame, _, _ in stamped)
         now_ns = self._clock()
         self._poll_due_ns = now_ns + (0 if self._bus.more else POLL_NS)
         self._resting_until_ns = self._rest(now_ns)

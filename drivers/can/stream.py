@@ -29,6 +29,8 @@ SILENCE_PERIODS: Final = 10
 """Readings that may be missing before the link is down."""
 SILENCE_MIN_NS: Final = 100_000_000
 """Shortest silence that is one, ns: above what an adapter or a busy host holds back."""
+_SPECIAL: Final = ERROR | REMOTE | LOST
+"""Flags of what is no data frame."""
 
 
 class BoardOptions(TypedDict, total=False):
@@ -121,7 +123,7 @@ class CanStream:
         readings: list[Reading] = []
         trouble = None
         for frame, t_ns, until_ns in frames:
-            if not frame.flags & (ERROR | REMOTE | LOST):
+            if not frame.flags & _SPECIAL:
                 readings += self._decoder.push(frame, t_ns, until_ns)
                 continue
             trouble = self._take_special(frame) or trouble
