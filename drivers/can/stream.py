@@ -22,7 +22,7 @@ from drivers.can.frames import (
     is_overflow,
 )
 from drivers.can.readings import CanCounters
-from drivers.link import Link, LinkState
+from drivers.link import GREETING, UP, Link
 
 NAME: Final = "can"
 SILENCE_PERIODS: Final = 10
@@ -105,7 +105,7 @@ class CanStream:
     @property
     def silent_at_ns(self) -> int | None:
         """When silence is to be noticed; None while the link is not up."""
-        return self._silent_at_ns if self.link.state is LinkState.UP else None
+        return self._silent_at_ns if self.link.state is UP else None
 
     def describe(self) -> dict[str, str]:
         """Bus, link and why it is not up, and whose frames are taken, for people."""
@@ -139,9 +139,9 @@ class CanStream:
         if self.counters.accepted_frames > self._accepted:
             self._accepted = self.counters.accepted_frames
             self._silent_at_ns = now_ns + self._silence_ns()
-            if self.link.state is LinkState.GREETING:
+            if self.link.state is GREETING:
                 self.link.up(self._where, now_ns)
-        elif self.link.state is LinkState.UP and now_ns >= self._silent_at_ns and not more:
+        elif self.link.state is UP and now_ns >= self._silent_at_ns and not more:
             self._down(f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms", now_ns)
             self.link.greeting()
 

@@ -214,8 +214,8 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
         )
         if not sound:
             return None
-        words = np.frombuffer(payload, _WORD, -1, _SWEEP.size)
-        return cls(seq, tick_start, tick_end, present, words.reshape(slots, sensors))
+        words = np.ndarray((slots, sensors), _WORD, payload, _SWEEP.size)
+        return cls(seq, tick_start, tick_end, present, words)
 
 
 @dataclass(frozen=True, slots=True)

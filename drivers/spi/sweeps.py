@@ -97,7 +97,7 @@ class SweepDecoder:
         self._is_sampled = self._source < samples
         self._sound = bytes(self._source.size)
         """Faults of a reading without any."""
-        self._shape = (hello.slots, hello.sensors)
+        self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
         self._all_present = sum(1 << sensor for sensor in set(sensors))
 
     def fits(self, hello: Hello) -> bool:
@@ -121,7 +121,7 @@ class SweepDecoder:
 
         `idle_ns` is when nothing was waiting to be read for the last time before its arrival.
         """
-        if sweep.words.shape != self._shape:
+        if sweep.words.shape != self._sweep.shape:
             self._counters.bad_frames += 1
             return None
         if not self._is_next(sweep):
@@ -155,7 +155,7 @@ class SweepDecoder:
 
     def _counts_and_faults(self, sweep: Sweep) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
-        self._words[:-1] = sweep.words.ravel()
+        self._sweep[...] = sweep.words
         counts, faults = decode_words(self._words[self._source])
         absent: list[int] = []
         if sweep.present & self._all_present != self._all_present:
