@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -137,7 +136,7 @@ class DriverCounters:
 
     def as_dict(self) -> dict[str, int]:
         """All counters by name, for the status message."""
-        return dataclasses.asdict(self)
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
 class Opened(ABC):
