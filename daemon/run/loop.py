@@ -18,7 +18,7 @@ from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.overload import Overload, after
-from daemon.run.selector import ExactSelector, Selector
+from daemon.run.selector import ExactSelector
 from daemon.trust.ledger import GraspId
 from drivers.base import Driver, JointReading, Reading, TactileReading
 
@@ -45,6 +45,9 @@ class Ended(Enum):
     """The scene is to be read again."""
     SLEPT = "slept"
     """The computer has slept: what is known of the hand is from before, however fresh it looks."""
+
+
+Selector = ExactSelector | selectors.BaseSelector
 
 
 @dataclass(frozen=True, slots=True)

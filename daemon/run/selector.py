@@ -6,10 +6,6 @@ import ctypes
 import os
 import select
 import time
-from typing import TYPE_CHECKING, Protocol
-
-if TYPE_CHECKING:
-    from _typeshed import FileDescriptorLike
 
 NS_PER_S = 1_000_000_000
 ABSOLUTE = 1
@@ -17,22 +13,6 @@ ABSOLUTE = 1
 
 Ready = list[tuple[int, int]]
 """Descriptors and what they are ready for, as poll(2) says it."""
-
-
-class Selector(Protocol):
-    """What the loop wants of a `selectors.BaseSelector`; what is ready it finds out by itself."""
-
-    def register(self, fileobj: FileDescriptorLike, events: int, /) -> object:
-        """Wait for this descriptor too; `events` is `selectors.EVENT_READ`."""
-
-    def unregister(self, fileobj: FileDescriptorLike, /) -> object:
-        """Wait for it no longer. Raises `KeyError` if it was not registered."""
-
-    def select(self, timeout: float | None = None, /) -> object:
-        """Return once anything is ready, after `timeout` s at the latest; None: no limit."""
-
-    def close(self) -> None:
-        """Close it, but none of the descriptors that were registered."""
 
 
 class _TimerSpec(ctypes.Structure):
@@ -58,6 +38,7 @@ class ExactSelector:
     def __init__(self) -> None:
         """Where the process has no descriptor left for the timer, waits are whole milliseconds."""
         self._poll = select.poll()
+        self.register, self.unregister = self._poll.register, self._poll.unregister
         libc = ctypes.CDLL(None)
         self._set = libc.timerfd_settime
         self._set.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
@@ -67,14 +48,6 @@ class ExactSelector:
         self._timer: int = libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._timer >= 0:
             self._poll.register(self._timer, select.POLLIN)
-
-    def register(self, fileobj: FileDescriptorLike, events: int) -> None:
-        """Wait for this descriptor too; `events` is `selectors.EVENT_READ`."""
-        self._poll.register(fileobj, events)
-
-    def unregister(self, fileobj: FileDescriptorLike) -> None:
-        """Wait for it no longer. Raises `KeyError` if it was not registered."""
-        self._poll.unregister(fileobj)
 
     def select(self, timeout: float | None = None) -> Ready:
         """What is ready, once anything is, after `timeout` s at the latest; None: no limit."""

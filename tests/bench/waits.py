@@ -11,7 +11,8 @@ from contextlib import closing
 
 import numpy as np
 
-from daemon.run.selector import ExactSelector, Selector
+from daemon.run.loop import Selector
+from daemon.run.selector import ExactSelector
 from tests.bench.live import table
 
 DESCRIPTORS = 12
