@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -73,7 +72,7 @@ class Annotation:
     """How the lift ended: True slip, False stable, None not recorded."""
 
 
-class TactileReading(msgspec.Struct, frozen=True, eq=False):
+class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """One sweep over all electrodes of all fingers of a hand."""
 
     t_ns: int
@@ -102,7 +101,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False):
             raise ValueError(f"faults {self.faults.shape} do not fit counts {self.counts.shape}")
 
 
-class JointReading(msgspec.Struct, frozen=True, eq=False):
+class JointReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Joint angles of a hand at one time."""
 
     t_ns: int
@@ -137,7 +136,7 @@ class DriverCounters:
 
     def as_dict(self) -> dict[str, int]:
         """All counters by name, for the status message."""
-        return dataclasses.asdict(self)
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
 class Opened(ABC):

@@ -7,7 +7,7 @@ SynTouch where the manual is silent.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,14 +90,14 @@ def encode_word(count: int) -> int:
 
 
 def decode_words(
-    words: NDArray[np.uint16],
+    words: NDArray[np.integer[Any]],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Counts and `ElectrodeFault` bits of response words, in the shape of `words`.
 
-    A word with a fault has the count 0. Words are the 16 bits as sent, first byte high.
+    A word with a fault has the count 0. Words are the 16 bits as sent, first byte high, soonest
+    decoded as `np.intp`.
     """
-    at = words.astype(np.intp)  # once for both tables
-    return _COUNTS.take(at), _FAULTS.take(at)
+    return _COUNTS[words], _FAULTS[words]
 
 
 def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:

@@ -28,6 +28,10 @@ class LinkState(StrEnum):
     """Readings can come."""
 
 
+CLOSED, WAITING, GREETING, UP = LinkState
+"""Asked for several times a reading: a class of an enumeration takes longer to look them up."""
+
+
 class Link:
     """State and retry schedule of one link. Does no I/O; times are monotonic ns.
 

@@ -31,8 +31,8 @@ class Sleep:
         self._clock = clock
         self._boot_clock = boot_clock
         # In this order a look that the scheduler interrupts takes no sleep for granted.
-        self._apart_ns = max(boot_clock() - clock() for _ in range(LOOKS))
+        self._slept_from_ns = SLEPT_NS + max(boot_clock() - clock() for _ in range(LOOKS))
 
     def has_slept(self) -> bool:
         """True once the computer has slept. Takes a microsecond."""
-        return self._boot_clock() - self._clock() - self._apart_ns > SLEPT_NS
+        return self._boot_clock() - self._clock() > self._slept_from_ns

@@ -24,7 +24,8 @@ class Deadlines:
 
     def add(self, reading: TactileReading, age_ms: float, period_ns: int | None) -> None:
         """Count a reading, answered `age_ms` after its last byte, of a driver with this period."""
-        self.worst_age_ms = max(self.worst_age_ms, age_ms)
+        if age_ms > self.worst_age_ms:
+            self.worst_age_ms = age_ms
         if period_ns is not None:
             self.late += age_ms * 1e6 > period_ns
             elapsed_ns = reading.t_ns - self._last_ns

@@ -38,7 +38,7 @@ DECISION_CODE: dict[Decision, Literal[0, 1, 2]] = {
 """The same as a number, because plotting tools draw numbers and skip text."""
 
 
-class _Message(msgspec.Struct, frozen=True, kw_only=True):
+class _Message(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """How every message begins; what `t_mono_ns` is the time of, each says itself."""
 
     v: Literal[1] = WIRE_VERSION

@@ -21,9 +21,11 @@ from daemon.publish.peer import SHARE_BYTES, PlainPeer
 from daemon.publish.socket_file import BACKLOG, SocketFile
 from daemon.publish.zmtp import (
     GREETING,
+    MORE,
     Message,
     Role,
     ZmtpError,
+    frame,
     message,
 )
 
@@ -90,7 +92,7 @@ class PlainDoor(Door):
 
     def receive(self) -> Sequence[tuple[Peer, Message]]:
         """What peers have sent: some of it, so that a flood does not hold up readings."""
-        if not self.is_open:
+        if self._epoll.closed:
             return ()
         if self._strangers or self._waiting or self._listen_due_ns:
             self._see_to_time(time.monotonic_ns())
@@ -221,7 +223,7 @@ class PlainDoor(Door):
         audience = self._who_wants(topic)
         if not audience:
             return True
-        data = message((topic, payload))
+        data = frame(topic, MORE) + frame(payload)
         taken = True
         for peer in audience:
             if to is None or peer in to:

@@ -72,7 +72,8 @@ class Publisher(Bound):
         if topic.startswith(REPEATED):
             self._last[topic] = (payload, self._clock())
             self._owed.pop(topic, None)  # this one is newer
-        self._counted["queues_full"] += not self.door.publish(topic, payload)
+        if not self.door.publish(topic, payload):
+            self._counted["queues_full"] += 1
 
     def take(self) -> None:
         """See who has subscribed, and repeat the last messages for them."""

@@ -148,7 +148,7 @@ class Sockets(Companion):
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Answer those who have waited too long for a better answer."""
-        if self.questions is not None:
+        if self.questions is not None and self.questions.waiting:
             grasp = GraspId(verdict.boot_id, verdict.grasp)
             self.questions.answer(payload, self._clock(), grasp)
 

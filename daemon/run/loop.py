@@ -5,6 +5,7 @@ from __future__ import annotations
 import selectors
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal
@@ -46,6 +47,9 @@ class Ended(Enum):
     """The computer has slept: what is known of the hand is from before, however fresh it looks."""
 
 
+Selector = ExactSelector | selectors.BaseSelector
+
+
 @dataclass(frozen=True, slots=True)
 class Timing:
     """What the loop knows of time."""
@@ -58,7 +62,7 @@ class Timing:
     """Says whether the computer has slept."""
     rest: Callable[[float], None] = time.sleep
     """Has the kernel put this thread to sleep, s."""
-    selector: Callable[[], selectors.BaseSelector] = ExactSelector
+    selector: Callable[[], Selector] = ExactSelector
     """Makes what waits for descriptors."""
 
 
@@ -114,7 +118,7 @@ class Loop:
         now_ns = self._clock()
         self._overload = Overload(now_ns, live=self._tactile.live, sleep=timing.rest)
         self._last_t_ns = now_ns
-        self._silence_due_ns = now_ns + self._silence_ns()
+        self._silence_due_ns = now_ns + self._silence_ns(self._tactile.period_ns)
         self._status_due_ns = now_ns + STATUS_PERIOD_NS
         self._status_at_ns = now_ns
         self._readings_since_status = 0
@@ -125,7 +129,7 @@ class Loop:
         Raises `DriverError` if a driver gives up. Call `close` when it is not to go on.
         """
         self._watched = []
-        with self._new_selector() as selector:
+        with closing(self._new_selector()) as selector:
             selector.register(self._stop, selectors.EVENT_READ)
             while self._stop.received is None:
                 if self._tactile.exhausted:
@@ -179,7 +183,7 @@ class Loop:
         for keep in self._keep:
             keep(answer)
 
-    def _go_round(self, selector: selectors.BaseSelector) -> None:
+    def _go_round(self, selector: Selector) -> None:
         # Now, and not when the descriptors say so: sending quietens them.
         for before_wait in self._before_wait:
             before_wait(self)
@@ -198,7 +202,7 @@ class Loop:
             on_answer(verdict, payload)
         return Ended.SLEPT
 
-    def _wait(self, selector: selectors.BaseSelector) -> None:
+    def _wait(self, selector: Selector) -> None:
         """Sleep until a driver, a timer, a companion or a signal wants attention."""
         wanted = [fd for driver in self._drivers if (fd := driver.fileno()) is not None]
         for filenos in self._filenos:
@@ -292,9 +296,10 @@ class Loop:
         judgement = self._pipeline.judge(reading)
         if self._sleep.has_slept():
             return False
-        silence_ns = self._silence_ns()
+        period_ns = self._tactile.period_ns
+        silence_ns = self._silence_ns(period_ns)
         verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
-        self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
+        self._deadlines.add(reading, verdict.age_ms, period_ns)
         self._state = State.RUNNING
         self._last_t_ns = reading.t_ns
         self._silence_due_ns = received_ns + silence_ns
@@ -320,16 +325,17 @@ class Loop:
 
     def _tell_silence(self, now_ns: int) -> tuple[Verdict, bytes]:
         self._state = State.SILENT
-        self._silence_due_ns = now_ns + self._silence_ns()
+        silence_ns = self._silence_ns(self._tactile.period_ns)
+        self._silence_due_ns = now_ns + silence_ns
         verdict, payload = self._outbox.verdict(
-            self._pipeline.silence(self._last_t_ns), now_ns, self._silence_ns()
+            self._pipeline.silence(self._last_t_ns), now_ns, silence_ns
         )
         self._tell(verdict, payload, None)
         return verdict, payload
 
-    def _silence_ns(self) -> int:
+    def _silence_ns(self, period_ns: int | None) -> int:
         """How long nothing may come before it is said, ns."""
-        return max(self._max_age_ns, SILENCE_PERIODS * (self._tactile.period_ns or 0))
+        return max(self._max_age_ns, SILENCE_PERIODS * (period_ns or 0))
 
     def _send_status(self) -> None:
         for before_readings in self._before_readings:

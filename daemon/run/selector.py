@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import ctypes
 import os
-import selectors
+import select
 import time
 
 NS_PER_S = 1_000_000_000
 ABSOLUTE = 1
 """TFD_TIMER_ABSTIME of timerfd_settime(2), which Python has from 3.13 on."""
 
-Ready = list[tuple[selectors.SelectorKey, int]]
+Ready = list[tuple[int, int]]
+"""Descriptors and what they are ready for, as poll(2) says it."""
 
 
 class _TimerSpec(ctypes.Structure):
@@ -22,7 +23,7 @@ class _TimerSpec(ctypes.Structure):
     at_ns: int
 
 
-class ExactSelector(selectors.PollSelector):
+class ExactSelector:
     """poll(2), whose own timeout counts whole milliseconds, with a timer among its descriptors.
 
     Unlike select(2) it knows descriptors above 1024, and its waits are not lengthened by the slack
@@ -36,7 +37,8 @@ class ExactSelector(selectors.PollSelector):
 
     def __init__(self) -> None:
         """Where the process has no descriptor left for the timer, waits are whole milliseconds."""
-        super().__init__()
+        self._poll = select.poll()
+        self.register, self.unregister = self._poll.register, self._poll.unregister
         libc = ctypes.CDLL(None)
         self._set = libc.timerfd_settime
         self._set.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
@@ -45,17 +47,17 @@ class ExactSelector(selectors.PollSelector):
         """When the timer comes, or has come before that was seen; None: it is not set."""
         self._timer: int = libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
         if self._timer >= 0:
-            self.register(self._timer, selectors.EVENT_READ)
+            self._poll.register(self._timer, select.POLLIN)
 
     def select(self, timeout: float | None = None) -> Ready:
         """What is ready, once anything is, after `timeout` s at the latest; None: no limit."""
         if self._timer < 0 or (timeout is not None and timeout <= 0):
-            return self._others(super().select(timeout))
+            return self._others(self._poll.poll(None if timeout is None else max(timeout, 0) * 1e3))
         due_ns = None if timeout is None else time.monotonic_ns() + round(timeout * NS_PER_S)
         while True:
             if due_ns is not None and (self._due_ns is None or due_ns < self._due_ns):
                 self._arm(due_ns)
-            ready = super().select()
+            ready = self._poll.poll()
             others = self._others(ready)
             # Without any, a signal has come, or the timer, which may be that of an earlier wait.
             if others or not ready or (due_ns is not None and time.monotonic_ns() >= due_ns):
@@ -68,14 +70,13 @@ class ExactSelector(selectors.PollSelector):
 
     def _others(self, ready: Ready) -> Ready:
         """What is ready but the timer; that is set anew before it is waited for again."""
-        others = [each for each in ready if each[0].fd != self._timer]
+        others = [each for each in ready if each[0] != self._timer]
         if len(others) != len(ready):
             self._due_ns = None
         return others
 
     def close(self) -> None:
         """Close it, but none of the descriptors that were registered."""
-        super().close()
         if self._timer >= 0:
             os.close(self._timer)
             self._timer = -1

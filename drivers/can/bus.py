@@ -177,10 +177,9 @@ class CanBus:
     def _drain_socket(self, raw: socket.socket, frames: list[Stamped]) -> None:
         now_ns = self._clock()
         ahead_ns = now_ns - self._wall_clock()
+        receive, flags = raw.recvmsg, int(socket.MSG_DONTWAIT)
         for _ in range(FRAMES_PER_DRAIN):
-            record, ancillary, _flags, _sender = raw.recvmsg(
-                CANFD_FRAME.size, ANCILLARY_BYTES, socket.MSG_DONTWAIT
-            )
+            record, ancillary, _, _ = receive(CANFD_FRAME.size, ANCILLARY_BYTES, flags)
             t_ns = now_ns
             for level, kind, data in ancillary:
                 if level != socket.SOL_SOCKET:

@@ -234,7 +234,7 @@ class SweepFrameDecoder(CanDecoder):
 
 def _is_sound(words: bytes) -> bool:
     """Whether some word is a count, and every other one that of a sensor that is not there."""
-    _, faults = decode_words(np.frombuffer(words, dtype=">u2").astype(np.uint16))
+    _, faults = decode_words(np.frombuffer(words, dtype=">u2"))
     return not (faults & ~np.uint8(_MISSING)).any() and not faults.all()
 
 

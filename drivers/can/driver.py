@@ -21,7 +21,7 @@ from drivers.can.formats import CanFormat
 from drivers.can.frames import LOST, Stamped
 from drivers.can.readings import CanCounters
 from drivers.can.stream import NAME, BoardOptions, CanStream
-from drivers.link import LinkState
+from drivers.link import CLOSED, UP, WAITING, LinkState
 
 POLL_NS: Final = 1_000_000
 """How often a bus without a descriptor is asked for frames, ns."""
@@ -111,7 +111,7 @@ class CanBridgeDriver(Opened):
     def describe(self) -> dict[str, str]:
         """Bus, link, and how much it brings, for people."""
         known = self.stream.describe()
-        if self.link_state is LinkState.UP:
+        if self.link_state is UP:
             known["frames"] = f"{self.frames_per_s:.0f} /s"
         return known
 
@@ -142,7 +142,7 @@ class CanBridgeDriver(Opened):
     def due_ns(self) -> int | None:
         """When to open again, to notice silence, or to poll a bus without a descriptor."""
         link = self.stream.link
-        if link.state in (LinkState.CLOSED, LinkState.WAITING):
+        if link.state in (CLOSED, WAITING):
             return link.retry_ns
         if self._resting_until_ns is not None:
             return self._resting_until_ns
@@ -152,9 +152,9 @@ class CanBridgeDriver(Opened):
 
     def read_ready(self) -> Sequence[Reading]:
         """Readings that are complete now. Raises `DriverError` only if no try can ever succeed."""
-        if self.link_state is LinkState.CLOSED:
+        if self.link_state is CLOSED:
             raise RuntimeError("the CAN bridge is not open")
-        if self.link_state is LinkState.WAITING and not self._is_open_again():
+        if self.link_state is WAITING and not self._is_open_again():
             return ()
         frames = self._bus.drain()
         readings, trouble = self.stream.receive(frames)
@@ -170,7 +170,7 @@ class CanBridgeDriver(Opened):
         if not self.stream.link.is_due(self._clock()):
             return False
         self._try_to_open()
-        return self.link_state is not LinkState.WAITING
+        return self.link_state is not WAITING
 
     def _try_to_open(self) -> None:
         try:
@@ -190,7 +190,9 @@ class CanBridgeDriver(Opened):
         self.stream.lost(why, self._clock())
 
     def _count(self, stamped: Sequence[Stamped]) -> None:
-        frames = sum(not frame.flags & LOST for frame, _, _ in stamped)
+        frames = len(stamped)
+        if self._bus.kernel_drops:
+            frames -= sum(frame.flags == LOST for frame, _, _ in stamped)
         now_ns = self._clock()
         self._poll_due_ns = now_ns + (0 if self._bus.more else POLL_NS)
         self._resting_until_ns = self._rest(now_ns)

@@ -16,9 +16,10 @@ name, `drivers/twins/can.py` a twin that sends it, and the two pages above its d
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from enum import IntFlag, StrEnum
-from typing import Final, NamedTuple
+from typing import Final
+
+import msgspec
 
 from drivers.base import ELECTRODES, FINGERS
 from drivers.biotac import CHANNELS, sample_command
@@ -60,7 +61,7 @@ class Reject(StrEnum):
     CONTENT = "malformed_frames"
 
 
-class SynTouchSample(NamedTuple):
+class SynTouchSample(msgspec.Struct, frozen=True, gc=False):
     """One channel sampled by all sensors at once."""
 
     channel: int
@@ -83,8 +84,7 @@ class SweepStatus(IntFlag):
 _STATUS_BITS: Final = int(SweepStatus.ABSENT | SweepStatus.REPEATED | SweepStatus.OVERRUN)
 
 
-@dataclass(frozen=True, slots=True)
-class SweepFrame:
+class SweepFrame(msgspec.Struct, frozen=True, gc=False):
     """All electrodes of one finger, sampled in one sweep."""
 
     finger: int

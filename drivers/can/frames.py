@@ -6,7 +6,9 @@ Source: linux/can.h and linux/can/error.h.
 from __future__ import annotations
 
 import struct
-from typing import Final, NamedTuple
+from typing import Final
+
+import msgspec
 
 STANDARD_ID_MAX: Final = 0x7FF
 EXTENDED_ID_MAX: Final = 0x1FFFFFFF
@@ -51,7 +53,7 @@ LOST: Final = 16
 """No frame: at this place frames were lost."""
 
 
-class CanFrame(NamedTuple):
+class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """One frame from a bus."""
 
     arbitration_id: int
@@ -78,6 +80,8 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
         return None
     if length > longest:
         return None
+    if word <= STANDARD_ID_MAX:
+        return CanFrame(word, data[:length], flags)
     if word & ERR_FLAG:
         return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | ERROR)
     if word & RTR_FLAG:

@@ -113,9 +113,7 @@ class ReadingMaker:
         self.seq += sweeps
         self.counters.missed_readings += sweeps
 
-    def make(
-        self, words: NDArray[np.uint16], marks: NDArray[np.uint8], t_ns: int
-    ) -> TactileReading:
+    def make(self, words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int) -> TactileReading:
         """The reading of response words, shape (fingers, 24).
 
         `marks`: `ElectrodeFault` bits that are known beforehand; a word under `MISSING` means

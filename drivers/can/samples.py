@@ -120,7 +120,7 @@ class SampleAssembler:
         self._count_run(place, t_ns)
         if until_ns is None:
             until_ns = t_ns
-        elif until_ns - t_ns >= self._lateness_ns():
+        elif until_ns > t_ns and until_ns - t_ns >= self._lateness_ns():
             return self._untimed(place, t_ns)
         if not self._synchronised and not self._starts(place):
             self._counters.unsynchronised_frames += 1
@@ -167,7 +167,8 @@ class SampleAssembler:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
             self._seen = place
-        self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
+        if t_ns - self._at_ns > self._widest_ns:
+            self._widest_ns = t_ns - self._at_ns
         self._at_ns = t_ns
 
     def _begin(self) -> None:
@@ -267,7 +268,7 @@ class SampleAssembler:
         self._finished = True
         self._check_time()
         self._previous_had = self._have
-        words = np.zeros((len(self._rows), ELECTRODES), dtype=np.uint16)
+        words = np.zeros((len(self._rows), ELECTRODES), dtype=np.intp)
         came = np.frombuffer(self._buffer, dtype=">u2").reshape(ELECTRODES, self._sensors)
         words[:, self._electrodes] = came.T[self._rows]
         marks = np.zeros(words.shape, dtype=np.uint8)

@@ -22,13 +22,15 @@ from drivers.can.frames import (
     is_overflow,
 )
 from drivers.can.readings import CanCounters
-from drivers.link import Link, LinkState
+from drivers.link import GREETING, UP, Link
 
 NAME: Final = "can"
 SILENCE_PERIODS: Final = 10
 """Readings that may be missing before the link is down."""
 SILENCE_MIN_NS: Final = 100_000_000
 """Shortest silence that is one, ns: above what an adapter or a busy host holds back."""
+_SPECIAL: Final = ERROR | REMOTE | LOST
+"""Flags of what is no data frame."""
 
 
 class BoardOptions(TypedDict, total=False):
@@ -103,7 +105,7 @@ class CanStream:
     @property
     def silent_at_ns(self) -> int | None:
         """When silence is to be noticed; None while the link is not up."""
-        return self._silent_at_ns if self.link.state is LinkState.UP else None
+        return self._silent_at_ns if self.link.state is UP else None
 
     def describe(self) -> dict[str, str]:
         """Bus, link and why it is not up, and whose frames are taken, for people."""
@@ -121,7 +123,7 @@ class CanStream:
         readings: list[Reading] = []
         trouble = None
         for frame, t_ns, until_ns in frames:
-            if not frame.flags & (ERROR | REMOTE | LOST):
+            if not frame.flags & _SPECIAL:
                 readings += self._decoder.push(frame, t_ns, until_ns)
                 continue
             trouble = self._take_special(frame) or trouble
@@ -137,9 +139,9 @@ class CanStream:
         if self.counters.accepted_frames > self._accepted:
             self._accepted = self.counters.accepted_frames
             self._silent_at_ns = now_ns + self._silence_ns()
-            if self.link.state is LinkState.GREETING:
+            if self.link.state is GREETING:
                 self.link.up(self._where, now_ns)
-        elif self.link.state is LinkState.UP and now_ns >= self._silent_at_ns and not more:
+        elif self.link.state is UP and now_ns >= self._silent_at_ns and not more:
             self._down(f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms", now_ns)
             self.link.greeting()
 

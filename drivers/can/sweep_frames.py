@@ -37,7 +37,7 @@ class FrameAssembler:
         self._all = (1 << fingers) - 1
         self._readings = ReadingMaker(counters)
         self._counters = counters
-        self._words = np.zeros((fingers, ELECTRODES), dtype=np.uint16)
+        self._words = np.zeros((fingers, ELECTRODES), dtype=np.intp)
         self._faults = np.zeros(fingers, dtype=np.uint8)
         self._current: int | None = None
         self._synchronised = False

@@ -81,7 +81,8 @@ class DeviceClock:
         self._proof_ns = PROOF_FIRST_NS
         self._drift = _Drift()
         self._last_tick = -1
-        self._last_ns: int | None = None
+        self._last_ns = -AGE_MAX_NS
+        """Last mapped time; at first one that is before all others."""
 
     @property
     def trusted(self) -> bool:
@@ -137,9 +138,8 @@ class DeviceClock:
         if mapped_ns is None:
             self.fallbacks += 1
             mapped_ns = min(idle_ns, arrival_ns) - UNKNOWN_DELAY_NS
-        mapped_ns = max(mapped_ns, arrival_ns - AGE_MAX_NS)
-        if self._last_ns is not None:  # made later than the reading before, so not older
-            mapped_ns = max(mapped_ns, self._last_ns)
+        # Made later than the reading before, so not older.
+        mapped_ns = max(mapped_ns, self._last_ns, arrival_ns - AGE_MAX_NS)
         self._last_ns = min(mapped_ns, arrival_ns)
         return self._last_ns
 
@@ -173,7 +173,7 @@ class DeviceClock:
             self.faults += 1
         self._on_probation = True
         self._best = None
-        self._last_ns = None
+        self._last_ns = -AGE_MAX_NS
         self._bounds.clear()
         self._drift = _Drift()
 

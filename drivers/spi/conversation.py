@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from drivers.base import Reading, TactileReading, sensor_rows
-from drivers.link import Link, LinkState
+from drivers.link import GREETING, WAITING, Link
 from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
     DIGEST,
@@ -162,7 +162,7 @@ class Conversation:
 
     def say(self, now_ns: int) -> list[bytes]:
         """What is to be sent now, frame by frame; may find that the link is lost instead."""
-        if self.link.state is LinkState.WAITING:
+        if self.link.state is WAITING:
             return []
         said = [encode(Start())] if self._starts else []
         self._starts = False
@@ -206,7 +206,7 @@ class Conversation:
         """
         readings: list[Reading] = []
         for kind, payload in self._parser.feed(chunk):
-            if self.link.state is LinkState.WAITING:
+            if self.link.state is WAITING:
                 break  # lost because of a frame before this one
             if kind == Hello.TYPE and not self._speaks_our_language(payload, arrival_ns):
                 continue
@@ -322,7 +322,7 @@ class Conversation:
             return None
         self._next_seq = self._sweeps.next_seq
         self._silent_at_ns = arrival_ns + self._silence_ns
-        if self.link.state is LinkState.GREETING:
+        if self.link.state is GREETING:
             self.link.up(", ".join(_about(self._sweeps.hello).values()), arrival_ns)
         return reading
 

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from drivers.base import LinkError, Opened, Reading
-from drivers.link import LinkState
+from drivers.link import CLOSED, GREETING, UP, WAITING, LinkState
 from drivers.spi.conversation import NAME, NONCES, Conversation
 from drivers.spi.line import LineEvent, SerialLine
 from drivers.spi.messages import Stop, encode
@@ -97,7 +97,7 @@ class SpiBridgeDriver(Opened):
 
     def close(self) -> None:
         """Stop the bridge and give the port back."""
-        if self.link_state in (LinkState.GREETING, LinkState.UP):
+        if self.link_state in (GREETING, UP):
             with contextlib.suppress(LinkError):  # one that is gone has stopped in its own way
                 self._line.write(encode(Stop()))
         self._line.close()
@@ -110,7 +110,7 @@ class SpiBridgeDriver(Opened):
     def due_ns(self) -> int | None:
         """When the next try, PING or deadline is due, or None while closed."""
         link = self.conversation.link
-        if link.state in (LinkState.CLOSED, LinkState.WAITING):
+        if link.state in (CLOSED, WAITING):
             return link.retry_ns
         due_ns = self.conversation.due_ns
         return due_ns if self._line.fileno() is not None else min(due_ns, self._poll_due_ns)
@@ -118,10 +118,10 @@ class SpiBridgeDriver(Opened):
     def read_ready(self) -> Sequence[Reading]:
         """Readings of the sweeps that have arrived. Never raises for anything a bridge does."""
         link = self.conversation.link
-        if link.state is LinkState.CLOSED:
+        if link.state is CLOSED:
             raise RuntimeError("the bridge is not open")
         began_ns = self._clock()
-        if link.state is LinkState.WAITING:
+        if link.state is WAITING:
             if link.is_due(began_ns):
                 self._connect()
             return ()
@@ -156,7 +156,7 @@ class SpiBridgeDriver(Opened):
                     self.conversation.not_sent()
         except LinkError as error:
             self._lose(error)
-        if self.link_state is LinkState.WAITING:
+        if self.link_state is WAITING:
             self._line.close()
 
     def _lose(self, error: LinkError) -> None:

@@ -20,6 +20,8 @@ ENCODED_MAX_BYTES = 1024
 sensors, takes 671. It bounds what a parser holds back."""
 
 _CRC = struct.Struct("<I")
+_CRC_RESIDUE: Final = 0x2144DF1C
+"""CRC-32 of anything with its own checksum behind it, whatever the checksum was continued from."""
 _SHORTEST = 1 + _CRC.size
 """A frame without payload: type and checksum, bytes."""
 
@@ -115,10 +117,9 @@ class FrameParser:
         except cobs.DecodeError:
             self.counters.bad_cobs += 1
             return None
-        body = decoded[: -_CRC.size]
         seed = 0 if decoded and decoded[0] in self._unseeded else self._digest
-        if len(decoded) < _SHORTEST or _CRC.pack(zlib.crc32(body, seed)) != decoded[-_CRC.size :]:
+        if len(decoded) < _SHORTEST or zlib.crc32(decoded, seed) != _CRC_RESIDUE:
             self.counters.bad_crc += 1
             return None
         self.counters.frames += 1
-        return body[0], body[1:]
+        return decoded[0], decoded[1 : -_CRC.size]

@@ -55,7 +55,8 @@ class SerialLine:
         self._baud = baud
         self._serial: serial.Serial | None = None
         self._fileno: int | None = None
-        self._is_terminal = False
+        self._terminal: int | None = None
+        """Its descriptor, where the port is a terminal, which is read without pyserial."""
 
     def open(self) -> None:
         """Take the port for this process alone. Raises `LinkError`, or `DriverError` for ever."""
@@ -73,7 +74,7 @@ class SerialLine:
         except ValueError as error:
             raise DriverError(f"{self.port}: {error}") from error
         self._fileno = self._descriptor()
-        self._is_terminal = type(self._serial) is serial.Serial
+        self._terminal = self._fileno if type(self._serial) is serial.Serial else None
         self._lower_latency()
         if self.tap is not None:
             self.tap(LineEvent.OPENED, b"")
@@ -109,25 +110,23 @@ class SerialLine:
 
     def read(self) -> bytes:
         """All bytes that are there, possibly none. Raises `LinkError`."""
-        port = self._opened()
-        chunks: list[bytes] = []
+        port, data = self._opened(), b""
         self.drained = False
         try:
-            while len(chunks) < READS_MAX and not self.drained:
-                chunk = b""
-                if self._is_terminal and self._fileno is not None:
-                    chunk = os.read(self._fileno, READ_BYTES)
-                    self.drained = 0 < len(chunk) < SHORT_BYTES
+            for _ in range(READS_MAX):
+                chunk = b"" if self._terminal is None else os.read(self._terminal, READ_BYTES)
+                self.drained = 0 < len(chunk) < SHORT_BYTES
                 if not chunk:  # of a terminal pyserial tells whether it is still there
                     chunk = port.read(READ_BYTES)
                     self.drained = not chunk
-                chunks.append(chunk)
+                data += chunk
+                if self.drained:
+                    break
         except BlockingIOError:
             self.drained = True
         except (OSError, termios.error) as error:
-            if not chunks:  # else the next call says so, after these bytes
+            if not data:  # else the next call says so, after these bytes
                 raise LinkError(f"{self.port}: {_loss(error)}") from error
-        data = b"".join(chunks)
         if self.tap is not None and data:
             self.tap(LineEvent.RECEIVED, data)
         return data

@@ -169,7 +169,7 @@ class Hello:
         )
 
 
-class Sweep(msgspec.Struct, frozen=True, eq=False):
+class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
     """The response words of one sweep over all slots and sensors, as they were read."""
 
     TYPE: ClassVar[int] = 0x02
@@ -182,11 +182,12 @@ class Sweep(msgspec.Struct, frozen=True, eq=False):
     present: int
     """Bit i: sensor i had a serial number when it was last looked for."""
     words: NDArray[np.uint16]
-    """Shape (slots, sensors), 16-bit response words, not yet judged (manual figure 15)."""
+    """Shape (slots, sensors), 16-bit response words of either byte order, not yet judged (manual
+    figure 15)."""
 
     def to_bytes(self) -> bytes:
         """The payload. Raises `ValueError`."""
-        if self.words.ndim != 2 or self.words.dtype != np.uint16:
+        if self.words.ndim != 2 or self.words.dtype not in (np.uint16, _WORD):
             raise ValueError(f"words are {self.words.dtype} of shape {self.words.shape}")
         slots, sensors = self.words.shape
         _check_range("seq", self.seq, 0, _U32)
@@ -213,8 +214,8 @@ class Sweep(msgspec.Struct, frozen=True, eq=False):
         )
         if not sound:
             return None
-        words = np.frombuffer(payload, _WORD, -1, _SWEEP.size).astype(np.uint16)
-        return cls(seq, tick_start, tick_end, present, words.reshape(slots, sensors))
+        words = np.ndarray((slots, sensors), _WORD, payload, _SWEEP.size)
+        return cls(seq, tick_start, tick_end, present, words)
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,9 +93,11 @@ class SweepDecoder:
         self._source = np.full((len(sensors), ELECTRODES), samples, dtype=np.intp)
         for row, sensor in enumerate(sensors):
             self._source[row, columns[:, 1]] = columns[:, 0] * hello.sensors + sensor
-        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.uint16)
+        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.intp)
         self._is_sampled = self._source < samples
-        self._shape = (hello.slots, hello.sensors)
+        self._sound = bytes(self._source.size)
+        """Faults of a reading without any."""
+        self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
         self._all_present = sum(1 << sensor for sensor in set(sensors))
 
     def fits(self, hello: Hello) -> bool:
@@ -119,12 +121,13 @@ class SweepDecoder:
 
         `idle_ns` is when nothing was waiting to be read for the last time before its arrival.
         """
-        if sweep.words.shape != self._shape:
+        if sweep.words.shape != self._sweep.shape:
             self._counters.bad_frames += 1
             return None
         if not self._is_next(sweep):
             return None
-        self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
+        if sweep.tick_end - sweep.tick_start > self.longest_ticks:
+            self.longest_ticks = sweep.tick_end - sweep.tick_start
         faults, fallbacks = self.clock.faults, self.clock.fallbacks
         t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
         self._counters.clock_faults += self.clock.faults - faults
@@ -152,7 +155,7 @@ class SweepDecoder:
 
     def _counts_and_faults(self, sweep: Sweep) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
-        self._words[:-1] = sweep.words.ravel()
+        self._sweep[...] = sweep.words
         counts, faults = decode_words(self._words[self._source])
         absent: list[int] = []
         if sweep.present & self._all_present != self._all_present:
@@ -167,7 +170,7 @@ class SweepDecoder:
         counters = self._counters
         counters.readings += 1
         counters.absent_sensors += len(absent)
-        if not np.count_nonzero(faults):
+        if faults.tobytes() == self._sound:
             return
         counters.faulty_readings += 1
         read = self._is_sampled.copy()

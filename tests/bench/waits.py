@@ -7,9 +7,11 @@ import random
 import selectors
 import time
 from collections.abc import Callable
+from contextlib import closing
 
 import numpy as np
 
+from daemon.run.loop import Selector
 from daemon.run.selector import ExactSelector
 from tests.bench.live import table
 
@@ -18,15 +20,15 @@ DESCRIPTORS = 12
 WAITS, LOOKS, TURNS = 500, 5000, 4
 WAIT_NS = (200_000, 2_000_000)
 """From and to so long a wait, ns."""
-KINDS: tuple[Callable[[], selectors.BaseSelector], ...] = (selectors.SelectSelector, ExactSelector)
+KINDS: tuple[Callable[[], Selector], ...] = (selectors.SelectSelector, ExactSelector)
 
 
-def measured(kind: Callable[[], selectors.BaseSelector]) -> tuple[list[int], list[int]]:
+def measured(kind: Callable[[], Selector]) -> tuple[list[int], list[int]]:
     """By how much waits were too long, and how long it takes where something is ready, ns."""
     rng = random.Random(1)
     pipes = [os.pipe() for _ in range(DESCRIPTORS)]
     late_ns, took_ns = [], []
-    with kind() as selector:
+    with closing(kind()) as selector:
         for reads, _ in pipes:
             selector.register(reads, selectors.EVENT_READ)
         for _ in range(WAITS):

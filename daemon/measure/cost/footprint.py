@@ -221,7 +221,7 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
     stack.callback(stop.close)
     timing = Timing(parts.scene.max_age_ns)
-    stack.enter_context(timing.selector())
+    stack.callback(timing.selector().close)
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")
     return outbox

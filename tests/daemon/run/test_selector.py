@@ -9,7 +9,7 @@ import selectors
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -33,7 +33,7 @@ class Pipe:
 
 @pytest.fixture
 def selector() -> Iterator[ExactSelector]:
-    with ExactSelector() as made:
+    with closing(ExactSelector()) as made:
         yield made
 
 
@@ -46,7 +46,7 @@ def pipe() -> Iterator[Pipe]:
 
 def ready(selector: ExactSelector, timeout: float | None) -> list[int]:
     """Descriptors that are ready within that time, s."""
-    return [key.fd for key, events in selector.select(timeout) if events & selectors.EVENT_READ]
+    return [fd for fd, events in selector.select(timeout) if events & selectors.EVENT_READ]
 
 
 def late_ns(selector: ExactSelector, wait_ns: int) -> int:
@@ -135,7 +135,7 @@ def test_without_a_descriptor_for_the_timer_it_still_waits(pipe: Pipe) -> None:
     os.close(lowest_free)
     resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
     try:
-        with ExactSelector() as selector:
+        with closing(ExactSelector()) as selector:
             selector.register(pipe.reads, selectors.EVENT_READ)
             assert late_ns(selector, 1_500_000) >= 0
             os.write(pipe.writes, b"x")

@@ -43,7 +43,7 @@ class _Records:
 
 def _sample_frame(rng: random.Random) -> tuple[bytes, SynTouchSample]:
     sample = SynTouchSample(rng.choice(CHANNELS), rng.randbytes(2 * SENSORS))
-    return pack_frame(CanFrame(SAMPLE_ID, encode_sample(*sample))), sample
+    return pack_frame(CanFrame(SAMPLE_ID, encode_sample(sample.channel, sample.words))), sample
 
 
 def _sweep_frame(rng: random.Random) -> tuple[bytes, SweepFrame]:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import can
+import msgspec
 import numpy as np
 import pytest
 
@@ -146,7 +147,9 @@ def test_every_single_flipped_bit_of_a_sweep_frame_shows_and_invents_nothing(
                 data = bytearray(frame.data)
                 if (sweep, row) == (110, spoiled_row):
                     data[bit // 8] ^= 1 << bit % 8
-                readings += made.push(frame._replace(data=bytes(data)), sweep * 10 * MS)
+                readings += made.push(
+                    msgspec.structs.replace(frame, data=bytes(data)), sweep * 10 * MS
+                )
         told = counters.as_dict()
         harmless = {"readings", "accepted_frames", "lost_frames"}
         assert any(count for name, count in told.items() if name not in harmless), f"bit {bit}"
