@@ -29,6 +29,32 @@ settings.load_profile("side by side")
 
 ROOT = Path(__file__).parents[1]
 
+BEGUN_FIRST = (
+    "emulated/test_driver.py",
+    "emulated/test_timing.py",
+    "bench/test_mutants.py",
+    "bench/test_fuzz.py",
+    "daemon/measure/test_stability.py",
+    "daemon/measure/test_report.py",
+    "daemon/doctor/test_healthy.py",
+    "daemon/run/test_realtime.py",
+    "daemon/judge/test_only_stable_if.py",
+    "daemon/judge/test_grasps_to_the_lift.py",
+    "daemon/commands/test_replay_command.py",
+    "daemon/commands/test_hardware_commands.py",
+    "daemon/record/test_record_and_replay.py",
+    "daemon/record/test_link_log.py",
+    "daemon/watch/test_watch_browser.py",
+    "deploy/test_install.py",
+    "models/training/making/test_making_export.py",
+    "models/training/commands/test_evaluate.py",
+    "models/training/commands/test_train.py",
+    "models/training/evaluating/test_run_jobs.py",
+    "test_readme.py",
+)
+"""Files that take longest, by their place in this folder: a file is one process's own, and none of
+these may be left when the other processes are done."""
+
 
 def data_dir() -> Path | None:
     """Folder of the real recordings, or None where there is none."""
@@ -52,6 +78,12 @@ def what_is_there_is_kept() -> None:
     all modules before have left would cost most of the time."""
     gc.collect()
     gc.freeze()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes long is begun first; all else stays in its order."""
+    rank = {ROOT / "tests" / name: at for at, name in enumerate(BEGUN_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
 
 
 @pytest.fixture

@@ -67,6 +67,12 @@ def record(kind: str, folder: Path) -> tuple[Path, Path]:
     return recording, log
 
 
+@pytest.fixture(scope="module")
+def of_can(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The recording of a board and its link log; the scene is in the folder above them."""
+    return record("can", tmp_path_factory.mktemp("can"))
+
+
 def compared(verdict: dict[str, Any]) -> dict[str, Any]:
     said = {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
     return dict(without_null(said))
@@ -110,9 +116,9 @@ def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given
 
 
 def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_were(
-    tmp_path: Path,
+    of_can: tuple[Path, Path],
 ) -> None:
-    recording, log = record("can", tmp_path)
+    recording, log = of_can
     offset_ns = header_of(recording).wall_minus_monotonic_ns
     board = CanLog(("ff", "mf", "th"), arbitration_id=0x100, sequence="electrodes")
     decoded: dict[int, TactileReading] = {}
@@ -132,13 +138,13 @@ def test_candump_text_through_the_real_decoder_gives_the_readings_that_there_wer
             same += found.faults.ravel().tolist() == content["faults"]
     # A machine that is too busy to look at the bus for 100 ms takes it for silent, and cuts sweeps.
     assert same > 0.95 * len(known)
-    result = graspd("replay", "--json", log, "--scene", tmp_path / "scene.toml")
+    result = graspd("replay", "--json", log, "--scene", log.parents[1] / "scene.toml")
     assert result.returncode == 0, result.stderr
     assert len(result.stdout.splitlines()) == readings
 
 
-def test_candump_text_is_what_other_programs_read(tmp_path: Path) -> None:
-    _, log = record("can", tmp_path)
+def test_candump_text_is_what_other_programs_read(of_can: tuple[Path, Path]) -> None:
+    _, log = of_can
     assert log.name.endswith(".can.log")
     with can.CanutilsLogReader(log) as reader:
         frames = list(reader)

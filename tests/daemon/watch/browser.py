@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -25,7 +26,7 @@ Answer = dict[str, Any]
 
 
 class Browser:
-    """One page. Ends with the block."""
+    """One page at a time. Ends with the block."""
 
     def __init__(self, profile: Path) -> None:
         """`profile` is an empty folder for what the browser keeps."""
@@ -48,12 +49,7 @@ class Browser:
         )
         os.close(told)
         os.close(said)
-        targets = self._ask("Target.getTargets")["targetInfos"]
-        page = next(each["targetId"] for each in targets if each["type"] == "page")
-        attached = self._ask("Target.attachToTarget", targetId=page, flatten=True)
-        self._session = attached["sessionId"]
-        for domain in ("Page", "Runtime", "Log"):
-            self.ask(f"{domain}.enable")
+        self._ask("Target.getTargets")  # it answers once it has started
         return self
 
     def __exit__(self, *_details: object) -> None:
@@ -66,6 +62,19 @@ class Browser:
             self._process.kill()
             self._process.wait()
         os.close(self._hear)
+
+    @contextlib.contextmanager
+    def blank(self) -> Iterator[Self]:
+        """Show a new page meanwhile, which knows nothing of those before it."""
+        context = self._ask("Target.createBrowserContext")["browserContextId"]
+        where = {"url": "about:blank", "browserContextId": context}
+        page = self._ask("Target.createTarget", **where)["targetId"]
+        self._session = self._ask("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]
+        self.complaints.clear()
+        for domain in ("Page", "Runtime", "Log"):
+            self.ask(f"{domain}.enable")
+        yield self
+        self._ask("Target.disposeBrowserContext", browserContextId=context)
 
     def ask(self, method: str, **parameters: object) -> Answer:
         """What the page answers."""

@@ -80,9 +80,15 @@ def talker(tmp_path: Path) -> Iterator[Talker]:
         yield made
 
 
+@pytest.fixture(scope="module")
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("profile")) as made:
+        yield made
+
+
 @pytest.fixture
-def browser(tmp_path: Path) -> Iterator[Browser]:
-    with Browser(tmp_path / "profile") as made:
+def browser(chromium: Browser) -> Iterator[Browser]:
+    with chromium.blank() as made:
         yield made
 
 
