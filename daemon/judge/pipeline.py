@@ -126,7 +126,8 @@ class Pipeline:
 
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
-        self._clock = clock
+        self.clock = clock
+        """Gives monotonic ns, by which readings have an age."""
         self._learns = learns
         self._needs_session = needs_session
         self._fingers = contract.fingers
@@ -248,6 +249,10 @@ class Pipeline:
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
             self._note(grasp, judgement.grasp)
         return judgement
+
+    def watch(self, reading: TactileReading) -> None:
+        """Take in a reading that is not to be judged: what repeats it later is not fresh."""
+        self._health.watch(reading)
 
     def silence(self, last_t_ns: int) -> Judgement:
         """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
@@ -394,4 +399,4 @@ class Pipeline:
         )
 
     def _age_ns(self, t_ns: int) -> int:
-        return self._clock() - t_ns
+        return self.clock() - t_ns
