@@ -109,6 +109,24 @@ def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) ->
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("sections", "says"),
+    [
+        ("", "nothing is written but what the session has learned"),
+        ("[session]\nkeep = false", "nothing is written"),
+        ("[model]\nname = 'cnn1'\n[learn]\nenabled = false", "nothing is written"),
+        ("[model]\nname = 'cnn1'", "nothing is written but what the session has learned"),
+    ],
+)
+def test_check_says_what_is_written_without_a_recording(
+    tmp_path: Path, sections: str, says: str
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f'[tactile]\ndriver = "can"\n{sections}\n')
+    result = graspd("check", scene, "--json")
+    assert json.loads(result.stdout)["left_out"]["record"] == says, result.stderr
+
+
 EARLY = "judged early after 100 ms, again after 240 ms"
 
 
