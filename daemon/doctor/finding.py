@@ -72,6 +72,9 @@ class Cause(StrEnum):
 _LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD, Cause.SILENT})
 _NOISE = frozenset({Cause.SENSOR_WORDS, Cause.REPEATED, Cause.ELECTRODE_RESTLESS})
 EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
+    Cause.PORT_HELD: _LOSS
+    | _NOISE
+    | {Cause.LINK_LOST, Cause.DAMAGED, Cause.CLOCK, Cause.RESTARTED},
     Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED, Cause.RESTARTED},
     Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
     Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},
