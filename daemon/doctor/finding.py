@@ -16,7 +16,7 @@ class Level(StrEnum):
 
 
 class Cause(StrEnum):
-    """What is at fault. Programs may rely on these names."""
+    """What is at fault. Programs may rely on these names, which deploy/CONNECT.md lists."""
 
     PORT_MISSING = "port-missing"
     PORT_DENIED = "port-denied"
