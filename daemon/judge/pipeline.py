@@ -127,7 +127,6 @@ class Pipeline:
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
         self.clock = clock
-        """Gives monotonic ns, by which readings have an age."""
         self._learns = learns
         self._needs_session = needs_session
         self._fingers = contract.fingers
@@ -330,7 +329,7 @@ class Pipeline:
             return Felt(self.memory.readings, None if watched.reasons else reading.counts)
         grip.observe(reading, watched)
         counts, renews = None, grip.renews
-        if not watched.reasons and 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
+        if not watched.reasons and 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns:
             counts = grip.counts_to_judge(reading, watched)
             if counts is not None:
                 grip.judged()
@@ -357,7 +356,7 @@ class Pipeline:
             settled=felt.settled,
             gate=felt.reasons,
             # Taken last, so that a slow inference counts too.
-            age_ns=self._age_ns(t_ns),
+            age_ns=self.clock() - t_ns,
             against_stable=None
             if self.trust is None or assessment is None
             else WITHHELD[self.trust.permission(GraspId(self.boot_id, felt.grasp), assessment)],
@@ -397,6 +396,3 @@ class Pipeline:
             risk=None if trust is None else trust.report(),
             judged_counts=counts,
         )
-
-    def _age_ns(self, t_ns: int) -> int:
-        return self.clock() - t_ns
