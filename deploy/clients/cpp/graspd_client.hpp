@@ -671,10 +671,10 @@ public:
                                                      : newest.reasons);
     }
 
-    // What was decided; if it is no lift, also that nobody has answered.
+    // What was decided; if it is no lift on a message, also that nobody has answered.
     Verdict at_the_end(Verdict said) const {
         auto& why = said.reasons;
-        if (asks_ && !heard_ && !is_over(said) &&
+        if (asks_ && !heard_ && said.seq && !is_over(said) &&
             std::find(why.begin(), why.end(), "no-answer") == why.end())
             why.emplace_back("no-answer");
         return said;

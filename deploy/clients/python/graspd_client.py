@@ -619,8 +619,8 @@ class _Question:
         return newest.unknown(*(newest.reasons or ("no-answer",)))
 
     def at_the_end(self, said: Verdict) -> Verdict:
-        """What was decided; if it is no lift, also that nobody has answered."""
-        if self._asking is None or self._heard or self.is_over(said):
+        """What was decided; if it is no lift on a message, also that nobody has answered."""
+        if self._asking is None or self._heard or said.seq is None or self.is_over(said):
             return said
         return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
 
