@@ -312,7 +312,9 @@ def _what_is_left_out(
     if wanted.risk is None:
         left_out["risk"] = "nothing limits how many `stable` lifts slip"
     if wanted.record is None:
-        left_out["record"] = "nothing is written but what the session has learned"
+        learns = "session" not in left_out or wanted.learn.enabled or wanted.risk is not None
+        but = " but what the session has learned" if learns and wanted.keeps_session else ""
+        left_out["record"] = f"nothing is written{but}"
     if wanted.curve is None:
         left_out["curve"] = "no keys: sockets are for this computer alone"
     if wanted.realtime is None:

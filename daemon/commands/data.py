@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import http.client
+import shlex
 import signal
 import sys
 import urllib.request
@@ -76,10 +77,14 @@ def _get(args: argparse.Namespace, file: TableFile) -> str:
 
 
 def _from_folder(folder: Path, file: TableFile) -> bytes:
-    for name in (f"{file.name}.csv", file.upstream_name):
+    names = f"{file.name}.csv", file.upstream_name
+    for name in names:
         if (folder / name).is_file():
             return _checked(_read(folder / name), file, str(folder / name))
-    raise DataError(f"{folder}: has neither {file.name}.csv nor {file.upstream_name}")
+    below = (f"{deeper}/{name}" for deeper in ("*", "*/*") for name in names)
+    found = next((path for each in below for path in folder.glob(each)), None)
+    hint = "" if found is None else f"; try --from {shlex.quote(str(found.parent))}"
+    raise DataError(f"{folder}: has neither {' nor '.join(names)}{hint}")
 
 
 def fetch(base: str, file: TableFile, limit_s: float = FETCH_MAX_S) -> bytes:

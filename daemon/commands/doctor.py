@@ -27,6 +27,7 @@ from daemon.doctor.surroundings import (
     explained,
     model_finding,
     realtime_findings,
+    shared_findings,
     socket_findings,
 )
 from daemon.process.text import Colour, coloured, complain, printable
@@ -195,7 +196,10 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
         seconds = _collect([driver for driver, _ in opened], statistics, listen_s)
         for driver, section in opened:
             felt = statistics if driver is drivers[0] else None
-            for finding in examine(driver, felt, seconds):
+            told = examine(driver, felt, seconds)
+            if all(finding.cause is not Cause.PORT_HELD for finding in told):
+                told = roots([*shared_findings(section), *told])
+            for finding in told:
                 findings += explained(finding, section)
             counted = driver.counters.as_dict()
             report[driver.name] = {"device": driver.describe(), "counters": counted}

@@ -256,11 +256,12 @@ def _comparisons(
     }
     alone = wanted.model_copy(update=update)
     if pipeline.session is not None and args.session != OFF:
-        found = assembly.build_pipeline(alone, assembly.load_model(wanted), learns=False)
+        other = assembly.load_model(wanted)
+        found = assembly.build_pipeline(alone, other, pipeline.clock, learns=False)
         yield Comparison(WITHOUT_SESSION, found, result)
     if pipeline.trust is not None and (args.outcomes or recorded is not None):
-        learns = args.session != OFF and wanted.session.learn
-        found = assembly.build_pipeline(alone, assembly.load_model(wanted), learns=learns)
+        other, learns = assembly.load_model(wanted), args.session != OFF and wanted.session.learn
+        found = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
         _begin(args, found, wanted, recorded)
         yield Comparison(WITHOUT_LEARNING, found, result)
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import errno
 import faulthandler
 import os
+import re
 import resource
 import sys
 from contextlib import ExitStack
@@ -50,9 +52,20 @@ def run(args: argparse.Namespace) -> int:
         complain(error)
         return 2
     except (PublishError, DriverError) as error:
-        complain(error)
+        complain(f"{error}{_held_by(str(error))}")
         return 1
     return 0
+
+
+def _held_by(said: str) -> str:
+    """Who has the port that cannot be had, as far as that is what was said and may be known."""
+    address = re.search(r"\b(tcp|udp)://\S*:(\d+)", said)
+    if address is None or os.strerror(errno.EADDRINUSE) not in said:
+        return ""
+    from daemon.doctor.computer import port_holders
+
+    holders = port_holders(address[1], int(address[2]))
+    return f": {'; '.join(map(str, holders))}" if holders else ""
 
 
 def _allow_descriptors() -> None:

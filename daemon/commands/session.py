@@ -243,10 +243,10 @@ def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> Non
     again = _judge(wanted, pipeline)
     unlike = sum(Reason.NEVER_SEEN in judgement.reasons for judgement in again)
     if 2 * unlike > len(again):
-        name = model.contract.name
+        contract, trained = model.contract, sum(file.rows for file in model.contract.datasets)
         raise DriverError(
-            f"{unlike} of {len(again)} readings are unlike all grasps that {name} was trained on: "
-            "nothing is written"
+            f"{unlike} of {len(again)} readings are unlike all grasps that {contract.name} was "
+            f"trained on, which were {trained}: nothing is written"
         )
 
 

@@ -17,6 +17,7 @@ ARPHRD_CAN = "280"
 """Type of a CAN interface in `/sys/class/net/*/type`."""
 LISTENING = {"tcp": {"0A"}, "udp": {"01", "07"}}
 """States in `/proc/net` of a socket that has a port for itself."""
+TERMINAL_MAKER = "/dev/ptmx"
 IP_TIMEOUT_S = 5.0
 COMMAND_MAX = 400
 """Characters of a command that are shown."""
@@ -137,7 +138,10 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 
 
 def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
-    """Other processes that have locked a file, or else have it open, as far as we may know it."""
+    """Other processes that have locked a file, or else have it open, as far as we may know it.
+
+    A pseudo-terminal is open in the program that made it, too: that one is not meant.
+    """
     try:
         there = os.stat(path)
     except OSError:
@@ -149,8 +153,11 @@ def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
             words = line.split()  # 1: FLOCK ADVISORY WRITE 123 00:1a:3 0 EOF
             if len(words) > 5 and words[5] == device:
                 locked.add(int(words[4]))
-    opened = locked or _with_open({(there.st_dev, there.st_ino)}, proc)
-    return _processes(opened, proc)
+    found = locked - {os.getpid()} or _with_open({_identity(there)}, proc) - {os.getpid()}
+    if found and stat.S_ISCHR(there.st_mode):
+        with suppress(OSError):
+            found -= _with_open({_identity(os.stat(TERMINAL_MAKER))}, proc)
+    return _processes(found, proc)
 
 
 def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
@@ -172,12 +179,14 @@ def _with_open(wanted: Collection[object], proc: Path) -> set[int]:
     for descriptor in proc.glob("[0-9]*/fd/*"):
         with suppress(OSError):
             opened = descriptor.stat()
-            identity: object = (opened.st_dev, opened.st_ino)
-            if stat.S_ISSOCK(opened.st_mode):
-                identity = opened.st_ino
-            if identity in wanted:
+            is_socket = stat.S_ISSOCK(opened.st_mode)
+            if (opened.st_ino if is_socket else _identity(opened)) in wanted:
                 found.add(int(descriptor.parts[-3]))
     return found
+
+
+def _identity(file: os.stat_result) -> tuple[int, int]:
+    return file.st_dev, file.st_ino
 
 
 def _processes(pids: Collection[int], proc: Path) -> list[Process]:

@@ -16,7 +16,7 @@ class Level(StrEnum):
 
 
 class Cause(StrEnum):
-    """What is at fault. Programs may rely on these names."""
+    """What is at fault. Programs may rely on these names, which deploy/CONNECT.md lists."""
 
     PORT_MISSING = "port-missing"
     PORT_DENIED = "port-denied"
@@ -72,6 +72,9 @@ class Cause(StrEnum):
 _LOSS = frozenset({Cause.FRAMES_LOST, Cause.SLOW, Cause.ELECTRODE_UNREAD, Cause.SILENT})
 _NOISE = frozenset({Cause.SENSOR_WORDS, Cause.REPEATED, Cause.ELECTRODE_RESTLESS})
 EXPLAINS: dict[Cause | None, frozenset[Cause]] = {
+    Cause.PORT_HELD: _LOSS
+    | _NOISE
+    | {Cause.LINK_LOST, Cause.DAMAGED, Cause.CLOCK, Cause.RESTARTED},
     Cause.LINK_LOST: _LOSS | {Cause.DAMAGED, Cause.CLOCK, Cause.REPEATED, Cause.RESTARTED},
     Cause.DAMAGED: _LOSS | _NOISE | {Cause.CLOCK, Cause.RESTARTED},
     Cause.BUS_ERRORS: _LOSS | {Cause.LINK_LOST},

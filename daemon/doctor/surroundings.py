@@ -73,6 +73,20 @@ def explained(finding: Finding, section: Section) -> list[Finding]:
             return [finding]
 
 
+def shared_findings(section: Section) -> list[Finding]:
+    """Whether another program has a serial port open that could be opened all the same.
+
+    `explained` says which. `section` is the one of the scene that names the port's driver.
+    """
+    match section:
+        case SpiTactile(port=port) | CanTactile(channel=port):
+            what = f"{section.driver}: {port} is open in another program, which may take its bytes"
+            held = Finding(Level.WARNING, what, Cause.PORT_HELD, "end it")
+            return [held] if computer.file_holders(port) else []
+        case _:
+            return []
+
+
 def can_finding(interface: computer.CanInterface, tactile: CanTactile | None = None) -> Finding:
     """The state of a CAN interface, and how to bring it up for this section of a scene."""
     if interface.is_fine:

@@ -126,7 +126,7 @@ class Pipeline:
 
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
-        self._clock = clock
+        self.clock = clock
         self._learns = learns
         self._needs_session = needs_session
         self._fingers = contract.fingers
@@ -249,6 +249,10 @@ class Pipeline:
             self._note(grasp, judgement.grasp)
         return judgement
 
+    def watch(self, reading: TactileReading) -> None:
+        """Take in a reading that is not to be judged: what repeats it later is not fresh."""
+        self._health.watch(reading)
+
     def silence(self, last_t_ns: int) -> Judgement:
         """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
         if self.grip is None:
@@ -325,7 +329,7 @@ class Pipeline:
             return Felt(self.memory.readings, None if watched.reasons else reading.counts)
         grip.observe(reading, watched)
         counts, renews = None, grip.renews
-        if not watched.reasons and 0 <= self._age_ns(reading.t_ns) <= self._limits.max_age_ns:
+        if not watched.reasons and 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns:
             counts = grip.counts_to_judge(reading, watched)
             if counts is not None:
                 grip.judged()
@@ -352,7 +356,7 @@ class Pipeline:
             settled=felt.settled,
             gate=felt.reasons,
             # Taken last, so that a slow inference counts too.
-            age_ns=self._age_ns(t_ns),
+            age_ns=self.clock() - t_ns,
             against_stable=None
             if self.trust is None or assessment is None
             else WITHHELD[self.trust.permission(GraspId(self.boot_id, felt.grasp), assessment)],
@@ -392,6 +396,3 @@ class Pipeline:
             risk=None if trust is None else trust.report(),
             judged_counts=counts,
         )
-
-    def _age_ns(self, t_ns: int) -> int:
-        return self._clock() - t_ns

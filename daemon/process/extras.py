@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+import sys
+from pathlib import Path
+
 OURS = frozenset({"daemon", "drivers", "models"})
 
 
@@ -15,6 +20,16 @@ def needs(what: str, extra: str, error: ModuleNotFoundError) -> str:
     if package in OURS:
         raise error
     return (
-        f"{what} needs the package '{package}': run pip install '.[{extra}]' in the folder of "
-        "graspd's source"
+        f"{what} needs the package '{package}': run {installer(Path(sys.prefix))} '.[{extra}]' in "
+        "the folder of graspd's source"
     )
+
+
+def installer(environment: Path) -> str:
+    """The command that adds packages to a virtual environment, by who made it: pipx, uv or pip."""
+    if (environment / "pipx_metadata.json").exists():
+        return f"pipx runpip {shlex.quote(environment.name)} install"
+    config = environment / "pyvenv.cfg"
+    if config.is_file() and re.search(r"^uv = ", config.read_text(), re.MULTILINE):
+        return f"uv pip install --python {shlex.quote(str(environment))}"
+    return "pip install"

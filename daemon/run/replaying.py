@@ -83,7 +83,8 @@ class Comparison(Companion):
     """Judges every judged grasp once more in another way, for the summary alone."""
 
     def __init__(self, how: str, pipeline: Pipeline, result: Summary) -> None:
-        """`how` is a key of `Summary.compared`; to `pipeline` each reading is a grasp."""
+        """`how` is a key of `Summary.compared`; to `pipeline` each reading is a grasp, and it has
+        the clock of the pipeline that made the verdicts."""
         self._how = how
         self._pipeline = pipeline
         self._result = result
@@ -91,7 +92,10 @@ class Comparison(Companion):
 
     def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
         """Count what the first verdict on a grasp would have been."""
-        if reading is None or not verdict.judged or verdict.grasp == self._grasp:
+        if reading is None:
+            return
+        if not verdict.judged or verdict.grasp == self._grasp:
+            self._pipeline.watch(reading)
             return
         self._grasp = verdict.grasp
         slipped = None if reading.annotation is None else reading.annotation.slipped

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
@@ -10,7 +9,7 @@ from typing import get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from daemon.process.text import printable
+from daemon.process.text import did_you_mean, printable
 
 Section = type[BaseModel]
 
@@ -45,9 +44,11 @@ def _line(path: Path, scene: Section, mistake: ErrorDetails) -> str:
         return f"{path}: {key}.driver: is missing"
     if mistake["type"] == "union_tag_invalid":
         context = mistake["ctx"]
-        known = context["expected_tags"].replace("'", "")
-        tag = printable(context["tag"], SHOWN_MAX)
-        return f"{path}: {key}.driver: no driver '{tag}'; there are: {known}"
+        known, tag = context["expected_tags"].replace("'", ""), context["tag"]
+        return (
+            f"{path}: {key}.driver: no driver '{printable(tag, SHOWN_MAX)}'"
+            f"{did_you_mean(tag, known.split(', ')) or f'; there are: {known}'}"
+        )
     message = mistake["msg"].removeprefix("Value error, ").replace("tuple", "list")
     message = printable(message, MESSAGE_MAX)
     given = mistake["input"]
@@ -102,7 +103,5 @@ def _tags(section: Section) -> tuple[str, ...]:
 def _suggestion(wrong: str, section: Section | None) -> str:
     known = list(section.model_fields) if section else []
     stem = wrong.rsplit("_", 1)[0]  # `max_age_s` for `max_age_ms`: the unit is the mistake
-    close = difflib.get_close_matches(wrong, known, n=1) or [
-        name for name in known if name.rsplit("_", 1)[0] == stem
-    ]
-    return f"; did you mean {close[0]}?" if close else f"; there are: {', '.join(known)}"
+    of_unit = (f"; did you mean {name}?" for name in known if name.rsplit("_", 1)[0] == stem)
+    return did_you_mean(wrong, known) or next(of_unit, f"; there are: {', '.join(known)}")

@@ -95,7 +95,7 @@ def figures(seen: Snapshot, name_max: int) -> list[Items]:
     """All figures with their units, in groups; the first of a group matter most."""
     timing, session = seen.timing, seen.session
     counts = ", ".join(f"{count} {decision}" for decision, count in seen.counts.items())
-    first: Items = [("grasps seen", counts)]
+    first: Items = [("since watch began", counts)]
     if seen.tone is Tone.SILENT and seen.last_t is not None:
         then = time.strftime("%H:%M:%S", time.localtime(seen.last_t))
         ago = f"{then}, {seen.t - seen.last_t:.0f} s ago; figures of then"

@@ -82,7 +82,6 @@ class Timing(msgspec.Struct, frozen=True, kw_only=True):
     verdicts_hz: float
     readings_hz: float | None
     age_ms: float | None
-    latency_us: float | None
     p50_us: float | None
     p99_us: float | None
     max_us: float | None

@@ -241,7 +241,6 @@ class View:
             verdicts_hz=(received - before) / elapsed_s if elapsed_s > 0.0 else 0.0,
             readings_hz=None if status is None else status.readings_hz,
             age_ms=None if verdict is None else verdict.age_ms,
-            latency_us=None if verdict is None else verdict.latency_us,
             p50_us=delays.get("p50"),
             p99_us=delays.get("p99"),
             max_us=delays.get("max"),

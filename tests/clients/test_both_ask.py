@@ -266,6 +266,26 @@ def test_an_answer_alone_allows_no_lift(lift_gate: Path, tmp_path: Path, outcome
         )
 
 
+@pytest.mark.parametrize("reasons", [["moving"], ["settling", "joints-late"]])
+@pytest.mark.parametrize("answers", [True, False])
+def test_where_nobody_answers_a_restless_hand_is_not_all_that_is_told(
+    lift_gate: Path, tmp_path: Path, reasons: list[str], answers: bool
+) -> None:
+    out, ask = f"ipc://{tmp_path}/out", f"ipc://{tmp_path}/{'ask' if answers else 'nobody'}"
+    deadline_s = 3.0 if answers else DEADLINE_S
+    expected = [*reasons, *([] if answers else ["no-answer"])]
+    with (
+        false_daemon(tmp_path, told(), "unknown", reasons=reasons),
+        Client(out, ask_endpoint=ask) as graspd,
+    ):
+        answer = graspd.may_i_lift(deadline_s)
+        words = [str(lift_gate), out, str(deadline_s), ask]
+        result = subprocess.run(words, capture_output=True, text=True, timeout=200, check=False)
+    assert (bool(answer), list(answer.verdict.reasons)) == (False, expected)
+    assert result.returncode == 1
+    assert [word for word in result.stdout.split() if word in (*reasons, "no-answer")] == expected
+
+
 BOOT = "0f0e0d0c0b0a09080706050403020100"
 LIFTED_ON = Verdict(Decision.STABLE, grasp=42, boot_id=BOOT)
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -185,16 +186,27 @@ def test_slip_is_a_no_at_once_however_short_a_time_the_hand_has_been_still() -> 
     assert answer.waited_s < 1e-3
 
 
-@pytest.mark.parametrize("deadline_s", [-1.0, float("nan"), float("inf")])
-def test_a_deadline_that_is_none_is_refused(deadline_s: float) -> None:
+@pytest.mark.parametrize("deadline_s", [-1.0, float("nan"), float("inf"), "half", None])
+def test_a_deadline_that_is_none_is_refused(deadline_s: Any) -> None:  # noqa: ANN401
     with client(World([])) as graspd, pytest.raises(ValueError, match="deadline"):
         graspd.may_i_lift(deadline_s)
 
 
-@pytest.mark.parametrize("max_age_ms", [0.0, float("nan"), float("inf")])
-def test_an_age_that_is_none_is_refused(max_age_ms: float) -> None:
+@pytest.mark.parametrize("max_age_ms", [0.0, float("nan"), float("inf"), "long", None])
+def test_an_age_that_is_none_is_refused(max_age_ms: Any) -> None:  # noqa: ANN401
     with pytest.raises(ValueError, match="max_age_ms"):
         Client("ipc:///nowhere", max_age_ms=max_age_ms)
+
+
+@pytest.mark.parametrize("name", ["endpoint", "hand", "ask_endpoint"])
+@pytest.mark.parametrize("value", [None, 5555, b"ipc:///nowhere"])
+def test_a_place_that_is_no_text_is_refused(name: str, value: Any) -> None:  # noqa: ANN401
+    places = {"endpoint": "ipc:///nowhere", name: value}
+    if (name, value) == ("ask_endpoint", None):
+        Client(**places).close()
+    else:
+        with pytest.raises(TypeError, match=f"^{name} must be a text, not "):
+            Client(**places)
 
 
 def test_a_closed_client_says_no_without_waiting() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
+import signal
 import subprocess
 from pathlib import Path
 
@@ -89,6 +91,15 @@ def test_the_unit_keeps_what_the_daemon_needs() -> None:
     (before,) = unit["ExecStartPre"]
     assert before.startswith("-/opt/graspd/")
     assert before.endswith(" check /etc/graspd/%i.toml")
+
+
+def test_a_reload_needs_nothing_but_the_shell(tmp_path: Path) -> None:
+    (command,) = settings(UNIT)["ExecReload"]
+    with subprocess.Popen(["/bin/sleep", "60"]) as process:
+        words = shlex.split(command.replace("$MAINPID", str(process.pid)))
+        assert words[0] == "/bin/sh"
+        subprocess.run(words, check=True, env={"PATH": str(tmp_path)}, timeout=60)
+        assert process.wait(60) == -signal.SIGHUP
 
 
 def test_every_priority_that_a_scene_may_name_is_granted() -> None:

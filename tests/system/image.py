@@ -22,7 +22,7 @@ PACKAGES: Final = (
     "python3-venv",
     "iproute2",
     "kmod",
-    "procps",  # /bin/kill, which every Debian but a minimal one has
+    "procps",  # ps
 )
 MODULES: Final = (
     "arch",

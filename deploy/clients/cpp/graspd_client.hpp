@@ -650,6 +650,7 @@ public:
         if (!asks_) return newest;
         if (const auto payload = asked_ ? link_.asking.answer() : std::nullopt) {
             asked_ = false;
+            heard_ = true;
             answer_ = newest_.answered(*payload);
             if (answer_) answer_ = if_still(*std::move(answer_));
             const bool permitted = answer_ && permits(*answer_);
@@ -671,6 +672,15 @@ public:
                                                      : newest.reasons);
     }
 
+    // What was decided; if it is no lift on a message, also that nobody has answered.
+    Verdict at_the_end(Verdict said) const {
+        auto& why = said.reasons;
+        if (asks_ && !heard_ && said.seq && !is_over(said) &&
+            std::find(why.begin(), why.end(), "no-answer") == why.end())
+            why.emplace_back("no-answer");
+        return said;
+    }
+
 private:
     // A verdict, unknown if it permits a lift before the hand has been still for so long.
     Verdict if_still(Verdict said) const {
@@ -680,7 +690,7 @@ private:
 
     Newest& newest_;
     Link& link_;
-    bool asks_, supervised_, asked_ = false;
+    bool asks_, supervised_, asked_ = false, heard_ = false;
     std::optional<double> still_ms_;
     std::optional<Verdict> answer_;  // that is to be confirmed
 };
@@ -739,6 +749,7 @@ public:
             if (detail::now_ns() > due_ns && question.permits(decided))
                 decided = decided.unknown({"late"});
         }
+        decided = question.at_the_end(std::move(decided));
         const auto waited_ns = static_cast<double>(detail::now_ns() - began_ns);
         const LiftAnswer answer{decided, waited_ns / 1e9, supervised && decided.supervised};
         if (answer) allow(key(decided));

@@ -23,6 +23,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from numbers import Real
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -229,13 +230,16 @@ class Client:
         somebody to tell. `same_computer` says whether the daemon's monotonic clock is one's own;
         unless given, it is with `ipc://` and on loopback addresses: say False through a tunnel.
         A `stable` with a `p_slip` of `max_p_slip` or more is none: say the scene's `slip_threshold`
-        if that is higher. Raises `zmq.ZMQError` for an endpoint, `ValueError` for an age or a
-        probability that is none.
+        if that is higher. Raises `zmq.ZMQError` for an endpoint, `TypeError` for one that is no
+        text, `ValueError` for an age or a probability that is none.
         """
-        if not 0.0 < max_age_ms < math.inf:
-            raise ValueError(f"max_age_ms must be above 0 and finite, not {max_age_ms}")
-        if not 0.0 < max_p_slip <= 1.0:
-            raise ValueError(f"max_p_slip must be above 0 and at most 1, not {max_p_slip}")
+        for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
+            if not isinstance(text, str) and (name, text) != ("ask_endpoint", None):
+                raise TypeError(f"{name} must be a text, not {text!r}")
+        if not (_is_time(max_age_ms) and max_age_ms > 0.0):
+            raise ValueError(f"max_age_ms must be above 0 and finite, not {max_age_ms!r}")
+        if not (_is_time(max_p_slip) and 0.0 < max_p_slip <= 1.0):
+            raise ValueError(f"max_p_slip must be above 0 and at most 1, not {max_p_slip!r}")
         if same_computer is None:
             same_computer = is_same_computer(endpoint)
         topic = f"verdict.{hand}".encode()
@@ -292,10 +296,10 @@ class Client:
         gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
         Raises `ValueError` for a time that is none.
         """
-        if not 0.0 <= deadline_s < math.inf:
-            raise ValueError(f"the deadline must be 0 s or more and finite, not {deadline_s}")
-        if still_ms is not None and (isinstance(still_ms, bool) or not 0.0 <= still_ms < math.inf):
-            raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms}")
+        if not _is_time(deadline_s):
+            raise ValueError(f"the deadline must be 0 s or more and finite, not {deadline_s!r}")
+        if still_ms is not None and not _is_time(still_ms):
+            raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms!r}")
         began_ns = time.monotonic_ns()
         due_ns = began_ns + round(deadline_s * 1e9)
         asking = self._link.asking if self._asks and not self._closed else None
@@ -308,6 +312,7 @@ class Client:
                     decided = decided.unknown("late")
         finally:
             self._link.asking.hang_up()
+        decided = question.at_the_end(decided)
         waited_s = (time.monotonic_ns() - began_ns) / 1e9
         answer = LiftAnswer(decided, waited_s, supervised is True and decided.supervised)
         if answer:
@@ -572,7 +577,7 @@ class _Question:
     ) -> None:
         self._newest, self._asking, self._supervised = newest, asking, supervised
         self._still_ms = still_ms
-        self._asked = False
+        self._asked = self._heard = False
         self._answer: Verdict | None = None
         """That is to be confirmed."""
 
@@ -591,7 +596,7 @@ class _Question:
             return newest
         payload = self._asking.answer() if self._asked else None
         if payload is not None:
-            self._asked = False
+            self._asked, self._heard = False, True
             answer = self._newest.read(payload)
             said = Verdict(Decision.UNKNOWN)
             if not isinstance(answer, str):
@@ -613,6 +618,12 @@ class _Question:
         if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
         return newest.unknown(*(newest.reasons or ("no-answer",)))
+
+    def at_the_end(self, said: Verdict) -> Verdict:
+        """What was decided; if it is no lift on a message, also that nobody has answered."""
+        if self._asking is None or self._heard or said.seq is None or self.is_over(said):
+            return said
+        return replace(said, reasons=tuple(dict.fromkeys([*said.reasons, "no-answer"])))
 
     def _if_still(self, said: Verdict) -> Verdict:
         """A verdict, unknown if it permits a lift before the hand has been still for so long."""
@@ -705,6 +716,13 @@ class _Call:
 def is_same_computer(endpoint: str) -> bool:
     """Whether an endpoint can only be of this computer."""
     return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
+
+
+def _is_time(value: object) -> bool:
+    """Whether it is a number, 0 or more and finite."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return False
+    return 0.0 <= float(value) < math.inf
 
 
 def _slept_ns() -> int:

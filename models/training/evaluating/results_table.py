@@ -19,6 +19,11 @@ REFERENCE = "cnn1"
 FIGURES = ("f1", "accuracy", "precision", "recall")
 """Figures that the paper gives."""
 
+ONE_ROW = (
+    "A row is made again by its system, its protocols and its seeds in place of those of the "
+    "command; of several commands the first stands for all rows that have no other."
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Made:
@@ -266,6 +271,7 @@ def _everything(summaries: Sequence[Summary]) -> Iterator[str]:
 def _how(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
     yield "## How this was made"
     yield f"    {made.command}"
+    yield ONE_ROW
     total = sum(summary.seconds for summary in summaries)
     yield (
         f"{sum(map(_trainings, summaries))} trainings, {_duration(total)} in all on one thread "

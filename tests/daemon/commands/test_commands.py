@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -109,6 +110,24 @@ def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) ->
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize(
+    ("sections", "says"),
+    [
+        ("", "nothing is written but what the session has learned"),
+        ("[session]\nkeep = false", "nothing is written"),
+        ("[model]\nname = 'cnn1'\n[learn]\nenabled = false", "nothing is written"),
+        ("[model]\nname = 'cnn1'", "nothing is written but what the session has learned"),
+    ],
+)
+def test_check_says_what_is_written_without_a_recording(
+    tmp_path: Path, sections: str, says: str
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(f'[tactile]\ndriver = "can"\n{sections}\n')
+    result = graspd("check", scene, "--json")
+    assert json.loads(result.stdout)["left_out"]["record"] == says, result.stderr
+
+
 EARLY = "judged early after 100 ms, again after 240 ms"
 
 
@@ -155,6 +174,27 @@ def test_check_says_nothing_of_motion_where_each_reading_is_a_grasp(tmp_path: Pa
         f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n[gate]\nmode = "every"\n'
     )
     assert "still" not in json.loads(graspd("check", scene, "--json").stdout)["in"]
+
+
+def test_run_names_the_process_that_has_the_port(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.toml"
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+        socket.create_server(("127.0.0.1", 0)) as tcp,
+    ):
+        udp.bind(("127.0.0.1", 0))
+        endpoint = f"ipc://{tmp_path}/graspd"
+        for source, publish in (
+            (f"udp://127.0.0.1:{udp.getsockname()[1]}", endpoint),
+            ("udp://127.0.0.1:0", f"tcp://127.0.0.1:{tcp.getsockname()[1]}"),
+        ):
+            scene.write_text(
+                f'[tactile]\ndriver = "palm"\nsource = "{source}"\n'
+                f'[publish]\nendpoint = "{publish}"\n[session]\nkeep = false\n'
+            )
+            result = graspd("run", scene)
+            assert result.returncode == 1, result.stderr
+            assert f"Address already in use: PID {os.getpid()}, " in result.stderr
 
 
 def test_check_finds_a_recording_that_is_not_there(tmp_path: Path) -> None:

@@ -279,6 +279,12 @@ fcntl.flock(held, fcntl.LOCK_EX)
 print(flush=True)
 sys.stdin.read()
 """
+HOLD_OPEN = """
+import os, sys
+held = os.open(sys.argv[1], os.O_RDONLY | os.O_NOCTTY)
+print(flush=True)
+sys.stdin.read()
+"""
 HOLD_UDP = """
 import socket, sys
 held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -320,6 +326,19 @@ def test_a_port_that_another_program_holds_is_told_with_its_pid(
         os.close(slave)
     assert told["cause"] == "port-held"
     assert f"PID {pid}, {sys.executable} -c" in told["what"]
+    assert told["advice"] == f"end it: kill {pid}"
+
+
+def test_a_reader_without_a_lock_is_told_with_its_pid(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], healthy: str
+) -> None:
+    port = tmp_path / "bridge"
+    with holder(HOLD_OPEN, port) as (pid, _):
+        (told,) = look(tmp_path, capsys, healthy + MODEL + published(tmp_path))
+    assert told["cause"] == "port-held"
+    assert told["level"] == "warning"
+    assert f"{port} is open in another program" in told["what"]
+    assert f"PID {pid}, " in told["what"]
     assert told["advice"] == f"end it: kill {pid}"
 
 

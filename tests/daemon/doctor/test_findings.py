@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -223,6 +224,12 @@ def test_a_link_that_is_not_up_is_an_error_with_cause_and_advice(
     assert finding.level is Level.ERROR
     assert finding.what == f"palm: link {state}" + (f": {why}" if why else "")
     assert finding.advice
+
+
+def test_the_page_names_every_cause_once_and_nothing_else() -> None:
+    page = (Path(__file__).parents[3] / "deploy/CONNECT.md").read_text()
+    _, table = page.split("| of | causes |\n")
+    assert sorted(re.findall(r"`([^`]+)`", table)) == sorted(Cause)
 
 
 def test_a_recording_has_no_link() -> None:

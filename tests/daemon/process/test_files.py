@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.process.extras import needs
+from daemon.process.extras import installer, needs
 from daemon.process.files import read_regular, write_atomically
 from daemon.process.text import markdown_table
 
@@ -77,6 +77,24 @@ def test_a_missing_package_is_named_with_its_extra_and_a_missing_part_of_graspd_
     )
     with pytest.raises(ModuleNotFoundError, match=r"daemon\.nothing"):
         needs("watch", "watch", ModuleNotFoundError("daemon.nothing", name="daemon.nothing"))
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "command"),
+    [
+        ("pyvenv.cfg", "home = /usr/bin\n", "pip install"),
+        ("pipx_metadata.json", "{}", "pipx runpip graspd install"),
+        ("pyvenv.cfg", "home = /usr/bin\nuv = 0.4.0\n", "uv pip install --python {}"),
+    ],
+)
+def test_packages_are_added_by_what_made_the_environment(
+    tmp_path: Path, file: str, content: str, command: str
+) -> None:
+    environment = tmp_path / "graspd"
+    environment.mkdir()
+    assert installer(environment) == "pip install"
+    (environment / file).write_text(content)
+    assert installer(environment) == command.format(environment)
 
 
 def test_a_table_is_markdown_with_numbers_to_the_right_and_bars_escaped() -> None:

@@ -8,11 +8,14 @@ from typing import Literal
 import msgspec
 import pytest
 
+from daemon.judge.reasons import Decision, Reason
+from daemon.judge.recurrence import SWEEPS
 from daemon.publish.companion import Answer
 from daemon.publish.messages import decode_verdict
-from daemon.run.replaying import Controller
+from daemon.run.replaying import Comparison, Controller
+from daemon.run.summary import WITHOUT_SESSION, Summary
 from drivers.base import Annotation
-from tests.daemon.fakes import reading
+from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 
 GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
 
@@ -54,3 +57,24 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     controller.on_verdict(verdict, b"", msgspec.structs.replace(reading(0), annotation=note))
     controller.tell()
     assert requests.told == [("slip", told)]
+
+
+@pytest.mark.parametrize(("between", "fresh"), [(SWEEPS, True), (SWEEPS - 2, False)])
+def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
+    between: int, fresh: bool
+) -> None:
+    clock, result = Clock(), Summary()
+    run, compared = pipeline(FakeModel(), clock), pipeline(FakeModel(), clock)
+    comparison = Comparison(WITHOUT_SESSION, compared, result)
+    verdict = decode_verdict(GOLDEN.read_bytes())
+    seeds = [1, *range(2, 2 + between), 1]
+    for seq, seed in enumerate(seeds):
+        new = reading(clock.now_ns, seed=seed, seq=seq)
+        last = run.judge(new)
+        judged = seq in (0, len(seeds) - 1)
+        told = msgspec.structs.replace(verdict, judged=judged, grasp=1 + seq)
+        comparison.on_verdict(told, b"", new)
+    tally = result.compared[WITHOUT_SESSION]
+    assert tally.decisions.total() == 2
+    assert tally.decisions[Decision.UNKNOWN] == tally.reasons[Reason.FROZEN] == (not fresh)
+    assert (Reason.FROZEN in last.reasons) is not fresh

@@ -55,10 +55,11 @@ def test_a_scene_does_not_change_after_loading(tmp_path: Path) -> None:
         ("", "tactile", "is missing"),
         ("[tactile]\nrecordings = ['a']", "tactile.driver", "is missing"),
         (
-            "[tactile]\ndriver = 'spy'\nrecordings = ['a']",
+            "[tactile]\ndriver = 'i2c'\nrecordings = ['a']",
             "tactile.driver",
             "there are: replay, spi, can, palm",
         ),
+        ("[tactile]\ndriver = 'spii'", "tactile.driver", "no driver 'spii'; did you mean spi?"),
         ("[tactile]\ndriver = 'replay'\nrecordings = []", "tactile.recordings", "at least 1"),
         ("[tactile]\ndriver = 'replay'\nrecordings = 'a'", "tactile.recordings", "valid list"),
         (GOOD + "[hnad]\nname = 'left'", "hnad", "did you mean hand?"),

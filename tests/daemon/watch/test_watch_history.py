@@ -59,7 +59,9 @@ def test_grasps_are_counted_once_each_however_many_readings_they_have() -> None:
             assert view.snapshot(0).counts == {"stable": 0, "slip": 2, "unknown": 1}
     seen = view.snapshot(0)
     assert seen.counts == {"stable": 1, "slip": 2, "unknown": 1}
-    assert "grasps seen 1 stable, 2 slip, 1 unknown" in "\n".join(text_of(seen, 80, 24, Canvas()))
+    assert "since watch began 1 stable, 2 slip, 1 unknown" in "\n".join(
+        text_of(seen, 80, 24, Canvas())
+    )
     closing = verdict(seq, grasp=5, gate=GateState.CLOSING)
     view.take(b"verdict.right", closing, 0)
     assert view.snapshot(0).counts == seen.counts  # not known yet

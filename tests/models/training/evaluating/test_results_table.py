@@ -15,7 +15,7 @@ pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 
 from models.training.data.protocols import EvalProtocol, splits
 from models.training.evaluating.jobs import JobResult
-from models.training.evaluating.results_table import Made, difference, results_table
+from models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
 from models.training.evaluating.summaries import (
     Summary,
     read_summaries,
@@ -166,6 +166,14 @@ def test_every_published_row_is_there_even_if_nothing_was_run(
     assert [f"`{system}`", f"`{protocol}`", figure, paper, "-", "-", "-", "-"] in rows(
         results_table([], MADE), 1
     )
+
+
+def test_the_document_says_itself_how_one_row_is_made_again() -> None:
+    kept = (Path(__file__).parents[4] / "models/RESULTS.md").read_text()
+    for text in (kept, results_table([], MADE)):
+        command, sentence, *_ = text.split("## How this was made\n\n")[1].split("\n\n")
+        assert command.startswith("    graspd evaluate ")
+        assert sentence == ONE_ROW
 
 
 def test_sessions_are_told_by_the_number_of_grasps() -> None:
