@@ -32,6 +32,9 @@ def _run(heeded: bool) -> int:
     # Modules leave next to no garbage: to look for it takes a tenth of a start, and to look through
     # what is loaded, ever again, 30 ms in which no reading is judged.
     gc.disable()
+    # Matrices are small here. numpy's threads for large ones, one for each further processor, would
+    # spin through the start; and with memory locked each of them takes its whole stack.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from daemon.cli import parse
 
     command = parse()
