@@ -80,6 +80,9 @@ def parse(arguments: Sequence[str] | None = None) -> Callable[[], int]:
     arguments = sys.argv[1:] if arguments is None else arguments
     named = next((word for word in arguments if not word.startswith("-")), None)
     parser = _parser(lambda name: name == named)
+    if not arguments:
+        parser.print_help(sys.stderr)
+        raise SystemExit(WRONG)
     args = parser.parse_args(arguments)
     logs.set_up(os.environ)
     if args.command != named:

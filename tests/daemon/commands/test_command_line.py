@@ -117,6 +117,12 @@ def test_what_is_mistyped_is_answered_with_the_nearest(arguments: list[str], mea
     assert done.stderr.endswith(f"; did you mean {meant}?\n")
 
 
+def test_without_a_command_it_names_all_that_there_are() -> None:
+    bare = graspd()
+    assert (bare.returncode, bare.stdout) == (2, "")
+    assert bare.stderr == graspd("--help").stdout
+
+
 def test_what_is_like_nothing_is_answered_with_no_guess() -> None:
     done = graspd("qqqq")
     assert done.returncode == 2
