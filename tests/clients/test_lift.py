@@ -188,8 +188,11 @@ def test_slip_is_a_no_at_once_however_short_a_time_the_hand_has_been_still() -> 
 
 @pytest.mark.parametrize("deadline_s", [-1.0, float("nan"), float("inf"), "half", None])
 def test_a_deadline_that_is_none_is_refused(deadline_s: Any) -> None:  # noqa: ANN401
-    with client(World([])) as graspd, pytest.raises(ValueError, match="deadline"):
-        graspd.may_i_lift(deadline_s)
+    with client(World([])) as graspd:
+        with pytest.raises(ValueError, match="deadline"):
+            graspd.may_i_lift(deadline_s)
+        with pytest.raises(ValueError, match="wait_s"):
+            graspd.verdict(deadline_s)
 
 
 @pytest.mark.parametrize("max_age_ms", [0.0, float("nan"), float("inf"), "long", None])

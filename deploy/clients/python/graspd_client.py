@@ -272,10 +272,13 @@ class Client:
         return self._forgotten + sum(untold)
 
     def verdict(self, wait_s: float = 0.0) -> Verdict:
-        """The newest verdict; waits at most `wait_s` seconds for a new message."""
+        """The newest verdict; waits at most `wait_s` seconds for a new message.
+
+        Raises `ValueError` for a time that is none.
+        """
+        due_ns = time.monotonic_ns() + _duration_ns("wait_s", wait_s)
         if self._closed:
             return Verdict(Decision.UNKNOWN, ("closed",))
-        due_ns = time.monotonic_ns() + round(wait_s * 1e9)
         while not self._drain() and self._wait(due_ns):
             pass
         if self._behind:
@@ -296,12 +299,10 @@ class Client:
         gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
         Raises `ValueError` for a time that is none.
         """
-        if not _is_time(deadline_s):
-            raise ValueError(f"the deadline must be 0 s or more and finite, not {deadline_s!r}")
         if still_ms is not None and not _is_time(still_ms):
             raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms!r}")
         began_ns = time.monotonic_ns()
-        due_ns = began_ns + round(deadline_s * 1e9)
+        due_ns = began_ns + _duration_ns("deadline_s", deadline_s)
         asking = self._link.asking if self._asks and not self._closed else None
         question = _Question(self._newest, asking, supervised is True, still_ms)
         try:
@@ -330,16 +331,16 @@ class Client:
 
         Waits at most `wait_s` seconds: graspd answers once it is written to disk. An answer that
         comes later is taken in by later calls; without one, tell it again. Raises `ValueError`
-        without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` that is none,
-        and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins with one
-        of the last two.
+        without an ask endpoint, for a verdict that is of no grasp, for an `Outcome` or a time that
+        is none, and for a name that is no 1 to 64 letters (ASCII), digits, `_`, `-`, `.`, or begins
+        with one of the last two.
         """
         telling = _telling(lifted_on, Outcome(how), object_name)
         if not self._asks:
             raise ValueError("an outcome needs an ask_endpoint")
+        due_ns = time.monotonic_ns() + _duration_ns("wait_s", wait_s)
         if self._closed:
             return OutcomeAnswer("closed")
-        due_ns = time.monotonic_ns() + round(wait_s * 1e9)
         self._link.telling.hang_up()
         self._link.telling.ask(telling)
         self._told, self._telling = OutcomeAnswer("no-answer"), _key(lifted_on)
@@ -716,6 +717,12 @@ class _Call:
 def is_same_computer(endpoint: str) -> bool:
     """Whether an endpoint can only be of this computer."""
     return endpoint.startswith(("ipc://", "tcp://127.", "tcp://[::1]", "tcp://localhost:"))
+
+
+def _duration_ns(name: str, seconds: float) -> int:
+    if not _is_time(seconds):
+        raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
+    return round(seconds * 1e9)
 
 
 def _is_time(value: object) -> bool:
