@@ -410,6 +410,20 @@ def test_letting_go_takes_less_than_six_tenths_of_a_touch() -> None:
     assert not hand.play(touched(0.5, 12.0)).any(), "10 begins none"
 
 
+def test_a_hold_is_measured_by_how_deep_it_was_seconds_before() -> None:
+    hand = Hand()
+    hand.play(still(2.0))
+    assert hand.play(touched(0.5, 400.0)).any(axis=0).all()
+    # Electrodes feel all or a fifth of a touch: their falls are four fifths of it apart. A quarter
+    # of 320, less 5 counts/s, is where it lets go: 64 after 13 s, 76 after 3 s.
+    assert hand.play(touched(3.0, 150.0))[-1].all()
+    assert not hand.play(touched(0.2, 85.0))[-1].any()
+    hand.play(still(2.0))
+    assert hand.play(touched(0.5, 400.0)).any(axis=0).all()
+    assert hand.play(touched(13.0, 150.0))[-1].all()
+    assert hand.play(touched(0.2, 95.0))[-1].all()
+
+
 def test_memory_does_not_grow() -> None:
     hand = Hand()
     sweeps = np.concatenate([still(3.0), touched(2.0, 100.0)])
