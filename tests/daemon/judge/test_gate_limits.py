@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -173,7 +174,8 @@ def test_another_grasp_is_more_than_the_limit_away(counts: int, state: str) -> N
 
 
 @pytest.mark.parametrize(
-    ("gap_ms", "causes"), [(100, ""), (100.001, "closing:gap"), (-1, "closing:gap")]
+    ("gap_ms", "causes"),
+    [(100, ""), (100.001, "closing:gap"), (-1, "closing:gap"), (-1e-6, "closing:gap")],
 )
 def test_a_gap_is_longer_than_its_limit(gap_ms: float, causes: str) -> None:
     steps = Steps()
@@ -338,6 +340,33 @@ def test_a_finger_lost_while_settled_is_contact_lost() -> None:
     assert steps.gate.state is GateState.SETTLED
     steps.step(touching=(True, True, False))
     assert steps.gate.take_changes()[-1].cause is GateCause.CONTACT_LOST
+
+
+def test_a_grasp_that_slides_slowly_while_settled_must_settle_anew() -> None:
+    steps = Steps(on_request=True)
+    steps.rest()
+    for _ in range(25):
+        steps.step()
+    assert steps.gate.state is GateState.SETTLED
+    for sweep in range(100):
+        if steps.step(counts=3000 + 0.37 * sweep) is not GateState.SETTLED:
+            break
+    assert steps.gate.motion.early, "nothing moves fast"
+    assert steps.gate.take_changes()[-1].cause is GateCause.MOVED
+
+
+def test_a_finger_that_need_not_touch_need_not_be_tared() -> None:
+    grip, none = Grip(FINGERS, replace(LIMITS, required=FINGERS[:2])), Watched((), ~ALL)
+    for t_s, reading in readings(Scenario("firm", GRASPED, UP)):
+        counts = reading.counts.copy()
+        counts[2] += round(22.0 * (t_s + 5.0))  # it warms up too fast to be tared, and is no slide
+        grip.observe(msgspec.structs.replace(reading, counts=counts), none)
+        if grip.counts_to_judge(reading, none) is not None:
+            grip.judged()
+        if t_s > 0.7:
+            break
+    assert grip.tared == FINGERS[:2]
+    assert grip.settled
 
 
 def test_released_ends_though_time_went_back() -> None:
