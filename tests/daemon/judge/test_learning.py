@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
-from daemon.judge.pipeline import Pipeline
+from daemon.judge.pipeline import Judgement, Pipeline
+from daemon.judge.reasons import Decision, Reason
 from drivers.base import TactileReading
 from drivers.twins.grasps import synthetic
 from models import zoo
@@ -25,9 +26,11 @@ def grasps(number: int) -> NDArray[np.uint16]:
     return drawn.counts.reshape(number, 3, 24)
 
 
-def judge(pipeline: Pipeline, rows: NDArray[np.uint16]) -> None:
-    for seq, row in enumerate(rows):
+def judge(pipeline: Pipeline, rows: NDArray[np.uint16]) -> list[Judgement]:
+    return [
         pipeline.judge(TactileReading(0, seq, row, np.zeros(row.shape, dtype=np.uint8)))
+        for seq, row in enumerate(rows)
+    ]
 
 
 @pytest.fixture
@@ -67,3 +70,34 @@ def test_a_grasp_of_a_sensor_that_was_exchanged_is_not_learnt(pipeline: Pipeline
     pipeline.sensors_exchanged()
     assert pipeline.session is not None
     assert pipeline.session.grasps == 0
+
+
+def test_a_grasp_is_learnt_as_what_it_was_judged_to_be(
+    pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slips: list[bool | None] = []
+    monkeypatch.setattr(SessionCalibration, "observe", lambda *_, slip: slips.append(slip))
+    judged = judge(pipeline, grasps(40))
+    pipeline.learn()
+    known = [it for it in judged if it.decision is not Decision.UNKNOWN]
+    told = [slip for slip in slips if slip is not None]  # None: it is like nothing seen before
+    assert told == [it.decision is Decision.SLIP for it in known]
+    assert set(told) == {False, True}
+
+
+def test_who_needs_a_calibrated_session_has_no_verdict_before_it_is_one() -> None:
+    model = TactileModel(zoo.find("small-session"))
+    careful, bold = (
+        Pipeline(model, model.contract.fingers, Limits(10**9), lambda: 0, needs_session=needs)
+        for needs in (True, False)
+    )
+    rows, calibrated = grasps(60), []
+    for mine, other in zip(judge(careful, rows), judge(bold, rows), strict=True):
+        if mine.session_calibrated:
+            assert mine == other
+            calibrated.append(mine.decision)
+        else:
+            assert mine.decision is Decision.UNKNOWN
+            assert Reason.NOT_CALIBRATED in mine.reasons
+            assert Reason.NOT_CALIBRATED not in other.reasons
+    assert Decision.STABLE in calibrated
