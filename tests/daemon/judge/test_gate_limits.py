@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from daemon.judge.gate import CHANGES_MAX, Gate
 from daemon.judge.grip import Grip
 from daemon.judge.limits import GateLimits, JointLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
+from daemon.judge.stillness import Motion
 from tests.daemon.judge.test_gate import (
     ALL,
     FINGERS,
@@ -464,6 +466,26 @@ def test_motion_is_told_as_soon_as_one_window_knows_it_and_of_the_one_nearer_to_
     assert known[0.15][0] > 2.0 * known[0.15][1]
     assert 1.0 < known[0.79][1] < 1.4
     assert known[1.12][1] > 1.4
+
+
+def test_of_both_windows_the_one_nearer_to_its_limit_is_told() -> None:
+    grip, none = Grip(FINGERS, LIMITS), Watched((), ~ALL)
+    alone, told = Motion(3, LIMITS.gate.false_alarms, early=LIMITS.gate.early), set()
+    for _, reading in readings(Scenario("firm", GRASPED, UP)):
+        grip.observe(reading, none)
+        alone.add(reading.t_ns, reading.counts, ALL)
+        felt = grip.felt(None)
+        motion, limits = felt.motion or {}, felt.motion_limits or {}
+        if not grip.touching or not alone.known or max(alone.slow) == math.inf:
+            continue
+        for place, finger in enumerate(FINGERS):
+            fast = alone.fast[place], alone.fast_limits[place]
+            slow = alone.slow[place], alone.slow_limits[place]
+            is_slow = slow[0] / slow[1] > fast[0] / fast[1]
+            nearer = slow if is_slow else fast
+            assert (motion[finger], limits[finger]) == pytest.approx(nearer, abs=0.00501)
+            told.add(is_slow)
+    assert told == {False, True}
 
 
 def test_nobody_looks_for_motion_while_nothing_touches() -> None:
