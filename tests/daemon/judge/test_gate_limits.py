@@ -354,6 +354,7 @@ def test_a_grasp_that_slides_slowly_while_settled_must_settle_anew() -> None:
         if steps.step(counts=3000 + 0.37 * sweep) is not GateState.SETTLED:
             break
     assert steps.gate.motion.early, "nothing moves fast"
+    assert steps.gate.reasons == (Reason.MOVING,)
     assert steps.gate.take_changes()[-1].cause is GateCause.MOVED
 
 
