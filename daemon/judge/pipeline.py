@@ -127,6 +127,7 @@ class Pipeline:
             self._session = SessionCalibration(contract.input, electrodes.centre, electrodes.spread)
         self._limits = limits
         self.clock = clock
+        """Gives monotonic ns, by which readings have an age."""
         self._learns = learns
         self._needs_session = needs_session
         self._fingers = contract.fingers

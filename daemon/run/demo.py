@@ -73,11 +73,10 @@ class Demo(Companion):
         self._line("all", self._whole, report.target)
         self._write("", f"graspd learned from {trust.learner.outcomes} outcomes of lifts.")
         if report.target is not None and report.bound is not None:
-            more = report.bound - report.target * report.lifts
             self._write(
                 f"Of its {report.lifts} `stable` {report.slips} slipped; at most "
                 f"{int(report.bound)} can, whatever drifts: {100 * report.target:g} % of them, "
-                f"and {more:.2f} more."
+                f"and {report.beyond_share:.2f} more."
             )
         self._write("Each verdict: --verbose. Real grasps: `graspd data`.")
 

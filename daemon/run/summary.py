@@ -285,9 +285,9 @@ def _learned(trust: Trust | None) -> Iterator[str]:
     yield f"learned from {trust.learner.outcomes} outcomes"
     report = trust.report()
     if report.target is not None and report.bound is not None:
-        more = report.bound - report.target * report.lifts
         yield (
             f"risk: of {report.lifts} lifts of `stable` {report.slips} slipped, allowed are "
-            f"{100 * report.target:g} % and {more:.2f} more, so at most {report.bound:.1f}"
+            f"{100 * report.target:g} % and {report.beyond_share:.2f} more, "
+            f"so at most {report.bound:.1f}"
             + (f"; {report.outstanding} outcomes are still out" if report.outstanding else "")
         )

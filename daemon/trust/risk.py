@@ -68,6 +68,13 @@ class RiskReport(msgspec.Struct, frozen=True, kw_only=True):
     warm_up_left: Count
     """Outcomes that are missing until the warm-up is over; 0 without a risk."""
 
+    @property
+    def beyond_share(self) -> float:
+        """How many slips the bound allows beyond the target's share of the lifts; 0 without one."""
+        if self.target is None or self.bound is None:
+            return 0.0
+        return self.bound - self.target * self.lifts
+
 
 class RiskState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a rule knows; see the attributes of `Risk`."""
