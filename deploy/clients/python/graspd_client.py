@@ -236,9 +236,9 @@ class Client:
         for name, text in (("endpoint", endpoint), ("hand", hand), ("ask_endpoint", ask_endpoint)):
             if not isinstance(text, str) and (name, text) != ("ask_endpoint", None):
                 raise TypeError(f"{name} must be a text, not {text!r}")
-        if not (_is_time(max_age_ms) and max_age_ms > 0.0):
+        if not (_is_amount(max_age_ms) and max_age_ms > 0.0):
             raise ValueError(f"max_age_ms must be above 0 and finite, not {max_age_ms!r}")
-        if not (_is_time(max_p_slip) and 0.0 < max_p_slip <= 1.0):
+        if not (_is_amount(max_p_slip) and 0.0 < max_p_slip <= 1.0):
             raise ValueError(f"max_p_slip must be above 0 and at most 1, not {max_p_slip!r}")
         if same_computer is None:
             same_computer = is_same_computer(endpoint)
@@ -299,7 +299,7 @@ class Client:
         gets a no; without it, what the daemon calls `stable` is enough, also where it is `early`.
         Raises `ValueError` for a time that is none.
         """
-        if still_ms is not None and not _is_time(still_ms):
+        if still_ms is not None and not _is_amount(still_ms):
             raise ValueError(f"still_ms must be 0 or more and finite, not {still_ms!r}")
         began_ns = time.monotonic_ns()
         due_ns = began_ns + _duration_ns("deadline_s", deadline_s)
@@ -720,12 +720,12 @@ def is_same_computer(endpoint: str) -> bool:
 
 
 def _duration_ns(name: str, seconds: float) -> int:
-    if not _is_time(seconds):
+    if not _is_amount(seconds):
         raise ValueError(f"{name} must be 0 or more and finite, not {seconds!r}")
     return round(seconds * 1e9)
 
 
-def _is_time(value: object) -> bool:
+def _is_amount(value: object) -> bool:
     """Whether it is a number, 0 or more and finite."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return False
