@@ -65,11 +65,15 @@ class Steps:
         for _ in range(round(seconds * 100)):
             self.step(touching=NOTHING)
 
-    def grasp(self) -> None:
-        """Rest, touch, and hold until it is judged."""
+    def hold(self) -> None:
+        """Rest, touch, and hold until nothing moves or slides."""
         self.rest()
         for _ in range(25):
             self.step()
+
+    def grasp(self) -> None:
+        """Hold until it is judged."""
+        self.hold()
         assert self.gate.settled
 
     def story(self) -> str:
@@ -336,9 +340,7 @@ def test_a_single_reading_is_judged_as_it_came() -> None:
 
 def test_a_finger_lost_while_settled_is_contact_lost() -> None:
     steps = Steps(on_request=True)
-    steps.rest()
-    for _ in range(25):
-        steps.step()
+    steps.hold()
     assert steps.gate.state is GateState.SETTLED
     steps.step(touching=(True, True, False))
     assert steps.gate.take_changes()[-1].cause is GateCause.CONTACT_LOST
@@ -346,9 +348,7 @@ def test_a_finger_lost_while_settled_is_contact_lost() -> None:
 
 def test_a_grasp_that_slides_slowly_while_settled_must_settle_anew() -> None:
     steps = Steps(on_request=True)
-    steps.rest()
-    for _ in range(25):
-        steps.step()
+    steps.hold()
     assert steps.gate.state is GateState.SETTLED
     for sweep in range(100):
         if steps.step(counts=3000 + 0.37 * sweep) is not GateState.SETTLED:
