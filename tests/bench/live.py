@@ -12,7 +12,6 @@ import itertools
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -230,14 +229,6 @@ def where_of(kind: Kind, folder: Path) -> str:
     if kind == "spi":
         return str(folder / "bridge")
     return f"239.74.{os.getpid() % 250}.{2 + time.monotonic_ns() // 1000 % 250}"
-
-
-def free_port() -> int:
-    """A UDP port of this computer that nobody has."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Child:

@@ -28,11 +28,11 @@ from tests.bench.live import (
     PATIENCE_S,
     Child,
     Subscriber,
-    free_port,
     held_grasp,
     start_daemon,
     tactile_section,
 )
+from tests.ports import free_port
 
 JOINTS = ("FFJ3", "MFJ3", "THJ5")
 JOINT_PERIOD_S = 0.01
@@ -61,7 +61,7 @@ class Bench:
             stack.enter_context(self._subscriber)
             stack.enter_context(self.twin)
             joint_socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-            port = free_port()
+            port = free_port(socket.SOCK_DGRAM)
             joint_socket.connect(("127.0.0.1", port))
             threads = [
                 threading.Thread(target=self.twin.serve, args=(self._ends,)),

@@ -22,11 +22,11 @@ from daemon.publish.keys import load_pair, make
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import PATIENCE_S, Child, start_daemon
+from tests.ports import free_port
 from tests.threads import at_work
 
 MEMORY_MAX_MIB = 32.0
 """So far from rest the daemon's memory may go."""
-PUBLISH_PORT, ASK_PORT = 25951, 25952
 CONNECTIONS = 5000
 """In one round to each socket, of each kind."""
 OPEN_MAX = 1500
@@ -122,7 +122,7 @@ def hand(folder: Path, scheme: str) -> Iterator[Hand]:
         make(folder / "clients", "friend")
         keys = '[curve]\nsecret_key = "daemon.key_secret"\nclients = "clients"\n'
     if scheme != "ipc":
-        publish, ask = (f"tcp://127.0.0.1:{port}" for port in (PUBLISH_PORT, ASK_PORT))
+        publish, ask = (f"tcp://127.0.0.1:{port}" for port in (free_port(), free_port()))
     scene = folder / "scene.toml"
     scene.write_text(
         f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'

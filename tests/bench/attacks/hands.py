@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import operator
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -30,12 +31,12 @@ from tests.bench.live import (
     SEED,
     Subscriber,
     can_id,
-    free_port,
     judged_counts,
     start_daemon,
     tactile_section,
     where_of,
 )
+from tests.ports import free_port
 from tests.threads import at_work
 
 PALM_HZ = 1000.0 / 14.0
@@ -97,7 +98,7 @@ def second_palm(plan: Plan) -> Outcome:
     known, told, stable, tried = 0, 0, 0, 0
     for folder in plan.folders():
         tried += 1
-        port = free_port()
+        port = free_port(socket.SOCK_DGRAM)
         tactile = f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{port}"\n'
         with daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n") as subscriber:
             with sending(grasped(), port):

@@ -40,11 +40,11 @@ from tests.bench.live import (
     SEED,
     Subscriber,
     can_id,
-    free_port,
     start_daemon,
     tactile_section,
     where_of,
 )
+from tests.ports import free_port
 from tests.threads import at_work
 
 RING_MIN, RING_MAX = 2, 64
@@ -133,7 +133,7 @@ def over_can(
 
 
 def over_palm(_folder: Path, counts: Iterator[Counts], _rate_hz: float) -> tuple[str, Send]:
-    target = f"udp://127.0.0.1:{free_port()}"
+    target = f"udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
     serve = partial(PalmTwin(counts).serve, target)
     return f'[tactile]\ndriver = "palm"\nsource = "{target}"\n', serve
 
@@ -270,7 +270,7 @@ def joints_frozen(plan: Plan) -> Outcome:
     """Joint angles that stand still to the bit beside sweeps that go on."""
 
     def one(folder: Path) -> tuple[int, int]:
-        port, begin = free_port(), threading.Event()
+        port, begin = free_port(socket.SOCK_DGRAM), threading.Event()
         frozen_ns: list[int] = []
         counts = Ring(1, None, RATE_HZ).counts()
         section, serve = over_spi(folder, counts, RATE_HZ)

@@ -100,7 +100,6 @@ def test_a_sensor_that_fails_ends_in_unknown_at_the_subscriber(tmp_path: Path, f
         (["doctor", "--listen", "inf"], "inf is not a number from 0.1 to 3600"),
         (["run", "absent.toml"], "absent.toml: cannot read the scene"),
         (["nonsense"], "invalid choice"),
-        ([], "required"),
     ],
 )
 def test_a_wrong_command_line_is_exit_code_2(arguments: list[str], says: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -17,6 +18,7 @@ from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE, Pace, ReplayDriver
 from tests.bench.live import Subscriber
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
+from tests.ports import free_port
 
 WANTED = 150
 """Readings to wait for, of the 200 rows of the recording."""
@@ -32,7 +34,7 @@ TWINS: dict[str, list[str]] = {
     "can": [],
     "palm": ["--to", "udp://127.0.0.1:{port}"],
 }
-PORT = 25911
+PORT = free_port(socket.SOCK_DGRAM)
 
 
 def scene_for(kind: str, folder: Path) -> Path:

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -38,6 +39,7 @@ from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from tests.daemon.doctor.emulated import FINGERS, LINKS, STEPS_PER_S, Hand, faults_told, listen
 from tests.daemon.processes import start, wait_for
 from tests.drivers.can.can_standin import LOOPBACK, SocketBus, sweep_of_frames
+from tests.ports import free_port
 
 LOOK_S = 3
 
@@ -373,7 +375,9 @@ def test_an_address_of_another_computer_is_told(
     text = '[tactile]\ndriver = "palm"\nsource = "udp://192.0.2.1:9870"\n'
     (told,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
     assert told["cause"] == "address"
-    text += '[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:25878"\n'
+    text += (
+        f'[joints]\ndriver = "stream"\nsource = "udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"\n'
+    )
     _, joints = look(tmp_path, capsys, text + MODEL + published(tmp_path))
     assert joints["what"] == "joints: link greeting"
     assert joints["cause"] == "silent"
@@ -531,7 +535,9 @@ def test_a_socket_that_graspd_holds_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "graspd.lock").touch()
-    text = '[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:25877"\n'
+    text = (
+        f'[tactile]\ndriver = "palm"\nsource = "udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"\n'
+    )
     with holder(HOLD_LOCKED, tmp_path / "graspd.lock") as (pid, _):
         told = look(tmp_path, capsys, text + MODEL + published(tmp_path))
     assert [finding["cause"] for finding in told] == ["silent", "socket-held"]

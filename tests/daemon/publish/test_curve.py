@@ -15,7 +15,7 @@ import zmq
 from daemon.publish import access
 from daemon.publish.binding import Peer, PublishError
 from daemon.publish.curve import FREED_NS, GROWTH_MAX_BYTES, LOOK_NS, CurvePeer, Guard
-from tests.daemon.publish.test_keys import PATIENCE_S, PORT, Door, door
+from tests.daemon.publish.test_keys import PATIENCE_S, Door, door
 
 __all__ = ["door"]
 
@@ -89,7 +89,7 @@ def test_strangers_make_place_and_friends_stay(door: Door, monkeypatch: pytest.M
     assert door.hears(friend, PATIENCE_S)
     with contextlib.ExitStack() as stack:
         for _ in range(25):
-            stack.enter_context(socket.create_connection(("127.0.0.1", PORT), PATIENCE_S))
+            stack.enter_context(socket.create_connection(("127.0.0.1", door.port), PATIENCE_S))
         door.until(lambda: door.counted("crowded_out") == 20)
         assert door.hears(friend, PATIENCE_S)
         assert door.hears(door.connect(door.known), PATIENCE_S)

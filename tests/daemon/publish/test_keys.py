@@ -22,9 +22,8 @@ from daemon.publish.sockets import Sockets
 from daemon.scene import SceneError
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
+from tests.ports import free_port
 
-PORT = 25931
-ENDPOINT = f"tcp://127.0.0.1:{PORT}"
 PATIENCE_S = 100.0
 QUIET_S = 0.5
 """How long nothing may come to who is not let in, s."""
@@ -40,10 +39,13 @@ class Door:
         self.clients = folder / "clients"
         self.known = self.client("controller", folder / "theirs")
         (folder / "theirs" / "controller.key").rename(self.clients / "controller.key")
+        self.port = free_port()
+        self._endpoint = f"tcp://127.0.0.1:{self.port}"
+        self._ask = f"tcp://127.0.0.1:{free_port()}"
         text = {
             "tactile": {"driver": "replay", "recordings": ["any.csv"]},
-            "publish": {"endpoint": ENDPOINT},
-            "ask": {"endpoint": f"tcp://127.0.0.1:{PORT + 1}"},
+            "publish": {"endpoint": self._endpoint},
+            "ask": {"endpoint": self._ask},
             "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
         }
         self.sockets = Sockets(scene.parse(text, folder / "scene.toml"))
@@ -83,7 +85,7 @@ class Door:
         if keys is not None:
             made.curve_publickey, made.curve_secretkey = keys
             made.curve_serverkey = server or self.public
-        made.connect(ENDPOINT if kind == zmq.SUB else f"tcp://127.0.0.1:{PORT + 1}")
+        made.connect(self._endpoint if kind == zmq.SUB else self._ask)
         if kind == zmq.SUB:
             made.subscribe("")
         return made
@@ -175,7 +177,7 @@ STRANGERS = {
 def test_who_speaks_no_zeromq_is_turned_away_and_counted_once(
     door: Door, caplog: pytest.LogCaptureFixture, says: bytes
 ) -> None:
-    with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as stranger:
+    with socket.create_connection(("127.0.0.1", door.port), PATIENCE_S) as stranger:
         stranger.sendall(says)
         with contextlib.suppress(OSError):  # it may be cut off already
             stranger.shutdown(socket.SHUT_WR)
@@ -188,7 +190,7 @@ def test_who_speaks_no_zeromq_is_turned_away_and_counted_once(
 def test_friends_that_go_are_not_counted_and_who_waits_at_the_door_meanwhile_is(
     door: Door,
 ) -> None:
-    with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as silent:
+    with socket.create_connection(("127.0.0.1", door.port), PATIENCE_S) as silent:
         for _ in range(3):
             friend = door.connect(door.known)
             assert door.hears(friend, PATIENCE_S)
@@ -471,7 +473,7 @@ def test_a_folder_that_others_may_write_is_refused_before_anything_starts(
     scene = tmp_path / "scene.toml"
     scene.write_text(
         f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "{ENDPOINT}"\n'
+        f'[publish]\nendpoint = "tcp://127.0.0.1:{free_port()}"\n'
         '[curve]\nsecret_key = "keys/daemon.key_secret"\nclients = "keys/clients"\n'
     )
     (tmp_path / "keys").chmod(0o777)
@@ -504,7 +506,7 @@ def test_a_port_that_is_lost_to_another_costs_that_port_alone(
         deadline_s = time.monotonic() + PATIENCE_S
         while True:
             try:
-                thief.bind(("127.0.0.1", PORT))
+                thief.bind(("127.0.0.1", door.port))
                 break
             except OSError:
                 assert time.monotonic() < deadline_s

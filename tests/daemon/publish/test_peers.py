@@ -21,7 +21,7 @@ from daemon.publish.peer import SUBSCRIPTIONS_MAX
 from daemon.publish.peers import PEERS_MAX, PlainDoor
 from daemon.publish.publisher import Publisher
 from daemon.publish.questions import Questions
-from tests.daemon.publish.test_publisher import ENDPOINTS, WAIT_MS, Peers, first_message
+from tests.daemon.publish.test_publisher import WAIT_MS, Peers, endpoint_of, first_message
 from tests.daemon.publish.test_zmtp import GREETING_31, READY_REQ, READY_SUB, octets
 
 SUBSCRIBE_ALL = octets("00 01 01")
@@ -81,7 +81,7 @@ def is_cut_off(connection: socket.socket) -> bool:
 def test_every_kind_of_subscriber_hears(
     tmp_path: Path, friends: Peers, scheme: str, kind: int
 ) -> None:
-    endpoint = ENDPOINTS[scheme].format(folder=tmp_path)
+    endpoint = endpoint_of(scheme, tmp_path)
     with Publisher(endpoint) as publisher:
         subscriber = friends.connect(kind, endpoint)
         if kind == zmq.XSUB:
@@ -108,7 +108,7 @@ def test_every_kind_of_subscriber_hears(
 def test_every_kind_of_asker_is_answered(
     tmp_path: Path, friends: Peers, scheme: str, identity: bytes, kind: int
 ) -> None:
-    endpoint = ENDPOINTS[scheme].format(folder=tmp_path)
+    endpoint = endpoint_of(scheme, tmp_path)
     with Questions(endpoint, 10**9) as questions:
         asker = friends.context.socket(kind)
         asker.linger = 0

@@ -16,6 +16,7 @@ import zmq
 from daemon.process.signals import StopSignal
 from daemon.publish.binding import PublishError
 from daemon.publish.publisher import Publisher
+from tests.ports import free_port
 
 WAIT_MS = 100_000
 
@@ -56,7 +57,14 @@ def peers() -> Iterator[Peers]:
     peers.close()
 
 
-ENDPOINTS = {"ipc": "ipc://{folder}/v", "tcp": "tcp://127.0.0.1:25917", "ip6": "tcp://[::1]:25917"}
+SCHEMES = ("ipc", "tcp", "ip6")
+
+
+def endpoint_of(scheme: str, folder: Path) -> str:
+    """A place for a socket that nobody else has."""
+    if scheme == "ipc":
+        return f"ipc://{folder}/v"
+    return f"tcp://{'[::1]' if scheme == 'ip6' else '127.0.0.1'}:{free_port()}"
 
 
 def has_ipv6() -> bool:
@@ -68,13 +76,13 @@ def has_ipv6() -> bool:
     return True
 
 
-@pytest.mark.parametrize("scheme", ENDPOINTS)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_plain_subscriber_gets_two_frames_in_order(
     tmp_path: Path, peers: Peers, scheme: str
 ) -> None:
     if scheme == "ip6" and not has_ipv6():
         pytest.skip("this computer has no IPv6")
-    endpoint = ENDPOINTS[scheme].format(folder=tmp_path)
+    endpoint = endpoint_of(scheme, tmp_path)
     with Publisher(endpoint) as publisher:
         subscriber = peers.subscribe(endpoint, "verdict.")
         assert publisher.wait_for_subscriber(WAIT_MS / 1e3)
@@ -151,9 +159,10 @@ def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
     assert received == sorted(set(received))
 
 
-def test_a_second_publisher_on_the_same_port_is_refused() -> None:
-    with Publisher("tcp://127.0.0.1:25918"), pytest.raises(PublishError, match="in use"):
-        Publisher("tcp://127.0.0.1:25918")
+def test_a_second_publisher_on_the_same_port_is_refused(tmp_path: Path) -> None:
+    endpoint = endpoint_of("tcp", tmp_path)
+    with Publisher(endpoint), pytest.raises(PublishError, match="in use"):
+        Publisher(endpoint)
 
 
 def test_a_peer_that_sends_more_than_a_subscription_is_cut_off(

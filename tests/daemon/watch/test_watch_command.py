@@ -32,12 +32,16 @@ from daemon.watch.view import View
 from tests.daemon.fakes import Clock
 from tests.daemon.processes import GRASPD, graspd, start
 from tests.daemon.watch.watch_fakes import MS, Talker, verdict
+from tests.ports import free_port
 
 PATIENCE_S = 100.0
-PORT = 25941
-TCP = f"tcp://127.0.0.1:{PORT + 1}"
 ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 """Of the alternate screen (xterm)."""
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
 
 
 class Terminal:
@@ -293,19 +297,19 @@ def test_several_scenes_are_seen_in_one_terminal(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("by", ["scenes", "endpoints"])
-def test_several_hands_are_one_page_of_one_process(tmp_path: Path, by: str) -> None:
+def test_several_hands_are_one_page_of_one_process(tmp_path: Path, port: int, by: str) -> None:
     where = two_scenes(tmp_path)
     if by == "endpoints":
         ends = [f"ipc://{tmp_path}/{hand}" for hand in ("left", "right")]
         where = ["--connect", ends[0], "--connect", ends[1]]
     with (
         Talker(f"ipc://{tmp_path}/right") as talker,
-        start("watch", "--web", *where, "--port", PORT) as page,
+        start("watch", "--web", *where, "--port", port) as page,
     ):
         talker.decision = Decision.STABLE
         assert page.stdout is not None
         page.stdout.readline()
-        with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as link:
+        with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as link:
             link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
             with link.makefile("rb") as lines:
                 for line in lines:
@@ -344,7 +348,7 @@ def test_what_is_wrong_is_said_in_a_line(arguments: list[str], said: str) -> Non
     assert "Traceback" not in result.stderr
 
 
-def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str) -> None:
+def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str, port: int) -> None:
     code = (
         "import sys; sys.modules['rich'] = None; sys.stdout.isatty = lambda: True; "
         "from daemon.cli import main; sys.exit(main())"
@@ -357,10 +361,10 @@ def test_without_rich_the_extra_is_named_and_the_page_still_works(endpoint: str)
         "graspd's source; or watch --web, which needs none\n"
     )
     with subprocess.Popen(
-        [*command, "--web", "--port", str(PORT)], stdout=subprocess.PIPE, text=True
+        [*command, "--web", "--port", str(port)], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
-        assert process.stdout.readline() == f"http://127.0.0.1:{PORT}/ (Ctrl-C ends)\n"
+        assert process.stdout.readline() == f"http://127.0.0.1:{port}/ (Ctrl-C ends)\n"
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE_S) == 0
 
@@ -376,11 +380,11 @@ def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_page_ends_on_a_signal_with_pages_open(endpoint: str, number: int) -> None:
-    with Talker(endpoint), start("watch", "--web", "--connect", endpoint, "--port", PORT) as page:
+def test_the_page_ends_on_a_signal_with_pages_open(endpoint: str, port: int, number: int) -> None:
+    with Talker(endpoint), start("watch", "--web", "--connect", endpoint, "--port", port) as page:
         assert page.stdout is not None
-        assert page.stdout.readline() == f"http://127.0.0.1:{PORT}/ (Ctrl-C ends)\n"
-        with socket.create_connection(("127.0.0.1", PORT), PATIENCE_S) as link:
+        assert page.stdout.readline() == f"http://127.0.0.1:{port}/ (Ctrl-C ends)\n"
+        with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as link:
             link.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
             with link.makefile("rb") as lines:
                 assert any(b'"hand":"right"' in line for line in lines)
@@ -391,7 +395,12 @@ def test_the_page_ends_on_a_signal_with_pages_open(endpoint: str, number: int) -
 
 
 @pytest.fixture
-def door(tmp_path: Path) -> Iterator[Sockets]:
+def address() -> str:
+    return f"tcp://127.0.0.1:{free_port()}"
+
+
+@pytest.fixture
+def door(tmp_path: Path, address: str) -> Iterator[Sockets]:
     """A daemon's sockets that admit the key `known`."""
     make(tmp_path, "daemon")
     make(tmp_path / "clients", "known")
@@ -401,7 +410,7 @@ def door(tmp_path: Path) -> Iterator[Sockets]:
     make(tmp_path, "stranger")
     content = {
         "tactile": {"driver": "replay", "recordings": ["any.csv"]},
-        "publish": {"endpoint": TCP},
+        "publish": {"endpoint": address},
         "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
     }
     with Sockets(scene.parse(content, tmp_path / "scene.toml")) as made:
@@ -419,9 +428,9 @@ def hears(door: Sockets, feed: Feed, until: Callable[[bool], bool]) -> None:
         heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())
 
 
-def test_a_known_key_is_let_in(tmp_path: Path, door: Sockets) -> None:
+def test_a_known_key_is_let_in(tmp_path: Path, address: str, door: Sockets) -> None:
     keys = load_keys(tmp_path / "known.key_secret", tmp_path / "daemon.key")
-    with Feed(TCP, keys) as feed:
+    with Feed(address, keys) as feed:
         hears(door, feed, lambda heard: heard)
         assert feed.link == "connected"
 
@@ -435,10 +444,15 @@ def test_a_known_key_is_let_in(tmp_path: Path, door: Sockets) -> None:
     ],
 )
 def test_whoever_is_turned_away_is_told_why(
-    tmp_path: Path, door: Sockets, own: str | None, server: str | None, said: str
+    tmp_path: Path,
+    address: str,
+    door: Sockets,
+    own: str | None,
+    server: str | None,
+    said: str,
 ) -> None:
     keys = own and load_keys(tmp_path / f"{own}.key_secret", tmp_path / f"{server}.key")
-    with Feed(TCP, keys or None) as feed:
+    with Feed(address, keys or None) as feed:
         hears(door, feed, lambda heard: heard or feed.link.startswith("turned away"))
         assert said in feed.link
         later_s = time.monotonic() + 0.5  # whatever is tried again says the same
@@ -446,10 +460,12 @@ def test_whoever_is_turned_away_is_told_why(
         assert said in feed.link
 
 
-def test_who_was_turned_away_is_let_in_when_its_key_is_known(tmp_path: Path, door: Sockets) -> None:
+def test_who_was_turned_away_is_let_in_when_its_key_is_known(
+    tmp_path: Path, address: str, door: Sockets
+) -> None:
     clock = Clock()
     keys = load_keys(tmp_path / "stranger.key_secret", tmp_path / "daemon.key")
-    with Feed(TCP, keys, clock) as feed:
+    with Feed(address, keys, clock) as feed:
         hears(door, feed, lambda _: feed.is_turned_away)
         (tmp_path / "stranger.key").rename(tmp_path / "clients" / "stranger.key")
         door.check_keys()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -29,6 +29,7 @@ from tests.drivers.can.can_standin import (
     tactile,
 )
 from tests.drivers.can.can_words import Clock, truth
+from tests.ports import free_port
 
 MS = 1_000_000
 GROUP = "239.74.163.2"
@@ -77,7 +78,7 @@ def test_a_recording_arrives_count_for_count(frame_format: str, sequence: str) -
 @pytest.mark.parametrize("frame_format", FORMATS)
 def test_a_recording_arrives_over_udp_multicast(frame_format: str) -> None:
     counts, clock = contact(100), Clock()
-    with bus_options(port=23000 + os.getpid() % 2000):
+    with bus_options(port=free_port(socket.SOCK_DGRAM)):
         readings = over_multicast(counts, frame_format, clock=clock, wall_clock=clock)
         began_ns = time.monotonic_ns()
         timed = over_multicast(counts[:3], frame_format)
