@@ -60,10 +60,10 @@ def find(name: str) -> Path:
             return path
     others = added()
     near = difflib.get_close_matches(name, [*zoo.names(), *others], n=1)
-    meant = f"; did you mean {near[0]}?" if near else ""
+    meant = f"did you mean {near[0]}?" if near else "graspd models add FILE adds one"
     raise ModelError(
         f"no model '{name}' in the zoo; there are: {', '.join(zoo.names())}; in "
-        f"{' or '.join(map(str, folders()))}: {', '.join(others) or 'none'}{meant}"
+        f"{' or '.join(map(str, folders()))}: {', '.join(others) or 'none'}; {meant}"
     )
 
 

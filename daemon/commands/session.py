@@ -8,6 +8,7 @@ import contextlib
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -187,7 +188,8 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
     pipeline = assembly.build_pipeline(wanted, model)
     session, trust = pipeline.session, pipeline.trust
     with SessionFile(wanted.session_path) as file:
-        read = len(_judge(wanted, pipeline))
+        judgements = _judge(wanted, pipeline)
+        read = len(judgements)
         outcomes = 0 if trust is None else trust.learner.outcomes
         if session is None and not outcomes:
             raise DriverError(f"of {read} readings none is a grasp whose outcome is known")
@@ -204,9 +206,14 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         file.remove_former()
     grasps = outcomes if session is None else session.grasps
     sys.stdout.write(
-        f"{printable(str(wanted.session_path))}: {grasps} grasps of {read} readings taken in, "
-        f"{outcomes} outcomes learned\n"
+        f"{printable(str(wanted.session_path))}: {grasps} grasps of {read} readings taken in, each "
+        f"once for as long as it was held, {outcomes} outcomes learned\n"
     )
+    if refused := Counter(
+        reason for each in judgements if each.p_slip is None for reason in each.reasons
+    ):
+        why = ", ".join(f"{reason} {number}" for reason, number in refused.most_common())
+        sys.stdout.write(f"  nothing was learned from readings that were not judged: {why}\n")
     if known := trained_on(recordings, model):
         complain(
             f"warning: the model was trained on {', '.join(known)}: it judges other grasps worse, "
@@ -278,6 +285,7 @@ def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
         slipped = None if reading.annotation is None else reading.annotation.slipped
         if slipped is not None:
             pipeline.outcome(GraspId(pipeline.boot_id, judgement.grasp), slipped=slipped)
+    pipeline.learn()
     return judgements
 
 

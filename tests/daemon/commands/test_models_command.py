@@ -71,6 +71,8 @@ def test_a_model_that_there_is_not_lists_those_that_there_are() -> None:
     result = graspd("models", "cnn9")
     assert result.returncode == 2
     assert result.stderr.startswith("graspd: no model 'cnn9' in the zoo; there are: cnn1")
+    assert "did you mean cnn1?" in result.stderr
+    assert "; graspd models add FILE adds one" in graspd("models", "our-lab").stderr
 
 
 def scene_with(name: str, fingers: tuple[str, ...] = ("ff", "mf", "th")) -> Scene:

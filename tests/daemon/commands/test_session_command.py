@@ -93,6 +93,14 @@ def test_the_session_of_live_sensors_is_seeded_from_a_table(tmp_path: Path, bts3
     seeded = graspd("session", "seed", path, bts3_dir / "palm_45.csv")
     assert seeded.returncode == 0, seeded.stderr
     assert re.search(r": \d+ grasps of 2133 readings", seeded.stdout)
+    told = re.search(r"(\d+) outcomes learned\n.*: never-seen (\d+)\n", seeded.stdout)
+    assert told is not None
+    learned, refused = map(int, told.groups())
+    assert learned + refused == 2133  # each row of the table has an outcome
+    document = json.loads(graspd("session", "show", path, "--json").stdout)
+    with (bts3_dir / "palm_45.csv").open() as lines:
+        last = list(csv.reader(lines))[-1][2:74]
+    assert document["session"]["statistics"]["last"][-72:] == [float(count) for count in last]
     assert "warning: the model was trained on palm_45.csv" in seeded.stderr
 
 
