@@ -11,10 +11,8 @@ import argparse
 import contextlib
 import importlib
 import os
-import platform
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from importlib.metadata import version
 from typing import NoReturn
 
 from daemon.commands.arguments import Parser
@@ -123,6 +121,10 @@ class _Version(argparse.Action):
     """Tells graspd's version in the first line, and of what it stands on in the second."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        # Only where they are needed.
+        import platform
+        from importlib.metadata import version
+
         import zmq
 
         libraries = [f"Python {platform.python_version()}"]

@@ -3,7 +3,6 @@ of the user or, for services, of the system."""
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 import re
@@ -59,6 +58,8 @@ def find(name: str) -> Path:
         if os.path.isfile(path):  # without an error where the folder may not be read
             return path
     others = added()
+    import difflib  # only where it is needed
+
     near = difflib.get_close_matches(name, [*zoo.names(), *others], n=1)
     meant = f"did you mean {near[0]}?" if near else "graspd models add FILE adds one"
     raise ModelError(

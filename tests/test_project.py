@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
+import daemon
 from drivers.spi.messages import FIRMWARE
 
 ROOT = Path(__file__).parents[1]
-VERSION: str = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+VERSION = daemon.__version__
 MINOR = VERSION.rpartition(".")[0]
 PLACES = {
     "CITATION.cff": r"^version: (\S+)$",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import sys
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -37,6 +36,8 @@ def coloured(text: str, colour: Colour, stream: TextIO | None = None) -> str:
 
 def did_you_mean(wrong: str, known: Iterable[str]) -> str:
     """What to add to an error about a mistyped word: the nearest that is known, if one is near."""
+    import difflib  # only where it is needed
+
     near = difflib.get_close_matches(wrong, list(known), n=1)
     return f"; did you mean {near[0]}?" if near else ""
 

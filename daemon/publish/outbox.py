@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-import platform
+import sys
 import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Literal, Protocol
 
+import onnxruntime
+
+from daemon import __version__
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateChange, Reason
 from daemon.publish.latency import LatencyHistogram
@@ -94,9 +96,9 @@ class Outbox:
         self._judged: dict[int, None] = {}
         """Grasps that were judged last, oldest first."""
         self._versions = {
-            "graspd": version("graspd"),
-            "onnxruntime": version("onnxruntime"),
-            "python": platform.python_version(),
+            "graspd": __version__,
+            "onnxruntime": onnxruntime.__version__,
+            "python": sys.version.split()[0],
         }
 
     def verdict(

@@ -94,7 +94,9 @@ def main(arguments: list[str]) -> int:
     import gc
     import importlib
 
-    gc.disable()  # as `daemon.__main__` does
+    from daemon.__main__ import prepare
+
+    prepare()
     for name, modules in CORE:
         for module in modules:
             importlib.import_module(module)

@@ -51,6 +51,7 @@ NEVER = {
         "daemon.publish.keys",
         "daemon.publish.curve",
         "zmq",
+        "difflib",
     ),
 }
 """Modules, each with all below it, that none of these scenes needs: what no scene does, and what is
@@ -62,10 +63,14 @@ BUSES = {
         "drivers.recordings.faults",
     },
     "spi": {"serial", "cobs", "drivers.spi.driver", "drivers.spi.line"},
-    "can": {"can", "asyncio", "sqlite3", "drivers.can.driver", "drivers.can.bus"},
+    "can": {
+        *("can", "asyncio", "sqlite3", "importlib.metadata", "email"),
+        *("drivers.can.driver", "drivers.can.bus"),
+    },
     "palm": {"drivers.palm.driver", "drivers.palm.packet"},
 }
-"""Modules that only this driver needs; python-can brings asyncio and sqlite3."""
+"""Modules that only this driver needs; python-can brings asyncio, sqlite3 and plugins'
+names."""
 JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
 HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
 GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "median", "grip", "stillness")}
@@ -277,7 +282,7 @@ def test_the_packages_that_are_measured_first_are_those_that_the_daemon_imports(
 
 def test_the_replay_command_loads_no_bus_no_serial_port_and_nothing_of_training() -> None:
     code = (
-        "import json, sys; from daemon.cli import main; main(['replay']); "
+        "import json, sys; from daemon.__main__ import main; sys.argv[1:] = ['replay']; main(); "
         "sys.stderr.write(json.dumps(sorted(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)

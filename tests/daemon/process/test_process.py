@@ -82,6 +82,29 @@ def test_loading_collects_no_garbage_and_what_is_loaded_is_never_looked_through(
     assert int(done) < 60  # it takes some 110 while loading alone
 
 
+@pytest.mark.parametrize(
+    ("program", "is_loaded"),
+    [(("-c", "import pydantic\nclass A(pydantic.BaseModel): pass"), True), (GRASPD[1:], False)],
+    ids=["any program", "graspd"],
+)
+def test_plugins_that_others_have_installed_are_not_let_in(
+    program: tuple[str, ...], is_loaded: bool, tmp_path: Path
+) -> None:
+    """Nor looked for, among all that is installed."""
+    info = tmp_path / "stranger-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[pydantic]\nstranger = stranger:PLUGIN\n")
+    (tmp_path / "stranger.py").write_text(f"open({str(tmp_path / 'was here')!r}, 'w')")
+    subprocess.run(
+        [sys.executable, *program, *(("check", DEMO_SCENE) if program == GRASPD[1:] else ())],
+        env=os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}"},
+        capture_output=True,
+        check=True,
+    )
+    assert (tmp_path / "was here").exists() is is_loaded
+
+
 WHILE_LEAVING = """
 import os, signal
 from daemon.process.signals import StopSignal
