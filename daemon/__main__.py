@@ -39,8 +39,8 @@ def prepare() -> None:
     # Matrices are small here. numpy's threads for large ones, one for each further processor, would
     # spin through the start; and with memory locked each of them takes its whole stack.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # pydantic looks through all that is installed for plugins, which takes a twelfth of a start and
-    # 2.7 MiB; and what others have installed has no business in a daemon.
+    # pydantic looks through all that is installed for plugins, which takes a tenth of a start and
+    # 3 MiB; and what others have installed has no business in a daemon.
     plugins = ModuleType("pydantic.plugin._loader")
     vars(plugins)["get_plugins"] = tuple
     sys.modules.setdefault(plugins.__name__, plugins)

@@ -46,7 +46,8 @@ from drivers.palm.packet import (
 ROUND_NS: Final = ROUND * CYCLE_NS
 """Time between two samples of an electrode: 71.43 Hz."""
 LATE_MAX: Final = 10
-"""A packet may come so many cycles late; later than that, a whole round is taken for lost."""
+"""A packet may come so many cycles late; later than that, a whole round is taken for lost. So after
+`ROUND - 1 + LATE_MAX` cycles of silence no packet counts for the round before."""
 OUTAGE_NS: Final = 2_000_000_000
 """After this long, ns, nobody knows how many rounds were made: it counts as one missed."""
 

@@ -60,10 +60,21 @@ PACKETS = [
 def test_of_the_palm_a_round_of_fourteen_packets_is_a_sweep(plan: list[Step], first: int) -> None:
     """A packet may be up to 3 ms late; a relay that was started again goes on in any round."""
     stream = PalmStream(FINGERS)
-    for unit in arrivals(plan, silent=20):
+    for unit in arrivals(plan, silent=25):
         at = first + unit.index + 37 * unit.boot
         readings = stream.receive(PACKETS[at % len(PACKETS)], unit.at * MS)
         expect_one_sweep(readings or ())
+
+
+@pytest.mark.parametrize("before", range(ROUND, 2 * ROUND))
+def test_a_relay_that_was_silent_for_25_ms_may_go_on_anywhere(before: int) -> None:
+    for after in range(3 * ROUND, 6 * ROUND):
+        stream, seen = PalmStream(FINGERS), 0
+        came = [*range(before), *range(before + after, before + after + 3 * ROUND)]
+        for number, at in enumerate(came):
+            silent = 25 * MS if number >= before else 0
+            seen += expect_one_sweep(stream.receive(PACKETS[at], number * MS + silent) or ())
+        assert seen >= 3
 
 
 def sweep_frame(unit: Unit, first: int) -> CanFrame:
