@@ -18,7 +18,7 @@ WRONG = 2
 
 def main() -> int:
     """Run the command line; 2 and one line on stderr if another package is in the way of ours."""
-    gc.disable()  # until all is loaded: see `daemon.__main__`
+    gc.disable()  # until all is loaded: see `daemon.process.start`
     problem = clash()
     if problem is not None:
         sys.stderr.write(f"graspd: {problem}\n")

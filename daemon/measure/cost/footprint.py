@@ -94,7 +94,7 @@ def main(arguments: list[str]) -> int:
     import gc
     import importlib
 
-    from daemon.__main__ import prepare
+    from daemon.process.start import prepare
 
     prepare()
     for name, modules in CORE:
