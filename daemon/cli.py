@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import NoReturn
 
+from daemon import __version__
 from daemon.commands.arguments import Parser
 from daemon.process import logs
 from daemon.process.extras import needs
@@ -130,7 +131,7 @@ class _Version(argparse.Action):
         libraries = [f"Python {platform.python_version()}"]
         libraries += [f"{name} {version(name)}" for name in LIBRARIES]
         libraries.append(f"libzmq {zmq.zmq_version()}")
-        sys.stdout.write(f"graspd {version('graspd')}\n{', '.join(libraries)}\n")
+        sys.stdout.write(f"graspd {__version__}\n{', '.join(libraries)}\n")
         parser.exit()
 
 

@@ -30,6 +30,8 @@ def main() -> int:
 
 def clash() -> str | None:
     """Which package is in the way of one of ours, and what to do; None if all is well."""
+    beside = Path(__file__).parent.glob("graspd-*.dist-info/RECORD")
+    record = "".join(path.read_text() for path in beside)
     for name, file in OURS.items():
         spec = find_spec(name)
         if spec is None or spec.origin is None:
@@ -37,7 +39,7 @@ def clash() -> str | None:
         init = Path(spec.origin)
         others = set()
         is_ours = (init.parent / file).is_file()
-        if not is_ours or _was_replaced(init, name):
+        if not is_ours or _was_replaced(init, name, record):
             # Not at each start: it takes 20 ms.
             from importlib.metadata import packages_distributions
 
@@ -52,13 +54,12 @@ def clash() -> str | None:
     return None
 
 
-def _was_replaced(init: Path, name: str) -> bool:
-    """Whether an `__init__.py` is another than was installed; of a checkout nobody knows."""
+def _was_replaced(init: Path, name: str, record: str) -> bool:
+    """Whether an `__init__.py` is another than `record` has; of a checkout, with none, nobody
+    knows."""
     from base64 import urlsafe_b64encode
     from hashlib import sha256
 
-    beside = Path(__file__).parent.glob("graspd-*.dist-info/RECORD")
-    record = "".join(path.read_text() for path in beside)
     digest = urlsafe_b64encode(sha256(init.read_bytes()).digest()).rstrip(b"=").decode()
     lines = [line for line in record.splitlines() if line.startswith(f"{name}/__init__.py,")]
     return any(f",sha256={digest}," not in line for line in lines)
