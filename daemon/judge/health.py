@@ -130,11 +130,11 @@ class Health:
         self.memory.changed[~sound] = self.memory.number
         railed &= sound
         broken = ~sound | railed | self._worn_out()
+        repeats = self.memory.sweeps.recurs(counts, sound)
         faults = int(np.bitwise_or.reduce(flags, axis=None))
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
             return Watched(_fault_reasons(faults), broken)
-        repeats = bool((sound.any(axis=1) & ~(differs & sound).any(axis=1)).any())
-        repeats |= self.memory.sweeps.recurs(counts, sound)
+        repeats |= bool((sound.any(axis=1) & ~(differs & sound).any(axis=1)).any())
         return self._found(faults, railed, broken, repeats=repeats)
 
     def _found(

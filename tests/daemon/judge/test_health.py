@@ -225,6 +225,17 @@ def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) ->
     assert reasons == [(), (Reason.FROZEN,)]
 
 
+@pytest.mark.parametrize("flag", [ElectrodeFault.HELD, ElectrodeFault.CUT_OFF])
+def test_a_sweep_that_comes_again_was_seen_in_a_reading_that_could_not_be_used(flag: int) -> None:
+    health, reasons = Health(FINGERS), []
+    for place, (sweep, bits) in enumerate([(0, flag), (1, 0), (2, 0), (0, 0)]):
+        counts = np.full((FINGERS, 24), 2000 + sweep, dtype=np.uint16)
+        flags = np.zeros((FINGERS, 24), dtype=np.uint8)
+        flags[0, 0] = bits
+        reasons.append(health.watch(TactileReading(place, place, counts, flags)).reasons)
+    assert reasons[1:] == [(), (), (Reason.FROZEN,)]
+
+
 def test_electrodes_of_all_fingers_that_repeat_themselves_are_no_held_finger() -> None:
     """Ten of each finger, as a palm at 71.43 Hz read at 100 Hz: 2 of 7, and quiet ones."""
     health, flags = Health(FINGERS), np.zeros((FINGERS, 24), dtype=np.uint8)
