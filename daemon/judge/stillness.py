@@ -20,6 +20,7 @@ from daemon.judge.windows import (
     LONG_NS,
     SHORT_NS,
     STEP_NS,
+    STEP_SWEEPS_MAX,
     STEPS,
     STEPS_MIN,
     Noise,
@@ -241,7 +242,9 @@ class Motion:
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
         if memory.number and t_ns - memory.last_ns < STEP_NS:
-            if wanted and not self.looked:
+            if memory.sweeps > STEP_SWEEPS_MAX:
+                self._say_unknown()
+            elif wanted and not self.looked:
                 self._decide()
             return
         self._remember(memory.last_ns + memory.total_ns // memory.sweeps)

@@ -17,6 +17,8 @@ from drivers.base import ELECTRODES
 
 STEP_NS = 5_000_000
 """Of sweeps that come faster than this, the mean is remembered."""
+STEP_SWEEPS_MAX = 10
+"""Of more sweeps within a step nobody knows how the last ones move: they came late, and at once."""
 SHORT_NS, LONG_NS = 100_000_000, 240_000_000
 STEPS = LONG_NS // STEP_NS + 2
 """Steps remembered: the long window, and one at each end of it."""

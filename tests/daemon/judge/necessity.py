@@ -47,6 +47,9 @@ DOUBT_FOR = 40
 NEAREST, FURTHEST = 3, 5
 """Three fresh values are among the last five, for at most every other one is held; and two of them
 among the last three."""
+STEP_MS, STEP_SWEEPS_MAX = 5, 10
+"""Of sweeps that come within a step the mean is looked at, and of no more than so many."""
+REMEMBERED = FURTHEST + 2 * STEP_SWEEPS_MAX + 2
 KEPT_MS = STILL_MS + GAP_MS + 60
 """What is older matters to nothing here."""
 
@@ -86,7 +89,7 @@ class Necessity:
         self._still_ns = still_ms * MS
         self._rest = rest
         self._required = [fingers.index(finger) for finger in required]
-        self._values = np.repeat(rest[np.newaxis].astype(np.float64), FURTHEST, axis=0)
+        self._values = np.repeat(rest[np.newaxis].astype(np.float64), REMEMBERED, axis=0)
         """Last values of each electrode, newest first."""
         self._previous: NDArray[np.uint16] | None = None
         self._before: deque[list[bytes | None]] = deque(maxlen=SWEEPS_REMEMBERED)
@@ -94,6 +97,8 @@ class Necessity:
         self._unchanged = np.zeros(rest.shape, dtype=np.int64)
         self._sick = np.zeros(rest.shape, dtype=np.int64)
         self._doubt = 0
+        self._together = 0
+        """Readings that the judge used within the last two steps, before the last one."""
         self._used: list[_Used] = []
         """The last ones, between which time goes on and no gap is."""
         self._joints: dict[bytes, list[_Angles]] = {}
@@ -176,11 +181,13 @@ class Necessity:
         shifted = np.concatenate([reading.counts[np.newaxis], self._values[:-1]])
         self._values = np.where(valid, shifted, self._values)
         depth = float(self._depths()[self._required].min())
-        low, high = self._values.min(axis=0), self._values.max(axis=0)
-        low, high = np.where(self._sick > 0, 0, low), np.where(self._sick > 0, 4095, high)
         t_ns = reading.t_ns
         if self._used and not 0 <= t_ns - self._used[-1].t_ns <= GAP_MS * MS:
             self._used.clear()
+        self._together = sum(t_ns - used.t_ns < 2 * STEP_MS * MS for used in self._used)
+        values = self._values[: FURTHEST + self._together]
+        low, high = values.min(axis=0), values.max(axis=0)
+        low, high = np.where(self._sick > 0, 0, low), np.where(self._sick > 0, 4095, high)
         self._used = [used for used in self._used if t_ns - used.t_ns <= KEPT_MS * MS]
         self._used.append(_Used(t_ns, depth, low, high))
         self._drop_joints(t_ns)
@@ -203,6 +210,8 @@ class Necessity:
 
     def _lacks_stillness(self) -> list[str]:
         now = self._used[-1]
+        if self._together > REMEMBERED - FURTHEST:
+            return ["no more sweeps at once than can be told apart"]
         if now.t_ns - self._used[0].t_ns < self._still_ns:
             return ["readings without a gap for as long as it must be still"]
         for then in self._used:

@@ -133,6 +133,19 @@ def test_sweeps_that_come_fast_show_at_least_as_much() -> None:
     assert np.mean(still) < 0.11
 
 
+def test_of_too_many_sweeps_at_one_time_nothing_is_known_until_time_goes_on() -> None:
+    motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
+    t_ns = fed(motion, counts, 100.0)
+    known = []
+    for sweep in np.rint(counts[:20]).astype(np.uint16):
+        motion.add(t_ns, sweep, FINGER)
+        known.append(motion.known)
+    # Ten together, after the one that ended a step.
+    assert known == [True] * 11 + [False] * 9
+    motion.add(t_ns + 5_000_000, np.rint(counts[-1]).astype(np.uint16), FINGER)
+    assert motion.known
+
+
 def test_nothing_is_known_before_the_noise_is_and_not_in_the_first_window_after_a_gap() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(3.0, 100.0, 3.5, 4)
     known = []

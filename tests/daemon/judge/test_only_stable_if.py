@@ -351,6 +351,11 @@ SCENARIOS = {
         Feel(times=10),
     ),
     "old sweeps, a few at a time": (HELD, Feel(pose="old", times=40), Feel(times=40)),
+    "many at once": (
+        Feel("faint", times=35, asks=True),
+        Feel("grasp", times=40, step_ns=0, asks=True),
+        Feel(times=35, asks=True),
+    ),
     "asked once": (HELD, Feel("other", times=40), Feel("grasp", times=40)),
 }
 
