@@ -244,7 +244,7 @@ def test_it_works_by_itself_where_no_systemd_runs(tmp_path: Path, wheels: Path) 
         systemctl is-enabled graspd@right
         stat -c '%U %a' /var/lib/graspd
         test -f {DEPLOY.parent}/pyproject.toml -a -f /usr/local/share/man/man1/graspd.1
-        graspd
+        /usr/local/bin/graspd
         echo again
         {install}
         echo purge

@@ -210,8 +210,10 @@ def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
 class Twin:
     """An SPI bridge that sweeps as fast as it is told, and all that the daemon says of it."""
 
-    def __init__(self, folder: Path, listener: zmq.Socket[bytes]) -> None:
+    def __init__(self, folder: Path, listener: zmq.Socket[bytes], *, realtime: bool) -> None:
         self._path = folder / "twin"
+        # Where that may be: the daemon leaves it half of the machine, whoever else is at work.
+        self._before = ("chrt", "-f", "2") if realtime else ("nice", "-n", "-15")
         self._listener = listener
         self._process: subprocess.Popen[str] | None = None
         self.statuses: list[Status] = []
@@ -223,9 +225,8 @@ class Twin:
     def sweep(self, rate_hz: float) -> None:
         self.stop()
         play = ("--recording", DEMO_TABLE, "--loop")
-        first = ("nice", "-n", "-15")  # where that may be: the daemon leaves it half of the machine
         options = ("--path", self._path, "--rate", rate_hz, *play)
-        self._process = start("twin", "spi", *options, before=first)
+        self._process = start("twin", "spi", *options, before=self._before)
 
     def stop(self) -> None:
         process, self._process = self._process, None
@@ -255,13 +256,13 @@ class Twin:
 
 
 def too_many(former: Status, later: Status) -> bool:
-    """Whether, between two statuses, a fifth more readings came than were judged."""
+    """Whether, between two statuses, a fiftieth more readings came than were judged."""
     came = later.drivers["spi"]["readings"] - former.drivers["spi"]["readings"]
     skipped = later.skipped_readings - former.skipped_readings
     return came >= OVERLOAD * (came - skipped) > 0
 
 
-OVERLOAD = 1.2
+OVERLOAD = 1.02
 RATES_HZ = (2000, 4000, 8000, 16_000, 32_000)
 RTTIME_US = 1_000_000
 """As `LimitRTTIME` of the unit, but a fifth: so long may it compute without sleeping."""
@@ -316,7 +317,7 @@ def test_an_overloaded_daemon_lives_on_and_accounts_for_all(tmp_path: Path, real
         burden.rcvhwm = 1  # it never reads
         burden.subscribe("tactile.")  # so each reading takes long enough to be too many
         burden.connect(f"ipc://{tmp_path}/graspd")
-        twin = Twin(tmp_path, listener)
+        twin = Twin(tmp_path, listener, realtime=realtime)
         stack.callback(twin.stop)
         daemon = stack.enter_context(start("run", path, before=limit))
         stack.callback(daemon.terminate)
