@@ -26,6 +26,8 @@ from models.tactile_image import (
 )
 
 Floats = NDArray[np.float64]
+NUMBER = np.array(float(ELECTRODES))
+"""As an array, which numpy takes in half the time of a number."""
 
 
 class InputBuilder(Protocol):
@@ -129,7 +131,7 @@ class SessionBuilder(_FlatBuilder):
 
     def __init__(self, fingers: int, clip: float) -> None:
         self.shape = (fingers * FEATURES_PER_FINGER,)
-        self._clip = clip
+        self._low, self._high = np.array(-clip), np.array(clip)
         self._mean, self._spread = np.zeros(self.shape), np.ones(self.shape)
         self._scale = np.ones(self.shape)
 
@@ -147,8 +149,8 @@ class SessionBuilder(_FlatBuilder):
         standard: Floats = features - self._mean
         standard *= self._scale
         # What `np.clip` does, in half its time.
-        np.maximum(standard, -self._clip, out=standard)
-        return np.minimum(standard, self._clip, out=standard), spread
+        np.maximum(standard, self._low, out=standard)
+        return np.minimum(standard, self._high, out=standard), spread
 
 
 def raw_features(counts: NDArray[np.generic]) -> Floats:
@@ -180,9 +182,9 @@ def _z_scores(counts: Floats, z: Floats, mean: Floats, spread: Floats) -> None:
     counts of 12 bits the error is below 1e-9 of the largest magnitude, 6e-8 once it is float32.
     """
     np.add.reduce(counts, axis=-1, out=mean)
-    mean /= ELECTRODES
+    mean /= NUMBER
     np.subtract(counts, mean[..., np.newaxis], out=z)
     np.add.reduce(np.square(z), axis=-1, out=spread)
-    spread /= ELECTRODES
+    spread /= NUMBER
     np.sqrt(spread, out=spread)
     z *= scale_of(spread)[..., np.newaxis]

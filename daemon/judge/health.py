@@ -51,10 +51,9 @@ JUMPS_MAX = 2.0
 JUMPS_FADE = 0.9
 JUMPS_FORGOTTEN, JUMPS_LOOKED_AT = 1e-9, 16
 """Of a jump, after 200 readings: as good as none. Every so many readings it is seen."""
-# At a rail, far from the last count, not the same: so is a count that, less 1 or less the last one
-# and so much more, is above a limit. Modulo 2**16, so that steps down are small numbers, too.
-MORE = np.array([JUMP_COUNTS, 0], dtype=np.uint16)[:, np.newaxis, np.newaxis]
-LIMITS = np.array([COUNT_MAX - 2, 2 * JUMP_COUNTS, 0], dtype=np.uint16)[:, np.newaxis, np.newaxis]
+RAIL_LIMIT, JUMP_LIMIT, STEP_LIMIT = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
+"""A count less 1 is at a rail above the first; a step and `JUMP_COUNTS` is far above the second, a
+step is one above the third. Modulo 2**16, so that what is below zero is large."""
 
 
 @dataclass(slots=True, eq=False)
@@ -99,7 +98,11 @@ class Health:
         nothing = np.zeros(shape, dtype=np.bool_)
         nothing.flags.writeable = False  # one for all sound readings
         self._sound = Watched((), nothing)
-        self._less = np.ones((len(LIMITS), *shape), dtype=np.uint16)
+        # Constants of full shape, and buffers: numpy takes half the time.
+        self._one, self._jump = np.ones(shape, dtype=np.uint16), np.full(shape, JUMP_COUNTS, "u2")
+        self._above = np.empty((3, *shape), dtype=np.uint16)
+        self._limits = np.empty_like(self._above)
+        self._limits[...] = np.reshape((RAIL_LIMIT, JUMP_LIMIT, STEP_LIMIT), (-1, 1, 1))
         self._live_until = 0
         """Number of the reading before which no electrode can have kept its count for too long."""
 
@@ -168,12 +171,14 @@ class Health:
     def _compare(self, counts: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Take in how the counts have changed; which are at a rail and which differ from before,
         each of shape (fingers, 24)."""
-        memory, less = self.memory, self._less
-        previous = memory.previous
+        memory, previous = self.memory, self.memory.previous
         memory.number += 1
-        np.subtract(previous, MORE, out=less[1:])
-        railed, far, differs = counts - less > LIMITS
-        np.copyto(memory.changed, memory.number, where=differs)
+        above = self._above
+        np.subtract(counts, self._one, out=above[0])
+        step = np.subtract(counts, previous, out=above[2])
+        np.add(step, self._jump, out=above[1])
+        railed, far, differs = above > self._limits
+        np.putmask(memory.changed, differs, memory.number)
         if memory.has_jumped:
             memory.jumps *= JUMPS_FADE
             if memory.number % JUMPS_LOOKED_AT == 0:

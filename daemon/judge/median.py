@@ -84,9 +84,9 @@ class FreshMedian:
         all_usable = all_of(usable)
         if not all_usable:
             fresh &= usable
-        np.copyto(oldest, middle, where=fresh)
-        np.copyto(middle, newest, where=fresh)
-        np.copyto(newest, counts, where=fresh)
+        np.putmask(oldest, fresh, middle)
+        np.putmask(middle, fresh, newest)
+        np.putmask(newest, fresh, counts)
         if not (all_usable and memory.all_full):
             self._fill(counts, usable, fresh)
         memory.last = counts if all_usable else np.where(usable, counts, memory.last)

@@ -23,6 +23,7 @@ FLAT_SPREAD_COUNTS = 70.0
 """Standard deviation of a finger's electrodes below which it is not touching, or not working: half
 of the smallest of 4682 real grasps, 148."""
 ONES = np.ones(ELECTRODES)
+LESS, MORE = 1.0 - ROUNDING, 1.0 + ROUNDING
 
 
 class Plausibility:
@@ -44,11 +45,13 @@ class Plausibility:
 
         `session` is how today's sensors differ from the training's, as far as it is known.
         """
-        if _is_flat(counts, broken):
+        values = counts.astype(np.float64)
+        if _is_flat(values, broken):
             return Examined((Reason.FLAT,), counts)
-        if session is not None and not any_of(broken) and self._is_plain(counts, session):
-            return Examined((), counts, (), counts)
-        values = counts.astype(np.float64) if session is None else session.to_training(counts)
+        if session is not None:
+            if not any_of(broken) and self._is_plain(values, session):
+                return Examined((), counts, (), counts)
+            values = session.to_training(values)
         grasp, values = self._repair(counts, values, broken, session)
         known = int(np.count_nonzero(broken))
         at_most = known + CONTRADICTING_MAX + 1
@@ -73,7 +76,7 @@ class Plausibility:
             return Examined((Reason.NEVER_SEEN,), counts, (), grasp if learned else None)
         return Examined((), repaired, self._names(found) if number else (), grasp)
 
-    def _is_plain(self, counts: NDArray[np.uint16], session: Calibration) -> bool:
+    def _is_plain(self, counts: NDArray[np.float64], session: Calibration) -> bool:
         """Whether nothing at all is found: each limit is kept by more than rounding can be.
 
         In a fifth of the time of the examination, which would say the same.
@@ -81,9 +84,8 @@ class Plausibility:
         deviations = counts - session.counts_mean
         deviations *= session.scale
         square = None if session.odd else self._electrodes.plain_square(deviations)
-        return square is not None and all(
-            self._novelty.is_near(square * share) for share in (1.0 - ROUNDING, 1.0 + ROUNDING)
-        )
+        near = self._novelty.is_near
+        return square is not None and near(square * LESS) and near(square * MORE)
 
     def _repair(
         self,
@@ -105,11 +107,11 @@ class Plausibility:
         return tuple(electrode_name(self._fingers[finger], place) for finger, place in places)
 
 
-def _is_flat(counts: NDArray[np.uint16], broken: NDArray[np.bool_]) -> bool:
-    """Whether the sound electrodes of a finger read about the same."""
-    values, numbers = counts.astype(np.float64), [ELECTRODES] * len(counts)
+def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_]) -> bool:
+    """Whether the sound electrodes of a finger read about the same, counts of shape (fingers, 24)."""
+    numbers = [ELECTRODES] * len(values)
     if any_of(broken):
-        values[broken] = 0.0
+        values = np.where(broken, 0.0, values)
         numbers = (~broken).sum(axis=1).tolist()
     sums = values.dot(ONES).tolist()
     squares = np.square(values).dot(ONES).tolist()
