@@ -108,7 +108,7 @@ class Plausibility:
 
 
 def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_]) -> bool:
-    """Whether the sound electrodes of a finger read about the same, counts of shape (fingers, 24)."""
+    """Whether the sound electrodes of a finger read about the same; `values` are counts."""
     numbers = [ELECTRODES] * len(values)
     if any_of(broken):
         values = np.where(broken, 0.0, values)
