@@ -8,6 +8,9 @@ import os
 import select
 import socket
 import struct
+import subprocess
+import sys
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,11 +20,12 @@ import pytest
 import zmq
 
 from daemon.record.topics import schemas
+from tests.conftest import ROOT
 from tests.daemon.processes import TIMEOUT_S, graspd, start
 
 pytest.importorskip("foxglove", reason="extra foxglove")
 
-GOLDEN = Path(__file__).parents[1] / "publish" / "golden"
+GOLDEN = ROOT / "tests" / "daemon" / "publish" / "golden"
 
 
 class Viewer:
@@ -143,6 +147,34 @@ def test_a_viewer_gets_channels_and_messages_that_their_schemas_allow(hand: Hand
     assert said == ""
     assert message["p_slip"] == json.loads(sent["verdict"])["p_slip"]
     jsonschema.validate(message, json.loads(schemas()["verdict"][1]))
+
+
+def test_no_thread_of_the_library_asks_python_to_log() -> None:
+    """Such a thread may hold what the thread that runs Python waits for: once both hung."""
+    script = """
+        import logging
+        from daemon.record.live import LiveServer
+        from tests.daemon.record.test_live import Viewer
+        with LiveServer(0) as server:
+            server.send(b"status.right", b"{}")
+            viewer = Viewer(server.port)
+            (channel,) = viewer.channels({"status.right"}).values()
+            wanted = [{"id": 7, "channelId": channel["id"]}]
+            viewer.tell({"op": "subscribe", "subscriptions": wanted})
+            while viewer.message() is None:
+                server.send(b"status.right", b"{}")
+            viewer.close()
+        print([name for name in logging.root.manager.loggerDict if "foxglove" in name])
+    """
+    result = subprocess.run(
+        (sys.executable, "-c", textwrap.dedent(script)),
+        cwd=ROOT,
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    assert result.stdout == "[]\n", result.stderr
 
 
 def test_a_port_that_is_taken_is_said(hand: Hand) -> None:
