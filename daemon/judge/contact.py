@@ -302,17 +302,16 @@ class Contact:
                 touch.follow(t_ns, elapsed_s, deep, deep - middles[finger])
             else:
                 # With too few electrodes nobody knows any more, until it is tared again.
-                memory.tared[finger] = tared[finger] = False
+                memory.tared[finger] = False
                 touch.end()
         all_touch = all(touch.touching for touch in touches)
         due = []
         for finger, touch in enumerate(touches):
             anew = touch.must_be_tared_anew(t_ns, middles[finger], accompanied=all_touch)
             memory.touching[finger] = touch.touching
-            if anew and tared[finger]:
+            if anew and memory.tared[finger]:
                 self._forget(finger)
-                tared[finger] = False
-            if tared[finger] and touch.fall >= SUSPECT * touch.threshold:
+            if memory.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
                 memory.tares[finger].clear()  # it may be the beginning of a touch
             elif memory.tares[finger].add():
                 due.append(finger)

@@ -51,9 +51,9 @@ JUMPS_MAX = 2.0
 JUMPS_FADE = 0.9
 JUMPS_FORGOTTEN, JUMPS_LOOKED_AT = 1e-9, 16
 """Of a jump, after 200 readings: as good as none. Every so many readings it is seen."""
-RAIL_LIMIT, JUMP_LIMIT, STEP_LIMIT = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
-"""A count less 1 is at a rail above the first; a step and `JUMP_COUNTS` is far above the second, a
-step is one above the third. Modulo 2**16, so that what is below zero is large."""
+LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
+"""Above them are a count less 1 that is at a rail, a step and `JUMP_COUNTS` that is far, and a step
+that is one at all. Modulo 2**16, so that what is below zero is large."""
 
 
 @dataclass(slots=True, eq=False)
@@ -99,10 +99,11 @@ class Health:
         nothing.flags.writeable = False  # one for all sound readings
         self._sound = Watched((), nothing)
         # Constants of full shape, and buffers: numpy takes half the time.
-        self._one, self._jump = np.ones(shape, dtype=np.uint16), np.full(shape, JUMP_COUNTS, "u2")
-        self._above = np.empty((3, *shape), dtype=np.uint16)
-        self._limits = np.empty_like(self._above)
-        self._limits[...] = np.reshape((RAIL_LIMIT, JUMP_LIMIT, STEP_LIMIT), (-1, 1, 1))
+        self._one, self._jump, *limits = (
+            np.full(shape, number, dtype=np.uint16) for number in (1, JUMP_COUNTS, *LIMITS)
+        )
+        self._limits = np.stack(limits)
+        self._above = np.empty_like(self._limits)
         self._live_until = 0
         """Number of the reading before which no electrode can have kept its count for too long."""
 

@@ -24,6 +24,7 @@ FLAT_SPREAD_COUNTS = 70.0
 of the smallest of 4682 real grasps, 148."""
 ONES = np.ones(ELECTRODES)
 LESS, MORE = 1.0 - ROUNDING, 1.0 + ROUNDING
+"""What keeps a limit by both of these shares of itself keeps it however it was rounded."""
 
 
 class Plausibility:

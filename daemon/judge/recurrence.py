@@ -47,10 +47,9 @@ class PastSweeps:
         """
         if sound is not None or any(self.lacking):
             return self._recurs_in_part(counts, sound)
-        sweeps, begin, found = counts.tobytes(), 0, False
-        for past in self.past:
-            found |= _known(past, sweeps[begin : begin + SWEEP_BYTES])
-            begin += SWEEP_BYTES
+        sweeps, found = counts.tobytes(), False
+        for finger, past in enumerate(self.past):
+            found |= _known(past, sweeps[finger * SWEEP_BYTES : (finger + 1) * SWEEP_BYTES])
         return found
 
     def _recurs_in_part(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:

@@ -32,7 +32,7 @@ class LiveServer:
     def __init__(self, port: int, wall_clock: Callable[[], int] = time.time_ns) -> None:
         """Serve on a port of this computer, 0 for any free one. Raises `RuntimeError` if not."""
         self._wall_clock = wall_clock
-        # Its threads, which hold locks, would wait for Python, which waits for these locks.
+        # Its threads log through Python: one that holds a lock would wait for who waits for it.
         foxglove.set_log_level(logging.CRITICAL)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
