@@ -77,6 +77,8 @@ class Conversation:
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
+        self.period_ns: int | None = None
+        """Nominal time between sweeps by that HELLO, ns."""
         self._serials: dict[str, str] = {}
         self._believed: tuple[str, ...] = ()
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
@@ -108,11 +110,6 @@ class Conversation:
         counters.bad_cobs, counters.bad_crc = frames.bad_cobs, frames.bad_crc
         counters.too_long, counters.link_losses = frames.too_long, self.link.losses
         return counters
-
-    @property
-    def period_ns(self) -> int | None:
-        """Nominal time between sweeps by the last HELLO, ns; None before the first."""
-        return None if self.hello is None else self.hello.period_ns
 
     @property
     def serials(self) -> dict[str, str]:
@@ -309,7 +306,9 @@ class Conversation:
             self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
 
     def _take(self, hello: Hello) -> None:
-        self.hello, found = hello, hello.serials
+        self.hello = hello
+        self.period_ns = hello.period_ns
+        found = hello.serials
         known = zip(self._fingers, self._sensors, strict=True)
         self._serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
 

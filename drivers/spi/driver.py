@@ -105,7 +105,7 @@ class SpiBridgeDriver(Opened):
 
     def fileno(self) -> int | None:
         """Descriptor of the port, or None: no port, or one that must be polled."""
-        return self._line.fileno()
+        return self._line.descriptor
 
     def due_ns(self) -> int | None:
         """When the next try, PING or deadline is due, or None while closed."""
@@ -113,7 +113,7 @@ class SpiBridgeDriver(Opened):
         if link.state in (CLOSED, WAITING):
             return link.retry_ns
         due_ns = self.conversation.due_ns
-        return due_ns if self._line.fileno() is not None else min(due_ns, self._poll_due_ns)
+        return due_ns if self._line.descriptor is not None else min(due_ns, self._poll_due_ns)
 
     def read_ready(self) -> Sequence[Reading]:
         """Readings of the sweeps that have arrived. Never raises for anything a bridge does."""
@@ -156,7 +156,7 @@ class SpiBridgeDriver(Opened):
                     self.conversation.not_sent()
         except LinkError as error:
             self._lose(error)
-        if self.link_state is WAITING:
+        if self.conversation.link.state is WAITING:
             self._line.close()
 
     def _lose(self, error: LinkError) -> None:

@@ -53,8 +53,9 @@ class SerialLine:
         self.tap: Callable[[LineEvent, bytes], None] | None = None
         """Gets all bytes that are read, and those that are about to be written."""
         self._baud = baud
+        self.descriptor: int | None = None
+        """To wait on; None while closed, and for a kind of port that must be polled."""
         self._serial: serial.Serial | None = None
-        self._fileno: int | None = None
         self._terminal: int | None = None
         """Its descriptor, where the port is a terminal, which is read without pyserial."""
 
@@ -73,15 +74,15 @@ class SerialLine:
             raise LinkError(f"{self.port}: {_reason(error)}") from error
         except ValueError as error:
             raise DriverError(f"{self.port}: {error}") from error
-        self._fileno = self._descriptor()
-        self._terminal = self._fileno if type(self._serial) is serial.Serial else None
+        self.descriptor = self._find_descriptor()
+        self._terminal = self.descriptor if type(self._serial) is serial.Serial else None
         self._lower_latency()
         if self.tap is not None:
             self.tap(LineEvent.OPENED, b"")
 
     def close(self) -> None:
         """Give the port back. May be called more than once; a device that is gone is no error."""
-        port, self._serial, self._fileno = self._serial, None, None
+        port, self._serial, self.descriptor = self._serial, None, None
         if port is None:
             return
         try:
@@ -103,10 +104,6 @@ class SerialLine:
             _log.debug("%s: %s", self.port, error)
         if held is not None:
             held.close()
-
-    def fileno(self) -> int | None:
-        """Descriptor to wait on, or None: not open, or a kind of port that must be polled."""
-        return self._fileno
 
     def read(self) -> bytes:
         """All bytes that are there, possibly none. Raises `LinkError`."""
@@ -135,7 +132,7 @@ class SerialLine:
         """Write a few bytes if there is room; False if not. Raises `LinkError`."""
         port = self._opened()
         try:
-            if self._fileno is not None and not select.select([], [self._fileno], [], 0)[1]:
+            if self.descriptor is not None and not select.select([], [self.descriptor], [], 0)[1]:
                 return False
             if self.tap is not None:
                 self.tap(LineEvent.SENT, data)
@@ -151,7 +148,7 @@ class SerialLine:
             raise RuntimeError(f"{self.port} is not open")
         return self._serial
 
-    def _descriptor(self) -> int | None:
+    def _find_descriptor(self) -> int | None:
         try:
             return self._opened().fileno()
         except (OSError, AttributeError):

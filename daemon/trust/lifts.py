@@ -1,0 +1,200 @@
+"""The one book of lifts: what was said of each grasp, who lifts it, and how the lift ended."""
+
+from __future__ import annotations
+
+from collections import Counter
+from enum import StrEnum
+from typing import Annotated, Final, NamedTuple
+
+import msgspec
+from msgspec.structs import replace
+
+from daemon.trust.learner import vector
+
+LIFTS_MAX: Final = 256
+"""Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""
+NOT_ASSESSED: Final = b""
+"""Stands for the features of a grasp that nothing can be learned from: the model refused it, or
+the scene has no learner and no risk."""
+
+
+class GraspId(NamedTuple):
+    """Names a grasp for ever."""
+
+    boot_id: str
+    """Of the start of the daemon that judged it."""
+    grasp: Annotated[int, msgspec.Meta(ge=0)]
+    """Its number since that start."""
+
+
+class OutcomeStatus(StrEnum):
+    """What became of an outcome that was told."""
+
+    TAKEN = "taken"
+    REPEATED = "repeated"
+    """Known already, and the same: ignored."""
+    CONTRADICTS = "contradicts"
+    """Known already, and the opposite: refused, the first one counts."""
+    UNKNOWN = "unknown"
+    """Of a grasp that was not judged or is too long ago: refused."""
+
+
+class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One judged grasp."""
+
+    id: GraspId
+    stable: bool
+    """Whether it was called `stable`."""
+    features: bytes | None
+    """What it was judged by, float64; `NOT_ASSESSED` where nothing was; None once the learner must
+    not learn from it, because its outcome is known or a sensor was exchanged since."""
+    slipped: bool | None = None
+    """None until the outcome is told."""
+
+
+class LiftsState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is kept of the book between two starts of the daemon."""
+
+    records: Annotated[tuple[Lift, ...], msgspec.Meta(max_length=LIFTS_MAX)]
+    """Oldest first."""
+    told: dict[OutcomeStatus, Annotated[int, msgspec.Meta(ge=0)]]
+    unreported: Annotated[int, msgspec.Meta(ge=0)]
+
+    @property
+    def outstanding(self) -> int:
+        """Number of grasps called `stable` whose outcome can still come."""
+        return sum(each.stable and each.slipped is None for each in self.records)
+
+
+class Lifts:
+    """The last `LIFTS_MAX` judged grasps, and who may report how their lifts ended.
+
+    A peer that asks for a lift owns the grasp that it was answered about; it alone reports the
+    outcome. Owners are not kept between two starts: until a peer asks again, any peer may report.
+    """
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._lifts: dict[GraspId, Lift] = {}
+        """Oldest first."""
+        self._owners: dict[GraspId, bytes] = {}
+        """Routing id of the peer that asked to lift a grasp; the oldest first, at most `LIFTS_MAX`.
+        """
+        self._unkept: set[GraspId] = set()
+        """Grasps whose outcome was taken and is not on the disk yet."""
+        self.told: Counter[OutcomeStatus] = Counter()
+        """Number of outcomes, by what became of them."""
+        self.unreported = 0
+        """Number of grasps called `stable` that left the book before an outcome came."""
+        self.outstanding = 0
+        """Number of grasps called `stable` whose outcome can still come."""
+
+    def __contains__(self, grasp: object) -> bool:
+        """True if the grasp was judged and is in the book."""
+        return grasp in self._lifts
+
+    def is_told(self, grasp: GraspId) -> bool:
+        """True if the outcome of the grasp is known."""
+        lift = self._lifts.get(grasp)
+        return lift is not None and lift.slipped is not None
+
+    def is_stable(self, grasp: GraspId) -> bool:
+        """True if the grasp was called `stable`."""
+        lift = self._lifts.get(grasp)
+        return lift is not None and lift.stable
+
+    def note(self, grasp: GraspId, features: bytes, *, stable: bool) -> bool:
+        """Enter how a grasp was judged, and by which features (float64); True if that was new.
+
+        The first verdict counts, or the first that called the grasp `stable`: a controller lifts on
+        that one. A grasp that was not assessed is entered again once it is. Nothing changes after
+        the outcome is known.
+        """
+        lift = self._lifts.get(grasp)
+        if lift is not None:
+            first_stable = stable and not lift.stable
+            first_assessed = lift.features == NOT_ASSESSED != features
+            if lift.slipped is not None or not (first_stable or first_assessed):
+                return False
+            stable = stable or lift.stable
+            self.outstanding -= lift.stable
+        self._lifts[grasp] = Lift(grasp, stable, features)
+        self.outstanding += stable
+        if len(self._lifts) > LIFTS_MAX:
+            self._forget(next(iter(self._lifts)))
+        return True
+
+    def claim(self, grasp: GraspId, owner: bytes) -> None:
+        """Give a grasp to the peer that asked to lift it, unless another one owns it already."""
+        self._owners.setdefault(grasp, owner)
+        if len(self._owners) > LIFTS_MAX:
+            del self._owners[next(iter(self._owners))]
+
+    def may_report(self, grasp: GraspId, peer: bytes) -> bool:
+        """True if this peer may tell the outcome: the owner of the grasp.
+
+        For a grasp without an owner: any peer that owns another one, or any peer at all while
+        there is no owner.
+        """
+        owner = self._owners.get(grasp)
+        if owner is not None:
+            return owner == peer
+        return not self._owners or peer in self._owners.values()
+
+    def tell(self, grasp: GraspId, *, slipped: bool) -> tuple[OutcomeStatus, Lift | None]:
+        """Enter an outcome; return what became of it, and the entry as it was before."""
+        lift = self._lifts.get(grasp)
+        if lift is None:
+            status = OutcomeStatus.UNKNOWN
+        elif lift.slipped is None:
+            status = OutcomeStatus.TAKEN
+            self.outstanding -= lift.stable
+            self._lifts[grasp] = Lift(grasp, lift.stable, None, slipped)
+            self._unkept.add(grasp)
+        elif lift.slipped == slipped:
+            status = OutcomeStatus.REPEATED
+        else:
+            status = OutcomeStatus.CONTRADICTS
+        self.told[status] += 1
+        return status, lift
+
+    def is_kept(self, grasp: GraspId) -> bool:
+        """True unless an outcome of the grasp was taken and is not on the disk yet."""
+        return grasp not in self._unkept
+
+    def keep(self, grasp: GraspId) -> None:
+        """Note that the outcome of the grasp is on the disk, or that no disk is used."""
+        self._unkept.discard(grasp)
+
+    def exchanged(self) -> None:
+        """Note that a sensor was exchanged: outcomes still to come teach nothing any more."""
+        self._lifts = {grasp: replace(lift, features=None) for grasp, lift in self._lifts.items()}
+
+    def state(self) -> LiftsState:
+        """Return what `restore` needs: the grasps that were assessed."""
+        records = tuple(lift for lift in self._lifts.values() if lift.features != NOT_ASSESSED)
+        return LiftsState(records, dict(self.told), self.unreported)
+
+    def restore(self, state: LiftsState, width: int) -> None:
+        """Go on from an earlier state, with features (width,). Raises `ValueError`."""
+        lifts = {lift.id: lift for lift in state.records}
+        if len(lifts) != len(state.records):
+            raise ValueError("holds a grasp twice")
+        for lift in state.records:
+            if lift.features is not None:
+                vector(lift.features, width)
+            if lift.features is not None and lift.slipped is not None:
+                raise ValueError("would learn from a grasp twice")
+        self._lifts = lifts
+        self._unkept.clear()
+        self.told = Counter(state.told)
+        self.unreported = state.unreported
+        self.outstanding = state.outstanding
+
+    def _forget(self, grasp: GraspId) -> None:
+        """Drop the oldest grasp: its outcome is refused from now on."""
+        lift = self._lifts.pop(grasp)
+        self._unkept.discard(grasp)
+        forgotten = lift.stable and lift.slipped is None
+        self.unreported += forgotten
+        self.outstanding -= forgotten
