@@ -31,7 +31,7 @@ from daemon.doctor.surroundings import (
     socket_findings,
 )
 from daemon.process.text import Colour, coloured, complain, printable
-from drivers.base import Driver, DriverError, LinkError, TactileReading
+from drivers.base import Driver, DriverError, Fact, LinkError, TactileReading
 
 LISTEN_S = 3.0
 LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
@@ -115,7 +115,7 @@ def examine(
     device, counters = driver.describe(), driver.counters.as_dict()
     told = device_findings(driver.name, device, counters)
     readings = None if statistics is None else statistics.readings
-    if device.get("link", "up") == "up":
+    if "link" not in device or device["link"].fault is None:
         causes = {finding.cause for finding in told}
         more = counter_findings(driver.name, counters)
         told += [finding for finding in more if finding.cause not in causes]
@@ -190,7 +190,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
                 assembly.open_driver(driver)
                 opened.append((driver, section))
             except LinkError as error:
-                closed = {"link": "closed", "why": str(error)}
+                closed = {"link": Fact("closed", error.cause), "why": Fact(str(error))}
                 (finding,) = device_findings(driver.name, closed)
                 findings += explained(finding, section)
         seconds = _collect([driver for driver, _ in opened], statistics, listen_s)
@@ -201,8 +201,10 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
                 told = roots([*shared_findings(section), *told])
             for finding in told:
                 findings += explained(finding, section)
-            counted = driver.counters.as_dict()
-            report[driver.name] = {"device": driver.describe(), "counters": counted}
+            report[driver.name] = {
+                "device": {name: fact.text for name, fact in driver.describe().items()},
+                "counters": driver.counters.as_dict(),
+            }
     finally:
         for driver in drivers:
             driver.close()

@@ -44,7 +44,7 @@ def test_a_sweep_becomes_a_reading_by_slot_and_sensor(rig: Rig) -> None:
     (reading,) = take(rig.driver, rig.bridge)
     assert rig.driver.link_state is LinkState.UP
     assert rig.driver.conversation.link.reason is None
-    described = rig.driver.describe()
+    described = {name: fact.text for name, fact in rig.driver.describe().items()}
     assert described["board"] == "b"
     assert described["sensors"] == "BTSP-1, BTSP-1, BTSP-1"
     assert described["sequence"] == "24 samples at 100.0 Hz"
