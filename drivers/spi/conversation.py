@@ -22,12 +22,12 @@ from drivers.spi.messages import (
     DIGEST,
     FIRMWARE,
     VERSION,
+    BridgeStatus,
     Hello,
     HelloHead,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -56,7 +56,7 @@ SILENCE_PERIODS = 10
 SILENCE_MIN_NS = 100_000_000
 """Shortest silence that is one: above what a USB adapter or a busy host holds back."""
 
-_FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, Status.TYPE)
+_FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
 
 class Conversation:
@@ -89,7 +89,7 @@ class Conversation:
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
         self._doubted: tuple[str, ...] | None = None
         """Those of a HELLO that told others, until the next one."""
-        self.status: Status | None = None
+        self.status: BridgeStatus | None = None
         """The last STATUS, None before the first."""
         self._sensors = sensor_rows(fingers, sensors)
         self._fingers = tuple(fingers)
@@ -252,7 +252,7 @@ class Conversation:
     def _on_message(self, message: Message, arrival_ns: int) -> None:
         if isinstance(message, Hello):
             self._on_hello(message, arrival_ns)
-        elif isinstance(message, Status):
+        elif isinstance(message, BridgeStatus):
             self.status = message
             self._counters.bridge_overruns = message.overruns
             self._counters.bridge_tx_dropped = message.tx_dropped
@@ -357,7 +357,7 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
     return DeviceFault.SENSOR_ABSENT if len(present) < len(serials) else None
 
 
-def _about_errors(status: Status, hello: Hello) -> Fact:
+def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
     """SPI errors by chip select, without those where no sensor is: there they are no news."""
     errors = [
         number if serial else None

@@ -1,4 +1,4 @@
-"""Base of drivers that take datagrams from one sender: heard, silent, or broken and opened again."""
+"""Base of drivers that take datagrams from one sender: heard, silent, or broken and reopened."""
 
 from __future__ import annotations
 

@@ -11,10 +11,10 @@ from drivers.link import LinkState
 from drivers.spi.conversation import Conversation
 from drivers.spi.messages import (
     FIRMWARE,
+    BridgeStatus,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -152,7 +152,7 @@ def test_sensors_that_are_absent_or_twice_there_are_a_fault(
     for nonce in (42, 43):
         said(conversation, T0)
         hear(conversation, dataclasses.replace(hello(nonce), serials=serials), T0)
-    hear(conversation, Status(1, 0, 0, 0, 0, (0,) * 3), T0)
+    hear(conversation, BridgeStatus(1, 0, 0, 0, 0, (0,) * 3), T0)
     assert conversation.describe()["sensors"] == sensors
     assert conversation.describe()["spi errors"] == errors
 
@@ -169,7 +169,7 @@ def test_spi_errors_where_no_sensor_is_are_no_fault(numbers: tuple[int, ...], er
     for nonce in (42, 43):
         said(conversation, T0)
         hear(conversation, dataclasses.replace(hello(nonce), serials=("A", "", "C")), T0)
-    hear(conversation, Status(1, 0, 0, 0, 0, numbers), T0)
+    hear(conversation, BridgeStatus(1, 0, 0, 0, 0, numbers), T0)
     assert conversation.describe()["spi errors"] == errors
 
 
@@ -222,7 +222,7 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
     hear(conversation, late, T0 + S + 540 * MS)
     too_long = Fact("500.00 ms is too long for 500.00 ms", DeviceFault.SWEEP_TOO_LONG)
     assert conversation.describe()["sweep"] == too_long
-    hear(conversation, Status(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
+    hear(conversation, BridgeStatus(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
     told = words_of(conversation)
     assert told["clock rate"] == "1000000 Hz"
     assert told["spi errors"] == "0, 7, 24"
@@ -245,7 +245,7 @@ def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None
 
 def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words() -> None:
     conversation = greeted()
-    hear(conversation, Status(1, 2, 3, 4, 5, (6,)), T0)
+    hear(conversation, BridgeStatus(1, 2, 3, 4, 5, (6,)), T0)
     hear(conversation, Ping(7), T0)
     counters = conversation.counters
     shown = counters.bridge_overruns, counters.bridge_tx_dropped, counters.bridge_rx_errors
