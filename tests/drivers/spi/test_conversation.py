@@ -109,11 +109,13 @@ def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
     said(conversation, heard_ns + silence_ms * MS)
     assert state(conversation) is LinkState.WAITING
     assert conversation.link.reason == f"no sweep for {silence_ms} ms"
+    assert conversation.link.cause is LinkCause.TIMEOUT
 
 
 def test_a_bridge_that_sweeps_less_than_once_a_second_is_refused() -> None:
     conversation = greeted(1001)
     assert conversation.link.reason == "port: the bridge sweeps once in 1.001 s only"
+    assert conversation.link.cause is LinkCause.SETTINGS
     assert conversation.counters.refused_bridges == 1
 
 
@@ -327,6 +329,7 @@ def test_a_bridge_that_never_names_the_same_sensors_twice_is_given_up() -> None:
     assert said(conversation, T0 + 500 * MS) == []
     assert state(conversation) is LinkState.WAITING
     assert conversation.link.reason == "port: the bridge names other sensors each time"
+    assert conversation.link.cause is LinkCause.SERIALS
 
 
 @pytest.mark.parametrize(
