@@ -243,7 +243,7 @@ class Driver(Protocol):
 
     @property
     def live(self) -> bool:
-        """Whether readings come when the sensor makes them; those of a recording wait for us."""
+        """True if readings come when the sensor makes them; those of a recording wait."""
 
     @property
     def period_ns(self) -> int | None:
@@ -251,9 +251,11 @@ class Driver(Protocol):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial number of each finger's sensor, by finger, as far as they are known by now; where
-        the link tells none, who sends. Another one is another sensor: `read_ready` has given
-        nothing once between the readings of the two."""
+        """Serial number of each finger's sensor, by finger, without those that are not known yet.
+
+        A link that tells none names its sender instead. Another number is another sensor: between
+        the readings of the two, `read_ready` has given nothing once.
+        """
 
     def describe(self) -> dict[str, Fact]:
         """What is known of the device by name: versions, serials, why a link is down.

@@ -1,4 +1,4 @@
-"""Whether a link is up, why not, and when it is tried again: a backoff with a cap."""
+"""State of a link: up or why not, and when it is tried again, by a backoff with a cap."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class LinkState(StrEnum):
 
 
 CLOSED, WAITING, GREETING, UP = LinkState
-"""Asked for several times a reading: a class of an enumeration takes longer to look them up."""
+"""By name: looking a member up in its enumeration takes longer, and is done at each reading."""
 
 
 class Link:
@@ -58,11 +58,11 @@ class Link:
         self._down_since_ns = 0
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether it waits no longer for the next try."""
+        """True if the next try is due."""
         return self.retry_ns is None or now_ns >= self.retry_ns
 
     def start(self, now_ns: int) -> None:
-        """Begin: the first try is due at once."""
+        """Begin to try; the first try is due at once."""
         self.state = LinkState.WAITING
         self.reason = self.cause = None
         self._wait_s = BACKOFF_FIRST_S
@@ -85,7 +85,7 @@ class Link:
         self._warned.clear()
 
     def failed(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        """A try did not succeed or the link was lost: wait, longer after each failure."""
+        """Note a failed try or a lost link, and wait, longer after each failure."""
         if self.state is LinkState.UP:
             self.losses += 1
             self._down_since_ns = now_ns

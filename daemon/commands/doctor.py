@@ -110,7 +110,7 @@ def examine(
 ) -> list[Finding]:
     """What is wrong with an open driver, without what follows from something else of it.
 
-    `statistics` are of what it brought in so many `seconds`; None for joint angles.
+    `statistics` are of what it brought in `seconds`; None for joint angles.
     """
     device, counters = driver.describe(), driver.counters.as_dict()
     told = device_findings(driver.name, device, counters)
@@ -130,7 +130,7 @@ def examine(
 
 
 def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
-    """The findings for people, in lines of so many columns; with None a line for each."""
+    """The findings for people, in lines of at most `columns`; with None a line for each."""
     for finding in findings:
         what, mark = printable(finding.what), MARKS[finding.level]
         advice = printable(finding.advice or "")
@@ -221,7 +221,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed the statistics for so long; seconds from the first reading to the last."""
+    """Feed the statistics for `listen_s`; seconds from the first reading to the last."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         descriptors = [driver.fileno() for driver in drivers]

@@ -1,4 +1,4 @@
-"""What a driver says of its device and counts on its link, and which of it is a fault."""
+"""Findings on devices and links, by the faults and counters that their drivers tell."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VERSION_ADVICE = (
 
 
 class Trouble(NamedTuple):
-    """What something means, and what to do about it."""
+    """Cause of a fault, and what to do about it."""
 
     cause: Cause
     advice: str

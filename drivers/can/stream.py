@@ -46,7 +46,7 @@ class BoardOptions(TypedDict, total=False):
 class CanStream:
     """Decodes one bus, and says by `link` whether a board of ours is on it.
 
-    Whoever has the bus calls `link.greeting` when it is open, `receive` and then `watch` with what
+    The owner of the bus calls `link.greeting` when it is open, `receive` and then `watch` with what
     comes, and `lost` when it is gone. All times are monotonic ns.
     """
 

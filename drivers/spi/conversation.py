@@ -45,7 +45,7 @@ that agrees: a board that resets when its port is opened needs a second or two."
 PING_PERIOD_NS = 1_000_000_000
 PING_FIRST_NS = 50_000_000
 PINGS_FIRST = 8
-"""So many PINGs at the start follow each other quickly, so that times are good from the start."""
+"""PINGs at the start that follow each other quickly, so that times are good from the start."""
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """PINGs that may wait for an answer; the oldest is given up."""
@@ -62,7 +62,7 @@ _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 class Conversation:
     """What is said on one port, however often it is opened. All times are monotonic ns.
 
-    Whoever has the port calls `opened`, then `receive` with what comes, then writes what `say`
+    The owner of the port calls `opened`, then `receive` with what comes, then writes what `say`
     gives and calls `sent` right before. `link` says how it stands: when it is `WAITING`, the port
     is to be closed and opened again at `link.retry_ns`. A link log has no port and nothing to say:
     it calls `opened`, `receive` and `sent` with what it holds.
@@ -358,7 +358,7 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
 
 
 def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
-    """SPI errors by chip select, without those where no sensor is: there they are no news."""
+    """SPI errors by chip select, `-` for a chip select without a sensor, which always has some."""
     errors = [
         number if serial else None
         for number, serial in zip(status.spi_errors, hello.serials, strict=False)

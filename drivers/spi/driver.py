@@ -85,7 +85,7 @@ class SpiBridgeDriver(Opened):
         return self.conversation.describe()
 
     def open(self) -> None:
-        """Begin anew and try the port at once. Raises `DriverError` if that is hopeless."""
+        """Forget all and try the port at once. Raises `DriverError` if no try can ever succeed."""
         self.close()
         self.conversation = self._begin()
         self.conversation.link.start(self._clock())

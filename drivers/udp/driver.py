@@ -21,7 +21,7 @@ class DatagramCounters(DriverCounters):
     foreign_datagrams: int = 0
     """Datagrams from another sender than the one that is listened to; dropped."""
     kernel_drops: int = 0
-    """Datagrams that the kernel dropped because nobody took them in time."""
+    """Datagrams that the kernel dropped because they were not taken in time."""
     link_losses: int = 0
     """Times that the link was up and fell silent or broke."""
 

@@ -73,7 +73,7 @@ class DatagramReceiver:
         """`bytes_max` is the longest datagram that makes sense."""
         self._bytes_max = bytes_max
         self.dropped = 0
-        """Datagrams that the kernel dropped because nobody took them in time."""
+        """Datagrams that the kernel dropped because they were not taken in time."""
         self._socket = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         try:
             self._socket.setblocking(False)

@@ -96,7 +96,7 @@ class Lab:
         ]
 
     def warnings(self, hand: str, after_s: float) -> list[str]:
-        """What a hand's unit warned of since a time, but for an overloaded emulated processor."""
+        """Warnings of a hand's unit since a time, without those of an overloaded processor."""
         said = self.journal(hand, after_s, "warning")
         return [line for line in said if not line.startswith("overloaded: ")]
 

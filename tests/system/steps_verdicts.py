@@ -96,15 +96,15 @@ def judgement(message: Message) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What has been sent so far, and where it is, while nothing is on its way."""
+    """Counts of frames and readings, while nothing is on its way."""
 
     boot_id: str
     sent: int
     """Frames that the kernel has carried."""
     taken: int
-    """Of these the daemon has taken in so many."""
+    """Frames that the daemon has taken in."""
     dropped: int
-    """Of these the kernel could not keep so many."""
+    """Frames that the kernel could not keep."""
     readings: int
     judged: int
     """Verdicts on readings, from a start that is the same for all tallies: see `Messages`."""
