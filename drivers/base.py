@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntFlag
+from enum import Enum, IntFlag, auto
 from pathlib import Path
-from typing import Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -139,6 +140,69 @@ class DriverCounters:
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
+class LinkCause(Enum):
+    """Why a link is not up, for programs: texts are for people."""
+
+    UNKNOWN = auto()
+    """Not tried yet, or told by the text alone."""
+    NOT_FOUND = auto()
+    DENIED = auto()
+    IN_USE = auto()
+    NO_INTERFACE = auto()
+    """There is no such network interface or device."""
+    INTERFACE_DOWN = auto()
+    NO_ADDRESS = auto()
+    """The address to listen on is not one of this computer."""
+    BUS_OFF = auto()
+    SILENT = auto()
+    """The port is open, and nothing has come yet."""
+    NO_ANSWER = auto()
+    TIMEOUT = auto()
+    """Readings came, and then none for too long."""
+    DISCONNECTED = auto()
+    """The device went away or was reset."""
+    VERSION = auto()
+    SETTINGS = auto()
+    """The device does not sample what is wanted, or has changed what it samples."""
+    SERIALS = auto()
+    """The device tells other serial numbers of its sensors each time."""
+
+
+_CAUSES: dict[int | None, LinkCause] = {
+    errno.ENOENT: LinkCause.NOT_FOUND,
+    errno.EACCES: LinkCause.DENIED,
+    errno.EAGAIN: LinkCause.IN_USE,  # of a lock
+    errno.EBUSY: LinkCause.IN_USE,
+    errno.EADDRINUSE: LinkCause.IN_USE,
+    errno.ENODEV: LinkCause.NO_INTERFACE,
+    errno.ENXIO: LinkCause.NO_INTERFACE,
+    errno.ENETDOWN: LinkCause.INTERFACE_DOWN,
+    errno.EADDRNOTAVAIL: LinkCause.NO_ADDRESS,
+}
+
+
+class DeviceFault(Enum):
+    """What is wrong with a device whose link is up, for programs."""
+
+    OLD_FIRMWARE = auto()
+    NO_SENSOR = auto()
+    SENSOR_ABSENT = auto()
+    SENSOR_TWICE = auto()
+    """One sensor answers in two places."""
+    SENSOR_WORDS = auto()
+    """Words between a sensor and the device were damaged."""
+    SWEEP_TOO_LONG = auto()
+    CLOCK_NOT_TRUSTED = auto()
+    BUS_ERROR = auto()
+
+
+class Fact(NamedTuple):
+    """One thing that is known of a device: a text for people, and what is wrong with it."""
+
+    text: str
+    fault: LinkCause | DeviceFault | None = None
+
+
 class Opened(ABC):
     """A context manager: `with` opens it, and closes it at the end."""
 
@@ -179,7 +243,7 @@ class Driver(Protocol):
 
     @property
     def live(self) -> bool:
-        """Whether readings come when the sensor makes them; those of a recording wait for us."""
+        """True if readings come when the sensor makes them; those of a recording wait."""
 
     @property
     def period_ns(self) -> int | None:
@@ -187,12 +251,17 @@ class Driver(Protocol):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial number of each finger's sensor, by finger, as far as they are known by now; where
-        the link tells none, who sends. Another one is another sensor: `read_ready` has given
-        nothing once between the readings of the two."""
+        """Serial number of each finger's sensor, by finger, without those that are not known yet.
 
-    def describe(self) -> dict[str, str]:
-        """What is known about the device, for people: versions, serials, why a link is down."""
+        A link that tells none names its sender instead. Another number is another sensor: between
+        the readings of the two, `read_ready` has given nothing once.
+        """
+
+    def describe(self) -> dict[str, Fact]:
+        """What is known of the device by name: versions, serials, why a link is down.
+
+        A live link is the fact `link`, whose fault is None while it is up.
+        """
 
     def open(self) -> None:
         """Take the device. Raises `DriverError`."""
@@ -216,6 +285,22 @@ class DriverError(Exception):
 
 class LinkError(DriverError):
     """The device does not answer or went away: try again later."""
+
+    def __init__(self, cause: LinkCause, text: str) -> None:
+        """`cause` is for programs, `text` for people."""
+        super().__init__(text)
+        self.cause = cause
+
+    @classmethod
+    def from_errno(cls, error: BaseException, text: str) -> LinkError:
+        """Take the cause from the `errno` of `error`, or of the errors that led to it."""
+        reason: BaseException | None = error
+        while reason is not None:
+            cause = _CAUSES.get(getattr(reason, "errno", None))
+            if cause is not None:
+                return cls(cause, text)
+            reason = reason.__cause__ or reason.__context__
+        return cls(LinkCause.UNKNOWN, text)
 
 
 class RecordingError(DriverError):

@@ -1,9 +1,11 @@
-"""Whether a link is up, why not, and when it is tried again: a backoff with a cap."""
+"""State of a link: up or why not, and when it is tried again, by a backoff with a cap."""
 
 from __future__ import annotations
 
 import logging
 from enum import StrEnum
+
+from drivers.base import Fact, LinkCause
 
 BACKOFF_FIRST_S = 0.05
 BACKOFF_FACTOR = 1.8
@@ -29,7 +31,7 @@ class LinkState(StrEnum):
 
 
 CLOSED, WAITING, GREETING, UP = LinkState
-"""Asked for several times a reading: a class of an enumeration takes longer to look them up."""
+"""By name: looking a member up in its enumeration takes longer, and is done at each reading."""
 
 
 class Link:
@@ -49,19 +51,20 @@ class Link:
         self.losses = 0
         """Times that the link was up and was lost."""
         self.reason: str | None = None
+        self.cause: LinkCause | None = None
         """Why it is not up, None while it is or has not been tried."""
         self._wait_s = BACKOFF_FIRST_S
         self._warned: set[str] = set()
         self._down_since_ns = 0
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether it waits no longer for the next try."""
+        """True if the next try is due."""
         return self.retry_ns is None or now_ns >= self.retry_ns
 
     def start(self, now_ns: int) -> None:
-        """Begin: the first try is due at once."""
+        """Begin to try; the first try is due at once."""
         self.state = LinkState.WAITING
-        self.reason = None
+        self.reason = self.cause = None
         self._wait_s = BACKOFF_FIRST_S
         self._warned.clear()
         self._down_since_ns = self.retry_ns = now_ns
@@ -77,16 +80,16 @@ class Link:
         _log.info("%s: up after %.2f s: %s", self.name, down_s, what)
         self.state = LinkState.UP
         self.retry_ns = None
-        self.reason = None
+        self.reason = self.cause = None
         self._wait_s = BACKOFF_FIRST_S
         self._warned.clear()
 
-    def failed(self, why: str, now_ns: int) -> None:
-        """A try did not succeed or the link was lost: wait, longer after each failure."""
+    def failed(self, cause: LinkCause, why: str, now_ns: int) -> None:
+        """Note a failed try or a lost link, and wait, longer after each failure."""
         if self.state is LinkState.UP:
             self.losses += 1
             self._down_since_ns = now_ns
-        self.reason = why
+        self.cause, self.reason = cause, why
         level = logging.DEBUG
         if why not in self._warned and len(self._warned) < WARNINGS_MAX:
             self._warned.add(why)
@@ -100,3 +103,13 @@ class Link:
         """Stop trying."""
         self.state = LinkState.CLOSED
         self.retry_ns = None
+
+    def describe(self) -> dict[str, Fact]:
+        """State, and why it is not up: part of what a driver describes."""
+        cause = self.cause
+        if cause is None and self.state is not UP:
+            cause = LinkCause.SILENT if self.state is GREETING else LinkCause.UNKNOWN
+        known = {"link": Fact(str(self.state), cause)}
+        if self.reason is not None:
+            known["why"] = Fact(self.reason)
+        return known

@@ -31,7 +31,7 @@ from daemon.doctor.surroundings import (
     socket_findings,
 )
 from daemon.process.text import Colour, coloured, complain, printable
-from drivers.base import Driver, DriverError, LinkError, TactileReading
+from drivers.base import Driver, DriverError, Fact, LinkError, TactileReading
 
 LISTEN_S = 3.0
 LISTEN_MIN_S, LISTEN_MAX_S = 0.1, 3600.0
@@ -110,12 +110,12 @@ def examine(
 ) -> list[Finding]:
     """What is wrong with an open driver, without what follows from something else of it.
 
-    `statistics` are of what it brought in so many `seconds`; None for joint angles.
+    `statistics` are of what it brought in `seconds`; None for joint angles.
     """
     device, counters = driver.describe(), driver.counters.as_dict()
     told = device_findings(driver.name, device, counters)
     readings = None if statistics is None else statistics.readings
-    if device.get("link", "up") == "up":
+    if "link" not in device or device["link"].fault is None:
         causes = {finding.cause for finding in told}
         more = counter_findings(driver.name, counters)
         told += [finding for finding in more if finding.cause not in causes]
@@ -130,7 +130,7 @@ def examine(
 
 
 def in_words(findings: Sequence[Finding], columns: int | None) -> Iterator[str]:
-    """The findings for people, in lines of so many columns; with None a line for each."""
+    """The findings for people, in lines of at most `columns`; with None a line for each."""
     for finding in findings:
         what, mark = printable(finding.what), MARKS[finding.level]
         advice = printable(finding.advice or "")
@@ -190,7 +190,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
                 assembly.open_driver(driver)
                 opened.append((driver, section))
             except LinkError as error:
-                closed = {"link": "closed", "why": str(error)}
+                closed = {"link": Fact("closed", error.cause), "why": Fact(str(error))}
                 (finding,) = device_findings(driver.name, closed)
                 findings += explained(finding, section)
         seconds = _collect([driver for driver, _ in opened], statistics, listen_s)
@@ -201,8 +201,10 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
                 told = roots([*shared_findings(section), *told])
             for finding in told:
                 findings += explained(finding, section)
-            counted = driver.counters.as_dict()
-            report[driver.name] = {"device": driver.describe(), "counters": counted}
+            report[driver.name] = {
+                "device": {name: fact.text for name, fact in driver.describe().items()},
+                "counters": driver.counters.as_dict(),
+            }
     finally:
         for driver in drivers:
             driver.close()
@@ -219,7 +221,7 @@ def _listen(wanted: scene.Scene, report: dict[str, Any], listen_s: float) -> lis
 
 
 def _collect(drivers: Sequence[Driver], statistics: ElectrodeStatistics, listen_s: float) -> float:
-    """Feed the statistics for so long; seconds from the first reading to the last."""
+    """Feed the statistics for `listen_s`; seconds from the first reading to the last."""
     start_s = first_s = last_s = time.monotonic()
     while drivers and time.monotonic() - start_s < listen_s and not drivers[0].exhausted:
         descriptors = [driver.fileno() for driver in drivers]

@@ -138,7 +138,7 @@ def _details(ip: Sequence[str]) -> dict[str, dict[str, object]]:
 
 
 def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
-    """Other processes that have locked a file, or else have it open, as far as we may know it.
+    """Other processes that have locked a file, or else have it open, if /proc may be read.
 
     A pseudo-terminal is open in the program that made it, too: that one is not meant.
     """
@@ -161,7 +161,7 @@ def file_holders(path: str | Path, proc: Path = PROC) -> list[Process]:
 
 
 def port_holders(protocol: str, port: int, proc: Path = PROC) -> list[Process]:
-    """Other processes that listen on a port of `udp` or `tcp`, as far as we may know it."""
+    """Other processes that listen on a port of `udp` or `tcp`, if /proc may be read."""
     inodes = set()
     for table in (protocol, f"{protocol}6"):
         with suppress(OSError):

@@ -18,7 +18,7 @@ TOUCH_ELECTRODES = 5
 """A touch moves this many electrodes of a finger; fewer that jump from reading to reading, while
 the others keep still, are not touched but restless."""
 STILL_READINGS = 10
-"""So many equal counts in a row do not happen with 3 counts of noise."""
+"""Equal counts in a row that do not happen with 3 counts of noise."""
 RESTLESS_READINGS = 30
 """In fewer a spike or two of a sound electrode weigh too much."""
 FAULTY_FRACTION = 0.5
@@ -73,8 +73,10 @@ class ElectrodeStatistics:
 
     @property
     def noise(self) -> NDArray[np.float64]:
-        """Standard deviation from one reading to the next, counts, shape (fingers, 24): a slow
-        touch is none of it."""
+        """Standard deviation from one reading to the next, counts, shape (fingers, 24).
+
+        A slow touch does not raise it.
+        """
         noise: NDArray[np.float64] = np.sqrt(self._step_squares / np.maximum(self._steps, 1) / 2.0)
         return noise
 

@@ -42,7 +42,7 @@ class Cause(StrEnum):
     FRAMES_LOST = "frames-lost"
     OUT_OF_ORDER = "out-of-order"
     RESTARTED = "restarted"
-    """The board began anew."""
+    """The board started again."""
     COMPUTER_BUSY = "computer-busy"
     SLOW = "slow"
     CLOCK = "clock"

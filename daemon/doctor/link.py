@@ -1,12 +1,12 @@
-"""What a driver says of its device and counts on its link, and which of it is a fault."""
+"""Findings on devices and links, by the faults and counters that their drivers tell."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from daemon.doctor.finding import Cause, Finding, Level, fine
+from drivers.base import DeviceFault, Fact, LinkCause
 
 RATE_FRACTION = 0.9
 """Readings per nominal rate below which the link is slow."""
@@ -23,59 +23,13 @@ VERSION_ADVICE = (
 
 
 class Trouble(NamedTuple):
-    """What something means, and what to do about it."""
+    """Cause of a fault, and what to do about it."""
 
     cause: Cause
     advice: str
     level: Level = Level.WARNING
 
 
-LINK_TROUBLES = {
-    "no such file": Trouble(
-        Cause.PORT_MISSING,
-        "plug it in, or name one that there is; a Pico that is a drive has no firmware yet",
-    ),
-    "another program|in use|exclusively lock": Trouble(
-        Cause.PORT_HELD,
-        "sudo fuser -v and the port names it (of UDP: sudo ss -ulpn); a daemon: systemctl stop "
-        "'graspd@*'",
-    ),
-    "permission denied": Trouble(
-        Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
-    ),
-    "speaks version|has layout": Trouble(Cause.VERSION, FLASH),
-    "has . sensors|sweeps once|changed what": Trouble(
-        Cause.SETTINGS, f"let the scene and the settings of the bridge agree: {FLASH}"
-    ),
-    "other sensors": Trouble(
-        Cause.SENSOR_WORDS, "serial numbers are misread: see supply, ground, MISO and its pull-up"
-    ),
-    "no sweep|nothing from the board|nothing good": Trouble(
-        Cause.LINK_LOST,
-        "it began and stopped: see its supply and cable, and how busy this computer is",
-    ),
-    "went away|was reset": Trouble(
-        Cause.LINK_LOST, "plug, cable, hub and supply: it was unplugged, or lost power"
-    ),
-    "no interface with this name|No such device": Trouble(
-        Cause.INTERFACE_MISSING, "plug its adapter in"
-    ),
-    "Network is down": Trouble(Cause.INTERFACE_DOWN, "bring it up"),
-    "assign requested address": Trouble(
-        Cause.ADDRESS, "ip -brief address has those of this computer: listen on one of them"
-    ),
-    "bus-off": Trouble(
-        Cause.BITRATE, "let the interface have the board's bit rate; it has: then the terminators"
-    ),
-    "no answer": Trouble(
-        Cause.SILENT, f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
-    ),
-    "^greeting$": Trouble(
-        Cause.SILENT, "it has said nothing yet: is it on and connected? longer: --listen 10"
-    ),
-    "": Trouble(Cause.LINK_DOWN, "is it powered, connected, and the one that the scene names?"),
-}
-"""Why a link is not up, by the first pattern that is found in what it says of itself."""
 NOT_OURS = {
     ("unknown_versions",): Trouble(Cause.VERSION, VERSION_ADVICE),
     ("bad_lengths",): Trouble(
@@ -177,53 +131,90 @@ COUNTERS = {
 }
 """Counters that are trouble on a link that is up. Others are told by the electrodes that they
 befell, or are no trouble, and are not shown."""
-DEVICE_TROUBLES = {
-    ("last error", ""): COUNTERS["error_frames", "bus_off"],
-    ("newer firmware", ""): Trouble(Cause.FIRMWARE_OLD, FLASH),
-    ("sensors", "^none(, none)*$"): Trouble(
+TROUBLES: dict[LinkCause | DeviceFault, Trouble] = {
+    LinkCause.UNKNOWN: Trouble(
+        Cause.LINK_DOWN, "is it powered, connected, and the one that the scene names?"
+    ),
+    LinkCause.NOT_FOUND: Trouble(
+        Cause.PORT_MISSING,
+        "plug it in, or name one that there is; a Pico that is a drive has no firmware yet",
+    ),
+    LinkCause.DENIED: Trouble(
+        Cause.PORT_DENIED, "join the group of the port: ls -lL and the port names it"
+    ),
+    LinkCause.IN_USE: Trouble(
+        Cause.PORT_HELD,
+        "sudo fuser -v and the port names it (of UDP: sudo ss -ulpn); a daemon: systemctl stop "
+        "'graspd@*'",
+    ),
+    LinkCause.NO_INTERFACE: Trouble(Cause.INTERFACE_MISSING, "plug its adapter in"),
+    LinkCause.INTERFACE_DOWN: Trouble(Cause.INTERFACE_DOWN, "bring it up"),
+    LinkCause.NO_ADDRESS: Trouble(
+        Cause.ADDRESS, "ip -brief address has those of this computer: listen on one of them"
+    ),
+    LinkCause.BUS_OFF: Trouble(
+        Cause.BITRATE, "let the interface have the board's bit rate; it has: then the terminators"
+    ),
+    LinkCause.SILENT: Trouble(
+        Cause.SILENT, "it has said nothing yet: is it on and connected? longer: --listen 10"
+    ),
+    LinkCause.NO_ANSWER: Trouble(
+        Cause.SILENT, f"plug it in anew; on a UART: TX to RX, baud; not a bridge yet: {FLASH}"
+    ),
+    LinkCause.TIMEOUT: Trouble(
+        Cause.LINK_LOST,
+        "it began and stopped: see its supply and cable, and how busy this computer is",
+    ),
+    LinkCause.DISCONNECTED: Trouble(
+        Cause.LINK_LOST, "plug, cable, hub and supply: it was unplugged, or lost power"
+    ),
+    LinkCause.VERSION: Trouble(Cause.VERSION, FLASH),
+    LinkCause.SETTINGS: Trouble(
+        Cause.SETTINGS, f"let the scene and the settings of the bridge agree: {FLASH}"
+    ),
+    LinkCause.SERIALS: Trouble(
+        Cause.SENSOR_WORDS, "serial numbers are misread: see supply, ground, MISO and its pull-up"
+    ),
+    DeviceFault.BUS_ERROR: COUNTERS["error_frames", "bus_off"],
+    DeviceFault.OLD_FIRMWARE: Trouble(Cause.FIRMWARE_OLD, FLASH),
+    DeviceFault.NO_SENSOR: Trouble(
         Cause.SENSOR_ABSENT,
         "see what all share: 3.3 V, ground, SCK, MOSI, MISO and its pull-up",
         Level.ERROR,
     ),
-    ("sensors", r"(^|, )(?!none)([^,]+),(.*,)? \2(,|$)"): Trouble(
+    DeviceFault.SENSOR_TWICE: Trouble(
         Cause.SENSOR_TWICE, "two chip selects lead to one sensor, or touch", Level.ERROR
     ),
-    ("sensors", r"\bnone\b"): Trouble(
+    DeviceFault.SENSOR_ABSENT: Trouble(
         Cause.SENSOR_ABSENT, "they stand in the order of the chip selects"
     ),
-    ("spi errors", "[1-9]"): Trouble(
+    DeviceFault.SENSOR_WORDS: Trouble(
         Cause.SENSOR_WORDS,
         "by chip select, since its reset: look again; of one, and growing: its wires",
     ),
-    ("sweep", "too long"): Trouble(
+    DeviceFault.SWEEP_TOO_LONG: Trouble(
         Cause.SETTINGS, "set a longer period or a shorter sequence, and flash it"
     ),
-    ("clock", "not trusted"): Trouble(Cause.CLOCK, CLOCK_ADVICE),
+    DeviceFault.CLOCK_NOT_TRUSTED: Trouble(Cause.CLOCK, CLOCK_ADVICE),
 }
-"""What a device says of itself that is not fine: by key and pattern of the value."""
+"""What is wrong with a link or a device, by what its driver says."""
 
 
 def device_findings(
-    driver: str, device: Mapping[str, str], counters: Mapping[str, int] | None = None
+    driver: str, device: Mapping[str, Fact], counters: Mapping[str, int] | None = None
 ) -> list[Finding]:
-    """What a driver says of its device, key by key; of a link that is not up, only why."""
-    told = dict(device)
-    link, why = told.pop("link", "up"), told.pop("why", None)
-    if link != "up":
-        return [_of_link(driver, link if why is None else f"{link}: {why}", counters or {})]
-    found = [fine(f"{driver}: link up")] if "link" in device else []
-    if told.get("last error", "").startswith("nothing from"):
-        del told["last error"]  # a silence that is over: counted among the losses of the link
-    if "spi errors" in told:
-        told["spi errors"] = _of_present(told["spi errors"], told.get("sensors", ""))
-    for key, value in told.items():
-        what = f"{driver}: {key} {value}"
-        troubles = (
-            trouble
-            for (which, part), trouble in DEVICE_TROUBLES.items()
-            if which == key and re.search(part, value)
-        )
-        found.append(next((_finding(what, trouble) for trouble in troubles), fine(what)))
+    """Judge the facts of a device one by one; of a link that is not up only why."""
+    facts = dict(device)
+    link = facts.pop("link", None)
+    if link is not None and link.fault is not None:
+        what = f"{driver}: link {link.text}"
+        if "why" in facts:
+            what = f"{what}: {facts['why'].text}"
+        return [_of_link(what, TROUBLES[link.fault], counters or {})]
+    found = [] if link is None else [fine(f"{driver}: link up")]
+    for key, fact in facts.items():
+        what = f"{driver}: {key} {fact.text}"
+        found.append(fine(what) if fact.fault is None else _finding(what, TROUBLES[fact.fault]))
     return found
 
 
@@ -253,12 +244,8 @@ def rate_finding(driver: str, readings: int, seconds: float, period_ns: int | No
     return fine(what)
 
 
-def _of_link(driver: str, link: str, counters: Mapping[str, int]) -> Finding:
-    """Why a link is not up, by what it says and by what came nevertheless."""
-    what = f"{driver}: link {link}"
-    trouble = next(
-        trouble for part, trouble in LINK_TROUBLES.items() if re.search(part, link, re.IGNORECASE)
-    )
+def _of_link(what: str, trouble: Trouble, counters: Mapping[str, int]) -> Finding:
+    """Judge a link that is not up, by its trouble and by what came nevertheless."""
     if trouble.cause is Cause.SILENT and not counters.get("link_losses"):
         for names, other in NOT_OURS.items():
             if counted := _counted(names, counters):
@@ -277,13 +264,4 @@ def _counted(names: Sequence[str], counters: Mapping[str, int]) -> str:
         f"{number} {name.replace('_', ' ')}"
         for name in names
         if (number := counters.get(name, 0)) > JOINING_MAX * name.startswith(JOINING)
-    )
-
-
-def _of_present(errors: str, sensors: str) -> str:
-    """SPI errors by chip select, without those where no sensor is: there they are no news."""
-    names = sensors.split(", ") if sensors else [""] * len(errors.split(", "))
-    return ", ".join(
-        "-" if name == "none" else error
-        for error, name in zip(errors.split(", "), names, strict=False)
     )

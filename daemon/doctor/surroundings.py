@@ -129,11 +129,10 @@ def realtime_findings(wanted: Scene) -> list[Finding]:
     if wanted.realtime is None:
         return []
     with RealtimeMode(wanted.realtime) as mode:
-        lacking = [what.partition(" (") for what in mode.lacking]
-    return [
-        Finding(Level.WARNING, what, Cause.REALTIME, advice.rstrip(")"))
-        for what, _, advice in lacking
-    ] or [fine("realtime as the scene wants it may be had")]
+        lacking = mode.lacking.items()
+    return [Finding(Level.WARNING, what, Cause.REALTIME, advice) for what, advice in lacking] or [
+        fine("realtime as the scene wants it may be had")
+    ]
 
 
 def _denied(finding: Finding, port: str) -> Finding:

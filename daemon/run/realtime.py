@@ -33,8 +33,8 @@ class RealtimeMode(Companion):
         """`wanted` is the scene's section `[realtime]`."""
         self._wanted = wanted
         self._processors = os.sched_getaffinity(0)
-        self.lacking: list[str] = []
-        """What was refused, each with the right to grant."""
+        self.lacking: dict[str, str] = {}
+        """What was refused, and the right to grant."""
 
     def __enter__(self) -> Self:
         """Take what the scene wants, for all threads that exist now."""
@@ -49,7 +49,8 @@ class RealtimeMode(Companion):
         gc.freeze()
         gc.disable()
         if self.lacking:
-            log.warning("not quite realtime: %s", "; ".join(self.lacking))
+            refused = (f"{what} ({advice})" for what, advice in self.lacking.items())
+            log.warning("not quite realtime: %s", "; ".join(refused))
         return self
 
     def __exit__(
@@ -77,16 +78,15 @@ class RealtimeMode(Companion):
                 os.sched_setaffinity(thread, processors)
         except OSError as error:
             have = ", ".join(map(str, sorted(self._processors)))
-            self.lacking.append(f"realtime.cpus: {error.strerror} (there are {have})")
+            self.lacking[f"realtime.cpus: {error.strerror}"] = f"there are {have}"
 
     def _raise(self, priority: int) -> None:
         try:
             for thread in _threads():
                 os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
         except OSError as error:
-            self.lacking.append(
-                f"realtime.priority {priority}: {error.strerror} (grant LimitRTPRIO={priority} in "
-                f"the unit, or `rtprio {priority}` in limits.conf)"
+            self.lacking[f"realtime.priority {priority}: {error.strerror}"] = (
+                f"grant LimitRTPRIO={priority} in the unit, or `rtprio {priority}` in limits.conf"
             )
 
     def _lock(self) -> None:
@@ -98,9 +98,8 @@ class RealtimeMode(Companion):
             if _libc().mlockall(MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT) == 0:
                 return
             problem = os.strerror(ctypes.get_errno())
-        self.lacking.append(
-            f"realtime.lock_memory: {problem} (grant LimitMEMLOCK=infinity in the unit, or "
-            "`memlock unlimited` in limits.conf)"
+        self.lacking[f"realtime.lock_memory: {problem}"] = (
+            "grant LimitMEMLOCK=infinity in the unit, or `memlock unlimited` in limits.conf"
         )
 
 

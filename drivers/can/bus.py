@@ -21,7 +21,7 @@ from typing import Any, Final
 
 import can
 
-from drivers.base import DriverError, LinkError
+from drivers.base import DriverError, LinkCause, LinkError
 from drivers.can.frames import (
     CANFD_FRAME,
     ERROR,
@@ -59,14 +59,18 @@ def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.Bu
     if interface not in can.VALID_INTERFACES:
         known = "socketcan, slcan, udp_multicast, virtual"
         raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
-    try:
-        if interface == "socketcan":
+    where = f"cannot open {interface} {channel}"
+    if interface == "socketcan":
+        try:
             socket.if_nametoindex(channel)
+        except OSError as error:
+            raise LinkError(LinkCause.NO_INTERFACE, f"{where}: {error}") from error
+    try:
         return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
     except (NotImplementedError, ImportError) as error:
         raise DriverError(_what_is_missing(interface, error)) from error
     except Exception as error:
-        raise LinkError(f"cannot open {interface} {channel}: {error}") from error
+        raise LinkError.from_errno(error, f"{where}: {error}") from error
 
 
 def _what_is_missing(interface: str, error: Exception) -> str:
@@ -90,7 +94,7 @@ class CanBus:
         wall_clock: Callable[[], int],
     ) -> None:
         """`options` go to the constructor of python-can's bus, over the ones that we need."""
-        self.failure: str | None = None
+        self.failure: LinkError | None = None
         """Why the bus is of no use any more, None while it is."""
         self.more = False
         """Whether the last drain left frames behind."""
@@ -157,7 +161,7 @@ class CanBus:
         except BlockingIOError:
             pass
         except Exception as error:  # noqa: BLE001 (python-can lets any exception through)
-            self.failure = f"{type(error).__name__}: {error}"
+            self.failure = LinkError.from_errno(error, f"{type(error).__name__}: {error}")
         else:
             self.more = len(frames) >= FRAMES_PER_DRAIN
         if self.tap is not None and frames:

@@ -15,7 +15,7 @@ from typing import Any, Final, Unpack
 
 import can
 
-from drivers.base import DriverError, LinkError, Opened, Reading
+from drivers.base import DriverError, Fact, LinkError, Opened, Reading
 from drivers.can.bus import STAMPED_INTERFACES, CanBus
 from drivers.can.formats import CanFormat
 from drivers.can.frames import LOST, Stamped
@@ -108,11 +108,11 @@ class CanBridgeDriver(Opened):
         """Always empty: no CAN frame carries a sensor's serial number."""
         return {}
 
-    def describe(self) -> dict[str, str]:
-        """Bus, link, and how much it brings, for people."""
+    def describe(self) -> dict[str, Fact]:
+        """Bus, link, and how much it brings."""
         known = self.stream.describe()
         if self.link_state is UP:
-            known["frames"] = f"{self.frames_per_s:.0f} /s"
+            known["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
         return known
 
     def open(self) -> None:
@@ -176,7 +176,7 @@ class CanBridgeDriver(Opened):
         try:
             self._bus.open()
         except LinkError as error:
-            self._lose(str(error))
+            self._lose(error)
         except DriverError:
             self.stream.link.close()
             raise
@@ -184,10 +184,10 @@ class CanBridgeDriver(Opened):
             self.stream.link.greeting()
             self._poll_due_ns = self._clock()
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, error: LinkError) -> None:
         self._resting_until_ns = None
         self._bus.close()
-        self.stream.lost(why, self._clock())
+        self.stream.lost(error, self._clock())
 
     def _count(self, stamped: Sequence[Stamped]) -> None:
         frames = len(stamped)

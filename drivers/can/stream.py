@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, TypedDict
 
-from drivers.base import Reading
+from drivers.base import DeviceFault, Fact, LinkCause, LinkError, Reading
 from drivers.can.decoders import make_decoder
 from drivers.can.formats import SWEEP_BASE_ID, CanFormat
 from drivers.can.frames import (
@@ -46,7 +46,7 @@ class BoardOptions(TypedDict, total=False):
 class CanStream:
     """Decodes one bus, and says by `link` whether a board of ours is on it.
 
-    Whoever has the bus calls `link.greeting` when it is open, `receive` and then `watch` with what
+    The owner of the bus calls `link.greeting` when it is open, `receive` and then `watch` with what
     comes, and `lost` when it is gone. All times are monotonic ns.
     """
 
@@ -78,7 +78,10 @@ class CanStream:
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
-        """The last failure of the bus or error frame, for people; None before the first."""
+        """The last failure of the bus or error frame, for people; None before the first.
+
+        Silence is neither: `link` counts it.
+        """
         self._where = f"{bus}, {frame_format}"
         self._accepted = 0
         self._silent_at_ns = 0
@@ -107,18 +110,16 @@ class CanStream:
         """When silence is to be noticed; None while the link is not up."""
         return self._silent_at_ns if self.link.state is UP else None
 
-    def describe(self) -> dict[str, str]:
-        """Bus, link and why it is not up, and whose frames are taken, for people."""
-        known = {"bus": self._where, "link": str(self.link.state)}
-        if self.link.reason is not None:
-            known["why"] = self.link.reason
+    def describe(self) -> dict[str, Fact]:
+        """Bus, link and why it is not up, and whose frames are taken."""
+        known = {"bus": Fact(self._where), **self.link.describe()}
         if self.last_error is not None:
-            known["last error"] = self.last_error
+            known["last error"] = Fact(self.last_error, DeviceFault.BUS_ERROR)
         if self._decoder.arbitration_id is not None:
-            known["arbitration id"] = f"{self._decoder.arbitration_id:#x}"
+            known["arbitration id"] = Fact(f"{self._decoder.arbitration_id:#x}")
         return known
 
-    def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], str | None]:
+    def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
         """The readings that frames complete, oldest first; and why the bus is lost, if it is."""
         readings: list[Reading] = []
         trouble = None
@@ -142,28 +143,29 @@ class CanStream:
             if self.link.state is GREETING:
                 self.link.up(self._where, now_ns)
         elif self.link.state is UP and now_ns >= self._silent_at_ns and not more:
-            self._down(f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms", now_ns)
+            silence = f"nothing from the board for {self._silence_ns() / 1e6:.0f} ms"
+            self._down(LinkError(LinkCause.TIMEOUT, silence), now_ns)
             self.link.greeting()
 
-    def lost(self, why: str, now_ns: int) -> None:
+    def lost(self, error: LinkError, now_ns: int) -> None:
         """The bus is of no use any more, or could not be opened."""
         self.counters.bus_faults += 1
-        self._down(why, now_ns)
+        self.last_error = str(error)
+        self._down(error, now_ns)
 
     def interrupt(self) -> None:
         """Frames are missing from here on: a sweep that was cut through is dropped."""
         self._decoder.interrupt()
 
-    def _down(self, why: str, now_ns: int) -> None:
-        self.last_error = why
+    def _down(self, error: LinkError, now_ns: int) -> None:
         self.interrupt()
-        self.link.failed(f"{self._where}: {why}", now_ns)
+        self.link.failed(error.cause, f"{self._where}: {error}", now_ns)
         self.counters.link_losses = self.link.losses
 
     def _silence_ns(self) -> int:
         return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
 
-    def _take_special(self, frame: CanFrame) -> str | None:
+    def _take_special(self, frame: CanFrame) -> LinkError | None:
         """Count a remote or error frame; why the link is lost, if it is."""
         if frame.flags & (REMOTE | LOST):
             self.counters.remote_frames += bool(frame.flags & REMOTE)
@@ -174,4 +176,4 @@ class CanStream:
         if not is_bus_off(frame):
             return None
         self.counters.bus_off += 1
-        return "bus-off"
+        return LinkError(LinkCause.BUS_OFF, "bus-off")

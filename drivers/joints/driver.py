@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 from drivers.base import JointReading, Reading
 from drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointParser, MessageOrder
-from drivers.udp.link import DatagramDriver, DatagramLink
+from drivers.udp.driver import DatagramDriver
 
 SILENCE_NS = 500_000_000
 """Without a message for so long the link is lost: 50 at 100 Hz, and a sender of 10 Hz passes."""
@@ -31,15 +31,13 @@ class JointStreamDriver(DatagramDriver):
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        link = DatagramLink(
-            self.name,
+        super().__init__(
             source,
             clock,
             bytes_max=DATAGRAM_BYTES_MAX,
             silence_ns=SILENCE_NS,
             only_from=only_from,
         )
-        super().__init__(link)
         self._reset()
 
     def _reset(self) -> None:
@@ -51,20 +49,20 @@ class JointStreamDriver(DatagramDriver):
         """Listen."""
         self.close()
         self._reset()
-        self.link.open(self.counters)
+        self.listen(self.counters)
 
     def read_ready(self) -> Sequence[Reading]:
         """One reading per message that has arrived, oldest first."""
         readings: list[Reading] = []
-        for data, t_ns in self.link.receive():
+        for data, t_ns in self.datagrams():
             message = self._parser.parse(data)
             if message is None or not self._order.admits(message):
                 continue
-            self.link.confirm("joint stream")
+            self.confirm("joint stream")
             if message.names:
                 seq = self.counters.readings + self.counters.missed_readings
                 readings.append(JointReading(t_ns, seq, message.names, message.position_rad))
                 self.counters.readings += 1
-        if self.link.fell_silent():
+        if self.fell_silent():
             self._order.forget()
         return readings

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.hand import joint_name
-from drivers.udp.link import DatagramCounters
+from drivers.udp.driver import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
 """All 28 joints in full precision have about 900 bytes."""

@@ -33,9 +33,9 @@ from drivers.palm.hall import (
     RANGE_DEG,
     RANGE_MARGIN_DEG,
     SUMS,
-    Calibration,
     CoupledPoint,
     CoupledTable,
+    JointCalibration,
     Point,
     Table,
 )
@@ -63,7 +63,7 @@ class CalibrationError(DriverError):
         """Without the path; those of a joint begin with its name."""
 
 
-def load_calibration(path: Path) -> Calibration:
+def load_calibration(path: Path) -> JointCalibration:
     """Read a calibration file. Raises `CalibrationError`."""
     try:
         with path.open("rb") as file:
@@ -78,14 +78,14 @@ def load_calibration(path: Path) -> Calibration:
         raise CalibrationError(path, [f"is not TOML: {error}"]) from error
 
 
-def parse_calibration(data: Mapping[str, Any], path: Path) -> Calibration:
+def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
     """Check the content of a file; `path` is for the message. Raises `CalibrationError`."""
     problems = list(_problems(data))
     if problems:
         raise CalibrationError(path, problems)
     tables = {joint: Table(_points(rows)) for joint, rows in data.get("joints", {}).items()}
     coupled = data.get("coupled", {}).get(COUPLED_KEY)
-    return Calibration(tables, None if coupled is None else CoupledTable(_coupled(coupled)))
+    return JointCalibration(tables, None if coupled is None else CoupledTable(_coupled(coupled)))
 
 
 def _points(rows: Sequence[Sequence[float]]) -> list[Point]:

@@ -17,7 +17,7 @@ from drivers.link import LinkState
 from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
 from drivers.palm.rounds import ROUND_NS
 from drivers.palm.stream import PalmStream
-from drivers.udp.link import DatagramDriver, DatagramLink
+from drivers.udp.driver import DatagramDriver
 
 SILENCE_NS: Final = 10 * ROUND_NS
 """Without a packet for ten periods the link is lost."""
@@ -49,22 +49,19 @@ class PalmDriver(DatagramDriver):
         heed_finger_bits: bool = True,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        link = DatagramLink(
-            self.name,
+        super().__init__(
             source,
             clock,
             bytes_max=PACKET_BYTES_MAX,
             silence_ns=SILENCE_NS,
             only_from=only_from,
         )
-        super().__init__(link)
         self._make_stream = functools.partial(
             PalmStream, fingers, heed_finger_bits=heed_finger_bits
         )
         self._stream = self._make_stream()
         self._fingers = tuple(fingers)
         self._calibration = calibration
-        self._clock = clock
         self._attention_ns = 0
         self._rests = False
 
@@ -77,8 +74,7 @@ class PalmDriver(DatagramDriver):
     def serials(self) -> dict[str, str]:
         """Who sends, for each finger: no packet carries a serial number, and another sender is
         another hand."""
-        sender = self.link.sender
-        return {} if sender is None else dict.fromkeys(self._fingers, sender)
+        return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
 
     def open(self) -> None:
         """Read the calibration, then listen."""
@@ -86,7 +82,7 @@ class PalmDriver(DatagramDriver):
         self._stream = self._make_stream(calibration=self._calibration)
         self._attention_ns = self._clock()
         self._rests = False
-        self.link.open(self._stream.counters)
+        self.listen(self._stream.counters)
 
     def fileno(self) -> int | None:
         """The socket, but None while no round can end.
@@ -94,27 +90,27 @@ class PalmDriver(DatagramDriver):
         The kernel collects packets and notes their times. A loop that woke for each of them would
         wake a thousand times a second for 71 readings.
         """
-        return None if self._clock() < self._attention_ns else self.link.fileno()
+        return None if self._clock() < self._attention_ns else super().fileno()
 
     def due_ns(self) -> int | None:
         """When a round is about to end, or silence is to be noticed."""
-        due_ns = self.link.due_ns()
-        if self.link.state is LinkState.CLOSED or self._clock() >= self._attention_ns:
+        due_ns = super().due_ns()
+        if self.link_state is LinkState.CLOSED or self._clock() >= self._attention_ns:
             return due_ns
         return self._attention_ns if due_ns is None else min(due_ns, self._attention_ns)
 
     def read_ready(self) -> Sequence[Reading]:
-        """Readings that are complete, from `drivers.udp.link.DRAIN_MAX` packets at most."""
+        """Readings that are complete, from `drivers.udp.driver.DRAIN_MAX` packets at most."""
         if self._rests:
             self._rests = False
             return ()
         readings: list[Reading] = []
-        for data, t_ns in self.link.receive():
+        for data, t_ns in self.datagrams():
             made = self._stream.receive(data, t_ns)
             if made is not None:
-                self.link.confirm(f"palm {self._stream.palm}")
+                self.confirm(f"palm {self._stream.palm}")
                 readings.extend(made)
-        if self.link.fell_silent():
+        if self.fell_silent():
             self._stream.interrupt()
             self._rests = bool(readings)  # what comes next may be of others: see `Driver.serials`
         self._attention_ns = self._clock() + self._nothing_for_ns()

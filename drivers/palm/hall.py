@@ -114,7 +114,7 @@ class CoupledTable:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
+class JointCalibration:
     """What one hand's sensors mean. A joint without a table has no angle."""
 
     tables: Mapping[str, Table]

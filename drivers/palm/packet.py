@@ -17,7 +17,7 @@ from enum import StrEnum
 from typing import Final, NamedTuple
 
 from drivers.base import ELECTRODES
-from drivers.udp.link import DatagramCounters
+from drivers.udp.driver import DatagramCounters
 
 CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""

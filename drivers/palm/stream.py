@@ -21,7 +21,7 @@ from drivers.palm.rounds import RoundAssembler
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drivers.palm.hall import Calibration
+    from drivers.palm.hall import JointCalibration
 
 JOINT_PERIOD_NS: Final = 10_000_000
 """A joint reading at 100 Hz: the position of a hand has no more in it, and 1000 would be work."""
@@ -54,7 +54,7 @@ class PalmStream:
         self._parser = PalmParser(self.counters)
         self._rounds = RoundAssembler(fingers, self.counters, heed_finger_bits=heed_finger_bits)
         self._previous = b""
-        self._calibration: Calibration | None = None
+        self._calibration: JointCalibration | None = None
         self._uncalibrated = 0
         self._joint_due_ns = 0
         self._joint_seq = 0

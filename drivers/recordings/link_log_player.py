@@ -20,7 +20,7 @@ CANDUMP, SERIAL = ".log", ".serial"
 Record = TypeVar("Record")
 
 
-class Stream(Protocol):
+class LinkDecoder(Protocol):
     """What makes readings of one link."""
 
     @property
@@ -36,7 +36,7 @@ class LinkLog(Protocol[Record]):
     """One kind of file, and the stream that its records go through."""
 
     @property
-    def stream(self) -> Stream:
+    def stream(self) -> LinkDecoder:
         """The one that a driver of this link has."""
 
     def records(self, path: Path) -> Iterator[tuple[int, Record]]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from drivers.base import Reading, RecordingError
+from drivers.base import Fact, Reading, RecordingError
 from drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, PalmParser
 from drivers.palm.rounds import ROUND_NS
 from drivers.palm.stream import PalmStream
@@ -57,9 +57,9 @@ class PalmFileDriver(RecordedDriver[bytes]):
         """Counters since `open`."""
         return self._stream.counters
 
-    def describe(self) -> dict[str, str]:
+    def describe(self) -> dict[str, Fact]:
         """Which file is played."""
-        return {"source": str(self.paths[0])}
+        return {"source": Fact(str(self.paths[0]))}
 
     def open(self) -> None:
         """Read the calibration, tell the packets' length, then start over."""

@@ -8,7 +8,7 @@ from typing import Generic, TypeVar
 
 import msgspec
 
-from drivers.base import Opened, Reading, RecordingError
+from drivers.base import Fact, Opened, Reading, RecordingError
 
 Item = TypeVar("Item")
 
@@ -137,9 +137,9 @@ class RecordedDriver(Opened, Generic[Item]):
         """A recording is of no sensor that is there."""
         return {}
 
-    def describe(self) -> dict[str, str]:
+    def describe(self) -> dict[str, Fact]:
         """Which recordings are played."""
-        return {"recordings": ", ".join(map(str, self.paths))}
+        return {"recordings": Fact(", ".join(map(str, self.paths)))}
 
     def close(self) -> None:
         """Close the file that plays."""

@@ -8,19 +8,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from drivers.base import Reading, TactileReading, sensor_rows
+from drivers.base import (
+    DeviceFault,
+    Fact,
+    LinkCause,
+    Reading,
+    TactileReading,
+    sensor_rows,
+)
 from drivers.link import GREETING, WAITING, Link
 from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
     DIGEST,
     FIRMWARE,
     VERSION,
+    BridgeStatus,
     Hello,
     HelloHead,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -38,7 +45,7 @@ that agrees: a board that resets when its port is opened needs a second or two."
 PING_PERIOD_NS = 1_000_000_000
 PING_FIRST_NS = 50_000_000
 PINGS_FIRST = 8
-"""So many PINGs at the start follow each other quickly, so that times are good from the start."""
+"""PINGs at the start that follow each other quickly, so that times are good from the start."""
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """PINGs that may wait for an answer; the oldest is given up."""
@@ -49,13 +56,13 @@ SILENCE_PERIODS = 10
 SILENCE_MIN_NS = 100_000_000
 """Shortest silence that is one: above what a USB adapter or a busy host holds back."""
 
-_FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, Status.TYPE)
+_FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
 
 class Conversation:
     """What is said on one port, however often it is opened. All times are monotonic ns.
 
-    Whoever has the port calls `opened`, then `receive` with what comes, then writes what `say`
+    The owner of the port calls `opened`, then `receive` with what comes, then writes what `say`
     gives and calls `sent` right before. `link` says how it stands: when it is `WAITING`, the port
     is to be closed and opened again at `link.retry_ns`. A link log has no port and nothing to say:
     it calls `opened`, `receive` and `sent` with what it holds.
@@ -84,7 +91,7 @@ class Conversation:
         """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
         self._doubted: tuple[str, ...] | None = None
         """Those of a HELLO that told others, until the next one."""
-        self.status: Status | None = None
+        self.status: BridgeStatus | None = None
         """The last STATUS, None before the first."""
         self._sensors = sensor_rows(fingers, sensors)
         self._fingers = tuple(fingers)
@@ -123,19 +130,17 @@ class Conversation:
             return self._ping_due_ns
         return min(self._ping_due_ns, self._silent_at_ns)
 
-    def describe(self) -> dict[str, str]:
-        """Port, link, and what the bridge last said of itself, for people."""
-        known = {"port": self._port, "link": str(self.link.state)}
-        if self.link.reason is not None:
-            known["why"] = self.link.reason
+    def describe(self) -> dict[str, Fact]:
+        """Port, link, and what the bridge last said of itself."""
+        known = {"port": Fact(self._port), **self.link.describe()}
         if self.hello is not None:
-            known.update(_about(self.hello))
+            known |= _about(self.hello)
             if self.hello.firmware < FIRMWARE:
-                known["newer firmware"] = _version(FIRMWARE)
+                known["newer firmware"] = Fact(_version(FIRMWARE), DeviceFault.OLD_FIRMWARE)
         if self._sweeps is not None:
-            known.update(_about_time(self._sweeps))
-        if self.status is not None:
-            known["spi errors"] = ", ".join(map(str, self.status.spi_errors))
+            known |= _about_time(self._sweeps)
+        if self.hello is not None and self.status is not None:
+            known["spi errors"] = _about_errors(self.status, self.hello)
         return known
 
     def opened(self, now_ns: int) -> None:
@@ -149,13 +154,13 @@ class Conversation:
         self._ping_due_ns = self._silent_at_ns = now_ns
         self.link.greeting()
 
-    def lost(self, why: str, now_ns: int) -> None:
+    def lost(self, cause: LinkCause, why: str, now_ns: int) -> None:
         """Nothing more can come until `opened`."""
         self._sweeps = None
         self._counters.link_failures += 1
         self._counters.unanswered_pings += len(self._pings)
         self._pings.clear()
-        self.link.failed(why, now_ns)
+        self.link.failed(cause, why, now_ns)
 
     def say(self, now_ns: int) -> list[bytes]:
         """What is to be sent now, frame by frame; may find that the link is lost instead."""
@@ -164,7 +169,7 @@ class Conversation:
         said = [encode(Start())] if self._starts else []
         self._starts = False
         if self._sweeps is not None and now_ns >= self._silent_at_ns:
-            self.lost(f"no sweep for {self._silence_ns / 1e6:.0f} ms", now_ns)
+            self.lost(LinkCause.TIMEOUT, f"no sweep for {self._silence_ns / 1e6:.0f} ms", now_ns)
         elif now_ns < self._ping_due_ns:
             return said
         elif self._sweeps is not None:
@@ -175,10 +180,11 @@ class Conversation:
             self._ping_due_ns = now_ns + GREETING_NS
             # The zero byte ends whatever the line held before.
             return [DELIMITER + encode(Stop()), self._next_ping()]
+        elif self._doubted is None:
+            self.lost(LinkCause.NO_ANSWER, f"no answer from {self._port}", now_ns)
         else:
-            no_answer = f"no answer from {self._port}"
             others = f"{self._port}: the bridge names other sensors each time"
-            self.lost(no_answer if self._doubted is None else others, now_ns)
+            self.lost(LinkCause.SERIALS, others, now_ns)
         return []
 
     def sent(self, data: bytes, t_ns: int) -> None:
@@ -229,20 +235,21 @@ class Conversation:
         if head is None or (head.version, head.digest) == (VERSION, DIGEST):
             return True
         if head.version != VERSION:
-            self._refuse(f"speaks version {head.version}, this is version {VERSION}", now_ns)
+            why = f"speaks version {head.version}, this is version {VERSION}"
         else:
             layout = f"has layout 0x{head.digest:08X} of version {VERSION}"
-            self._refuse(f"{layout}, this is 0x{DIGEST:08X}", now_ns)
+            why = f"{layout}, this is 0x{DIGEST:08X}"
+        self._refuse(LinkCause.VERSION, why, now_ns)
         return False
 
-    def _refuse(self, why: str, now_ns: int) -> None:
+    def _refuse(self, cause: LinkCause, why: str, now_ns: int) -> None:
         self._counters.refused_bridges += 1
-        self.lost(f"{self._port}: the bridge {why}", now_ns)
+        self.lost(cause, f"{self._port}: the bridge {why}", now_ns)
 
     def _on_message(self, message: Message, arrival_ns: int) -> None:
         if isinstance(message, Hello):
             self._on_hello(message, arrival_ns)
-        elif isinstance(message, Status):
+        elif isinstance(message, BridgeStatus):
             self.status = message
             self._counters.bridge_overruns = message.overruns
             self._counters.bridge_tx_dropped = message.tx_dropped
@@ -260,10 +267,10 @@ class Conversation:
         if self._sweeps is None:
             self._greet(hello, arrival_ns)
         elif not self._sweeps.fits(hello):
-            self.lost("the bridge changed what it samples", arrival_ns)
+            self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
         elif not self._believes(hello.serials):
             # Misread or exchanged: at STOP it reads them again.
-            self.lost("the bridge names other sensors", arrival_ns)
+            self.lost(LinkCause.SERIALS, "the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
             self._take(hello)
             self._sweeps.round_trip(hello, sent_ns, arrival_ns)
@@ -282,7 +289,7 @@ class Conversation:
         """The bridge says that it has just been reset."""
         if self._sweeps is not None:
             self._counters.restarts += 1
-            self.lost("the bridge was reset", now_ns)
+            self.lost(LinkCause.DISCONNECTED, "the bridge was reset", now_ns)
         elif self._pings_sent < GREETING_TRIES:
             self._ping_due_ns = now_ns
 
@@ -290,9 +297,11 @@ class Conversation:
         """Begin sweeping with a bridge that has just answered, if its sensors are believed."""
         needed = max(self._sensors) + 1
         if hello.sensors < needed:
-            self._refuse(f"has {hello.sensors} sensors, the scene needs {needed}", now_ns)
+            why = f"has {hello.sensors} sensors, the scene needs {needed}"
+            self._refuse(LinkCause.SETTINGS, why, now_ns)
         elif hello.period_ns > PERIOD_MAX_NS:
-            self._refuse(f"sweeps once in {hello.period_ns / 1e9:g} s only", now_ns)
+            why = f"sweeps once in {hello.period_ns / 1e9:g} s only"
+            self._refuse(LinkCause.SETTINGS, why, now_ns)
         elif not self._believes(hello.serials):
             if self._pings_sent <= GREETING_TRIES:
                 self._ping_due_ns = now_ns
@@ -322,34 +331,58 @@ class Conversation:
         self._next_seq = self._sweeps.next_seq
         self._silent_at_ns = arrival_ns + self._silence_ns
         if self.link.state is GREETING:
-            self.link.up(", ".join(_about(self._sweeps.hello).values()), arrival_ns)
+            about = _about(self._sweeps.hello).values()
+            self.link.up(", ".join(fact.text for fact in about), arrival_ns)
         return reading
 
 
-def _about(hello: Hello) -> dict[str, str]:
-    """What a bridge says of itself, for people."""
+def _about(hello: Hello) -> dict[str, Fact]:
+    """What a bridge says of itself."""
+    sensors = ", ".join(serial or "none" for serial in hello.serials)
     return {
-        "board": hello.board or "unnamed",
-        "firmware": _version(hello.firmware),
-        "sequence": f"{hello.slots} samples at {hello.tick_hz / hello.period_ticks:.1f} Hz",
-        "sensors": ", ".join(serial or "none" for serial in hello.serials),
+        "board": Fact(hello.board or "unnamed"),
+        "firmware": Fact(_version(hello.firmware)),
+        "sequence": Fact(f"{hello.slots} samples at {hello.tick_hz / hello.period_ticks:.1f} Hz"),
+        "sensors": Fact(sensors, _sensor_fault(hello.serials)),
     }
 
 
-def _about_time(sweeps: SweepDecoder) -> dict[str, str]:
-    """What is known of a bridge's clock and of how long its sweeps take, for people."""
+def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
+    present = [serial for serial in serials if serial]
+    if not present:
+        return DeviceFault.NO_SENSOR
+    if len(set(present)) < len(present):
+        return DeviceFault.SENSOR_TWICE
+    return DeviceFault.SENSOR_ABSENT if len(present) < len(serials) else None
+
+
+def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
+    """SPI errors by chip select, `-` for a chip select without a sensor, which always has some."""
+    errors = [
+        number if serial else None
+        for number, serial in zip(status.spi_errors, hello.serials, strict=False)
+    ]
+    text = ", ".join("-" if number is None else str(number) for number in errors)
+    return Fact(text, DeviceFault.SENSOR_WORDS if any(errors) else None)
+
+
+def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
+    """What is known of a bridge's clock and of how long its sweeps take."""
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
-    known = {"clock": "trusted" if clock.trusted else "not trusted", "clock rate": f"{tick_hz} Hz"}
+    trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
+    known = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}
     if clock.drift_ppm is not None:
-        known["clock drift"] = f"{clock.drift_ppm:+.1f} ppm"
+        known["clock drift"] = Fact(f"{clock.drift_ppm:+.1f} ppm")
     elif clock.rate_limits_ppm is not None:
-        known["clock drift"] = "{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm)
+        known["clock drift"] = Fact("{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm))
     if clock.round_trip_ns is not None:
-        known["round trip"] = f"{clock.round_trip_ns / 1e6:.2f} ms"
+        known["round trip"] = Fact(f"{clock.round_trip_ns / 1e6:.2f} ms")
     if sweeps.longest_ticks:
         longest_ms, period_ms = 1e3 * sweeps.longest_ticks / tick_hz, sweeps.hello.period_ns / 1e6
-        fits = "at most, of" if longest_ms < period_ms else "is too long for"
-        known["sweep"] = f"{longest_ms:.2f} ms {fits} {period_ms:.2f} ms"
+        fits, fault = "at most, of", None
+        if longest_ms >= period_ms:
+            fits, fault = "is too long for", DeviceFault.SWEEP_TOO_LONG
+        known["sweep"] = Fact(f"{longest_ms:.2f} ms {fits} {period_ms:.2f} ms", fault)
     return known
 
 

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Sequence
 
-from drivers.base import LinkError, Opened, Reading
+from drivers.base import Fact, LinkError, Opened, Reading
 from drivers.link import CLOSED, GREETING, UP, WAITING, LinkState
 from drivers.spi.conversation import NAME, NONCES, Conversation
 from drivers.spi.line import LineEvent, SerialLine
@@ -80,12 +80,12 @@ class SpiBridgeDriver(Opened):
         """By finger, from the last HELLO; without the sensors that did not answer."""
         return self.conversation.serials
 
-    def describe(self) -> dict[str, str]:
-        """Port, link, and what the bridge last said of itself, for people."""
+    def describe(self) -> dict[str, Fact]:
+        """Port, link, and what the bridge last said of itself."""
         return self.conversation.describe()
 
     def open(self) -> None:
-        """Begin anew and try the port at once. Raises `DriverError` if that is hopeless."""
+        """Forget all and try the port at once. Raises `DriverError` if no try can ever succeed."""
         self.close()
         self.conversation = self._begin()
         self.conversation.link.start(self._clock())
@@ -161,4 +161,4 @@ class SpiBridgeDriver(Opened):
 
     def _lose(self, error: LinkError) -> None:
         self._line.close()
-        self.conversation.lost(str(error), self._clock())
+        self.conversation.lost(error.cause, str(error), self._clock())

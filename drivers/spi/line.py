@@ -13,7 +13,7 @@ from enum import IntEnum
 
 import serial
 
-from drivers.base import DriverError, LinkError
+from drivers.base import DriverError, LinkCause, LinkError
 
 READ_BYTES = 4096
 """A terminal hands over no more than this at once."""
@@ -71,7 +71,7 @@ class SerialLine:
                 exclusive=True,
             )
         except (OSError, termios.error) as error:
-            raise LinkError(f"{self.port}: {_reason(error)}") from error
+            raise LinkError.from_errno(error, f"{self.port}: {_reason(error)}") from error
         except ValueError as error:
             raise DriverError(f"{self.port}: {error}") from error
         self.descriptor = self._find_descriptor()
@@ -123,7 +123,7 @@ class SerialLine:
             self.drained = True
         except (OSError, termios.error) as error:
             if not data:  # else the next call says so, after these bytes
-                raise LinkError(f"{self.port}: {_loss(error)}") from error
+                raise self._loss(error) from error
         if self.tap is not None and data:
             self.tap(LineEvent.RECEIVED, data)
         return data
@@ -140,8 +140,12 @@ class SerialLine:
         except serial.SerialTimeoutException:
             return False
         except (OSError, termios.error) as error:
-            raise LinkError(f"{self.port}: {_loss(error)}") from error
+            raise self._loss(error) from error
         return True
+
+    def _loss(self, error: Exception) -> LinkError:
+        _log.debug("%s", error)
+        return LinkError(LinkCause.DISCONNECTED, f"{self.port}: the device went away")
 
     def _opened(self) -> serial.Serial:
         if self._serial is None:
@@ -170,8 +174,3 @@ def _reason(error: Exception) -> str:
     if number is not None:
         return os.strerror(number).lower()
     return str(error).partition("\n")[0]
-
-
-def _loss(error: Exception) -> str:
-    _log.debug("%s", error)
-    return "the device went away"

@@ -219,7 +219,7 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class BridgeStatus:
     """The bridge's own counters since its reset; comes once a second."""
 
     TYPE: ClassVar[int] = 0x03
@@ -248,7 +248,7 @@ class Status:
         return head + struct.pack(f"<{sensors}I", *self.spi_errors)
 
     @classmethod
-    def from_bytes(cls, payload: bytes) -> Status | None:
+    def from_bytes(cls, payload: bytes) -> BridgeStatus | None:
         """The message, or None if this is no STATUS."""
         if len(payload) < _STATUS.size:
             return None
@@ -304,12 +304,12 @@ class Stop(_Bare):
     TYPE: ClassVar[int] = 0x83
 
 
-Message = Hello | Sweep | Status | Ping | Start | Stop
+Message = Hello | Sweep | BridgeStatus | Ping | Start | Stop
 
 UNSEEDED: Final = frozenset({Hello.TYPE, Ping.TYPE})
 """Frames that peers with different layouts must still be able to exchange."""
 _MESSAGES: dict[int, type[Message]] = {
-    message.TYPE: message for message in (Hello, Sweep, Status, Ping, Start, Stop)
+    message.TYPE: message for message in (Hello, Sweep, BridgeStatus, Ping, Start, Stop)
 }
 
 

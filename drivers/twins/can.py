@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import can
 
-from drivers.base import ELECTRODES, FINGERS, DriverError, LinkError, Opened
+from drivers.base import ELECTRODES, FINGERS, Opened
 from drivers.biotac import E1, E24, PAC, PDC, SEQUENCES, TAC, TDC, encode_word
 from drivers.can.bus import open_bus
 from drivers.can.formats import (
@@ -109,14 +109,9 @@ class CanTwin(Opened):
         return self._injector.injected
 
     def open(self) -> None:
-        """Take the bus. Raises `LinkError`, also where a package is missing."""
+        """Take the bus. Raises `DriverError`, also where a package is missing."""
         self.close()
-        try:
-            self._bus = open_bus(self._interface, self._channel, self._options)
-        except LinkError:
-            raise
-        except DriverError as error:
-            raise LinkError(str(error)) from error
+        self._bus = open_bus(self._interface, self._channel, self._options)
 
     def close(self) -> None:
         """Let go of the bus."""

@@ -23,11 +23,11 @@ from drivers.spi.messages import (
     FIRMWARE,
     TEXT_BYTES,
     VERSION,
+    BridgeStatus,
     Hello,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -320,9 +320,9 @@ class SpiTwin(Opened):
             digest=self._digest,
         )
 
-    def _status(self) -> Status:
+    def _status(self) -> BridgeStatus:
         rx = self._parser.counters
-        return Status(
+        return BridgeStatus(
             tick=self._tick(self._clock()),
             sweeps=self.sweeps,
             overruns=0,

@@ -73,7 +73,7 @@ class DatagramReceiver:
         """`bytes_max` is the longest datagram that makes sense."""
         self._bytes_max = bytes_max
         self.dropped = 0
-        """Datagrams that the kernel dropped because nobody took them in time."""
+        """Datagrams that the kernel dropped because they were not taken in time."""
         self._socket = socket.socket(endpoint.family, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         try:
             self._socket.setblocking(False)
@@ -83,7 +83,8 @@ class DatagramReceiver:
             self._socket.bind((endpoint.address, endpoint.port))
         except OSError as error:
             self._socket.close()
-            raise LinkError(f"cannot listen on {endpoint}: {error.strerror}") from error
+            text = f"cannot listen on {endpoint}: {error.strerror}"
+            raise LinkError.from_errno(error, text) from error
 
     @property
     def port(self) -> int:
@@ -111,7 +112,8 @@ class DatagramReceiver:
             except InterruptedError:
                 continue
             except OSError as error:
-                raise LinkError(f"cannot receive: {error.strerror}") from error
+                text = f"cannot receive: {error.strerror}"
+                raise LinkError.from_errno(error, text) from error
             yield Datagram(data, self._age_ns(ancillary), sender[:2])
 
     def _age_ns(self, ancillary: list[tuple[int, int, bytes]]) -> int:

@@ -61,7 +61,7 @@ def measure(folder: Path, seconds: float, rate_hz: float) -> None:
             before = driver.counters.readings
             spent_us, ages_ms, cpu_s = listen(driver, seconds)
             counters = driver.counters
-            described = driver.describe()
+            described = {name: fact.text for name, fact in driver.describe().items()}
     finally:
         twin.communicate(b"stop\n")
     p50, p99 = np.percentile(spent_us, [50, 99])

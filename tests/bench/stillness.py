@@ -19,8 +19,8 @@ from daemon.judge.limits import GateLimits
 from daemon.judge.stillness import Motion
 from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
-from drivers.twins.grasps.slides import SECONDS, SPEED_COUNTS_PER_S, STANDSTILL_S, held
 from drivers.twins.grasps.whole_grasps import RATE_HZ, Sampling
+from tests.drivers.twins.slides import SECONDS, SPEED_COUNTS_PER_S, STANDSTILL_S, held
 
 REST_S = 1.5
 """The fingers rest before, so that their noise is known, s."""

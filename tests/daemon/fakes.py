@@ -12,7 +12,7 @@ from daemon.judge.decision import Limits
 from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.trust.trust import Trust
-from drivers.base import DriverCounters, DriverError, Reading, TactileReading
+from drivers.base import DriverCounters, DriverError, Fact, Reading, TactileReading
 from models.contract import (
     Dataset,
     Finger,
@@ -141,8 +141,8 @@ class FakeDriver:
     def serials(self) -> dict[str, str]:
         return {}
 
-    def describe(self) -> dict[str, str]:
-        return {"made": "by the test"}
+    def describe(self) -> dict[str, Fact]:
+        return {"made": Fact("by the test")}
 
     def open(self) -> None:
         self.is_open = True

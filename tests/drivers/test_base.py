@@ -21,7 +21,7 @@ from drivers.palm.packet import PalmCounters
 from drivers.recordings.faults import ReplayCounters
 from drivers.spi.framing import FrameCounters
 from drivers.spi.sweeps import BridgeCounters
-from drivers.udp.link import DatagramCounters
+from drivers.udp.driver import DatagramCounters
 
 COUNTERS = (
     *(DriverCounters, DatagramCounters, JointCounters, PalmCounters),

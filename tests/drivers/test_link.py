@@ -6,6 +6,7 @@ import logging
 
 import pytest
 
+from drivers.base import LinkCause
 from drivers.link import Link, LinkState
 from tests.drivers.spi.bridge_bench import Clock
 
@@ -17,7 +18,7 @@ def test_patience_grows_up_to_a_second_and_begins_anew_when_the_link_is_up() -> 
     assert link.retry_ns == clock.now_ns
     waits_s = []
     for _ in range(2000):  # half an hour
-        link.failed("not there", clock.now_ns)
+        link.failed(LinkCause.UNKNOWN, "not there", clock.now_ns)
         assert link.retry_ns is not None
         waits_s.append((link.retry_ns - clock.now_ns) / 1e9)
         assert not link.is_due(link.retry_ns - 1)
@@ -30,7 +31,7 @@ def test_patience_grows_up_to_a_second_and_begins_anew_when_the_link_is_up() -> 
     link.greeting()
     assert link.is_due(0), "nothing to wait for"
     link.up("a device", clock.now_ns)
-    link.failed("gone", clock.now_ns)
+    link.failed(LinkCause.UNKNOWN, "gone", clock.now_ns)
     assert link.retry_ns == clock.now_ns + 50_000_000
 
 
@@ -39,8 +40,8 @@ def test_the_journal_says_how_long_a_link_was_down(caplog: pytest.LogCaptureFixt
     with caplog.at_level(logging.INFO):
         link.start(2_000_000_000)
         link.up("a device", 5_250_000_000)
-        link.failed("gone", 8_000_000_000)
-        link.failed("not there", 8_100_000_000)
+        link.failed(LinkCause.UNKNOWN, "gone", 8_000_000_000)
+        link.failed(LinkCause.UNKNOWN, "not there", 8_100_000_000)
         link.up("a device", 9_000_000_000)
     assert [r.getMessage() for r in caplog.records if r.levelname == "INFO"] == [
         "spi: up after 3.25 s: a device",
@@ -51,14 +52,14 @@ def test_the_journal_says_how_long_a_link_was_down(caplog: pytest.LogCaptureFixt
 def test_only_a_link_that_was_up_is_lost() -> None:
     link = Link("spi")
     link.start(0)
-    link.failed("not there", 0)
+    link.failed(LinkCause.UNKNOWN, "not there", 0)
     link.greeting()
-    link.failed("no answer", 0)
+    link.failed(LinkCause.UNKNOWN, "no answer", 0)
     assert link.losses == 0
     link.greeting()
     link.up("a device", 0)
     assert (link.state, link.reason, link.retry_ns) == (LinkState.UP, None, None)
-    link.failed("gone", 0)
+    link.failed(LinkCause.UNKNOWN, "gone", 0)
     assert link.losses == 1
     assert link.reason == "gone"
     link.close()
@@ -70,10 +71,10 @@ def test_a_reason_is_warned_of_once_per_outage(caplog: pytest.LogCaptureFixture)
     with caplog.at_level(logging.DEBUG):
         link.start(0)
         for _ in range(50):
-            link.failed("not there", 0)
-            link.failed("wrong version", 0)
+            link.failed(LinkCause.UNKNOWN, "not there", 0)
+            link.failed(LinkCause.UNKNOWN, "wrong version", 0)
         link.up("a device", 0)
-        link.failed("not there", 0)
+        link.failed(LinkCause.UNKNOWN, "not there", 0)
     warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert warnings == [
         "spi: not there; trying again",
@@ -89,5 +90,5 @@ def test_reasons_that_never_repeat_do_not_fill_the_journal(
     link.start(0)
     with caplog.at_level(logging.WARNING):
         for number in range(1000):
-            link.failed(f"reason {number}", 0)
+            link.failed(LinkCause.UNKNOWN, f"reason {number}", 0)
     assert len(caplog.records) == 8

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.base import LinkError
+from drivers.base import Fact, LinkCause, LinkError
 from drivers.link import LinkState
-from drivers.udp.link import DatagramCounters, DatagramLink
+from drivers.udp.driver import DatagramCounters, DatagramDriver
 from drivers.udp.receiver import Datagram, DatagramReceiver, Endpoint
 from tests.drivers.spi.bridge_bench import MS, Clock
 
@@ -44,16 +44,24 @@ class Receiver:
         self.closed = True
 
 
+class Listener(DatagramDriver):
+    """A driver that a test opens and reads by hand."""
+
+    name = "test"
+
+    def open(self) -> None: ...
+
+
 class Bench:
     """A link, its clock, and the sockets that it opens one after the other."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, only_from: str | None = None) -> None:
         self.sockets = [Receiver(3), Receiver(4)]
         waiting = list(self.sockets)
-        monkeypatch.setattr("drivers.udp.link.DatagramReceiver", lambda *_: waiting.pop(0))
+        monkeypatch.setattr("drivers.udp.driver.DatagramReceiver", lambda *_: waiting.pop(0))
         self.clock = Clock()
-        self.link = DatagramLink(
-            *("test", "udp://127.0.0.1:5700", self.clock),
+        self.link = Listener(
+            *("udp://127.0.0.1:5700", self.clock),
             bytes_max=100,
             silence_ns=SILENCE_NS,
             only_from=only_from,
@@ -64,7 +72,7 @@ class Bench:
         """What comes through of what is sent."""
         self.sockets[0].waiting += sent
         heard = []
-        for data, t_ns in self.link.receive():
+        for data, t_ns in self.link.datagrams():
             heard.append((data, self.clock.now_ns - t_ns))
             if good:
                 self.link.confirm("somebody")
@@ -77,19 +85,19 @@ class Bench:
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     made = Bench(monkeypatch)
-    made.link.open(made.counters)
+    made.link.listen(made.counters)
     return made
 
 
 def test_the_first_good_sender_is_the_only_one_until_it_is_silent(bench: Bench) -> None:
     assert bench.hear(Datagram(b"x", 0, THERE), good=False) == [(b"x", 0)]
-    assert bench.link.state is LinkState.GREETING
+    assert bench.link.link_state is LinkState.GREETING
     assert bench.hear(Datagram(b"a", 0, HERE), Datagram(b"b", 0, THERE)) == [(b"a", 0)]
     assert bench.counters.foreign_datagrams == 1
     assert bench.link.describe() == {
-        "source": "udp://127.0.0.1:5700",
-        "link": "up",
-        "heard": "somebody from 127.0.0.1 port 7",
+        "source": Fact("udp://127.0.0.1:5700"),
+        "link": Fact("up"),
+        "heard": Fact("somebody from 127.0.0.1 port 7"),
     }
     bench.clock.now_ns += SILENCE_NS
     assert bench.link.fell_silent()
@@ -103,7 +111,7 @@ def test_only_one_address_is_heard_if_that_is_wanted(
     monkeypatch: pytest.MonkeyPatch, only_from: str | None, heard: bool
 ) -> None:
     bench = Bench(monkeypatch, only_from)
-    bench.link.open(bench.counters)
+    bench.link.listen(bench.counters)
     assert bool(bench.hear(Datagram(b"a", 0, HERE))) == heard
     assert bench.counters.foreign_datagrams == (not heard)
 
@@ -125,8 +133,9 @@ def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
     bench.clock.now_ns += 1
     assert bench.link.fell_silent()
     assert not bench.link.fell_silent()
-    assert (bench.link.state, bench.counters.link_losses) == (LinkState.GREETING, 1)
-    assert bench.link.describe()["why"] == "nothing good for 100 ms"
+    assert (bench.link.link_state, bench.counters.link_losses) == (LinkState.GREETING, 1)
+    assert bench.link.describe()["link"] == Fact("greeting", LinkCause.TIMEOUT)
+    assert bench.link.describe()["why"].text == "nothing good for 100 ms"
     assert bench.link.due_ns() is None
 
 
@@ -141,9 +150,9 @@ def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> Non
     first, second = bench.sockets
     bench.hear(Datagram(b"a", 0, HERE))
     assert bench.counters.kernel_drops == 3
-    first.waiting.append(LinkError("Network is down"))
+    first.waiting.append(LinkError(LinkCause.INTERFACE_DOWN, "Network is down"))
     assert bench.hear() == []
-    assert (bench.link.state, first.closed) == (LinkState.WAITING, True)
+    assert (bench.link.link_state, first.closed) == (LinkState.WAITING, True)
     assert bench.listening() == (None, None)
     due_ns = bench.link.due_ns()
     assert due_ns is not None
@@ -154,7 +163,7 @@ def test_what_the_kernel_dropped_is_summed_over_the_sockets(bench: Bench) -> Non
     assert bench.hear() == []
     assert bench.listening() == (99, 5700)
     assert bench.counters.kernel_drops == 3 + 4
-    second.waiting.append(LinkError("Network is down"))
+    second.waiting.append(LinkError(LinkCause.INTERFACE_DOWN, "Network is down"))
     assert bench.hear() == []
     assert bench.counters.kernel_drops == 3 + 4
 
@@ -175,12 +184,12 @@ def test_a_socket_keeps_128_kilobytes() -> None:
     assert len(sizes) == 1
 
 
-def test_a_closed_link_says_what_it_was_and_cannot_be_read(bench: Bench) -> None:
+def test_a_closed_link_says_whom_it_heard_and_cannot_be_read(bench: Bench) -> None:
     bench.hear(Datagram(b"a", 0, HERE))
     bench.link.close()
-    assert bench.link.describe()["link"] == "up"
+    assert bench.link.describe()["heard"].text == "somebody from 127.0.0.1 port 7"
     with pytest.raises(RuntimeError, match="test link is not open"):
-        next(bench.link.receive())
+        next(bench.link.datagrams())
 
 
 @pytest.mark.parametrize(
@@ -289,8 +298,9 @@ def test_an_interrupted_call_is_made_again_and_an_error_is_a_broken_link(
     receiver, _ = noted(monkeypatch, InterruptedError(), (b"a", []), broken)
     taken = receiver.receive(5)
     assert next(taken).data == b"a"
-    with pytest.raises(LinkError, match="cannot receive: Network is down"):
+    with pytest.raises(LinkError, match="cannot receive: Network is down") as raised:
         next(taken)
+    assert raised.value.cause is LinkCause.INTERFACE_DOWN
 
 
 def test_no_more_are_taken_than_are_wanted(monkeypatch: pytest.MonkeyPatch) -> None:

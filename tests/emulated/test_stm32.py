@@ -200,11 +200,11 @@ def test_the_driver_reads_the_chip_in_real_time(sensors_image: Path) -> None:
             port = re.findall(r"/dev/\S+", process.stdout.readline())[0]
         end_s = time.monotonic() + PATIENCE_S
         with SpiBridgeDriver(port, FINGERS) as driver:
-            while len(readings) < 200 or driver.describe()["clock"] != "trusted":
+            while len(readings) < 200 or driver.describe()["clock"].text != "trusted":
                 assert time.monotonic() < end_s, driver.describe()
                 readings += [r for r in driver.read_ready() if isinstance(r, TactileReading)]
                 time.sleep(0.002)
-            assert driver.describe()["board"] == board_of(sensors_image)
+            assert driver.describe()["board"].text == board_of(sensors_image)
             assert driver.serials == {f: f"BTSP{i:012}" for i, f in enumerate(FINGERS, 1)}
     finally:
         process.terminate()

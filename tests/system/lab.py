@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import math
 import shlex
 import threading
 import time
@@ -34,8 +33,8 @@ GRASPS: Final = Durations(first_rest_s=(6.5, 6.5), settle_s=(2.0, 2.0), rest_s=(
 sweeps) and to settle."""
 CAN_GRASPS: Final = Durations(first_rest_s=(13.0, 13.0), settle_s=(4.0, 4.0), rest_s=(13.0, 13.0))
 """The same at half that rate."""
-PATIENCE_S: Final = 300.0
-"""For what takes a second on a computer that is not emulated."""
+PATIENCE_S: Final = 600.0
+"""For what takes a second on a computer that is not emulated, nor busy."""
 LOOK_S: Final = 0.5
 
 
@@ -97,7 +96,7 @@ class Lab:
         ]
 
     def warnings(self, hand: str, after_s: float) -> list[str]:
-        """What a hand's unit warned of since a time, but for an overloaded emulated processor."""
+        """Warnings of a hand's unit since a time, without those of an overloaded processor."""
         said = self.journal(hand, after_s, "warning")
         return [line for line in said if not line.startswith("overloaded: ")]
 
@@ -154,14 +153,6 @@ class Lab:
                 raise StepError(f"{hand}: messages were lost after {former.body['seq']}")
         return found
 
-    def judged(self, hand: str) -> int:
-        """Readings that a daemon has given a verdict on since its start, not left out."""
-        last = self.last(hand, "verdict")
-        found = self.machine.messages.between(hand, "verdict", 0.0, math.inf)
-        own = [each for each in found if each.body["boot_id"] == last["boot_id"]]
-        silences = {each.body["seq"] for each in own if not each.told}
-        return int(last["seq"]) + 1 - len(silences)
-
     def observe(self) -> None:
         """Have a member of the group subscribe to both hands."""
         endpoints = " ".join(f"ipc:///run/graspd/{hand}.ipc" for hand in HANDS)
@@ -178,6 +169,11 @@ class Lab:
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
             f"--interface socketcan --channel vcan0 --format sweep_fd {shlex.join(options)}"
         )
+
+    def await_twin(self) -> None:
+        """Wait for a verdict on a reading that the twin made which was started last."""
+        now_s = self.now_s()
+        self.await_message("can", now_s, "a verdict", lambda m: m.told and m.made_s > now_s)
 
     def interface(self) -> dict[str, int]:
         """Frames that the kernel has carried on vcan0, by its own counters."""

@@ -19,11 +19,11 @@ from tests.system.messages import Messages
 
 MEMORY_MIB: Final = 1536
 CPUS: Final = 2
-START_TIMEOUT_S: Final = 10.0
+START_TIMEOUT_S: Final = 60.0
 BOOT_TIMEOUT_S: Final = 600.0
-ANSWER_TIMEOUT_S: Final = 100.0
+ANSWER_TIMEOUT_S: Final = 200.0
 """For a guest agent that is busy, under emulation."""
-COMMAND_TIMEOUT_S: Final = 200.0
+COMMAND_TIMEOUT_S: Final = 600.0
 SYNCHRONISE_S: Final = 5.0
 """After this long the agent is asked again: while it starts it loses what it was asked."""
 BOOT_ID: Final = "cat /proc/sys/kernel/random/boot_id"

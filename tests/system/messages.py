@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import socket
 import threading
 import time
@@ -30,6 +31,11 @@ class Message:
     """`verdict`, `gate` or `status`."""
     hand: str
     body: dict[str, Any]
+
+    @property
+    def made_s(self) -> float:
+        """When its reading was made or it was sent, by the same clock: before `t_s`."""
+        return float(self.body["t_mono_ns"]) / 1e9
 
     @property
     def told(self) -> bool:
@@ -83,6 +89,18 @@ class Messages:
     def last(self, hand: str, kind: str) -> Message | None:
         """The newest of a hand and kind."""
         return next(reversed(self.between(hand, kind, 0.0, float("inf"))), None)
+
+    def readings(self, hand: str) -> int:
+        """Count the verdicts on readings of a hand, by `seq`: also those that did not come.
+
+        Count from the first one that came: a subscriber that came late has missed silences, which
+        have a `seq` too and are no readings. So only the difference of two counts means something.
+        """
+        verdicts = self.between(hand, "verdict", 0.0, math.inf)
+        newest = verdicts[-1].body
+        own = [each for each in verdicts if each.body["boot_id"] == newest["boot_id"]]
+        silences = {each.body["seq"] for each in own if not each.told}
+        return int(newest["seq"]) - int(own[0].body["seq"]) + 1 - len(silences)
 
     def _listen(self, port: socket.socket, stop: threading.Event) -> None:
         rest = b""

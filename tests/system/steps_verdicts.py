@@ -11,7 +11,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Final
 
-from tests.system.lab import CAN_RATE_HZ, PAYLOAD, Lab, Outcome, StepError
+from tests.system.lab import CAN_RATE_HZ, PATIENCE_S, PAYLOAD, Lab, Outcome, StepError
 from tests.system.messages import Message
 
 P_SLIP_ERROR_MAX: Final = 0.05
@@ -20,14 +20,16 @@ P_SLIP_ERROR_MAX: Final = 0.05
 CAN_MODEL: Final = "small-electrodes"
 """As in `can.toml`."""
 GRASPS: Final = 3
-SETTLING_S: Final = 2.0
-"""After a twin's end: for what is on its way."""
 BURST_RATES_HZ: Final = (100.0, 200.0, 400.0, 800.0)
 """Sweeps/s, of which the first that is more than can be judged is the measure of what can be."""
 RECORDING: Final = ("--recording", f"{PAYLOAD}/recording.csv", "--loop")
 """Costs a twin less than to make up grasps."""
-TRIAL_S: Final = 12.0
-TRIAL_STATUSES: Final = 3
+REPLAY_TIMEOUT_S: Final = 600.0
+TRIAL_STATUSES: Final = 15
+"""Statuses after which a rate is one that is carried, if it has not overloaded by then."""
+OVERLOADED_STATUSES: Final = 3
+"""Statuses that tell what is judged of a rate that overloads."""
+LOOK_S: Final = 0.5
 OVERLOAD_MIN: Final = 3.0
 """By which a rate that is carried is below what is judged at most ..."""
 BURST_TIMES: Final = 10.0
@@ -39,7 +41,9 @@ BURST_S: Final = 10.0
 
 def can_verdicts(lab: Lab) -> Outcome:
     """Whole grasps over the CAN bus have the verdicts that a replay of the same recording gives."""
-    replayed = lab.sh(f"graspd replay --json --model {CAN_MODEL} {PAYLOAD}/recording.csv", 180.0)
+    replayed = lab.sh(
+        f"graspd replay --json --model {CAN_MODEL} {PAYLOAD}/recording.csv", REPLAY_TIMEOUT_S
+    )
     verdicts = [json.loads(line) for line in replayed.splitlines()]
     expected = [each["p_slip"] for each in verdicts if each["judged"] and each["valid"]]
     if len(expected) < GRASPS:
@@ -92,54 +96,68 @@ def judgement(message: Message) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What has been sent so far, and where it is, while nothing is on its way."""
+    """Counts of frames and readings, while nothing is on its way."""
 
     boot_id: str
     sent: int
     """Frames that the kernel has carried."""
     taken: int
-    """Of these the daemon has taken in so many."""
+    """Frames that the daemon has taken in."""
     dropped: int
-    """Of these the kernel could not keep so many."""
+    """Frames that the kernel could not keep."""
     readings: int
     judged: int
+    """Verdicts on readings, from a start that is the same for all tallies: see `Messages`."""
     skipped: int
+
+    def since(self, former: Tally) -> Tally:
+        """What was counted after `former`. Raises `StepError` unless all is accounted for."""
+        counts = {
+            name: getattr(self, name) - getattr(former, name)
+            for name in ("sent", "taken", "dropped", "readings", "judged", "skipped")
+        }
+        more = Tally(self.boot_id, **counts)
+        if former.boot_id != self.boot_id:
+            raise StepError("was started anew")
+        if more.taken + more.dropped != more.sent or more.judged + more.skipped != more.readings:
+            raise StepError(f"not accounted for: {more}")
+        return more
 
 
 def can_frames(lab: Lab) -> Outcome:
     """No frame is lost at a rate that is carried, and all are accounted for at ten times that."""
     restarts = lab.show("can", "NRestarts")
     try:
+        first = _tally(lab)
         sent_hz, judged_hz = _overloaded_hz(lab)
         carried_hz = judged_hz / OVERLOAD_MIN
         burst_hz = min(max(BURST_TIMES * carried_hz, sent_hz), TWIN_MAX_HZ)
         before = _tally(lab)
-        began_s = lab.now_s()
+        before.since(first)
         lab.twin("--rate", f"{carried_hz:.3f}", *RECORDING)
-        lab.await_message("can", began_s, "a verdict")
+        lab.await_twin()
         time.sleep(STEADY_S)
-        steady = _tally(lab)
-        if steady.dropped != before.dropped or steady.taken - before.taken != _sent(before, steady):
-            raise StepError(f"frames lost at {carried_hz:.1f} Hz: {before}, then {steady}")
+        after_steady = _tally(lab)
+        steady = after_steady.since(before)
+        if steady.dropped:
+            raise StepError(f"frames lost at {carried_hz:.1f} Hz: {steady}")
         began_s = lab.now_s()
         lab.twin("--rate", f"{burst_hz:.3f}", *RECORDING)
         lab.await_message("can", began_s, "overloaded", _overloaded)
         time.sleep(BURST_S)
-        burst = _tally(lab)
-        began_s = lab.now_s()
+        burst = _tally(lab).since(after_steady)
     finally:
         lab.twin("--rate", str(CAN_RATE_HZ), *RECORDING)
-    lab.await_message("can", began_s, "a verdict")
-    lab.await_message("can", began_s, "no longer overloaded", _calm)
-    if burst.boot_id != before.boot_id or lab.show("can", "NRestarts") != restarts:
+    lab.await_twin()
+    lab.await_message("can", lab.now_s(), "no longer overloaded", _calm)
+    if lab.show("can", "NRestarts") != restarts:
         raise StepError("was started anew")
-    sent, skipped = _sent(steady, burst), burst.skipped - steady.skipped
-    if not skipped:
+    if not burst.skipped:
         raise StepError(f"nothing was left out at {burst_hz:.0f} Hz")
     return Outcome(
-        f"{_sent(before, steady)} frames at {carried_hz:.0f} Hz: none lost; {sent} at "
-        f"{burst_hz:.0f} Hz: {burst.dropped - steady.dropped} dropped, {skipped} of "
-        f"{burst.readings - steady.readings} readings left out, overloaded, then well again"
+        f"{steady.sent} frames at {carried_hz:.0f} Hz: none lost; {burst.sent} at "
+        f"{burst_hz:.0f} Hz: {burst.dropped} dropped, {burst.skipped} of "
+        f"{burst.readings} readings left out, overloaded, then well again"
     )
 
 
@@ -149,15 +167,18 @@ def _overloaded_hz(lab: Lab) -> tuple[float, float]:
         began_s = lab.now_s()
         lab.twin("--rate", str(rate_hz), *RECORDING)
         lab.await_message("can", began_s, "a verdict")
-        time.sleep(TRIAL_S)
-        statuses = lab.machine.messages.between("can", "status", began_s, math.inf)
-        judged: list[float] = [
-            later.body["readings_hz"]
-            for former, later in itertools.pairwise(statuses)
-            if later.body["skipped_readings"] > former.body["skipped_readings"]
-        ]
-        if len(judged) >= TRIAL_STATUSES and any(map(_overloaded, statuses)):
-            return rate_hz, statistics.median(judged)
+        statuses: list[Message] = []
+        deadline_s = time.monotonic() + PATIENCE_S
+        while len(statuses) < TRIAL_STATUSES and time.monotonic() < deadline_s:
+            time.sleep(LOOK_S)
+            statuses = lab.machine.messages.between("can", "status", began_s, math.inf)
+            judged: list[float] = [
+                later.body["readings_hz"]
+                for former, later in itertools.pairwise(statuses)
+                if later.body["skipped_readings"] > former.body["skipped_readings"]
+            ]
+            if len(judged) >= OVERLOADED_STATUSES and any(map(_overloaded, statuses)):
+                return rate_hz, statistics.median(judged)
     raise StepError(f"not overloaded at {BURST_RATES_HZ[-1]} Hz")
 
 
@@ -169,34 +190,26 @@ def _calm(message: Message) -> bool:
     return message.kind == "status" and not message.body["overloaded"]
 
 
-def _sent(former: Tally, later: Tally) -> int:
-    return later.sent - former.sent
-
-
 def _tally(lab: Lab) -> Tally:
-    """Stop the twin and count. Raises `StepError` if something is not accounted for."""
-    began_s = lab.now_s()
+    """Stop the twin and count when the daemon has taken all that was sent."""
     # What was dropped is told with the frames after it.
     lab.twin("--rate", str(CAN_RATE_HZ), *RECORDING)
-    lab.await_message("can", began_s, "a verdict")
-    time.sleep(SETTLING_S)
+    lab.await_twin()
     lab.sh("systemctl stop twin-can")
-    time.sleep(SETTLING_S)
     now_s = lab.now_s()
-    status = lab.await_message("can", now_s, "silence", _silent).body
+    status = lab.await_message(
+        "can", now_s, "silence", lambda message: _silent(message) and message.made_s > now_s
+    ).body
     counters, interface = status["drivers"]["can"], lab.interface()
-    tally = Tally(
+    return Tally(
         boot_id=status["boot_id"],
         sent=interface["sent"],
         taken=counters["accepted_frames"],
         dropped=interface["dropped"] + counters["kernel_drops"],
         readings=counters["readings"],
-        judged=lab.judged("can"),
+        judged=lab.machine.messages.readings("can"),
         skipped=status["skipped_readings"],
     )
-    if tally.taken + tally.dropped != tally.sent or tally.judged + tally.skipped != tally.readings:
-        raise StepError(f"not accounted for: {tally}")
-    return tally
 
 
 def _silent(message: Message) -> bool:

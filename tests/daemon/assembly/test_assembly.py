@@ -84,7 +84,7 @@ def test_the_port_of_the_scene_arrives_at_the_bridge() -> None:
     scene = parse({"tactile": tactile}, Path("scene.toml"))
     (driver,) = assembly.build_drivers(scene)
     assert isinstance(driver, SpiBridgeDriver)
-    assert driver.describe()["port"] == "/dev/serial/by-id/mine"
+    assert driver.describe()["port"].text == "/dev/serial/by-id/mine"
 
 
 SPI: dict[str, Any] = {"driver": "spi", "port": "/nowhere"}

@@ -9,7 +9,7 @@ import pytest
 
 from daemon.assembly import assembly
 from daemon.scene import Scene, SceneError, parse
-from drivers.base import DriverError, LinkError, RecordingError
+from drivers.base import DriverError, LinkCause, LinkError, RecordingError
 from drivers.palm.calibration import CalibrationError
 from tests.daemon.fakes import Clock, FakeDriver
 
@@ -80,7 +80,7 @@ def test_what_a_driver_refuses_is_one_line_naming_the_section(
 @pytest.mark.parametrize(
     ("raised", "expected"),
     [
-        (LinkError("gone"), LinkError),
+        (LinkError(LinkCause.UNKNOWN, "gone"), LinkError),
         (DriverError("no such interface"), SceneError),
         (RecordingError(Path("a.csv"), "empty"), SceneError),
         (CalibrationError(Path("hand.toml"), ["no joint"]), SceneError),

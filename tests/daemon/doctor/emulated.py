@@ -112,7 +112,7 @@ def palm(hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Driver
         def step() -> None:
             clock.now_ns += MS
             for datagram in next(cycles):
-                sender.sendto(datagram, ("127.0.0.1", driver.link.port or 0))
+                sender.sendto(datagram, ("127.0.0.1", driver.port or 0))
 
         yield driver, step
 
@@ -128,7 +128,7 @@ def joints(_hand: Hand, _folder: Path, faults: LinkFaults) -> Iterator[tuple[Dri
         def step() -> None:
             clock.now_ns += 10 * MS
             for datagram in next(cycles):
-                sender.sendto(datagram, ("127.0.0.1", driver.link.port or 0))
+                sender.sendto(datagram, ("127.0.0.1", driver.port or 0))
 
         yield driver, step
 

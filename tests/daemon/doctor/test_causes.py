@@ -148,7 +148,7 @@ def test_a_hand_that_repeats_itself_is_told(tmp_path: Path) -> None:
 def test_error_frames_of_a_bus_without_ours_are_a_bit_rate(tmp_path: Path) -> None:
     silence, statistics = LinkFaults(drop_probability=1.0), ElectrodeStatistics(FINGERS)
     with LINKS["can"](Hand(100.0), tmp_path, silence) as (driver, step):
-        where = driver.describe()["bus"].split()[1].rstrip(",")
+        where = driver.describe()["bus"].text.split()[1].rstrip(",")
         with can.Bus(interface="virtual", channel=where, ignore_config=True) as bus:
             for _ in range(20):
                 bus.send(can.Message(arbitration_id=0x8, is_error_frame=True, dlc=8, data=bytes(8)))

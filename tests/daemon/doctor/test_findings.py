@@ -15,7 +15,7 @@ from daemon.doctor.electrodes import ElectrodeStatistics
 from daemon.doctor.finding import Cause, Level
 from daemon.doctor.link import counter_findings, device_findings, rate_finding
 from daemon.doctor.surroundings import can_finding
-from drivers.base import ElectrodeFault, TactileReading
+from drivers.base import DeviceFault, ElectrodeFault, Fact, LinkCause, TactileReading
 from drivers.link import LinkState
 
 FINGERS = ("ff", "mf", "th")
@@ -185,43 +185,57 @@ def test_can_interfaces_are_found_by_their_type(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "level", "advice"),
+    ("fault", "level", "cause", "advice"),
     [
-        ("firmware", "0.1", Level.OK, ""),
-        ("newer firmware", "0.2", Level.WARNING, "flash"),
-        ("sensors", "BTSP1, BTSP2, BTSP10", Level.OK, ""),
-        ("sensors", "BTSP-TWIN-1, BTSP-TWIN-2, BTSP-TWIN-10", Level.OK, ""),
-        ("sensors", "BTSP-1, BTSP-2, BTSP-2", Level.ERROR, "two chip selects"),
-        ("sensors", "BTSP-1, BTSP-1", Level.ERROR, "two chip selects"),
-        ("sensors", "none, BTSP2, none", Level.WARNING, "order of the chip selects"),
-        ("sensors", "none", Level.ERROR, "MISO"),
-        ("sensors", "none, none", Level.ERROR, "MISO"),
-        ("sensors", "BTSP1, none, BTSP1", Level.ERROR, "two chip selects"),
-        ("spi errors", "0, 0, 0", Level.OK, ""),
-        ("spi errors", "0, 10, 0", Level.WARNING, "by chip select"),
-        ("sweep", "1.91 ms at most, of 10.00 ms", Level.OK, ""),
-        ("sweep", "10.42 ms is too long for 10.00 ms", Level.WARNING, "longer period"),
-        ("clock", "trusted", Level.OK, ""),
-        ("clock", "not trusted", Level.WARNING, "flash"),
-        ("last error", "no buffer space", Level.WARNING, "terminators"),
+        (None, Level.OK, None, ""),
+        (DeviceFault.OLD_FIRMWARE, Level.WARNING, Cause.FIRMWARE_OLD, "flash"),
+        (DeviceFault.SENSOR_TWICE, Level.ERROR, Cause.SENSOR_TWICE, "two chip selects"),
+        (DeviceFault.SENSOR_ABSENT, Level.WARNING, Cause.SENSOR_ABSENT, "order of the chip"),
+        (DeviceFault.NO_SENSOR, Level.ERROR, Cause.SENSOR_ABSENT, "MISO"),
+        (DeviceFault.SENSOR_WORDS, Level.WARNING, Cause.SENSOR_WORDS, "by chip select"),
+        (DeviceFault.SWEEP_TOO_LONG, Level.WARNING, Cause.SETTINGS, "longer period"),
+        (DeviceFault.CLOCK_NOT_TRUSTED, Level.WARNING, Cause.CLOCK, "flash"),
+        (DeviceFault.BUS_ERROR, Level.WARNING, Cause.BUS_ERRORS, "terminators"),
     ],
 )
-def test_what_a_device_says_is_judged(key: str, value: str, level: Level, advice: str) -> None:
-    up, finding = device_findings("spi", {"link": "up", key: value})
+def test_a_fact_is_judged_by_its_fault_and_not_by_its_words(
+    fault: DeviceFault | None, level: Level, cause: Cause | None, advice: str
+) -> None:
+    up, finding = device_findings("spi", {"link": Fact("up"), "some key": Fact("xxx", fault)})
     assert (up.level, up.what) == (Level.OK, "spi: link up")
-    assert (finding.level, finding.what) == (level, f"spi: {key} {value}")
+    assert (finding.level, finding.cause, finding.what) == (level, cause, "spi: some key xxx")
     assert advice in (finding.advice or "")
-    assert bool(advice) == bool(finding.advice) == bool(finding.cause)
+    assert bool(advice) == bool(finding.advice)
+
+
+CAUSES = {
+    LinkCause.UNKNOWN: Cause.LINK_DOWN,
+    LinkCause.NOT_FOUND: Cause.PORT_MISSING,
+    LinkCause.DENIED: Cause.PORT_DENIED,
+    LinkCause.IN_USE: Cause.PORT_HELD,
+    LinkCause.NO_INTERFACE: Cause.INTERFACE_MISSING,
+    LinkCause.INTERFACE_DOWN: Cause.INTERFACE_DOWN,
+    LinkCause.NO_ADDRESS: Cause.ADDRESS,
+    LinkCause.BUS_OFF: Cause.BITRATE,
+    LinkCause.SILENT: Cause.SILENT,
+    LinkCause.NO_ANSWER: Cause.SILENT,
+    LinkCause.TIMEOUT: Cause.LINK_LOST,
+    LinkCause.DISCONNECTED: Cause.LINK_LOST,
+    LinkCause.VERSION: Cause.VERSION,
+    LinkCause.SETTINGS: Cause.SETTINGS,
+    LinkCause.SERIALS: Cause.SENSOR_WORDS,
+}
 
 
 @pytest.mark.parametrize("state", sorted({*LinkState} - {LinkState.UP}))
 @pytest.mark.parametrize("why", [None, "no answer from /dev/x", "something new"])
-def test_a_link_that_is_not_up_is_an_error_with_cause_and_advice(
-    state: LinkState, why: str | None
+@pytest.mark.parametrize("cause", LinkCause)
+def test_a_link_that_is_not_up_is_an_error_whose_cause_is_not_in_its_words(
+    state: LinkState, why: str | None, cause: LinkCause
 ) -> None:
-    device = {"link": str(state)} | ({} if why is None else {"why": why})
+    device = {"link": Fact(str(state), cause)} | ({} if why is None else {"why": Fact(why)})
     (finding,) = device_findings("palm", device)
-    assert finding.level is Level.ERROR
+    assert (finding.level, finding.cause) == (Level.ERROR, CAUSES[cause])
     assert finding.what == f"palm: link {state}" + (f": {why}" if why else "")
     assert finding.advice
 
@@ -233,5 +247,5 @@ def test_the_page_names_every_cause_once_and_nothing_else() -> None:
 
 
 def test_a_recording_has_no_link() -> None:
-    (finding,) = device_findings("replay", {"recordings": "a.csv"})
+    (finding,) = device_findings("replay", {"recordings": Fact("a.csv")})
     assert finding.level is Level.OK

@@ -11,8 +11,8 @@ from scipy.stats import norm
 
 from daemon.judge.stillness import Motion
 from daemon.judge.windows import STEPS, upper_tail
-from drivers.twins.grasps.slides import STANDSTILL_S, held
 from drivers.twins.grasps.whole_grasps import Sampling
+from tests.drivers.twins.slides import STANDSTILL_S, held
 
 REST_S = 1.5
 HAND = np.ones((3, 24), dtype=np.bool_)

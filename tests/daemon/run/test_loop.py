@@ -20,7 +20,7 @@ from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.trust import Trust
-from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
+from drivers.base import DriverError, JointReading, LinkCause, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 
 
@@ -244,7 +244,7 @@ def test_status_tells_the_rate(stop: StopSignal) -> None:
     assert [round(status.readings_hz) for status in bench.output.statuses()[:2]] == [100, 100]
 
 
-@pytest.mark.parametrize("error", [LinkError("gone"), DriverError("broken")])
+@pytest.mark.parametrize("error", [LinkError(LinkCause.UNKNOWN, "gone"), DriverError("broken")])
 def test_a_driver_that_gives_up_ends_the_loop_with_a_last_status(
     stop: StopSignal, error: DriverError
 ) -> None:
@@ -330,7 +330,7 @@ def test_the_watchdog_is_fed_after_each_round_and_not_after_a_failed_one(stop: S
     clock = Clock()
     queue: list[Reading | DriverError] = [
         *(reading(clock(), seed) for seed in (1, 2)),
-        LinkError("gone"),
+        LinkError(LinkCause.UNKNOWN, "gone"),
     ]
     watchdog = Watchdog()
     bench = Bench(FakeDriver(queue, clock), clock, stop, companions=[watchdog])

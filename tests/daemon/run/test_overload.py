@@ -139,6 +139,9 @@ def test_at_any_overload_the_newest_is_judged_and_all_are_accounted_for(times: f
     bench = flood(cost_ns, 4.0)
     status = bench.statuses[-1]
     assert len(bench.judged) + status.skipped_readings == 400
+    for each in bench.statuses:  # counts of one moment
+        taken = sum(each.verdicts.values()) + each.skipped_readings
+        assert taken == each.drivers["fake"]["readings"]
     assert bench.driver.counters.readings == 400
     assert status.skipped_readings == pytest.approx(400 * (1 - 1 / times), rel=0.25)
     # From the second round on, which knows what judging takes, none has waited for another.

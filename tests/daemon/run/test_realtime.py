@@ -81,7 +81,7 @@ def test_every_thread_gets_priority_and_processor_and_gives_them_back(as_before:
         pytest.skip("SCHED_FIFO is refused here")
     processor = max(os.sched_getaffinity(0))
     with RealtimeMode(Realtime(priority=7, cpus=(processor,), lock_memory=False)) as mode:
-        assert mode.lacking == []
+        assert mode.lacking == {}
         for thread in map(int, os.listdir("/proc/self/task")):
             assert os.sched_getscheduler(thread) == os.SCHED_FIFO
             assert os.sched_getparam(thread).sched_priority == 7

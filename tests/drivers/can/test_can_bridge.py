@@ -50,7 +50,7 @@ def test_the_bridge_is_a_driver() -> None:
     assert driver.name == "can"
     assert not driver.exhausted
     assert driver.fileno() is driver.due_ns() is driver.period_ns is None
-    assert driver.describe()["link"] == "closed"
+    assert driver.describe()["link"].text == "closed"
     driver.close()
     with pytest.raises(RuntimeError, match="not open"):
         driver.read_ready()

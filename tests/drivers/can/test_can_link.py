@@ -87,9 +87,9 @@ def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
     with driver:
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == truth(0)).all()
-        assert driver.describe()["link"] == "waiting"
+        assert driver.describe()["link"].text == "waiting"
         assert driver.fileno() is None
-        assert str(failure) in driver.describe()["last error"]
+        assert str(failure) in driver.describe()["last error"].text
         assert first.shut_down == 1
         assert driver.read_ready() == ()
         due_ns = driver.due_ns()
@@ -98,7 +98,7 @@ def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == truth(3)).all()
         assert not reading.faults.any()
-        assert driver.describe()["link"] == "up"
+        assert driver.describe()["link"].text == "up"
         counters = driver.counters
         assert (counters.bus_faults, counters.link_losses, counters.interrupted_sweeps) == (1, 1, 1)
     assert second.shut_down == 1
@@ -208,7 +208,8 @@ def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
             bus.send(message(bytes(7), 0x7FF))
             assert driver.read_ready() == []
         assert str(driver.link_state) == "greeting"
-        assert driver.describe()["last error"] == "nothing from the board for 100 ms"
+        assert driver.describe()["why"].text.endswith(": nothing from the board for 100 ms")
+        assert "last error" not in driver.describe()
         assert (driver.counters.link_losses, driver.counters.bus_faults) == (1, 0)
         before = len(link.readings)
         link.send(contact(3))

@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from drivers.base import DriverError, LinkError, TactileReading
+from drivers.base import DriverError, TactileReading
 from drivers.can.driver import CanBridgeDriver
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaults
@@ -114,7 +114,7 @@ def test_packages_are_named_as_they_are_installed(
         raise can.CanInterfaceNotImplementedError(says)
 
     monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
-    with pytest.raises(LinkError, match=f"pip install {package}$"):
+    with pytest.raises(DriverError, match=f"pip install {package}$"):
         CanTwin("slcan", "/dev/null", iter(())).open()
 
 
@@ -123,7 +123,7 @@ def test_a_library_that_does_not_work_here_says_why(monkeypatch: pytest.MonkeyPa
         raise can.CanInterfaceNotImplementedError("Windows only")
 
     monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
-    with pytest.raises(LinkError, match="does not work here: Windows only"):
+    with pytest.raises(DriverError, match="does not work here: Windows only"):
         CanTwin("vector", "0", iter(())).open()
 
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import Driver, JointReading, LinkError
+from drivers.base import Driver, Fact, JointReading, LinkCause, LinkError
 from drivers.joints.driver import JointStreamDriver
 from drivers.joints.message import (
     JointCounters,
@@ -217,7 +217,10 @@ def test_the_joint_stream_is_a_driver() -> None:
     driver: Driver = JointStreamDriver(LOOPBACK)
     assert (driver.name, driver.period_ns, driver.exhausted) == ("joints", None, False)
     assert driver.fileno() is driver.due_ns() is None
-    assert driver.describe() == {"source": LOOPBACK}
+    assert driver.describe() == {
+        "source": Fact(LOOPBACK),
+        "link": Fact("closed", LinkCause.UNKNOWN),
+    }
     with pytest.raises(RuntimeError, match="not open"):
         driver.read_ready()
     driver.close()
@@ -299,7 +302,7 @@ def test_silence_loses_the_link_and_a_message_brings_it_back(
         driver.read_ready()
         assert state(driver) is LinkState.GREETING
         assert driver.counters.link_losses == 1
-        assert driver.describe()["why"] == "nothing good for 500 ms"
+        assert driver.describe()["why"].text == "nothing good for 500 ms"
     assert len(taken(driver, message(1))) == 1  # another sender, counting from the start
     assert state(driver) is LinkState.UP
 

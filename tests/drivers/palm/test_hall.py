@@ -18,8 +18,8 @@ from drivers.palm.calibration import CalibrationError, load_calibration, parse_c
 from drivers.palm.hall import (
     HALL_SENSORS,
     JOINTS,
-    Calibration,
     CoupledTable,
+    JointCalibration,
     Table,
     impossible_angles,
 )
@@ -34,7 +34,7 @@ SNAPSHOT = [
 FILE = Path("hand.toml")
 
 
-def degrees(calibration: Calibration, **raws: int | tuple[int, ...]) -> dict[str, float]:
+def degrees(calibration: JointCalibration, **raws: int | tuple[int, ...]) -> dict[str, float]:
     """Angles, degrees, with the words of the given joints; THJ5 and WRJ1 take two."""
     words = {"FFJ1": 0, "FFJ2": 1, "FFJ3": 2, "FFJ4": 3, "LFJ5": 16, "THJ1": 17, "THJ2": 18,
              "THJ4": 20, "THJ5": 21, "WRJ1": 23, "WRJ2": 25}  # fmt: skip
@@ -45,7 +45,7 @@ def degrees(calibration: Calibration, **raws: int | tuple[int, ...]) -> dict[str
     return dict(zip(JOINTS, np.degrees(calibration.angles_rad(sensors)), strict=True))
 
 
-def calibration(**joints: list[list[float]]) -> Calibration:
+def calibration(**joints: list[list[float]]) -> JointCalibration:
     return parse_calibration({"version": 1, "joints": joints}, FILE)
 
 

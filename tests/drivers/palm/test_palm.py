@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import Driver, LinkError, Reading
+from drivers.base import Driver, LinkCause, LinkError, Reading
 from drivers.link import LinkState
 from drivers.palm.calibration import CalibrationError
 from drivers.palm.driver import PalmDriver
@@ -192,9 +192,9 @@ def test_another_sender_is_not_mixed_in(driver: PalmDriver, clock: Clock) -> Non
         stranger.send(*other)
         readings = list(driver.read_ready())
         assert np.array_equal([reading.counts for reading in tactile(readings)], rows(4, 9))
-    assert driver.describe()["heard"].startswith("palm 0220 from 127.0.0.1 port ")
+    assert driver.describe()["heard"].text.startswith("palm 0220 from 127.0.0.1 port ")
     driver.close()
-    assert driver.describe()["source"].startswith("udp://127.0.0.1:")
+    assert driver.describe()["source"].text.startswith("udp://127.0.0.1:")
 
 
 def test_who_sends_stands_for_the_serial_numbers(driver: PalmDriver, clock: Clock) -> None:
@@ -296,7 +296,7 @@ def test_a_broken_socket_is_opened_again(
         assert len(driver.read_ready()) == 1
 
         def broken(*_: object) -> Iterator[None]:
-            raise LinkError("cannot receive: Network is down")
+            raise LinkError(LinkCause.UNKNOWN, "cannot receive: Network is down")
             yield
 
         with monkeypatch.context() as patch:

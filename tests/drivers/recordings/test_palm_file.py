@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import RecordingError
+from drivers.base import Fact, RecordingError
 from drivers.palm.packet import Palm
 from drivers.recordings.palm_file import PalmFileDriver
 from drivers.twins.palm import PalmTwin
@@ -29,7 +29,7 @@ def test_a_file_of_packets_plays_count_for_count(
         while not driver.exhausted:
             clock.now_ns = driver.due_ns() or clock.now_ns
             readings += tactile(driver.read_ready())
-        assert driver.describe() == {"source": str(path)}
+        assert driver.describe() == {"source": Fact(str(path))}
         assert driver.counters.bad_lengths == 1  # the file ends in the middle of a packet
         assert driver.due_ns() is None
     assert np.array_equal([reading.counts for reading in readings], rows(40))

@@ -10,11 +10,11 @@ from drivers.spi.framing import DELIMITER, ENCODED_MAX_BYTES, encode_frame
 from drivers.spi.messages import (
     DIGEST,
     UNSEEDED,
+    BridgeStatus,
     Hello,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -33,7 +33,9 @@ def _message(rng: random.Random) -> Message:
         return _hello(rng)
     if kind == 5:
         errors = tuple(rng.getrandbits(8) for _ in range(rng.randint(1, 5)))
-        return Status(rng.getrandbits(40), rng.getrandbits(32), 1, 2, rng.getrandbits(8), errors)
+        return BridgeStatus(
+            rng.getrandbits(40), rng.getrandbits(32), 1, 2, rng.getrandbits(8), errors
+        )
     host: list[Message] = [Ping(rng.getrandbits(32)), Start(), Stop()]
     return rng.choice(host)
 

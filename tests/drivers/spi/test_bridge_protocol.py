@@ -16,12 +16,12 @@ from drivers.biotac import SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, sample_com
 from drivers.spi.messages import (
     DIGEST,
     SCHEMA,
+    BridgeStatus,
     Hello,
     HelloHead,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -50,7 +50,7 @@ SWEEP = Sweep(
     present=0b101,
     words=np.array([[0xA251, 0xFFFF, 0x94B9], [0x0101, 0x0000, 0xFEF8]], dtype=np.uint16),
 )
-STATUS = Status(1 << 40, 70_000, 1, 2, 3, (4, 5, 6))
+STATUS = BridgeStatus(1 << 40, 70_000, 1, 2, 3, (4, 5, 6))
 
 
 def test_schema_and_digest_are_those_of_the_document() -> None:
@@ -77,7 +77,7 @@ GOLDEN: list[tuple[Message, str]] = [
     (Start(), ""),
     (Stop(), ""),
 ]
-TYPES = {Hello: 0x01, Sweep: 0x02, Status: 0x03, Ping: 0x81, Start: 0x82, Stop: 0x83}
+TYPES = {Hello: 0x01, Sweep: 0x02, BridgeStatus: 0x03, Ping: 0x81, Start: 0x82, Stop: 0x83}
 
 
 @pytest.mark.parametrize(("message", "payload"), GOLDEN, ids=lambda value: type(value).__name__)
@@ -196,7 +196,7 @@ def test_a_sweep_has_1_to_5_sensors_and_1_to_64_slots(
 @pytest.mark.parametrize(("sensors", "sense"), [(0, False), (1, True), (5, True), (6, False)])
 def test_a_status_has_1_to_5_sensors(sensors: int, sense: bool) -> None:
     payload = struct.pack("<QIIIIB", 1, 2, 3, 4, 5, sensors) + bytes(4 * sensors)
-    assert (Status.from_bytes(payload) is not None) == sense
+    assert (BridgeStatus.from_bytes(payload) is not None) == sense
 
 
 def test_the_head_of_a_later_version_can_be_read() -> None:
@@ -230,7 +230,7 @@ MOST = Hello(
 )
 ONE_WORD, ALL_WORDS = np.full((1, 1), 0x0101, np.uint16), np.full((64, 5), 0xFEF8, np.uint16)
 SWEEPS = Sweep(0, 0, 0, 0, ONE_WORD), Sweep(U32, U64, U64, 0b11111, ALL_WORDS)
-STATES = Status(0, 0, 0, 0, 0, (0,)), Status(U64, U32, U32, U32, U32, (U32,) * 5)
+STATES = BridgeStatus(0, 0, 0, 0, 0, (0,)), BridgeStatus(U64, U32, U32, U32, U32, (U32,) * 5)
 EDGES: list[Message] = [LEAST, MOST, *SWEEPS, *STATES, Ping(0), Ping(U32)]
 BEYOND: list[Message] = [
     *(
@@ -260,7 +260,12 @@ BEYOND: list[Message] = [
         for message, step in ((STATES[0], -1), (STATES[1], 1))
         for field in ("tick", "sweeps", "overruns", "tx_dropped", "rx_errors")
     ),
-    *(Status(0, 0, 0, 0, 0, (0, -1)), Status(0, 0, 0, 0, 0, (0,) * 6), Ping(-1), Ping(U32 + 1)),
+    *(
+        BridgeStatus(0, 0, 0, 0, 0, (0, -1)),
+        BridgeStatus(0, 0, 0, 0, 0, (0,) * 6),
+        Ping(-1),
+        Ping(U32 + 1),
+    ),
 ]
 
 

@@ -6,14 +6,15 @@ import dataclasses
 
 import pytest
 
+from drivers.base import DeviceFault, Fact, LinkCause
 from drivers.link import LinkState
 from drivers.spi.conversation import Conversation
 from drivers.spi.messages import (
     FIRMWARE,
+    BridgeStatus,
     Message,
     Ping,
     Start,
-    Status,
     Stop,
     Sweep,
     decode,
@@ -108,11 +109,13 @@ def test_ten_missing_sweeps_and_never_less_than_100_ms_are_silence(
     said(conversation, heard_ns + silence_ms * MS)
     assert state(conversation) is LinkState.WAITING
     assert conversation.link.reason == f"no sweep for {silence_ms} ms"
+    assert conversation.link.cause is LinkCause.TIMEOUT
 
 
 def test_a_bridge_that_sweeps_less_than_once_a_second_is_refused() -> None:
     conversation = greeted(1001)
     assert conversation.link.reason == "port: the bridge sweeps once in 1.001 s only"
+    assert conversation.link.cause is LinkCause.SETTINGS
     assert conversation.counters.refused_bridges == 1
 
 
@@ -126,15 +129,57 @@ def test_of_pings_without_an_answer_eight_are_remembered() -> None:
     now_ns = conversation.due_ns
     assert said(conversation, now_ns) == [Ping(51)]
     assert conversation.counters.unanswered_pings == 1
-    conversation.lost("unplugged", now_ns)
+    conversation.lost(LinkCause.DISCONNECTED, "unplugged", now_ns)
     assert conversation.counters.unanswered_pings == 9
+
+
+def words_of(conversation: Conversation) -> dict[str, str]:
+    return {name: fact.text for name, fact in conversation.describe().items()}
+
+
+@pytest.mark.parametrize(
+    ("serials", "sensors", "errors"),
+    [
+        (("A", "B", "C"), Fact("A, B, C"), Fact("0, 0, 0")),
+        (("A", "B", "A"), Fact("A, B, A", DeviceFault.SENSOR_TWICE), Fact("0, 0, 0")),
+        (("A", "", "C"), Fact("A, none, C", DeviceFault.SENSOR_ABSENT), Fact("0, -, 0")),
+        (("A", "", "A"), Fact("A, none, A", DeviceFault.SENSOR_TWICE), Fact("0, -, 0")),
+        (("", "", ""), Fact("none, none, none", DeviceFault.NO_SENSOR), Fact("-, -, -")),
+    ],
+)
+def test_sensors_that_are_absent_or_twice_there_are_a_fault(
+    serials: tuple[str, ...], sensors: Fact, errors: Fact
+) -> None:
+    conversation = opened()
+    for nonce in (42, 43):
+        said(conversation, T0)
+        hear(conversation, dataclasses.replace(hello(nonce), serials=serials), T0)
+    hear(conversation, BridgeStatus(1, 0, 0, 0, 0, (0,) * 3), T0)
+    assert conversation.describe()["sensors"] == sensors
+    assert conversation.describe()["spi errors"] == errors
+
+
+@pytest.mark.parametrize(
+    ("numbers", "errors"),
+    [
+        ((0, 9, 0), Fact("0, -, 0")),
+        ((10, 9, 0), Fact("10, -, 0", DeviceFault.SENSOR_WORDS)),
+    ],
+)
+def test_spi_errors_where_no_sensor_is_are_no_fault(numbers: tuple[int, ...], errors: Fact) -> None:
+    conversation = opened()
+    for nonce in (42, 43):
+        said(conversation, T0)
+        hear(conversation, dataclasses.replace(hello(nonce), serials=("A", "", "C")), T0)
+    hear(conversation, BridgeStatus(1, 0, 0, 0, 0, numbers), T0)
+    assert conversation.describe()["spi errors"] == errors
 
 
 def test_people_are_told_what_is_known() -> None:
     conversation = opened()
-    assert conversation.describe() == {"port": "port", "link": "greeting"}
-    conversation.lost("unplugged", T0)
-    assert conversation.describe() == {"port": "port", "link": "waiting", "why": "unplugged"}
+    assert words_of(conversation) == {"port": "port", "link": "greeting"}
+    conversation.lost(LinkCause.DISCONNECTED, "unplugged", T0)
+    assert words_of(conversation) == {"port": "port", "link": "waiting", "why": "unplugged"}
     conversation.opened(T0)
     for nonce, t_ns in ((42, T0), (43, T0 + 2 * MS)):
         said(conversation, t_ns)
@@ -147,7 +192,7 @@ def test_people_are_told_what_is_known() -> None:
         "sequence": "24 samples at 100.0 Hz",
         "sensors": "BTSP-1, none, BTSP-3",
     }
-    assert conversation.describe() == {
+    assert words_of(conversation) == {
         "port": "port",
         "link": "greeting",
         "why": "unplugged",
@@ -157,8 +202,8 @@ def test_people_are_told_what_is_known() -> None:
         "round trip": "2.00 ms",
     }
     assert conversation.serials == {"ff": "BTSP-1", "th": "BTSP-3"}
-    conversation.lost("unplugged", T0)
-    assert conversation.describe() == {
+    conversation.lost(LinkCause.DISCONNECTED, "unplugged", T0)
+    assert words_of(conversation) == {
         "port": "port",
         "link": "waiting",
         "why": "unplugged",
@@ -175,11 +220,12 @@ def test_people_are_told_how_the_bridge_keeps_time() -> None:
         made = Sweep(seq, 1_000_200 + 3000 * seq, 1_000_200 + 3000 * seq + took, 7, words())
         assert hear(conversation, made, T0 + S + 20 * MS) == 1
     late = Sweep(3, 1_020_000, 1_520_000, 7, words())
-    assert conversation.describe()["sweep"] == "2.21 ms at most, of 500.00 ms"
+    assert conversation.describe()["sweep"] == Fact("2.21 ms at most, of 500.00 ms")
     hear(conversation, late, T0 + S + 540 * MS)
-    assert conversation.describe()["sweep"] == "500.00 ms is too long for 500.00 ms"
-    hear(conversation, Status(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
-    told = conversation.describe()
+    too_long = Fact("500.00 ms is too long for 500.00 ms", DeviceFault.SWEEP_TOO_LONG)
+    assert conversation.describe()["sweep"] == too_long
+    hear(conversation, BridgeStatus(1, 3, 0, 0, 0, (0, 7, 24)), T0 + S + 20 * MS)
+    told = words_of(conversation)
     assert told["clock rate"] == "1000000 Hz"
     assert told["spi errors"] == "0, 7, 24"
     # 1000100 +- 1 us by its clock are between 1000 and 1001 ms by ours.
@@ -195,12 +241,13 @@ def test_people_are_told_of_newer_firmware_only(firmware: int, newer: str | None
     for nonce in (42, 43):
         said(conversation, T0)
         hear(conversation, dataclasses.replace(hello(nonce), firmware=firmware), T0)
-    assert conversation.describe().get("newer firmware") == newer
+    told = None if newer is None else Fact(newer, DeviceFault.OLD_FIRMWARE)
+    assert conversation.describe().get("newer firmware") == told
 
 
 def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words() -> None:
     conversation = greeted()
-    hear(conversation, Status(1, 2, 3, 4, 5, (6,)), T0)
+    hear(conversation, BridgeStatus(1, 2, 3, 4, 5, (6,)), T0)
     hear(conversation, Ping(7), T0)
     counters = conversation.counters
     shown = counters.bridge_overruns, counters.bridge_tx_dropped, counters.bridge_rx_errors
@@ -282,6 +329,7 @@ def test_a_bridge_that_never_names_the_same_sensors_twice_is_given_up() -> None:
     assert said(conversation, T0 + 500 * MS) == []
     assert state(conversation) is LinkState.WAITING
     assert conversation.link.reason == "port: the bridge names other sensors each time"
+    assert conversation.link.cause is LinkCause.SERIALS
 
 
 @pytest.mark.parametrize(

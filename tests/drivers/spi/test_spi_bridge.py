@@ -12,7 +12,7 @@ from drivers.biotac import E1, PAC, PDC, SEQUENCE_ALL, SEQUENCE_INTERLEAVED, TDC
 from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
 from drivers.spi.framing import encode_frame
-from drivers.spi.messages import DIGEST, Status, Stop, encode
+from drivers.spi.messages import DIGEST, BridgeStatus, Stop, encode
 from tests.drivers.spi.bridge_bench import (
     FINGERS,
     Clock,
@@ -44,7 +44,7 @@ def test_a_sweep_becomes_a_reading_by_slot_and_sensor(rig: Rig) -> None:
     (reading,) = take(rig.driver, rig.bridge)
     assert rig.driver.link_state is LinkState.UP
     assert rig.driver.conversation.link.reason is None
-    described = rig.driver.describe()
+    described = {name: fact.text for name, fact in rig.driver.describe().items()}
     assert described["board"] == "b"
     assert described["sensors"] == "BTSP-1, BTSP-1, BTSP-1"
     assert described["sequence"] == "24 samples at 100.0 Hz"
@@ -206,7 +206,7 @@ def test_whole_frames_that_make_no_sense_are_counted(rig: Rig) -> None:
 
 
 def test_status_is_kept_and_its_counts_are_shown(rig: Rig) -> None:
-    status = Status(5, 100, 3, 4, 5, (6, 7, 8))
+    status = BridgeStatus(5, 100, 3, 4, 5, (6, 7, 8))
     rig.greet()
     rig.bridge.send(status)
     take(rig.driver, rig.bridge)

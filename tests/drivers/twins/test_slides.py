@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.twins.grasps.slides import HeldNoise, Hold, held
 from drivers.twins.grasps.whole_grasps import Sampling
+from tests.drivers.twins.slides import HeldNoise, Hold, held
 
 STREAMS = 40
 # Mean over 24 electrodes of the absolute fitted slope, counts/s, of 306 real streams at 100 Hz, by

@@ -1,0 +1,207 @@
+"""With every text of every driver made unreadable, the doctor still names each cause."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from daemon.commands.doctor import examine
+from daemon.doctor.electrodes import ElectrodeStatistics
+from daemon.doctor.finding import Cause
+from drivers.base import DeviceFault, Fact, LinkCause, LinkError
+from drivers.can.frames import ERROR, CanFrame
+from drivers.spi.conversation import Conversation
+from drivers.spi.driver import SpiBridgeDriver
+from drivers.spi.messages import FIRMWARE
+from drivers.twins import spi as spi_twin
+from drivers.twins.faults import LinkFaults
+from tests.daemon.doctor.emulated import FINGERS, LINKS, STEPS_PER_S, Hand, faults_told, listen
+from tests.daemon.doctor.test_causes import (
+    CAN,
+    LINK_FAULTS,
+    LOOK_S,
+    MODEL,
+    SPI,
+    look,
+    published,
+    refused,
+)
+from tests.drivers.can.can_standin import ScriptedBus, SocketBus, stand_in
+from tests.drivers.can.test_can_socket import DownSocket, over_socket
+from tests.drivers.spi.bridge_bench import MS, hello, sweep
+from tests.drivers.spi.test_conversation import T0, greeted, hear, opened, said, told
+
+XXX = "xxx"
+
+
+@pytest.fixture(autouse=True)
+def scrambled(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fact(
+        kind: type[Fact], _text: str, fault: LinkCause | DeviceFault | None = None
+    ) -> tuple[object, ...]:
+        return tuple.__new__(kind, (XXX, fault))
+
+    def error(self: LinkError, cause: LinkCause, _text: str) -> None:
+        Exception.__init__(self, XXX)
+        self.cause = cause
+
+    monkeypatch.setattr(Fact, "__new__", fact)
+    monkeypatch.setattr(LinkError, "__init__", error)
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [(fault, kind) for fault, (_, causes) in LINK_FAULTS.items() for kind in causes],
+)
+def test_a_fault_of_a_link_is_told_without_words(fault: str, kind: str, tmp_path: Path) -> None:
+    faults, expected = LINK_FAULTS[fault]
+    statistics = ElectrodeStatistics(FINGERS)
+    with LINKS[kind](Hand(100.0), tmp_path, faults) as (driver, step):
+        listen(driver, step, LOOK_S * STEPS_PER_S[kind], statistics)
+        assert {fact.text for fact in driver.describe().values()} == {XXX}
+        causes = {finding.cause for finding in faults_told(driver, statistics, float(LOOK_S))}
+    assert causes == {expected[kind]}
+
+
+@pytest.mark.parametrize(
+    ("attribute", "value", "cause"),
+    [("FIRMWARE", FIRMWARE - 1, Cause.FIRMWARE_OLD), ("TICK_HZ", 1_050_000, Cause.CLOCK)],
+)
+def test_a_fault_of_a_bridge_is_told_without_words(
+    attribute: str, value: int, cause: Cause, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    statistics = ElectrodeStatistics(FINGERS)
+    with LINKS["spi"](Hand(100.0), tmp_path, LinkFaults()) as (driver, step):
+        monkeypatch.setattr(spi_twin, attribute, value)
+        listen(driver, step, 2000 if cause is Cause.CLOCK else 300, statistics)
+        causes = [each.cause for each in faults_told(driver, statistics, 3.0)]
+    assert cause in causes
+
+
+def silent() -> Conversation:
+    conversation = opened()
+    for number in range(5):
+        said(conversation, T0 + 500 * number * MS)
+    return conversation
+
+
+def stopped() -> Conversation:
+    conversation = greeted()
+    hear(conversation, sweep(0, 10_000), T0)
+    said(conversation, T0 + 1000 * MS)
+    return conversation
+
+
+def reset() -> Conversation:
+    conversation = greeted()
+    hear(conversation, sweep(0, 10_000), T0)
+    hear(conversation, hello(0), T0)
+    return conversation
+
+
+def another_version() -> Conversation:
+    conversation = opened()
+    hear(conversation, dataclasses.replace(hello(0), digest=1), T0)
+    return conversation
+
+
+def rarely_sweeping() -> Conversation:
+    return greeted(1001)
+
+
+def misread() -> Conversation:
+    conversation = opened()
+    for number in range(5):
+        told(conversation, (f"A{number}", "B", "C"), T0)
+    said(conversation, T0)
+    said(conversation, T0 + 500 * MS)
+    return conversation
+
+
+@pytest.mark.parametrize(
+    ("conversed", "cause"),
+    [
+        (opened, Cause.SILENT),
+        (silent, Cause.SILENT),
+        (stopped, Cause.LINK_LOST),
+        (reset, Cause.LINK_LOST),
+        (another_version, Cause.VERSION),
+        (rarely_sweeping, Cause.SETTINGS),
+        (misread, Cause.SENSOR_WORDS),
+    ],
+)
+def test_why_a_bridge_is_not_heard_is_told_without_words(
+    conversed: Callable[[], Conversation], cause: Cause
+) -> None:
+    driver = SpiBridgeDriver("port", FINGERS)
+    driver.conversation = conversed()
+    (finding,) = examine(driver, None, 1.0)
+    assert finding.cause is cause
+    assert finding.what.startswith("spi: link xxx")
+
+
+def test_a_bus_that_is_lost_is_told_without_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    with SocketBus() as bus:
+        stand_in(monkeypatch, lambda: bus)
+        with over_socket() as driver:
+            bus.send(CanFrame(0x040, bytes(8), ERROR))
+            driver.read_ready()
+            (finding,) = examine(driver, None, 1.0)
+    assert finding.cause is Cause.BITRATE
+    down = ScriptedBus()
+    with DownSocket(socket.AF_UNIX, socket.SOCK_DGRAM) as down.socket:  # type: ignore[attr-defined]
+        stand_in(monkeypatch, lambda: down)
+        with over_socket() as driver:
+            driver.read_ready()
+            (finding,) = examine(driver, None, 1.0)
+    assert finding.cause is Cause.INTERFACE_DOWN
+
+
+@pytest.mark.parametrize(
+    ("number", "cause"),
+    [
+        (errno.ENOENT, "port-missing"),
+        (errno.EACCES, "port-denied"),
+        (errno.EBUSY, "port-held"),
+        (errno.EAGAIN, "port-held"),
+        (errno.ENODEV, "interface-missing"),
+        (errno.EIO, "link-down"),
+    ],
+)
+@pytest.mark.parametrize("tactile", [SPI, CAN + 'interface = "slcan"\n'], ids=["spi", "slcan"])
+def test_a_port_that_cannot_be_opened_is_told_without_words(
+    tactile: str,
+    number: int,
+    cause: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("serial.serial_for_url", refused(number))
+    text = tactile.format(tmp_path / "port") + MODEL + published(tmp_path)
+    (finding,) = look(tmp_path, capsys, text)
+    assert finding["cause"] == cause
+
+
+def test_an_address_and_a_port_that_cannot_be_had_are_told_without_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as held:
+        held.bind(("127.0.0.1", 0))
+        here = f"127.0.0.1:{held.getsockname()[1]}"
+        for source, cause in ((here, "port-held"), ("192.0.2.1:9870", "address")):
+            text = f'[tactile]\ndriver = "palm"\nsource = "udp://{source}"\n'
+            (finding,) = look(tmp_path, capsys, text + MODEL + published(tmp_path))
+            assert finding["cause"] == cause
+
+
+def test_an_interface_that_is_missing_is_told_without_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (finding,) = look(tmp_path, capsys, CAN.format("can7") + MODEL + published(tmp_path))
+    assert finding["cause"] == "interface-missing"
