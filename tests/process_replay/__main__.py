@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 path.write_text(now)
                 sys.stdout.write(f"{path.name}: {now.count(chr(10))} lines\n")
                 continue
-            found = kind.differences(path.read_text(), now)
+            found = kind.differences(path.read_text() if path.is_file() else "", now)
             sys.stdout.writelines(f"{path.name}: {line}\n" for line in found[:SHOWN_MAX])
             if found:
                 sys.stdout.write(f"{path.name}: {len(found)} differences\n")

@@ -1,4 +1,4 @@
-"""Comparing texts whose numbers may differ a little: they depend on the processor."""
+"""Compares texts whose numbers may differ a little, since they depend on the processor."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NUMBER: Final = re.compile(r"(?<=[\[:, ])-?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)(
 
 
 def lines_apart(before: Sequence[str], now: Sequence[str], tolerance: float) -> list[str]:
-    """Where lines differ, but for numbers with a point that are equal within `tolerance`."""
+    """Return where lines differ. Numbers with a point may differ by `tolerance`."""
     found = [
         f"line {number}: {was}\n  became: {is_now}"
         for number, (was, is_now) in enumerate(zip(before, now, strict=False), start=1)

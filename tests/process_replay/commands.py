@@ -30,14 +30,15 @@ from tests.process_replay.streams import CHECKOUT, demo
 
 FOLDER: Final = CHECKOUT / "tests" / "references" / "commands"
 LONG: Final = 12_000
-"""Characters of an output of which only the checksum is kept."""
+"""Outputs with more characters are kept as a checksum; other tests hold these texts."""
 TOLERANCE: Final = 1.1e-3
-"""Of numbers with a point: three digits of `p_slip` are shown."""
+"""Largest difference of numbers with a point: commands show three digits of `p_slip`."""
 
 COMMANDS: Final[Mapping[str, str]] = {
     "none": "",
     "unknown": "rnu",
     "help": "--help",
+    "version": "--version",
     "option-first": "--json check demo.toml",
     "wrong-option": "check demo.toml --jsn",
     "run": "run demo.toml --print",
@@ -64,7 +65,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "replay-warm-up": "replay table.csv --warm-up 3",
     "replay-scene": "replay table.csv --scene demo.toml",
     "replay-session-absent": "replay table.csv --session absent.json",
-    "check": "check demo.toml can.toml two-fingers.toml",
+    "check": "check demo.toml can.toml palm.toml spi.toml two-fingers.toml",
     "check-json": "check demo.toml --json",
     "check-all-wrong": "check wrong.toml absent.toml",
     "doctor-absent": "doctor absent.toml",
@@ -75,6 +76,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "models-no-file": "models absent.onnx",
     "session-seed": "session seed kept.toml table.csv",
     "session-show": "session show kept.toml",
+    "replay-session": "replay day.csv --session session.json",
     "session-reset": "session reset kept.toml",
     "session-none": "session show kept.toml",
     "keys-make": "keys make arm --dir keys",
@@ -125,6 +127,7 @@ _MASKS: Final = (
     (r'"(p50|p99|max|wall_s|t|t_mono_ns|age_ms|latency_us)": ?[0-9.e+-]+', r'"\1": *'),
     (r'"boot_id": ?"[0-9a-f]{32}"', '"boot_id": *'),
     (r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d, \d+ minutes ago", "*"),
+    (r"\b(graspd|Python|libzmq|onnxruntime|numpy|pyzmq|python-can|pyserial) [0-9.]+", r"\1 *"),
     (r"(?<=  arm  )\S{40}", "*"),
 )
 
@@ -157,7 +160,7 @@ def execute(arguments: Sequence[str], folder: Path) -> Said:
 
 @contextlib.contextmanager
 def _environment(folder: Path) -> Iterator[None]:
-    """Help is 80 characters wide, the home is empty, and what a command changes is undone."""
+    """Set the width of help texts and an empty home; undo what a command changes."""
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     former = {name: os.environ.get(name) for name in ("COLUMNS", "HOME")}
     os.environ.update(COLUMNS="80", HOME=str(folder))
@@ -173,7 +176,7 @@ def _environment(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _own_log() -> Iterator[None]:
-    """Let the command set up its log, whatever a test runner has set up before."""
+    """Let the command set up its log as in a new process, also under a test runner."""
     root = logging.getLogger()
     handlers, levels = root.handlers, [logging.getLogger(name).level for name in LOGGERS]
     root.handlers = []
@@ -186,18 +189,18 @@ def _own_log() -> Iterator[None]:
 
 
 def path_of(name: str) -> Path:
-    """The file of a reference."""
+    """Return the file of a reference."""
     return FOLDER / f"{name}.txt"
 
 
 def made(name: str) -> str:
-    """The text of a reference as it would be now."""
+    """Return the text of a reference as it would be now."""
     return _all()[name]
 
 
 @cache
 def _all() -> dict[str, str]:
-    """The texts of all references: some commands use what others have written."""
+    """Return the texts of all references. Some commands use files that earlier ones write."""
     found = {}
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -219,7 +222,7 @@ def _prepare(folder: Path) -> None:
         (folder / name).write_text("".join(lines[: rows + 1]))
     for name, text in SCENES.items():
         (folder / f"{name}.toml").write_text(text.replace("{folder}", str(folder)))
-    for name in ("can", "two-fingers"):
+    for name in ("can", "palm", "spi", "two-fingers"):
         shutil.copy(CHECKOUT / "deploy" / "scenes" / f"{name}.toml", folder)
     (folder / "keys").mkdir()
     case = Case(readings=demo, joints=True, tells=True, readings_max=1400)
@@ -242,5 +245,5 @@ def _text(line: str, said: Said, folder: Path) -> str:
 
 
 def differences(before: str, now: str) -> list[str]:
-    """Where two texts differ, line by line."""
+    """Return where two texts differ, line by line."""
     return lines_apart(before.splitlines(), now.splitlines(), TOLERANCE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import selectors
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -13,10 +14,12 @@ from typing import Any, Final
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.recorder import header_of, state_of
+from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion, Requests
 from daemon.publish.messages import Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
+from daemon.record.header import RecordingHeader
 from daemon.record.recorder import Recorder
 from daemon.run.loop import Loop, Timing
 from daemon.scene import Scene
@@ -25,12 +28,12 @@ from tests.process_replay.streams import FINGERS, PERIOD_NS, Clock
 
 BOOT_ID: Final = "0123456789abcdef" * 2
 ASKED_EVERY: Final = 40
-"""Readings from one question to the next, where questions are asked."""
+"""Verdicts from one question to the next."""
 SLOW_NS, SLOW_FOR, SLOW_EVERY = 15_000_000, 260, 600
-"""Where the computer is slow, the first 260 verdicts of each 600 take 15 ms: readings are skipped,
-until that is an overload."""
+"""On a slow computer the first 260 verdicts of each 600 take 15 ms. Readings are skipped, for long
+enough to be an overload."""
 STALL_NS, STALL_AT = 160_000_000, 500
-"""There, one verdict of each 600 takes 160 ms: the next readings are too old."""
+"""On a slow computer one verdict of each 600 takes 160 ms. The next readings are too old."""
 
 Message = tuple[str, str]
 """Kind, such as `verdict`, and payload."""
@@ -46,15 +49,15 @@ class Case:
     readings_max: int | None = None
     joints: bool = False
     asks: bool = False
-    """Whether the controller asks at fixed readings."""
+    """True if the controller asks at fixed readings."""
     tells: bool = False
-    """Whether the controller tells how each lift ended."""
+    """True if the controller tells how each lift ended."""
     slow: bool = False
-    """Whether judging takes longer than the sensors leave, so that readings are skipped."""
+    """True if judging is slower than the sensors at times, so that readings are skipped."""
 
 
 def run(case: Case, record_in: Path | None = None) -> list[Message]:
-    """All messages of a run, also recorded in a folder if that is given.
+    """Return all messages of a run; record it in a folder if that is given.
 
     This is the only place that builds a loop and its parts.
     """
@@ -65,16 +68,7 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
     world = _World(case, clock)
     outputs: list[Any] = [world]
     if record_in is not None:
-        outputs.append(
-            Recorder(
-                Retention(record_in, "right", BOOT_ID, keep_files=9, keep_bytes=10**9),
-                scene.Record(images_hz=0.0),
-                header_of(wanted, model, BOOT_ID),
-                take_state=lambda: state_of(pipeline),
-                clock=clock,
-                wall_clock=clock,
-            )
-        )
+        outputs.append(_recorder(record_in, clock, pipeline, header_of(wanted, model, BOOT_ID)))
     outbox = Outbox(
         wanted.hand.name,
         wanted.hand.fingers,
@@ -97,7 +91,21 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
         loop.run()
     for recorder in outputs[1:]:
         recorder.close()
+    for thread in threading.enumerate():
+        if thread.name == "recorder":
+            thread.join()  # `close` does not wait long enough for a slow computer
     return world.messages
+
+
+def _recorder(folder: Path, clock: Clock, pipeline: Pipeline, header: RecordingHeader) -> Recorder:
+    return Recorder(
+        Retention(folder, "right", BOOT_ID, keep_files=9, keep_bytes=10**9),
+        scene.Record(images_hz=0.0),
+        header,
+        take_state=lambda: state_of(pipeline),
+        clock=clock,
+        wall_clock=clock,
+    )
 
 
 def _scene(case: Case) -> Scene:
@@ -111,7 +119,7 @@ def _scene(case: Case) -> Scene:
 
 
 class _Driver:
-    """Hands readings over when they are due, as many as are."""
+    """Hands over all readings that are due."""
 
     name = "stream"
     period_ns: int | None = PERIOD_NS
@@ -153,7 +161,7 @@ class _Driver:
 
 
 class _World(Companion):
-    """Takes the messages; is the controller that asks and tells; makes the computer slow."""
+    """The world around the loop: takes messages, asks, tells outcomes, makes the computer slow."""
 
     def __init__(self, case: Case, clock: Clock) -> None:
         self.messages: list[Message] = []
@@ -164,7 +172,7 @@ class _World(Companion):
         self._lifted = 0
         """Number of the grasp that is lifted, or 0."""
         self._over: list[int] = []
-        """Grasps whose lift has ended and was not told yet."""
+        """Grasps whose lift has ended without being told yet."""
 
     def send(self, topic: bytes, payload: bytes) -> None:
         self.messages.append((topic.decode().partition(".")[0], payload.decode()))

@@ -16,21 +16,21 @@ from tests.process_replay.judging import Message
 from tests.process_replay.verdicts import FOLDER, played
 
 NAMES: Final = ("request_risk", "slow", "spi_early")
-"""Cases of `verdicts`."""
+"""Cases of `verdicts` whose messages are kept."""
 TOLERANCE: Final = 2e-4
-"""Of numbers with a point, absolute and relative: they depend on the processor, see `verdicts`."""
+"""Largest difference of numbers with a point, absolute and relative; see `verdicts`."""
 
 _COUNTER: Final = re.compile(r'(?<="seq":)\d+|(?<="t_mono_ns":)\d+')
 _VERSIONS: Final = re.compile(r'(?<="(?:graspd|python)":)"[^"]*"|(?<="onnxruntime":)"[^"]*"')
 
 
 def path_of(name: str) -> Path:
-    """The file of a reference."""
+    """Return the file of a reference."""
     return FOLDER / f"{name}.messages"
 
 
 def made(name: str) -> str:
-    """The text of a reference as it would be now."""
+    """Return the text of a reference as it would be now."""
     lines = []
     for _, group in groupby(played(name), _frame):
         alike = list(group)
@@ -41,7 +41,7 @@ def made(name: str) -> str:
 
 
 def _frame(message: Message) -> tuple[str, str]:
-    """What is left of a message without its numbers."""
+    """Return a message without its numbers."""
     kind, payload = message
     return kind, _COUNTER.sub("*", NUMBER.sub("*", payload))
 
@@ -51,5 +51,5 @@ def _rounded(number: re.Match[str]) -> str:
 
 
 def differences(before: str, now: str) -> list[str]:
-    """Where two texts differ, line by line; numbers with a point may differ a little."""
+    """Return where two texts differ, line by line; numbers with a point may differ a little."""
     return lines_apart(before.splitlines(), now.splitlines(), TOLERANCE)

@@ -44,11 +44,11 @@ FAULTS: Final = LinkFaults(
     dead_electrodes=((0, 6), (2, 15)),
     seed=7,
 )
-"""Of the twins: two dead electrodes, and now and then a frame that is damaged or missing."""
+"""Two dead electrodes, and at times a frame that is damaged, missing or sent twice."""
 FRAME_FAULTS: Final = LinkFaults(
     bit_flip_probability=3e-3, drop_probability=3e-3, duplicate_probability=3e-3, seed=7
 )
-"""The same for links that need only a few frames for a reading."""
+"""Damaged, missing and repeated frames, for links that need few frames for a reading."""
 PAUSES: Final = (range(700, 730),)
 """Sweeps during which the SPI bridge is silent: the link is lost and found again."""
 
@@ -64,7 +64,7 @@ class Clock:
 
 
 def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]:
-    """A CSV recording in its own time, with joints if it has them."""
+    """Play a CSV recording in its own time, with joints if it has them."""
     clock = Clock()
     with ReplayDriver([path], fingers, pace=Pace.REALTIME, clock=clock) as driver:
         while not driver.exhausted:
@@ -73,7 +73,7 @@ def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]
 
 
 def demo() -> Iterator[Reading]:
-    """The synthetic demo recording, with joints."""
+    """Play the synthetic demo recording, with joints."""
     return recording(DEMO_RECORDING)
 
 
@@ -82,7 +82,7 @@ def can(
     faults: LinkFaults = FAULTS,
     log: BinaryIO | None = None,
 ) -> Iterator[Reading]:
-    """The grasps of the demo from a CAN twin; its frames also go to `log`, as candump text."""
+    """Play the demo's grasps from a CAN twin; write its frames to `log`, as candump text."""
     clock = Clock()
     twin = CanTwin(
         "virtual", "none", _counts(), FINGERS, format=frame_format, faults=faults, clock=clock
@@ -104,7 +104,7 @@ def can(
 
 
 def palm() -> Iterator[Reading]:
-    """The same grasps from the twin of a palm, one packet a millisecond, with calibrated joints."""
+    """Play the same grasps from a palm twin, one packet a millisecond, with calibrated joints."""
     calibration = CHECKOUT / "deploy" / "calibration" / "example_hand.toml"
     stream = PalmStream(FINGERS, calibration=calibration)
     t_ns = START_NS
@@ -115,7 +115,7 @@ def palm() -> Iterator[Reading]:
 
 
 def spi(log: BinaryIO | None = None) -> Iterator[Reading]:
-    """The same grasps from an SPI bridge; the bytes also go to `log`, as a serial link log."""
+    """Play the same grasps from an SPI bridge; write the bytes to `log`, as a serial link log."""
     line = _Line(log)
     for sequence, counts in enumerate(_counts()):
         now_ns = START_NS + PERIOD_NS * sequence
@@ -157,7 +157,7 @@ class _Line:
                     self._answers.append(_hello(message.nonce, now_ns))
 
     def hear(self, now_ns: int, sequence: int, counts: Counts) -> Iterator[Reading]:
-        """Let the bridge answer and send a sweep; the readings that the host makes of it."""
+        """Let the bridge answer and send a sweep; yield the readings that the host makes of it."""
         words = np.array(
             [[encode_word(int(count)) for count in row] for row in counts.T], dtype=np.uint16
         )[:, [FINGERS.index(finger) for finger in WIRED]]
@@ -184,7 +184,7 @@ def _hello(nonce: int, now_ns: int) -> Hello:
 
 
 def _tick(now_ns: int) -> int:
-    """The bridge's clock, in microseconds, which runs 50 ppm too fast."""
+    """Return the time of the bridge's clock, us, which runs 50 ppm too fast."""
     return (now_ns - START_NS // 2) // 1000 * 20_001 // 20_000
 
 

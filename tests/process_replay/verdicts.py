@@ -26,10 +26,10 @@ from tests.process_replay.streams import FRAME_FAULTS, WIRED
 
 FOLDER: Final = Path(__file__).parents[1] / "references"
 P_SLIP_TOLERANCE: Final = 1e-4
-"""Of `p_slip`: other processors add float32 in another order; measured 7e-7 at worst."""
+"""Largest difference of `p_slip`. Other processors add float32 in another order: 7e-7 measured."""
 NEAR_THRESHOLD: Final = 1e-3
-"""From the threshold: what is so close to call is not compared as to `UNSURE_FIELDS`, since the
-tolerance could turn it. The references name it `near`."""
+"""Distance of `p_slip` from the threshold within which `UNSURE_FIELDS` are not compared, since the
+tolerance could turn them. The references name such an entry `near`."""
 UNSURE_FIELDS: Final = frozenset({"verdict", "verdict_code"})
 PROBABILITIES: Final = frozenset({"p_slip", "p_slip_model"})
 LEFT_OUT: Final = IGNORED_FIELDS | {
@@ -40,8 +40,8 @@ LEFT_OUT: Final = IGNORED_FIELDS | {
     "model",
     "model_sha",
 }
-"""Fields that are of the run, what the format's own tests hold, and what differs at every reading
-and shows in verdict and gate."""
+"""Fields that differ from run to run, and fields that differ at every reading and show in verdict
+and gate."""
 RISK: Final = {"risk": {"max_slip_when_stable": 0.3, "warm_up": 4, "explore": 0.3}}
 TWO_FINGERS: Final = ("ff", "th")
 
@@ -79,7 +79,7 @@ CASES: Final[Mapping[str, Case]] = {
     ),
     "slow": Case(readings=streams.demo, joints=True, slow=True),
 }
-"""Runs of the loop. Readings alternate with joints where there are any."""
+"""Runs of the loop. Joint readings count too in `readings_max`."""
 
 
 def _mcap(folder: Path) -> list[str]:
@@ -114,13 +114,13 @@ REPLAYED: Final[Mapping[str, Callable[[Path], list[str]]]] = {
     "serial_log": _serial_log,
     "can_log": _can_log,
 }
-"""What makes a recording in a folder, and the arguments by which `graspd replay` plays it."""
+"""Each makes a recording in a folder and returns the arguments of `graspd replay` for it."""
 NAMES: Final = (*CASES, *REPLAYED)
 
 
 @cache
 def played(name: str) -> tuple[Message, ...]:
-    """All messages of a case; of what `graspd replay` plays, the verdicts."""
+    """Return all messages of a case; of a recording only the verdicts of `graspd replay`."""
     if name in CASES:
         return tuple(run(CASES[name]))
     with TemporaryDirectory() as folder:
@@ -129,12 +129,12 @@ def played(name: str) -> tuple[Message, ...]:
 
 
 def judged(readings: Iterable[Reading], *, joints: bool) -> list[Entry]:
-    """What the default model says of readings, with the default gate; equal ones put together."""
+    """Return what the default model and gate say of readings; equal verdicts are one entry."""
     return entries_of(run(Case(readings=lambda: iter(readings), joints=joints)))
 
 
 def entries_of(messages: Iterable[Message]) -> list[Entry]:
-    """The verdicts among messages; equal ones in a row are put together."""
+    """Return the verdicts among messages; equal ones in a row are one entry."""
     found: list[Entry] = []
     for kind, payload in messages:
         if kind == "verdict":
@@ -150,18 +150,18 @@ def entries_of(messages: Iterable[Message]) -> list[Entry]:
 
 
 def is_near(entry: Entry) -> bool:
-    """Whether a verdict is too close to call for another processor."""
+    """Return True if a verdict is too close to call for another processor."""
     p_slip = entry.get("p_slip")
     return p_slip is not None and abs(p_slip - 0.5) < NEAR_THRESHOLD
 
 
 def path_of(name: str) -> Path:
-    """The file of a reference."""
+    """Return the file of a reference."""
     return FOLDER / f"{name}.jsonl"
 
 
 def made(name: str) -> str:
-    """The text of a reference as it would be now."""
+    """Return the text of a reference as it would be now."""
     lines, former = [], Entry()
     for entry in entries_of(played(name)):
         if is_near(entry):
@@ -179,7 +179,7 @@ def _changes(former: Entry, entry: Entry) -> Entry:
 
 
 def parsed(text: str) -> list[Entry]:
-    """The entries in the text of a reference."""
+    """Return the entries in the text of a reference."""
     found, former = [], Entry()
     for line in text.splitlines():
         fields = former | json.loads(line)
@@ -189,17 +189,17 @@ def parsed(text: str) -> list[Entry]:
 
 
 def reference(name: str) -> list[Entry]:
-    """What was judged when the references were renewed."""
+    """Return what was judged when the references were renewed."""
     return parsed(path_of(name).read_text())
 
 
 def differences(before: str, now: str) -> list[str]:
-    """Where two texts of references differ."""
+    """Return where two texts of references differ."""
     return entries_apart(parsed(before), parsed(now))
 
 
 def entries_apart(before: Sequence[Entry], now: Sequence[Entry]) -> list[str]:
-    """Where two lists of verdicts differ, one line each."""
+    """Return where two lists of verdicts differ, one line each."""
     found: list[str] = []
     for number, (was, is_now) in enumerate(zip(before, now, strict=False)):
         found += [
