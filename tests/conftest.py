@@ -50,6 +50,7 @@ BEGUN_FIRST = (
     "models/training/commands/test_evaluate.py",
     "models/training/commands/test_train.py",
     "models/training/evaluating/test_run_jobs.py",
+    "test_process_replay.py",
     "test_readme.py",
 )
 """Files that take longest, by their place in this folder: a file is one process's own, and none of

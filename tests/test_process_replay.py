@@ -1,4 +1,4 @@
-"""What is judged of known streams is what it was, within a tolerance that is stated."""
+"""What graspd says of known input is what it was, within a tolerance that is stated."""
 
 from __future__ import annotations
 
@@ -6,23 +6,42 @@ import copy
 
 import pytest
 
-from tests import process_replay
-from tests.process_replay import P_SLIP_TOLERANCE, differences, entries, is_near, reference
+from tests.process_replay import commands, messages, verdicts
+from tests.process_replay.__main__ import KINDS, SHOWN_MAX
+from tests.process_replay.alike import lines_apart
+from tests.process_replay.verdicts import P_SLIP_TOLERANCE, entries_apart, is_near, reference
+
+ALL = [(kind, name) for kind in KINDS for name in KINDS[kind].NAMES]
 
 
-@pytest.mark.parametrize("name", ["demo", "twin_faults"])
-def test_known_streams_are_judged_as_they_were(name: str) -> None:
-    found = differences(reference(name), entries(name))
+@pytest.mark.parametrize(("kind", "name"), ALL)
+def test_known_input_gets_the_answer_that_it_had(kind: str, name: str) -> None:
+    net = KINDS[kind]
+    found = net.differences(net.path_of(name).read_text(), net.made(name))
     advice = "if that is meant, `python -m tests.process_replay --renew`"
-    assert not found, "\n".join([*found[: process_replay.SHOWN_MAX], advice])
+    assert not found, "\n".join([*found[:SHOWN_MAX], advice])
 
 
-@pytest.mark.parametrize("name", ["demo", "twin_faults"])
+def test_every_reference_is_compared() -> None:
+    known = {net.path_of(name) for net in KINDS.values() for name in net.NAMES}
+    assert set(verdicts.FOLDER.rglob("*.*")) == known
+
+
+@pytest.mark.parametrize("name", ["demo", "twin_faults", "request_risk", "mcap", "serial_log"])
 def test_a_reference_has_grasps_that_were_judged_and_some_that_were_not(name: str) -> None:
     known = reference(name)
     assert sum(entry["n"] for entry in known) > 2500  # readings of the demo recording: 2836
-    assert {entry["verdict"] for entry in known} >= {"slip", "unknown"}
+    assert {entry["verdict"] for entry in known} >= {"stable", "slip", "unknown"}
     assert sum(entry["judged"] for entry in known) >= 12  # grasps of the demo recording
+
+
+@pytest.mark.parametrize("name", verdicts.NAMES)
+def test_every_reference_judges_some_grasp(name: str) -> None:
+    assert any(entry["judged"] and entry["valid"] for entry in reference(name))
+
+
+def test_a_recording_is_judged_as_it_was_when_it_was_made() -> None:
+    assert verdicts.path_of("mcap").read_text() == verdicts.path_of("request_risk").read_text()
 
 
 def test_under_faults_electrodes_are_repaired() -> None:
@@ -30,8 +49,27 @@ def test_under_faults_electrodes_are_repaired() -> None:
     assert {"ff_7", "th_16"} <= repaired  # those that the twin's faults name, counted from 1
 
 
+def test_a_slow_computer_skips_readings_is_overloaded_and_late() -> None:
+    text = messages.path_of("slow").read_text()
+    assert '"overloaded":true' in text
+    assert '"stale"' in text
+    assert text.rpartition('"skipped_readings":')[2].partition(",")[0] != "0"
+
+
+def test_outcomes_are_taken_and_refused_in_the_references() -> None:
+    lines = messages.path_of("request_risk").read_text().splitlines()
+    answers = {line.partition(": ")[2].partition(":")[0] for line in lines if " answer " in line}
+    assert answers == {"None", "contradicts", "unknown boot_id"}
+
+
+@pytest.mark.parametrize("code", [0, 1, 2])
+def test_each_exit_code_of_the_command_line_is_in_the_references(code: int) -> None:
+    texts = [commands.path_of(name).read_text() for name in commands.NAMES]
+    assert any(f"\nexit code {code}\n" in text for text in texts)
+
+
 def test_no_reference_is_so_near_to_the_threshold_that_another_processor_could_turn_it() -> None:
-    for name in process_replay.streams():
+    for name in verdicts.NAMES:
         for entry in reference(name):
             assert entry.get("near", False) == is_near(entry)
 
@@ -55,18 +93,49 @@ def test_a_verdict_that_changes_is_found(field: str, value: object) -> None:
     ][:2]
     now = copy.deepcopy(was)
     now[1][field] = value
-    (line,) = differences(was, now)
+    (line,) = entries_apart(was, now)
     assert line.startswith(f"1: {field}: ")
 
 
 def test_a_stream_that_ends_early_is_found() -> None:
     known = reference("demo")
-    assert differences(known, known[:-1]) == [f"{len(known)} entries became {len(known) - 1}"]
+    assert entries_apart(known, known[:-1]) == [f"{len(known)} entries became {len(known) - 1}"]
 
 
 def test_only_so_near_to_the_threshold_the_verdict_may_turn() -> None:
     was = {"n": 1, "verdict": "slip", "verdict_code": 2, "p_slip": 0.50005}
     now = was | {"verdict": "stable", "verdict_code": 1, "p_slip": 0.49998}
-    assert differences([was], [now]) == []
+    assert entries_apart([was], [now]) == []
     far = was | {"p_slip": 0.52}
-    assert differences([far], [far | {"verdict": "stable"}]) != []
+    assert entries_apart([far], [far | {"verdict": "stable"}]) != []
+
+
+def test_a_reference_reads_as_it_was_written() -> None:
+    text = (
+        '{"n": 2, "grasp": 1, "gate": "idle", "p_slip": 0.25}\n'
+        '{"n": 1, "p_slip": null}\n'
+        '{"n": 1, "grasp": 2}\n'
+    )
+    assert verdicts.parsed(text) == [
+        {"n": 2, "grasp": 1, "gate": "idle", "p_slip": 0.25},
+        {"n": 1, "grasp": 1, "gate": "idle"},
+        {"n": 1, "grasp": 2, "gate": "idle"},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("now", "differs"),
+    [
+        ('1 verdict {"seq":3,"p_slip":0.2501,"gate":null}', False),
+        ('1 verdict {"seq":3,"p_slip":0.2509,"gate":null}', True),
+        ('1 verdict {"seq":4,"p_slip":0.25,"gate":null}', True),
+        ('1 verdict {"p_slip":0.25,"seq":3,"gate":null}', True),
+        ('1 verdict {"seq":3,"p_slip":0.25, "gate":null}', True),
+        ('1 verdict {"seq":3,"p_slip":null,"gate":null}', True),
+    ],
+)
+def test_of_a_message_only_numbers_with_a_point_may_differ_a_little(
+    now: str, *, differs: bool
+) -> None:
+    was = '1 verdict {"seq":3,"p_slip":0.25,"gate":null}'
+    assert bool(lines_apart([was], [now], 2e-4)) == differs

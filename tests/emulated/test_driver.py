@@ -22,7 +22,7 @@ from tests.drivers.spi.bridge_c import pattern
 from tests.emulated.board import Board
 from tests.emulated.conftest import Image
 from tests.emulated.lockstep import EPOCH_NS, FINGERS, PATIENCE_S, LockStep
-from tests.process_replay import judged
+from tests.process_replay.verdicts import judged
 
 SWEEPS = 6000
 """A minute at 100 Hz."""

@@ -1,0 +1,49 @@
+"""Compare with the references, or renew them."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Final
+
+from tests.process_replay import commands, messages, verdicts
+
+KINDS: Final[Mapping[str, ModuleType]] = {
+    "verdicts": verdicts,
+    "messages": messages,
+    "commands": commands,
+}
+"""Each has `NAMES` of references, `path_of` and `made`, which take a name, and `differences`."""
+SHOWN_MAX: Final = 5
+"""Differences that are told; the rest only as a number."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compare with the references, or renew them; 1 if something differs."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.process_replay",
+        description="Compare with the references, or renew them.",
+    )
+    parser.add_argument("--renew", action="store_true", help="write the references")
+    args = parser.parse_args(arguments)
+    code = 0
+    for kind in KINDS.values():
+        for name in kind.NAMES:
+            path, now = kind.path_of(name), kind.made(name)
+            if args.renew:
+                path.parent.mkdir(exist_ok=True)
+                path.write_text(now)
+                sys.stdout.write(f"{path.name}: {now.count(chr(10))} lines\n")
+                continue
+            found = kind.differences(path.read_text() if path.is_file() else "", now)
+            sys.stdout.writelines(f"{path.name}: {line}\n" for line in found[:SHOWN_MAX])
+            if found:
+                sys.stdout.write(f"{path.name}: {len(found)} differences\n")
+            code = code or int(bool(found))
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,249 @@
+"""What the commands say: stdout, stderr and exit code, `references/commands/<name>.txt`.
+
+Each runs in this process, in a folder of its own with the files that `_prepare` makes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import logging
+import os
+import re
+import resource
+import shlex
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+from daemon import cli
+from daemon.process.logs import LOGGERS
+from drivers.recordings.csv_player import DEMO_DAY, DEMO_RECORDING, DEMO_TABLE
+from tests.process_replay.alike import lines_apart
+from tests.process_replay.judging import Case, run
+from tests.process_replay.streams import CHECKOUT, demo
+
+FOLDER: Final = CHECKOUT / "tests" / "references" / "commands"
+LONG: Final = 12_000
+"""Outputs with more characters are kept as a checksum; other tests hold these texts."""
+TOLERANCE: Final = 1.1e-3
+"""Largest difference of numbers with a point: commands show three digits of `p_slip`."""
+
+COMMANDS: Final[Mapping[str, str]] = {
+    "none": "",
+    "unknown": "rnu",
+    "help": "--help",
+    "version": "--version",
+    "option-first": "--json check demo.toml",
+    "wrong-option": "check demo.toml --jsn",
+    "run": "run demo.toml --print",
+    "run-absent": "run absent.toml",
+    "run-wrong-key": "run wrong.toml",
+    "run-wrong-recording": "run not-there.toml",
+    "run-wrong-fingers": "run fingers.toml",
+    "run-no-folder": "run no-folder.toml",
+    "run-no-scene": "run",
+    "replay-demo": "replay",
+    "replay-stream": "replay stream.csv",
+    "replay-json": "replay few.csv --json",
+    "replay-table": "replay table.csv --outcomes --max-slip-when-stable 0.1 --warm-up 5",
+    "replay-lifted": "replay day.csv --outcomes --only-lifted --min-confidence 0.6",
+    "replay-no-session": "replay table.csv --session off --model cnn1",
+    "replay-recorded": "replay recorded.mcap",
+    "replay-absent": "replay absent.csv",
+    "replay-absent-table": "replay bts3v2_palm_down.csv",
+    "replay-no-recording": "replay demo.toml",
+    "replay-no-model": "replay table.csv --model small-sesion",
+    "replay-no-outcomes": "replay recorded.mcap --outcomes",
+    "replay-wait": "replay table.csv --wait 3",
+    "replay-only-lifted": "replay table.csv --only-lifted",
+    "replay-warm-up": "replay table.csv --warm-up 3",
+    "replay-scene": "replay table.csv --scene demo.toml",
+    "replay-session-absent": "replay table.csv --session absent.json",
+    "check": "check demo.toml can.toml palm.toml spi.toml two-fingers.toml",
+    "check-json": "check demo.toml --json",
+    "check-all-wrong": "check wrong.toml absent.toml",
+    "doctor-absent": "doctor absent.toml",
+    "models": "models",
+    "models-card": "models small-session",
+    "models-json": "models small-session --json",
+    "models-unknown": "models cnn2",
+    "models-no-file": "models absent.onnx",
+    "session-seed": "session seed kept.toml table.csv",
+    "session-show": "session show kept.toml",
+    "replay-session": "replay day.csv --session session.json",
+    "session-reset": "session reset kept.toml",
+    "session-none": "session show kept.toml",
+    "keys-make": "keys make arm --dir keys",
+    "keys-make-again": "keys make arm --dir keys",
+    "keys-list": "keys list --dir keys",
+    "schema": "schema",
+    "scene-example": "scene --example spi",
+    "scene-page": "scene --page",
+    "scene-schema": "scene --schema",
+    "export-grasps": "export-grasps recorded.mcap --out grasps.csv",
+    "export-grasps-there": "export-grasps recorded.mcap --out grasps.csv",
+    "export-grasps-table": "export-grasps table.csv --out other.csv",
+    "data-absent": "data --from nowhere",
+    "completion": "completion bash",
+    "manual": "manual",
+    "report-unknown": "report accuracy",
+    "watch-wrong-port": "watch --port 0",
+    "twin-unknown": "twin hand",
+    **{
+        f"help-{words.replace(' ', '-')}": f"{words} --help"
+        for words in (
+            *("run", "replay", "watch", "scene", "check", "doctor", "twin", "data", "schema"),
+            *("models", "session", "export-grasps", "keys", "train", "evaluate", "report"),
+            *("completion", "manual", "twin spi", "twin can", "twin palm", "twin joints"),
+            *("session show", "session reset", "session seed", "keys make", "keys list"),
+        )
+    },
+}
+"""Command lines by the names of their references, run in this order."""
+NAMES: Final = tuple(COMMANDS)
+
+DEMO_SCENE: Final = (
+    '[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["stream.csv"]\n'
+    '[publish]\nendpoint = "ipc://{folder}/graspd"\n[gate]\nmax_age_ms = 10000\n'
+)
+SCENES: Final[Mapping[str, str]] = {
+    "demo": DEMO_SCENE,
+    "wrong": DEMO_SCENE.replace("[gate]", "[gaet]"),
+    "not-there": DEMO_SCENE.replace("stream.csv", "absent.csv"),
+    "fingers": DEMO_SCENE + '[hand]\nfingers = ["th", "mf", "ff"]\n',
+    "no-folder": DEMO_SCENE.replace("/graspd", "/absent/graspd"),
+    "kept": DEMO_SCENE + '[session]\nkeep = true\nfile = "session.json"\n',
+}
+
+_MASKS: Final = (
+    (r" +[0-9]+ us\b", " * us"),
+    (r"(readings|verdicts) in [0-9.]+ s", r"\1 in * s"),
+    (r'"(p50|p99|max|wall_s|t|t_mono_ns|age_ms|latency_us)": ?[0-9.e+-]+', r'"\1": *'),
+    (r'"boot_id": ?"[0-9a-f]{32}"', '"boot_id": *'),
+    (r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d, \d+ minutes ago", "*"),
+    (r"\b(graspd|Python|libzmq|onnxruntime|numpy|pyzmq|python-can|pyserial) [0-9.]+", r"\1 *"),
+    (r"(?<=  arm  )\S{40}", "*"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What a command has said."""
+
+    code: int
+    stdout: str
+    stderr: str
+
+
+def execute(arguments: Sequence[str], folder: Path) -> Said:
+    """Run a command in this process and folder."""
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with (
+        contextlib.chdir(folder),
+        _environment(folder),
+        _own_log(),
+        contextlib.redirect_stdout(stdout),
+        contextlib.redirect_stderr(stderr),
+    ):
+        try:
+            code = cli.main(arguments)
+        except SystemExit as left:
+            code = left.code if isinstance(left.code, int) else 1
+    return Said(code, stdout.getvalue(), stderr.getvalue())
+
+
+@contextlib.contextmanager
+def _environment(folder: Path) -> Iterator[None]:
+    """Set the width of help texts and an empty home; undo what a command changes."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    former = {name: os.environ.get(name) for name in ("COLUMNS", "HOME")}
+    os.environ.update(COLUMNS="80", HOME=str(folder))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        for name, value in former.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _own_log() -> Iterator[None]:
+    """Let the command set up its log as in a new process, also under a test runner."""
+    root = logging.getLogger()
+    handlers, levels = root.handlers, [logging.getLogger(name).level for name in LOGGERS]
+    root.handlers = []
+    try:
+        yield
+    finally:
+        root.handlers = handlers
+        for name, level in zip(LOGGERS, levels, strict=True):
+            logging.getLogger(name).setLevel(level)
+
+
+def path_of(name: str) -> Path:
+    """Return the file of a reference."""
+    return FOLDER / f"{name}.txt"
+
+
+def made(name: str) -> str:
+    """Return the text of a reference as it would be now."""
+    return _all()[name]
+
+
+@cache
+def _all() -> dict[str, str]:
+    """Return the texts of all references. Some commands use files that earlier ones write."""
+    found = {}
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        _prepare(folder)
+        for command, line in COMMANDS.items():
+            found[command] = _text(line, execute(shlex.split(line), folder), folder)
+    return found
+
+
+def _prepare(folder: Path) -> None:
+    """Make the files that the commands are given."""
+    for name, source, rows in (
+        ("stream.csv", DEMO_RECORDING, 700),
+        ("table.csv", DEMO_TABLE, 60),
+        ("few.csv", DEMO_TABLE, 12),
+        ("day.csv", DEMO_DAY, 40),
+    ):
+        lines = source.read_text().splitlines(keepends=True)
+        (folder / name).write_text("".join(lines[: rows + 1]))
+    for name, text in SCENES.items():
+        (folder / f"{name}.toml").write_text(text.replace("{folder}", str(folder)))
+    for name in ("can", "palm", "spi", "two-fingers"):
+        shutil.copy(CHECKOUT / "deploy" / "scenes" / f"{name}.toml", folder)
+    (folder / "keys").mkdir()
+    case = Case(readings=demo, joints=True, tells=True, readings_max=1400)
+    run(case, record_in=folder / "record")
+    for path in (folder / "record").glob("*.mcap"):
+        path.rename(folder / "recorded.mcap")
+
+
+def _text(line: str, said: Said, folder: Path) -> str:
+    parts = [f"$ graspd {line}\nexit code {said.code}\n"]
+    for name, output in (("stdout", said.stdout), ("stderr", said.stderr)):
+        text = output.replace(str(folder), "FOLDER").replace(str(CHECKOUT), "CHECKOUT")
+        for pattern, instead in _MASKS:
+            text = re.sub(pattern, instead, text)
+        if len(text) > LONG:
+            text = f"sha256 {hashlib.sha256(text.encode()).hexdigest()}\n"
+        if text:
+            parts.append(f"--- {name}\n{text}")
+    return "".join(parts)
+
+
+def differences(before: str, now: str) -> list[str]:
+    """Return where two texts differ, line by line."""
+    return lines_apart(before.splitlines(), now.splitlines(), TOLERANCE)

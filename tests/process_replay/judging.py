@@ -1,0 +1,235 @@
+"""One run of the loop over a stream, on a stepped clock: every message that it sends."""
+
+from __future__ import annotations
+
+import selectors
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from daemon import scene
+from daemon.assembly import assembly
+from daemon.assembly.recorder import header_of, state_of
+from daemon.judge.pipeline import Pipeline
+from daemon.publish.companion import Companion, Requests
+from daemon.publish.messages import Verdict
+from daemon.publish.outbox import Outbox
+from daemon.record.files import Retention
+from daemon.record.header import RecordingHeader
+from daemon.record.recorder import Recorder
+from daemon.run.loop import Loop, Timing
+from daemon.scene import Scene
+from drivers.base import DriverCounters, Reading, TactileReading
+from tests.process_replay.streams import FINGERS, PERIOD_NS, Clock
+
+BOOT_ID: Final = "0123456789abcdef" * 2
+ASKED_EVERY: Final = 40
+"""Verdicts from one question to the next."""
+SLOW_NS, SLOW_FOR, SLOW_EVERY = 15_000_000, 260, 600
+"""On a slow computer the first 260 verdicts of each 600 take 15 ms. Readings are skipped, for long
+enough to be an overload."""
+STALL_NS, STALL_AT = 160_000_000, 500
+"""On a slow computer one verdict of each 600 takes 160 ms. The next readings are too old."""
+
+Message = tuple[str, str]
+"""Kind, such as `verdict`, and payload."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A stream, and how it is judged."""
+
+    readings: Callable[[], Iterator[Reading]]
+    sections: Mapping[str, Any] = field(default_factory=dict)
+    """Sections of the scene that are not the usual ones."""
+    readings_max: int | None = None
+    joints: bool = False
+    asks: bool = False
+    """True if the controller asks at fixed readings."""
+    tells: bool = False
+    """True if the controller tells how each lift ended."""
+    slow: bool = False
+    """True if judging is slower than the sensors at times, so that readings are skipped."""
+
+
+def run(case: Case, record_in: Path | None = None) -> list[Message]:
+    """Return all messages of a run; record it in a folder if that is given.
+
+    This is the only place that builds a loop and its parts.
+    """
+    clock, wanted = Clock(), _scene(case)
+    model = assembly.load_model(wanted)
+    pipeline = assembly.build_pipeline(wanted, model, clock)
+    pipeline.boot_id = BOOT_ID
+    world = _World(case, clock)
+    outputs: list[Any] = [world]
+    if record_in is not None:
+        outputs.append(_recorder(record_in, clock, pipeline, header_of(wanted, model, BOOT_ID)))
+    outbox = Outbox(
+        wanted.hand.name,
+        wanted.hand.fingers,
+        model.contract.name,
+        model.sha256,
+        outputs,
+        clock,
+        lambda: clock() / 1e9,
+        boot_id=BOOT_ID,
+    )
+    driver = _Driver(islice(case.readings(), case.readings_max), clock, live=case.slow)
+    timing = Timing(
+        wanted.max_age_ns,
+        clock,
+        rest=lambda _seconds: None,
+        selector=lambda: _Selector(clock),
+    )
+    loop = Loop([driver], pipeline, outbox, _Never(), outputs, timing)
+    with closing(loop):
+        loop.run()
+    for recorder in outputs[1:]:
+        recorder.close()
+    for thread in threading.enumerate():
+        if thread.name == "recorder":
+            thread.join()  # `close` does not wait long enough for a slow computer
+    return world.messages
+
+
+def _recorder(folder: Path, clock: Clock, pipeline: Pipeline, header: RecordingHeader) -> Recorder:
+    return Recorder(
+        Retention(folder, "right", BOOT_ID, keep_files=9, keep_bytes=10**9),
+        scene.Record(images_hz=0.0),
+        header,
+        take_state=lambda: state_of(pipeline),
+        clock=clock,
+        wall_clock=clock,
+    )
+
+
+def _scene(case: Case) -> Scene:
+    sections: dict[str, Any] = {
+        "hand": {"fingers": FINGERS},
+        "tactile": {"driver": "palm", "source": "udp://127.0.0.1:9870"},
+    }
+    if case.joints:
+        sections["joints"] = {"driver": "stream", "source": "udp://127.0.0.1:9871"}
+    return scene.parse({**sections, **case.sections}, Path("process replay"))
+
+
+class _Driver:
+    """Hands over all readings that are due."""
+
+    name = "stream"
+    period_ns: int | None = PERIOD_NS
+
+    def __init__(self, readings: Iterator[Reading], clock: Clock, *, live: bool) -> None:
+        self.live = live
+        self.counters = DriverCounters()
+        self.serials: dict[str, str] = {}
+        self._readings = readings
+        self._clock = clock
+        self._next = next(readings, None)
+
+    @property
+    def exhausted(self) -> bool:
+        return self._next is None
+
+    def describe(self) -> dict[str, str]:
+        return {}
+
+    def open(self) -> None:
+        """There is nothing to open."""
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    def fileno(self) -> int | None:
+        return None
+
+    def due_ns(self) -> int | None:
+        return None if self._next is None else self._next.t_ns
+
+    def read_ready(self) -> Sequence[Reading]:
+        ready: list[Reading] = []
+        while self._next is not None and self._next.t_ns <= self._clock():
+            ready.append(self._next)
+            self.counters.readings += isinstance(self._next, TactileReading)
+            self._next = next(self._readings, None)
+        return ready
+
+
+class _World(Companion):
+    """The world around the loop: takes messages, asks, tells outcomes, makes the computer slow."""
+
+    def __init__(self, case: Case, clock: Clock) -> None:
+        self.messages: list[Message] = []
+        self._case = case
+        self._clock = clock
+        self._verdicts = 0
+        self._asking = False
+        self._lifted = 0
+        """Number of the grasp that is lifted, or 0."""
+        self._over: list[int] = []
+        """Grasps whose lift has ended without being told yet."""
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        self.messages.append((topic.decode().partition(".")[0], payload.decode()))
+
+    def wanted(self, _topic: bytes) -> bool:
+        return self._verdicts == 0
+
+    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+        self._verdicts += 1
+        self._asking = self._case.asks and self._verdicts % ASKED_EVERY == 0
+        if self._lifted not in (0, verdict.grasp):
+            self._over.append(self._lifted)
+            self._lifted = 0
+        if verdict.judged and self._case.tells:
+            self._lifted = verdict.grasp
+        if self._case.slow and reading is not None:
+            phase = self._verdicts % SLOW_EVERY
+            self._clock.now_ns += SLOW_NS if phase < SLOW_FOR else 0
+            self._clock.now_ns += STALL_NS if phase == STALL_AT else 0
+
+    def before_wait(self, requests: Requests) -> None:
+        if self._asking:
+            requests.ask()
+            self._asking = False
+        for grasp in self._over:
+            self._tell(requests, BOOT_ID, grasp)
+            if grasp % 5 == 0:
+                self._tell(requests, BOOT_ID, grasp, turned=True)
+                self._tell(requests, "f" * 32, grasp)
+        self._over.clear()
+
+    def _tell(self, requests: Requests, boot_id: str, grasp: int, *, turned: bool = False) -> None:
+        slipped = (grasp % 3 == 0) != turned
+        object_name = "cup" if grasp % 2 else None
+        why = requests.outcome(boot_id, grasp, "slip" if slipped else "stable", object_name)
+        self.messages.append(("answer", f"{grasp}: {why}"))
+
+
+class _Never:
+    """Nothing stops the loop before its readings end."""
+
+    received = None
+
+    def fileno(self) -> int:
+        return 0
+
+    def take_reload(self) -> bool:
+        return False
+
+
+class _Selector(selectors.SelectSelector):
+    """Moves the clock instead of waiting."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self._clock = clock
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self._clock.now_ns += round((timeout or 0.0) * 1e9)
+        return []

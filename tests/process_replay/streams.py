@@ -1,0 +1,192 @@
+"""Streams that are the same every time: recordings, and twins whose bytes go through our parsers.
+
+No socket, no port, no sleep: each stream has a clock of its own that moves from reading to reading.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import numpy as np
+
+from drivers.base import Reading
+from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
+from drivers.can.formats import CanFormat
+from drivers.can.frames import FD, CanFrame
+from drivers.can.stream import CanStream
+from drivers.link import LinkState
+from drivers.palm.stream import PalmStream
+from drivers.recordings.can_log import line_of
+from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.recordings.serial_log import encode_records
+from drivers.spi.conversation import Conversation
+from drivers.spi.line import LineEvent
+from drivers.spi.messages import Hello, Message, Ping, Sweep, decode, encode, frame_parser
+from drivers.twins.can import CanTwin
+from drivers.twins.faults import LinkFaultInjector, LinkFaults
+from drivers.twins.grasps.grasps import Counts, recorded_counts
+from drivers.twins.palm import PalmTwin
+from models.contract import Finger
+
+CHECKOUT: Final = Path(__file__).parents[2]
+FINGERS: Final[tuple[Finger, ...]] = ("ff", "mf", "th")
+WIRED: Final[tuple[Finger, ...]] = ("mf", "th", "ff")
+"""Fingers in the order of the SPI bridge's chip selects."""
+START_NS: Final = 10**12
+PERIOD_NS: Final = 10_000_000
+MS: Final = 1_000_000
+FAULTS: Final = LinkFaults(
+    bit_flip_probability=2e-4,
+    drop_probability=2e-4,
+    duplicate_probability=2e-4,
+    dead_electrodes=((0, 6), (2, 15)),
+    seed=7,
+)
+"""Two dead electrodes, and at times a frame that is damaged, missing or sent twice."""
+FRAME_FAULTS: Final = LinkFaults(
+    bit_flip_probability=3e-3, drop_probability=3e-3, duplicate_probability=3e-3, seed=7
+)
+"""Damaged, missing and repeated frames, for links that need few frames for a reading."""
+PAUSES: Final = (range(700, 730),)
+"""Sweeps during which the SPI bridge is silent: the link is lost and found again."""
+
+
+class Clock:
+    """A clock that moves only when told to."""
+
+    def __init__(self) -> None:
+        self.now_ns = START_NS
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+
+def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]:
+    """Play a CSV recording in its own time, with joints if it has them."""
+    clock = Clock()
+    with ReplayDriver([path], fingers, pace=Pace.REALTIME, clock=clock) as driver:
+        while not driver.exhausted:
+            clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
+            yield from driver.read_ready()
+
+
+def demo() -> Iterator[Reading]:
+    """Play the synthetic demo recording, with joints."""
+    return recording(DEMO_RECORDING)
+
+
+def can(
+    frame_format: CanFormat = CanFormat.SYNTOUCH,
+    faults: LinkFaults = FAULTS,
+    log: BinaryIO | None = None,
+) -> Iterator[Reading]:
+    """Play the demo's grasps from a CAN twin; write its frames to `log`, as candump text."""
+    clock = Clock()
+    twin = CanTwin(
+        "virtual", "none", _counts(), FINGERS, format=frame_format, faults=faults, clock=clock
+    )
+    injector = LinkFaultInjector(faults)
+    stream = CanStream("virtual", FINGERS, format=frame_format)
+    stream.link.greeting()
+    flags = FD if frame_format is CanFormat.SWEEP_FD else 0
+    while frames := twin.next_frames():
+        for number, (arbitration_id, data) in enumerate(frames):
+            t_ns = clock.now_ns + PERIOD_NS * (number + 1) // len(frames)
+            for spoilt in injector.spoil(data):
+                frame = CanFrame(arbitration_id, spoilt, flags)
+                if log is not None:
+                    log.write(line_of(frame, t_ns, "can0").encode())
+                readings, _ = stream.receive([(frame, t_ns, t_ns)])
+                yield from readings
+        clock.now_ns += PERIOD_NS
+
+
+def palm() -> Iterator[Reading]:
+    """Play the same grasps from a palm twin, one packet a millisecond, with calibrated joints."""
+    calibration = CHECKOUT / "deploy" / "calibration" / "example_hand.toml"
+    stream = PalmStream(FINGERS, calibration=calibration)
+    t_ns = START_NS
+    for datagrams in PalmTwin(_counts(), FINGERS, faults=FRAME_FAULTS).cycles():
+        t_ns += MS
+        for data in datagrams:
+            yield from stream.receive(data, t_ns) or ()
+
+
+def spi(log: BinaryIO | None = None) -> Iterator[Reading]:
+    """Play the same grasps from an SPI bridge; write the bytes to `log`, as a serial link log."""
+    line = _Line(log)
+    for sequence, counts in enumerate(_counts()):
+        now_ns = START_NS + PERIOD_NS * sequence
+        line.say(now_ns)
+        if not any(sequence in pause for pause in PAUSES):
+            yield from line.hear(now_ns + MS, sequence, counts)
+
+
+class _Line:
+    """A serial line: the conversation of the host on one end, a simple bridge on the other."""
+
+    def __init__(self, log: BinaryIO | None) -> None:
+        self._log = log
+        self._host = Conversation("bridge", FINGERS, WIRED)
+        self._injector = LinkFaultInjector(FRAME_FAULTS)
+        self._parser = frame_parser()
+        self._answers: list[Message] = []
+        self._open(START_NS)
+
+    def _open(self, now_ns: int) -> None:
+        self._host.opened(now_ns)
+        self._write(LineEvent.OPENED, now_ns, b"")
+
+    def _write(self, event: LineEvent, t_ns: int, data: bytes) -> None:
+        if self._log is not None:
+            self._log.write(encode_records(event, t_ns, data))
+
+    def say(self, now_ns: int) -> None:
+        """Let the host say what it has to say."""
+        link = self._host.link
+        if link.state is LinkState.WAITING and now_ns >= (link.retry_ns or 0):
+            self._open(now_ns)
+        for data in self._host.say(now_ns):
+            self._host.sent(data, now_ns)
+            self._write(LineEvent.SENT, now_ns, data)
+            for kind, payload in self._parser.feed(data):
+                message = decode(kind, payload)
+                if isinstance(message, Ping):
+                    self._answers.append(_hello(message.nonce, now_ns))
+
+    def hear(self, now_ns: int, sequence: int, counts: Counts) -> Iterator[Reading]:
+        """Let the bridge answer and send a sweep; yield the readings that the host makes of it."""
+        words = np.array(
+            [[encode_word(int(count)) for count in row] for row in counts.T], dtype=np.uint16
+        )[:, [FINGERS.index(finger) for finger in WIRED]]
+        sweep = Sweep(sequence, _tick(now_ns) - 2000, _tick(now_ns), 7, words)
+        pieces = [encode(answer) for answer in self._answers]
+        self._answers.clear()
+        pieces += self._injector.spoil(encode(sweep))
+        for piece in pieces:
+            self._write(LineEvent.RECEIVED, now_ns, piece)
+            if self._host.link.state is not LinkState.WAITING:
+                yield from self._host.receive(piece, now_ns, now_ns - MS)
+
+
+def _hello(nonce: int, now_ns: int) -> Hello:
+    return Hello(
+        nonce=nonce,
+        tick=_tick(now_ns),
+        tick_hz=1_000_000,
+        period_ticks=PERIOD_NS // 1000,
+        serials=tuple(f"BTSP-{finger}" for finger in WIRED),
+        commands=tuple(sample_command(channel) for channel in SEQUENCE_ELECTRODES),
+        board="replayed",
+    )
+
+
+def _tick(now_ns: int) -> int:
+    """Return the time of the bridge's clock, us, which runs 50 ppm too fast."""
+    return (now_ns - START_NS // 2) // 1000 * 20_001 // 20_000
+
+
+def _counts() -> Iterator[Counts]:
+    return recorded_counts(DEMO_RECORDING)
