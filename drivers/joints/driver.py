@@ -9,9 +9,6 @@ from drivers.base import JointReading, Reading
 from drivers.joints.message import DATAGRAM_BYTES_MAX, JointCounters, JointParser, MessageOrder
 from drivers.udp.driver import DatagramDriver
 
-SILENCE_NS = 500_000_000
-"""Without a message for so long the link is lost: 50 at 100 Hz, and a sender of 10 Hz passes."""
-
 
 class JointStreamDriver(DatagramDriver):
     """Gives a `JointReading` per message.
@@ -22,6 +19,9 @@ class JointStreamDriver(DatagramDriver):
     """
 
     name = "joints"
+    bytes_max = DATAGRAM_BYTES_MAX
+    silence_ns = 500_000_000
+    """50 messages at 100 Hz; a sender of 10 Hz passes."""
     period_ns: int | None = None
 
     def __init__(
@@ -31,13 +31,7 @@ class JointStreamDriver(DatagramDriver):
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        super().__init__(
-            source,
-            clock,
-            bytes_max=DATAGRAM_BYTES_MAX,
-            silence_ns=SILENCE_NS,
-            only_from=only_from,
-        )
+        super().__init__(source, only_from=only_from, clock=clock)
         self._reset()
 
     def _reset(self) -> None:

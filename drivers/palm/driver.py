@@ -19,8 +19,6 @@ from drivers.palm.rounds import ROUND_NS
 from drivers.palm.stream import PalmStream
 from drivers.udp.driver import DatagramDriver
 
-SILENCE_NS: Final = 10 * ROUND_NS
-"""Without a packet for ten periods the link is lost."""
 SPARE_CYCLES: Final = 2
 """The driver asks to be woken by packets again so many cycles before a round can end."""
 
@@ -37,6 +35,8 @@ class PalmDriver(DatagramDriver):
     """
 
     name = "palm"
+    bytes_max = PACKET_BYTES_MAX
+    silence_ns = 10 * ROUND_NS
     period_ns: int | None = ROUND_NS
 
     def __init__(
@@ -49,13 +49,7 @@ class PalmDriver(DatagramDriver):
         heed_finger_bits: bool = True,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        super().__init__(
-            source,
-            clock,
-            bytes_max=PACKET_BYTES_MAX,
-            silence_ns=SILENCE_NS,
-            only_from=only_from,
-        )
+        super().__init__(source, only_from=only_from, clock=clock)
         self._make_stream = functools.partial(
             PalmStream, fingers, heed_finger_bits=heed_finger_bits
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -38,26 +39,26 @@ class DatagramDriver(Opened):
     """
 
     name: str
+    bytes_max: int
+    """Longest datagram that makes sense."""
+    silence_ns: int
+    """Time without a good datagram after which the link is lost, ns."""
     exhausted = False
     live = True
 
     def __init__(
         self,
         source: str,
-        clock: Callable[[], int],
         *,
-        bytes_max: int,
-        silence_ns: int,
         only_from: str | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """`source` is `udp://ADDRESS:PORT`, `only_from` an IP address; `clock` gives monotonic ns.
 
-        Without a good datagram for `silence_ns` the link is lost. Raises `ValueError`.
+        Raises `ValueError`.
         """
         self._endpoint = Endpoint.parse(source)
         self._only_from = None if only_from is None else str(ipaddress.ip_address(only_from))
-        self._bytes_max = bytes_max
-        self._silence_ns = silence_ns
         self._clock = clock
         self._receiver: DatagramReceiver | None = None
         self._begin(DatagramCounters())
@@ -103,7 +104,7 @@ class DatagramDriver(Opened):
         Raises `LinkError` if it cannot: at the start that means that the scene is wrong.
         """
         self._begin(counters)
-        receiver = DatagramReceiver(self._endpoint, self._bytes_max)
+        receiver = DatagramReceiver(self._endpoint, self.bytes_max)
         self._link.start(self._clock())
         self._use(receiver)
 
@@ -120,7 +121,7 @@ class DatagramDriver(Opened):
     def due_ns(self) -> int | None:
         """When to read without a datagram: to open again, or to notice silence."""
         if self._link.state is LinkState.UP:
-            return self._good_t_ns + self._silence_ns
+            return self._good_t_ns + self.silence_ns
         return self._link.retry_ns
 
     def datagrams(self) -> Iterator[tuple[bytes, int]]:
@@ -156,8 +157,8 @@ class DatagramDriver(Opened):
     def fell_silent(self) -> bool:
         """True if the link is down now and was up the last time."""
         is_up = self._link.state is LinkState.UP
-        if is_up and self._clock() - self._good_t_ns >= self._silence_ns:
-            silence = f"nothing good for {self._silence_ns / 1e6:.0f} ms"
+        if is_up and self._clock() - self._good_t_ns >= self.silence_ns:
+            silence = f"nothing good for {self.silence_ns / 1e6:.0f} ms"
             self._lose(LinkError(LinkCause.TIMEOUT, silence))
             self._link.greeting()
             is_up = False
@@ -184,7 +185,7 @@ class DatagramDriver(Opened):
         if not self._link.is_due(self._clock()):
             return None
         try:
-            return self._use(DatagramReceiver(self._endpoint, self._bytes_max))
+            return self._use(DatagramReceiver(self._endpoint, self.bytes_max))
         except LinkError as error:
             self._lose(error)
             return None

@@ -48,6 +48,8 @@ class Listener(DatagramDriver):
     """A driver that a test opens and reads by hand."""
 
     name = "test"
+    bytes_max = 100
+    silence_ns = SILENCE_NS
 
     def open(self) -> None: ...
 
@@ -61,10 +63,9 @@ class Bench:
         monkeypatch.setattr("drivers.udp.driver.DatagramReceiver", lambda *_: waiting.pop(0))
         self.clock = Clock()
         self.link = Listener(
-            *("udp://127.0.0.1:5700", self.clock),
-            bytes_max=100,
-            silence_ns=SILENCE_NS,
+            "udp://127.0.0.1:5700",
             only_from=only_from,
+            clock=self.clock,
         )
         self.counters = DatagramCounters()
 

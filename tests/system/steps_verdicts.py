@@ -27,7 +27,7 @@ RECORDING: Final = ("--recording", f"{PAYLOAD}/recording.csv", "--loop")
 REPLAY_TIMEOUT_S: Final = 600.0
 TRIAL_STATUSES: Final = 15
 """Statuses after which a rate is one that is carried, if it has not overloaded by then."""
-OVERLOADED_STATUSES: Final = 3
+OVERLOADED_STATUSES: Final = 5
 """Statuses that tell what is judged of a rate that overloads."""
 LOOK_S: Final = 0.5
 OVERLOAD_MIN: Final = 3.0

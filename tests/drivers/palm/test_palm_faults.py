@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.driver import SILENCE_NS, PalmDriver
+from drivers.palm.driver import PalmDriver
 from drivers.palm.packet import PalmCounters, PalmParser
 from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
@@ -214,7 +214,7 @@ def test_a_second_palm_after_silence_is_told_and_never_mixed_in(into_round: int)
             assert all(row_of(reading, hand) is not None for reading in readings)
             assert not any(reading.faults.any() for reading in readings)
             assert driver.serials["ff"] == f"udp://127.0.0.1:{sender.port}"
-            clock.now_ns += SILENCE_NS
+            clock.now_ns += PalmDriver.silence_ns
             assert driver.read_ready() == []
 
 
