@@ -6,10 +6,7 @@ are counted, and no time of the loop.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import sys
 import threading
 import time
 from collections import Counter, deque
@@ -21,7 +18,8 @@ from typing import TYPE_CHECKING, Final, Protocol, cast
 
 import msgspec
 
-from daemon.publish.companion import Companion
+from daemon.process.worker import Worker
+from daemon.publish.companion import Companion, LoopEvent, Published
 from daemon.record.files import Retention
 from daemon.record.flat import flat
 from daemon.record.header import Known, RecordingHeader
@@ -29,11 +27,10 @@ from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
 from daemon.record.viewers import ForPeople
 from daemon.scene import Record
+from drivers.base import JointReading, Reading
 
 if TYPE_CHECKING:
-    from daemon.judge.pipeline import Judgement
     from daemon.trust.learner import LearnerState
-    from drivers.base import JointReading
     from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
@@ -49,9 +46,6 @@ the interpreter when the loop does."""
 FLUSH_AFTER: Final = 0.8
 """Part of the flush interval after which a flush is due: with a round and the writing, nothing
 waits longer than the interval."""
-SWITCH_S: Final = 0.0005
-"""Python's switch interval while recording, s: how long the thread may keep the loop waiting for
-the interpreter. A tenth of the default."""
 CLOSE_S: Final = 0.5
 """How long `close` waits for the thread, s."""
 
@@ -155,10 +149,8 @@ class Recorder(Companion):
         if take_state is not None:
             self._queue.append((clock(), b"", _Turn(take_state())))
         self._stopping = threading.Event()
-        self._switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
-        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
-        self._thread.start()
+        self._worker: Worker[None] = Worker("recorder")
+        self._worker.submit(self._work)
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Record a published message."""
@@ -175,29 +167,30 @@ class Recorder(Companion):
         """Always: what nobody subscribes to is recorded all the same."""
         return True
 
-    def on_joints(self, reading: JointReading) -> None:
-        """Record joint angles."""
-        self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
+    def on_reading(self, reading: Reading) -> None:
+        """Record joint angles; tactile readings come as messages."""
+        if isinstance(reading, JointReading):
+            self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
-    def on_judged(self, judgement: Judgement) -> None:
+    def on_verdict(self, published: Published) -> None:
         """Record the counts that the network judged."""
+        judgement = published.judgement
         if judgement.judged and judgement.judged_counts is not None:
             making = partial(Judged.of, self._header.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
-    def on_asked(self) -> None:
-        """Record, with the next reading, that the controller asks for a judgement."""
-        self._asked = True
+    def on_event(self, event: LoopEvent) -> None:
+        """Record that readings were skipped; or, with the next reading, that a controller asked."""
+        if event is LoopEvent.ASKED:
+            self._asked = True
+        else:
+            self._tell_asked()
+            self._put(self._names[Topic.SKIPPED], EVENT)
 
     def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
         """Record that a sensor is another one than before, and what was known of the new ones."""
         self._tell_asked()
         self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
-
-    def on_skipped(self) -> None:
-        """Record that readings were left out before the next one."""
-        self._tell_asked()
-        self._put(self._names[Topic.SKIPPED], EVENT)
 
     def _tell_asked(self) -> None:
         """Record a question before what the judge does before the next reading."""
@@ -215,30 +208,23 @@ class Recorder(Companion):
         else:
             self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
 
-    def counters(self) -> dict[str, int]:
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
         """Since the start: entries `recorded`, `dropped` because the disk was too slow, and `lost`
         when it failed; `files` begun and `removed`, `failures`; `writing`, 1 while a file is open.
         """
-        writing = self._open is not None
-        return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
-
-    def counters_by_part(self) -> dict[str, dict[str, int]]:
-        """The same, as part of the status."""
-        return {"record": self.counters()}
+        writing = int(self._open is not None)
+        return {"record": {**self._counted, "dropped": self._dropped, "writing": writing}}
 
     def close(self) -> None:
         """Write what is queued and end the files; give up if the disk does not answer in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
-        self._thread.join(CLOSE_S)
-        if self._thread.is_alive():
+        if not self._worker.close(CLOSE_S):
             log.warning("record: the disk does not answer, the end of the recording is lost")
-        sys.setswitchinterval(self._switch_s)
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError):  # never in the way of the loop, if that is realtime
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
             while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
                 self.go_round()
@@ -246,6 +232,7 @@ class Recorder(Companion):
             self.go_round()
         except BaseException:
             self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
+            log.exception("record: nothing is recorded any more")
             raise
         finally:
             self._finish()

@@ -177,6 +177,7 @@ class Runner:
                 self._reload,
                 [companion for companion in companions if companion is not None],
                 Timing(wanted.max_age_ns),
+                around.keep,
             )
             stack.callback(sockets.publisher.forget)
             stack.callback(loop.close)

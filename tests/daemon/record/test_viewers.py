@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.publish.companion import LoopEvent
 from daemon.publish.messages import Tactile, encode
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
@@ -300,8 +301,8 @@ def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
     writing = recorder(tmp_path)
     for number in range(3):
         if number:
-            writing.on_asked()
-            writing.on_asked()
+            writing.on_event(LoopEvent.ASKED)
+            writing.on_event(LoopEvent.ASKED)
         writing.send(b"tactile.right", tactile(number))
     writing.close()
     found = recorded(tmp_path)
@@ -312,9 +313,9 @@ def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("event", ["skipped", "exchanged"])
 def test_a_question_before_an_event_stays_before_it(tmp_path: Path, event: str) -> None:
     writing = recorder(tmp_path)
-    writing.on_asked()
+    writing.on_event(LoopEvent.ASKED)
     if event == "skipped":
-        writing.on_skipped()
+        writing.on_event(LoopEvent.SKIPPED)
     else:
         writing.exchanged(None, None)
     writing.send(b"tactile.right", tactile(0))
@@ -340,8 +341,8 @@ def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
     counts = np.arange(48).reshape(2, 24)
     writing = recorder(tmp_path)
     angles = JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan]))
-    writing.on_joints(angles)
-    writing.on_asked()
+    writing.on_reading(angles)
+    writing.on_event(LoopEvent.ASKED)
     writing.send(b"tactile.right", tactile(0, counts))
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
@@ -392,7 +393,7 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
 def test_an_event_has_a_schema_too(tmp_path: Path) -> None:
     assert {topic for topic in Topic if topic.message is Event} == {Topic.ASKED, Topic.SKIPPED}
     writing = recorder(tmp_path)
-    writing.on_skipped()
+    writing.on_event(LoopEvent.SKIPPED)
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
     with open_recording(path) as stream:

@@ -275,17 +275,17 @@ def test_the_kernel_takes_the_rests_of_an_overloaded_loop_for_sleep(tmp_path: Pa
     said = in_a_process(
         f"""
 import time
-from daemon.run.overload import Overload
+from daemon.run.overload import LoadShedder
 RLIMIT_RTTIME = 15  # linux/asm-generic/resource.h
 resource.setrlimit(RLIMIT_RTTIME, ({RTTIME_US // 2}, {RTTIME_US}))
 with RealtimeMode(Realtime(priority=1, cpus=(max(os.sched_getaffinity(0)),), lock_memory=False)):
-    overload = Overload(time.monotonic_ns(), live=True)
+    shedder = LoadShedder(time.monotonic_ns(), live=True)
     end_s = time.monotonic() + 2.5
     while time.monotonic() < end_s:
         judged_s = time.monotonic() + 0.03
         while time.monotonic() < judged_s:
             pass
-        overload.rest(time.monotonic_ns())
+        shedder.yield_processor(time.monotonic_ns())
 print("lives on")
 """,
         tmp_path,

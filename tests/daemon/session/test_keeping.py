@@ -11,29 +11,27 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import pytest
 
-from daemon.publish.companion import Requests
 from daemon.session.file import SessionFile, load
-from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAITING_MAX, SessionKeeper
+from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAIT_S, WAITING_MAX, SessionKeeper
 from daemon.trust.ledger import GRASPS_MAX, Told
 from daemon.trust.trust import Trust, TrustState, decode
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
+    NOBODY,
     calibration,
     judge,
     observe,
+    read_once,
     sensors,
     tell,
     trust,
 )
 
 KeeperOf = Callable[..., SessionKeeper]
-NOBODY = cast(Requests, None)
-"""Of whom nothing is requested here."""
 
 
 class Disk:
@@ -112,8 +110,7 @@ def test_an_outcome_is_answered_when_it_is_on_the_disk(
     disk.goes_on.clear()
     keeper.keep(lambda why: found.append((why, kept_trust(file))))
     for _ in range(3):
-        keeper.before_wait(NOBODY)
-        keeper.before_readings()
+        read_once(keeper)
     assert found == []
     disk.goes_on.set()
     go_round(keeper)
@@ -275,7 +272,7 @@ def test_whoever_waits_is_answered_whatever_ends_the_writing(
         monkeypatch.setattr(file, "save", lambda *_: 1 // 0)
         judge(part, 0)
         keeper.keep(found.append)
-        keeper.wait()
+        keeper.wait(WAIT_S)
         assert found == ["not kept: it could not be written"]
         monkeypatch.setattr(file, "save", save)
         keeper.keep(found.append)
@@ -341,7 +338,7 @@ def test_what_a_run_has_no_use_for_is_kept_as_it_is(tmp_path: Path) -> None:
         keeper.save()
         assert kept_trust(file) == image.state()
         keeper = SessionKeeper(off, FINGERS, sensors(ff="B"), file, clock)
-        keeper.before_readings()  # and none of it is left once a sensor is exchanged
+        read_once(keeper)  # and none of it is left once a sensor is exchanged
         keeper.save()
     assert (off.grasps, kept_trust(file)) == (0, None)
 
@@ -351,14 +348,14 @@ def test_an_exchanged_sensor_ends_what_was_learned(tmp_path: Path) -> None:
     driver = sensors(ff="A")
     with SessionFile(path) as file:
         keeper = SessionKeeper(session, FINGERS, driver, file, Clock(), trust=part)
-        keeper.before_readings()
+        read_once(keeper)
         observe(session, 30)
         for grasp in range(20):
             judge(part, grasp)
             tell(part, grasp)
         lifts = part.risk.lifts
         driver.known = {"ff": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     again, other = calibration(), trust()
     with SessionFile(path) as file:
@@ -373,7 +370,7 @@ def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
     driver, part = sensors(ff="A"), trust()
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(None, FINGERS, driver, file, Clock(), trust=part)
-        keeper.before_readings()
+        read_once(keeper)
         for first, sensor in ((0, "B"), (20, "A")):
             for grasp in range(first, first + 20):
                 judge(part, grasp)
@@ -382,7 +379,7 @@ def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
             if first == 0:
                 taught = learned
             driver.known = {"ff": sensor}
-            keeper.before_readings()
+            read_once(keeper)
             lifts = part.risk.state().lifts, part.risk.state().slips
             assert lifts == (counted.lifts, counted.slips)
             assert part.risk.proven == 0
@@ -397,11 +394,11 @@ def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
     part, clock = trust(), Clock()
     keeper = keeper_of(part, clock)
     judge(part, 1)
-    keeper.before_readings()
+    read_once(keeper)
     assert not keeper.filenos()
     for _ in range(3):
         clock.now_ns += SAVE_PERIOD_NS
-        keeper.before_readings()
+        read_once(keeper)
         go_round(keeper)
     assert disk.written == 1  # nothing is written where nothing is new
     assert kept_trust(file) == part.state()

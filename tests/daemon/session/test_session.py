@@ -22,7 +22,7 @@ from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
-from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
+from daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S, SessionKeeper
 from daemon.session.sensors import exchanged
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
@@ -32,7 +32,15 @@ from models.inputs import SessionBuilder, raw_features
 from models.runtime import TactileModel
 from models.training.data.datasets import read_table
 from tests.daemon.fakes import Clock
-from tests.daemon.session.learning import FINGERS, calibration, counts, grasps_of, observe, sensors
+from tests.daemon.session.learning import (
+    FINGERS,
+    calibration,
+    counts,
+    grasps_of,
+    observe,
+    read_once,
+    sensors,
+)
 
 
 def test_the_input_follows_the_session() -> None:
@@ -66,11 +74,11 @@ def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(first, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
         observe(first, 30)
-        keeper.before_readings()
+        read_once(keeper)
         assert load(file.path) is None  # not every second
         clock.now_ns += SAVE_PERIOD_NS
-        keeper.before_readings()
-        keeper.wait()
+        read_once(keeper)
+        keeper.wait(WAIT_S)
         assert load(file.path) is not None
         keeper.save()
     second = calibration()
@@ -86,21 +94,21 @@ def test_an_exchanged_sensor_ends_the_session(
     clock, session = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(session, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
-        keeper.before_readings()
+        read_once(keeper)
         observe(session, 30)
         keeper.save()
     again = calibration()
     driver = sensors()
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(again, FINGERS, driver, file, clock)
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 30  # nothing is known of the sensors yet
         driver.known = {"ff": "A", "mf": "B", "th": "C"}
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 30
         driver.known = {"ff": "A", "mf": "X", "th": "C"}
-        keeper.before_readings()
-        keeper.wait()
+        read_once(keeper)
+        keeper.wait(WAIT_S)
         assert again.grasps == 0
         assert "new sensor on mf" in caplog.text
         kept = file.load()
@@ -114,17 +122,17 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
     clock, session, driver = Clock(), calibration(), sensors(ff="A", mf="B")
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(session, FINGERS, driver, file, clock)
-        keeper.before_readings()
+        read_once(keeper)
         observe(session, 30)
         known = session.state()
         driver.known = {"ff": "A", "mf": "X"}
-        keeper.before_readings()
+        read_once(keeper)
         assert session.grasps == 0
         observe(session, 7, seed=1)
         driver.known = {"ff": "A"}  # the other one does not answer yet
-        keeper.before_readings()
+        read_once(keeper)
         driver.known = {"ff": "A", "mf": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         assert session.state() == known
         observe(session, 1, seed=2)
         keeper.save()
@@ -133,10 +141,10 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(again, FINGERS, driver, file, clock)
         assert again.grasps == 31
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 7
         driver.known = {"ff": "A", "mf": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 31
         keeper.save()
 
@@ -145,18 +153,18 @@ def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
     session, driver = calibration(), sensors(ff="0")
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        read_once(keeper)
         for number in range(1, 8):
             observe(session, 30 + number, seed=number)
             driver.known = {"ff": str(number)}
-            keeper.before_readings()
+            read_once(keeper)
             keeper.save()
             assert session.grasps == 0
         kept = [(each.serials["ff"], grasps_of(each)) for each in others(file.path)]
         assert kept == [(str(6 - at), 37 - at) for at in range(4)]
         for number in (2, 6):
             driver.known = {"ff": str(number)}
-            keeper.before_readings()
+            read_once(keeper)
             assert session.grasps == (37 if number == 6 else 0)
         keeper.save()
         assert len(list(tmp_path.iterdir())) == 4 + 3  # the session, the former one, the lock
@@ -171,10 +179,10 @@ def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
     session, driver = calibration(), sensors(ff="A")
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        read_once(keeper)
         observe(session, 30)
         driver.known = {"ff": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     (path,) = tmp_path.glob("right.json.of-*")
     data = path.read_bytes()
@@ -184,7 +192,7 @@ def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
     driver.known = {"ff": "A"}
     with SessionFile(tmp_path / "right.json") as file:
         keeper = SessionKeeper(again, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 0
         keeper.save()
     assert f"{path}: not a session" in caplog.text
@@ -200,9 +208,9 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
     with SessionFile(tmp_path / "right.json") as file:
         file.put_aside(kept_now(odd, FINGERS, {"ff": "B"}))
         keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        read_once(keeper)
         driver.known = {"ff": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     assert session.grasps == 0
     assert "a new session begins" in caplog.text
@@ -293,8 +301,8 @@ def test_a_full_disk_is_one_warning_and_no_crash(
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
-            keeper.before_readings()
-            keeper.wait()
+            read_once(keeper)
+            keeper.wait(WAIT_S)
         assert caplog.text.count("No space left on device") == 1
         monkeypatch.undo()
         keeper.save()
@@ -319,7 +327,7 @@ def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.M
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
-            keeper.before_readings()  # comes back, though nothing is on the disk yet
+            read_once(keeper)  # comes back, though nothing is on the disk yet
         assert file.load() is None
         hangs.set()
         keeper.save()
@@ -532,14 +540,14 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
     with SessionFile(tmp_path / "right.json") as file:
         file.save(seeded.state(), FINGERS, {})
         keeper = SessionKeeper(calibration(), FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
         kept = file.load()
         assert kept is not None
         assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
         later = calibration()
         keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     assert later.grasps == 0
 
