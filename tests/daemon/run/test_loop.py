@@ -26,6 +26,7 @@ from daemon.publish.companion import (
 from daemon.publish.messages import Lifts, State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
+from daemon.session.sensors import SensorWatch
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.trust import Trust
 from drivers.base import DriverError, JointReading, LinkError, Reading, TactileReading
@@ -537,6 +538,27 @@ def test_the_opposite_of_what_an_earlier_start_was_told_is_counted_and_not_publi
     assert not [topic for topic, _ in bench.output.sent if topic.startswith(b"outcome.")]
     assert bench.loop.outcome(*earlier, "slip") is None
     assert [topic for topic, _ in bench.output.sent] == [b"outcome.right"]
+
+
+class Exchanging(FakeDriver):
+    """Whose sensor is another one from the third reading on."""
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return {"ff": "A" if self.counters.readings < 3 else "B"}
+
+
+def test_an_exchanged_sensor_is_noticed_before_its_first_reading_is_published_or_judged(
+    stop: StopSignal,
+) -> None:
+    clock = Clock()
+    driver = Exchanging([reading(clock(), seed) for seed in range(4)], clock)
+    published_at_exchange: list[int] = []
+    watch = SensorWatch(driver, lambda: published_at_exchange.append(len(bench.output.sent)))
+    bench = Bench(driver, clock, stop, companions=[watch])
+    bench.output.wants = True
+    bench.run()
+    assert published_at_exchange == [4]  # two readings and their verdicts
 
 
 def test_companions_are_called_in_their_order_and_only_for_hooks_of_their_own() -> None:
