@@ -22,7 +22,7 @@ from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateCause
 from daemon.publish.companion import LoopEvent, Published
-from daemon.publish.messages import Verdict
+from daemon.publish.messages import Status, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import Known, RecordingHeader
@@ -36,8 +36,8 @@ from tests.daemon.record.recorded import messages
 BOOT = "0123456789abcdef" * 2
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12
-NO_VERDICT = cast(Verdict, None)
-"""The recorder gets verdicts as messages."""
+NO_VERDICT, NO_STATUS = cast(Verdict, None), cast(Status, None)
+"""The recorder gets both as messages."""
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -61,6 +61,8 @@ class Loop:
         payload = json.dumps({"number": self.sent}).encode()
         self.sent += 1
         recorder.send(topic, payload)
+        if topic == STATUS:
+            recorder.on_status(NO_STATUS)
 
 
 def make(folder: Path, loop: Loop, **options: float) -> Recorder:
@@ -166,6 +168,7 @@ class Daemon:
         if reading.seq % 100 == 99:
             time.sleep(0.05)
             self.recorder.send(STATUS, b"{}")
+            self.recorder.on_status(NO_STATUS)
         return judgement
 
 

@@ -16,7 +16,7 @@ from daemon.publish.companion import LoopEvent
 from daemon.publish.messages import Tactile, encode
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
-from daemon.record.header import RecordingHeader
+from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.player import McapReplayDriver
 from daemon.record.recorder import Recorder
@@ -275,7 +275,9 @@ def test_a_broken_message_is_not_said(kind: str) -> None:
 
 def recorder(folder: Path) -> Recorder:
     options = Record(flush_ms=100.0)
-    return Recorder(Retention(folder, "right", BOOT, 9, 10**9), options, HEADER)
+    return Recorder(
+        Retention(folder, "right", BOOT, 9, 10**9), options, HEADER, take_state=lambda: Known
+    )
 
 
 def tactile(number: int, counts: NDArray[np.int64] = REST) -> bytes:
