@@ -103,7 +103,7 @@ class Assembly:
             scene.hand.fingers,
             self._parts.drivers[0],
             file,
-            on_exchange=pipeline.sensors_exchanged,
+            pipeline.sensors_exchanged,
             trust=pipeline.trust,
         )
         self._stack.callback(keeper.save)

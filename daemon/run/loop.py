@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Literal
 
-from daemon.judge.pipeline import Pipeline
+from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.process.signals import Stop
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import (
@@ -23,7 +23,7 @@ from daemon.publish.companion import (
     hooks,
 )
 from daemon.publish.deadlines import Deadlines
-from daemon.publish.messages import State
+from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.overload import LoadShedder, mark_repeats
 from daemon.trust.ledger import GraspId
@@ -269,34 +269,41 @@ class Loop:
         judgement = self._pipeline.judge(reading)
         if self._sleep.has_slept():
             return False
-        silence_ns = self._silence_ns
-        verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
-        self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
         self._state = State.RUNNING
         self._last_t_ns = reading.t_ns
-        self._silence_due_ns = received_ns + silence_ns
         self._readings_since_status += 1
-        is_answer = verdict.judged or not self._pipeline.on_request
-        published = Published(judgement, verdict, payload, reading, is_answer)
-        for on_verdict in self._on_verdict:
-            on_verdict(published)
+        verdict = self._publish(judgement, reading, received_ns)
+        self._deadlines.add(reading, verdict.age_ms, self._tactile.period_ns)
         return True
 
     def _check_silence(self) -> None:
         now_ns = self._clock()
         if now_ns >= self._silence_due_ns and not self._tactile.exhausted:
-            self._report_silence(now_ns, is_answer=not self._pipeline.on_request)
+            self._report_silence(now_ns)
 
-    def _report_silence(self, now_ns: int, *, is_answer: bool) -> None:
+    def _report_silence(self, now_ns: int, *, is_answer: bool = False) -> None:
         """Publish that nothing is known of the hand."""
         self._state = State.SILENT
-        silence_ns = self._silence_ns
-        self._silence_due_ns = now_ns + silence_ns
         judgement = self._pipeline.silence(self._last_t_ns)
-        verdict, payload = self._outbox.verdict(judgement, now_ns, silence_ns)
-        published = Published(judgement, verdict, payload, None, is_answer)
+        self._publish(judgement, None, now_ns, is_answer=is_answer)
+
+    def _publish(
+        self,
+        judgement: Judgement,
+        reading: TactileReading | None,
+        received_ns: int,
+        *,
+        is_answer: bool = False,
+    ) -> Verdict:
+        """Publish a verdict; with `is_answer`, answer also those who wait for a judgement."""
+        silence_ns = self._silence_ns
+        self._silence_due_ns = received_ns + silence_ns
+        verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
+        is_answer = is_answer or verdict.judged or not self._pipeline.on_request
+        published = Published(judgement, verdict, payload, reading, is_answer)
         for on_verdict in self._on_verdict:
             on_verdict(published)
+        return verdict
 
     @property
     def _silence_ns(self) -> int:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Final, Self
 
 import msgspec
@@ -97,16 +96,9 @@ class SessionFile:
             os.close(lock)
 
     def __enter__(self) -> Self:
-        """Nothing to do: the file is taken from the start."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close."""
+    def __exit__(self, *_details: object) -> None:
         self.close()
 
     def load(self) -> KeptSession | None:

@@ -24,8 +24,7 @@ from daemon.session.file import (
     others,
     statistics_of,
 )
-from daemon.session.sensors import SensorWatch
-from daemon.trust.learner import LearnerState
+from daemon.session.sensors import OnExchange, SensorWatch
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Driver
 from models.session_statistics import SessionState
@@ -41,7 +40,6 @@ WAITING_MAX: Final = 64
 BUSY: Final = "busy: too many wait for the disk, tell it again"
 UNEXPECTED: Final = "it could not be written"
 HANGS: Final = "not kept: the disk does not answer"
-OnExchange = Callable[[SessionState | None, LearnerState | None], None]
 
 
 class SavedState(NamedTuple):
@@ -67,9 +65,10 @@ class SessionKeeper(SensorWatch):
         fingers: Sequence[str],
         tactile: Driver,
         file: SessionFile,
-        clock: Callable[[], int] = time.monotonic_ns,
-        on_exchange: OnExchange | None = None,
+        on_exchange: OnExchange,
+        *,
         trust: Trust | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Restore what `file` holds; if that is no session of these fingers, warn and start a new
         one.
@@ -77,12 +76,11 @@ class SessionKeeper(SensorWatch):
         `session` is None for a model without one, `trust` where nothing learns: what the file has
         for those stays as it is. `tactile` knows the serial numbers of the sensors. `on_exchange`
         is called when one of them is another than before, with what the file has of the new ones,
-        and must reset session and trust to that. By default only that is done.
+        and must reset session and trust to that.
         """
         self._session = session
         self._trust = trust
-        self._exchanged = on_exchange or self._reset
-        super().__init__(tactile, lambda: self._exchanged(None, None))
+        super().__init__(tactile, on_exchange)
         self._fingers = tuple(fingers)
         self._file = file
         self._clock = clock
@@ -221,16 +219,6 @@ class SessionKeeper(SensorWatch):
         except ValueError as error:
             log.warning("%s: what was learned %s; learning begins anew", self._file.path, error)
 
-    def _reset(
-        self, session: SessionState | None = None, learned: LearnerState | None = None
-    ) -> None:
-        if self._session is not None:
-            self._session.reset()
-            if session is not None:
-                self._session.restore(session)
-        if self._trust is not None:
-            self._trust.sensors_exchanged(learned)
-
     def _exchange(self, changed: list[str], serials: Mapping[str, str]) -> None:
         """Put the session aside, and take up that of the sensors that are there now, if any."""
         grasps = "" if self._session is None else f"'s {self._session.grasps} grasps"
@@ -244,7 +232,7 @@ class SessionKeeper(SensorWatch):
             self._leaving.append(leaving)
         self._unused = SavedState({})
         if former is None or not self._take_up(former):
-            self._on_exchange()
+            self._on_exchange(None, None)
         self._save_due_ns = self._clock()
 
     def _take_up(self, former: SavedState) -> bool:
@@ -253,7 +241,7 @@ class SessionKeeper(SensorWatch):
         if trust is not None and self._trust is not None and not self._trust.fits(trust):
             trust = None
         try:
-            self._exchanged(former.statistics, None if trust is None else trust.learner)
+            self._on_exchange(former.statistics, None if trust is None else trust.learner)
         except ValueError as error:
             log.warning("what was kept of these sensors %s; a new session begins", error)
             return False

@@ -6,7 +6,12 @@ import logging
 from collections.abc import Callable, Mapping
 
 from daemon.publish.companion import Companion
+from daemon.trust.learner import LearnerState
 from drivers.base import Driver, Reading
+from models.session_statistics import SessionState
+
+OnExchange = Callable[[SessionState | None, LearnerState | None], None]
+"""Takes what is known of the new sensors, or None."""
 
 log = logging.getLogger("graspd")
 
@@ -14,7 +19,7 @@ log = logging.getLogger("graspd")
 class SensorWatch(Companion):
     """Has the judge forget sensors that were exchanged, before it judges the new ones."""
 
-    def __init__(self, tactile: Driver, on_exchange: Callable[[], None]) -> None:
+    def __init__(self, tactile: Driver, on_exchange: OnExchange) -> None:
         """`tactile` knows the serial numbers; `on_exchange` is called when one is another."""
         self._tactile = tactile
         self._on_exchange = on_exchange
@@ -33,7 +38,7 @@ class SensorWatch(Companion):
 
     def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
         log.warning("new sensor on %s: the hand must be seen open first", ", ".join(changed))
-        self._on_exchange()
+        self._on_exchange(None, None)
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

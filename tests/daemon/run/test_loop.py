@@ -554,7 +554,7 @@ def test_an_exchanged_sensor_is_noticed_before_its_first_reading_is_published_or
     clock = Clock()
     driver = Exchanging([reading(clock(), seed) for seed in range(4)], clock)
     published_at_exchange: list[int] = []
-    watch = SensorWatch(driver, lambda: published_at_exchange.append(len(bench.output.sent)))
+    watch = SensorWatch(driver, lambda *_: published_at_exchange.append(len(bench.output.sent)))
     bench = Bench(driver, clock, stop, companions=[watch])
     bench.output.wants = True
     bench.run()

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from daemon.judge.calibration import SessionCalibration
 from daemon.publish.companion import Companion, Requests
-from daemon.session.file import KeptSession
-from daemon.trust.learner import sigmoid
+from daemon.session.file import KeptSession, SessionFile
+from daemon.session.keeper import SessionKeeper
+from daemon.trust.learner import LearnerState, sigmoid
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
+from drivers.base import Driver
 from models.contract import Finger, SessionInput, Sharpness
+from models.session_statistics import SessionState
 from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
@@ -84,3 +87,25 @@ def read_once(companion: Companion) -> None:
     """Tell a companion of one reading and of the next wait, as the loop does."""
     companion.on_reading(reading(0))
     companion.before_wait(NOBODY)
+
+
+def session_keeper(
+    session: SessionCalibration | None,
+    tactile: Driver,
+    file: SessionFile,
+    clock: Clock | None = None,
+    part: Trust | None = None,
+) -> SessionKeeper:
+    """A keeper that resets session and trust at an exchange, as the pipeline does."""
+
+    def exchanged(known: SessionState | None, learned: LearnerState | None) -> None:
+        if session is not None:
+            session.reset()
+            if known is not None:
+                session.restore(known)
+        if part is not None:
+            part.sensors_exchanged(learned)
+
+    return SessionKeeper(
+        session, FINGERS, tactile, file, exchanged, trust=part, clock=clock or Clock()
+    )

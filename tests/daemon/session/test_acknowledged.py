@@ -83,7 +83,13 @@ class Lab:
             self.controller = Controller(f"ipc://{folder}/ask", disk, goes_on_at)
             with SessionFile(self.path) as file:
                 keeper = SessionKeeper(
-                    None, FINGERS, sensors(), file, clock, judge.sensors_exchanged, self.trust
+                    None,
+                    FINGERS,
+                    sensors(),
+                    file,
+                    judge.sensors_exchanged,
+                    trust=self.trust,
+                    clock=clock,
                 )
                 driver = FakeDriver([reading(clock(), seed) for seed in range(READINGS)], clock)
                 outbox = Outbox("right", FINGERS, "fake", "0" * 64, [sockets], clock, boot_id=BOOT)

@@ -20,7 +20,7 @@ def test_another_sensor_is_told_once_and_before_its_readings(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     driver, exchanges = sensors(), []
-    watch = SensorWatch(driver, lambda: exchanges.append(dict(driver.known)))
+    watch = SensorWatch(driver, lambda *_: exchanges.append(dict(driver.known)))
     steps: list[dict[str, str]] = [
         {},
         {"ff": "A", "mf": "B"},

@@ -22,7 +22,7 @@ from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
-from daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S, SessionKeeper
+from daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S
 from daemon.session.sensors import exchanged
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
@@ -40,6 +40,7 @@ from tests.daemon.session.learning import (
     observe,
     read_once,
     sensors,
+    session_keeper,
 )
 
 
@@ -72,7 +73,7 @@ def test_a_young_session_is_less_sure(grasps: int, temperature: float, calibrate
 def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
     clock, first = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(first, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper = session_keeper(first, sensors(ff="A", mf="B", th="C"), file, clock)
         observe(first, 30)
         read_once(keeper)
         assert load(file.path) is None  # not every second
@@ -83,7 +84,7 @@ def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
         keeper.save()
     second = calibration()
     with SessionFile(tmp_path / "right.json") as file:
-        SessionKeeper(second, FINGERS, sensors(), file, clock)
+        session_keeper(second, sensors(), file, clock)
     assert second.state() == first.state()
     assert second.calibrated
 
@@ -93,14 +94,14 @@ def test_an_exchanged_sensor_ends_the_session(
 ) -> None:
     clock, session = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper = session_keeper(session, sensors(ff="A", mf="B", th="C"), file, clock)
         read_once(keeper)
         observe(session, 30)
         keeper.save()
     again = calibration()
     driver = sensors()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
+        keeper = session_keeper(again, driver, file, clock)
         read_once(keeper)
         assert again.grasps == 30  # nothing is known of the sensors yet
         driver.known = {"ff": "A", "mf": "B", "th": "C"}
@@ -121,7 +122,7 @@ def test_an_exchanged_sensor_ends_the_session(
 def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
     clock, session, driver = Clock(), calibration(), sensors(ff="A", mf="B")
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, clock)
+        keeper = session_keeper(session, driver, file, clock)
         read_once(keeper)
         observe(session, 30)
         known = session.state()
@@ -139,7 +140,7 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
     again = calibration()
     driver.known = {"ff": "A", "mf": "X"}  # between two starts
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
+        keeper = session_keeper(again, driver, file, clock)
         assert again.grasps == 31
         read_once(keeper)
         assert again.grasps == 7
@@ -152,7 +153,7 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
 def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
     session, driver = calibration(), sensors(ff="0")
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
+        keeper = session_keeper(session, driver, file, Clock())
         read_once(keeper)
         for number in range(1, 8):
             observe(session, 30 + number, seed=number)
@@ -178,7 +179,7 @@ def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
 ) -> None:
     session, driver = calibration(), sensors(ff="A")
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
+        keeper = session_keeper(session, driver, file, Clock())
         read_once(keeper)
         observe(session, 30)
         driver.known = {"ff": "B"}
@@ -191,7 +192,7 @@ def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
     again = calibration()
     driver.known = {"ff": "A"}
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(again, FINGERS, driver, file, Clock())
+        keeper = session_keeper(again, driver, file, Clock())
         read_once(keeper)
         assert again.grasps == 0
         keeper.save()
@@ -207,7 +208,7 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
     odd = msgspec.structs.replace(state, mean=state.mean[:-1], squares=state.squares[:-1])
     with SessionFile(tmp_path / "right.json") as file:
         file.put_aside(kept_now(odd, FINGERS, {"ff": "B"}))
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
+        keeper = session_keeper(session, driver, file, Clock())
         read_once(keeper)
         driver.known = {"ff": "B"}
         read_once(keeper)
@@ -254,7 +255,7 @@ def test_what_is_no_session_is_one_line_and_a_new_session(
     assert "\n" not in str(error.value)
     session = calibration()
     with SessionFile(path) as file:
-        SessionKeeper(session, FINGERS, sensors(), file)
+        session_keeper(session, sensors(), file)
     assert session.grasps == 0
     assert "a new session begins" in caplog.text
 
@@ -266,7 +267,7 @@ def test_a_session_of_other_fingers_begins_anew(
     observe(other, 9)
     with SessionFile(tmp_path / "right.json") as file:
         file.save(other.state(), ("ff", "mf"), {})
-        SessionKeeper(session, FINGERS, sensors(), file)
+        session_keeper(session, sensors(), file)
     assert "is of the fingers ff, mf, the hand has" in caplog.text
     assert session.grasps == 0
 
@@ -292,7 +293,7 @@ def test_a_full_disk_is_one_warning_and_no_crash(
 ) -> None:
     session, clock = calibration(), Clock()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+        keeper = session_keeper(session, sensors(), file, clock)
 
         def full(descriptor: int) -> None:
             raise OSError(28, "No space left on device")
@@ -323,7 +324,7 @@ def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(os, "fsync", slow)
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+        keeper = session_keeper(session, sensors(), file, clock)
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
@@ -539,14 +540,14 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
     observe(seeded, 30)
     with SessionFile(tmp_path / "right.json") as file:
         file.save(seeded.state(), FINGERS, {})
-        keeper = SessionKeeper(calibration(), FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper = session_keeper(calibration(), sensors(ff="A", mf="B", th="C"), file, clock)
         read_once(keeper)
         keeper.save()
         kept = file.load()
         assert kept is not None
         assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
         later = calibration()
-        keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
+        keeper = session_keeper(later, sensors(mf="X"), file, clock)
         read_once(keeper)
         keeper.save()
     assert later.grasps == 0
