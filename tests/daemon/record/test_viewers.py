@@ -18,7 +18,7 @@ from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
-from daemon.record.player import McapReplayDriver
+from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.recorder import Recorder
 from daemon.record.topics import EVENT, Event, Exchanged, Topic, schemas
 from daemon.record.viewers import INFO, SCALE, WARNING, Journal, Painter, RawImage
@@ -331,7 +331,7 @@ def play(path: Path) -> list[object]:
     """Readings and questions, in their order."""
     found: list[object] = []
     driver = McapReplayDriver([path], ("th", "ff"))
-    driver.on_event = {Topic.ASKED: lambda: found.append("asked")}
+    driver.on_event = found.append
     with driver:
         while not driver.exhausted:
             found.extend(driver.read_ready())
@@ -352,7 +352,7 @@ def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
     assert isinstance(joints, JointReading)
     assert joints.names == angles.names
     assert np.array_equal(joints.position_rad, angles.position_rad, equal_nan=True)
-    assert asked == "asked"
+    assert asked is Topic.ASKED
     assert isinstance(played, TactileReading)
     assert played.counts.tolist() == counts[::-1].tolist()
 
@@ -371,7 +371,7 @@ def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
     assert isinstance(angles, JointReading)
     assert angles.names == ("FFJ3", "THJ4")
     assert np.array_equal(angles.position_rad, [0.25, np.nan], equal_nan=True)
-    assert asked == "asked"
+    assert asked is Topic.ASKED
     assert isinstance(played, TactileReading)
     assert played.counts.tolist() == counts[::-1].tolist()
 
@@ -383,9 +383,9 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
     writing.exchanged(session, learned)
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
-    told: list[Exchanged] = []
+    told: list[RecordedEvent] = []
     driver = McapReplayDriver([path], ("ff",))
-    driver.on_exchange = told.append
+    driver.on_event = told.append
     with driver:
         while not driver.exhausted:
             driver.read_ready()
