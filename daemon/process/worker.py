@@ -38,16 +38,17 @@ class Worker(Generic[R]):
         self._name = name
         self._thread: threading.Thread | None = None
         self._jobs: SimpleQueue[Callable[[], R] | None]
-        """Of this thread, as the next two; None ends it."""
+        """Jobs of this thread; None ends it."""
         self._results: SimpleQueue[R | Exception]
+        """What its jobs returned or raised."""
         self._ended: int
-        """Descriptor that counts results; the thread closes it."""
+        """Descriptor that counts the results; the thread closes it."""
         self.busy = False
         """True from `submit` until the result is taken."""
 
     def submit(self, job: Callable[[], R]) -> bool:
         """Start a job; return False if the worker is busy, or the system has no thread for it."""
-        if self.busy or not self._has_thread():
+        if self.busy or (self._thread is None and not self._start_thread()):
             return False
         self.busy = True
         self._jobs.put(job)
@@ -85,10 +86,8 @@ class Worker(Generic[R]):
             sys.setswitchinterval(ORDINARY_SWITCH_S)
         return not thread.is_alive()
 
-    def _has_thread(self) -> bool:
-        """Start the thread if there is none; return False if the system refuses it."""
-        if self._thread is not None:
-            return True
+    def _start_thread(self) -> bool:
+        """Start the thread; return False if the system refuses it."""
         self._jobs, self._results, self._ended = SimpleQueue(), SimpleQueue(), -1
         try:
             self._ended = os.eventfd(0, os.EFD_CLOEXEC)

@@ -172,6 +172,27 @@ def test_the_end_cuts_short_what_waits_for_its_turn(monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(found, "close", lambda: None)
 
 
+def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(reload, "PERIOD_NS", 60_000_000_000)
+    with reloading() as (found, preparing):
+        assert found.due_ns() is None
+        preparing.go.release()
+        began_ns = time.monotonic_ns()
+        hang_up()
+        wait_for(found.take_reload)
+        found.take()
+        assert found.due_ns() is None
+        hang_up()
+        assert not found.take_reload()
+        due_ns = found.due_ns()
+        assert due_ns is not None
+        assert due_ns - began_ns >= 60_000_000_000
+        assert not found.take_reload()
+        assert len(preparing.began) == 1
+
+
 def test_nothing_is_there_before_it_is_said_to_be() -> None:
     with reloading() as (found, _), pytest.raises(RuntimeError):
         found.take()
