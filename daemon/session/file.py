@@ -111,17 +111,11 @@ class SessionFile:
         self._newest_is_whole = path == self.path
         return kept
 
-    def save(
-        self,
-        statistics: SessionState | None,
-        fingers: Sequence[str],
-        serials: Mapping[str, str],
-        trust: TrustState | None = None,
-    ) -> None:
+    def save(self, kept: KeptSession) -> None:
         """Replace the file in one step, keeping the former one. Raises `SessionFileError`."""
         former = former_of(self.path) if self._newest_is_whole else None
         self._newest_is_whole = False
-        _write(self.path, kept_now(statistics, fingers, serials, trust), former)
+        _write(self.path, kept, former)
         self._newest_is_whole = True
 
     def put_aside(self, kept: KeptSession) -> None:

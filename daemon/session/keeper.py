@@ -159,20 +159,18 @@ class SessionKeeper(SensorWatch):
 
     def _write(self, state: SavedState) -> SavedState:
         """Write `state` and return it; called in the worker. Raises `SessionFileError`."""
-        self._put_aside()  # first, so that a session is always in one of the files
-        self._file.save(state.statistics, self._fingers, state.serials, state.trust)
+        while self._leaving:  # first, so that a session is always in one of the files
+            left = self._leaving.popleft()
+            try:
+                self._file.put_aside(self._kept(left))
+            except SessionFileError:
+                self._leaving.appendleft(left)  # the next save tries it again
+                raise
+        self._file.save(self._kept(state))
         return state
 
-    def _put_aside(self) -> None:
-        """Write the sessions of sensors that have left. Raises `SessionFileError`."""
-        while self._leaving:
-            left = self._leaving.popleft()
-            kept = kept_now(left.statistics, self._fingers, left.serials, left.trust)
-            try:
-                self._file.put_aside(kept)
-            except SessionFileError:
-                self._leaving.appendleft(left)  # to be tried again with the next save
-                raise
+    def _kept(self, state: SavedState) -> KeptSession:
+        return kept_now(state.statistics, self._fingers, state.serials, state.trust)
 
     def _answer(self, number: int, why: str | None) -> None:
         """Answer those who have waited longest."""

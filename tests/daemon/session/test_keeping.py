@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.session.file import SessionFile, load
+from daemon.session.file import SessionFile, kept_now, load
 from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAIT_S, WAITING_MAX, SessionKeeper
 from daemon.trust.ledger import GRASPS_MAX, Told
 from daemon.trust.trust import Trust, TrustState, decode
@@ -251,7 +251,7 @@ def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
     session = calibration()
     observe(session, 30)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None)
+        file.save(kept_now(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None))
         part = trust()
         keeper = session_keeper(None, sensors(), file, Clock(), part=part)
         judge(part, 0)
@@ -307,7 +307,7 @@ def test_with_another_model_the_session_stays_and_learning_begins_anew(
     judge(part, 1)
     tell(part, 1)
     with SessionFile(path) as file:
-        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
         again, other = calibration(), trust("b")
         session_keeper(again, sensors(), file, Clock(), part=other)
     assert again.state() == session.state()
@@ -321,7 +321,7 @@ def test_what_a_run_has_no_use_for_is_kept_as_it_is(tmp_path: Path) -> None:
     judge(part, 1)
     tell(part, 1)
     with SessionFile(path) as file:
-        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
         image = trust("of images", inputs=0)
         keeper = session_keeper(None, sensors(), file, clock, part=image)  # a model without session
         judge(image, 2)

@@ -266,7 +266,7 @@ def test_a_session_of_other_fingers_begins_anew(
     other, session = calibration(), calibration()
     observe(other, 9)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(other.state(), ("ff", "mf"), {})
+        file.save(kept_now(other.state(), ("ff", "mf"), {}))
         session_keeper(session, sensors(), file)
     assert "is of the fingers ff, mf, the hand has" in caplog.text
     assert session.grasps == 0
@@ -342,13 +342,13 @@ KILLED = """
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from daemon.session.file import SessionFile
+from daemon.session.file import SessionFile, kept_now
 from tests.daemon.session.test_session import FINGERS, calibration, observe
 session = calibration()
 with SessionFile(Path(sys.argv[1])) as file:
     while True:
         observe(session, 1, session.grasps)
-        file.save(session.state(), FINGERS, {})
+        file.save(kept_now(session.state(), FINGERS, {}))
         print(session.grasps, flush=True)
 """
 
@@ -539,7 +539,7 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
     seeded = calibration()
     observe(seeded, 30)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(seeded.state(), FINGERS, {})
+        file.save(kept_now(seeded.state(), FINGERS, {}))
         keeper = session_keeper(calibration(), sensors(ff="A", mf="B", th="C"), file, clock)
         read_once(keeper)
         keeper.save()
