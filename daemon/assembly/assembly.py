@@ -130,9 +130,7 @@ def gate_mode(scene: Scene) -> GateMode:
     """When the scene has grasps judged. Raises `SceneError` or `RecordingError`."""
     if scene.gate.mode is not None:
         return scene.gate.mode
-    if not isinstance(scene.tactile, ReplayTactile):
-        return "settled"
-    if is_mcap(scene.tactile):
+    if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):
         return "settled"
     streams = {columns.time is not None for columns in _columns(scene, scene.tactile)}
     if len(streams) > 1:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 import uuid
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from daemon.assembly import assembly
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion
+from daemon.publish.companion import Answer, Companion, at_once
 from daemon.publish.outbox import Outbox, Output
 from daemon.publish.sockets import Sockets
 from daemon.scene import Scene
@@ -53,7 +54,9 @@ class Assembly:
     def __init__(self, parts: Parts, stack: ExitStack) -> None:
         """`stack` closes what is opened."""
         self.companions: list[Companion] = []
-        """Sockets, session keeper and recorder, as far as there are."""
+        """Those of sockets, session keeper and recorder that the scene wants."""
+        self.keep: Callable[[Answer], None] = at_once
+        """Answers an outcome once it is on the disk; at once if there is no session keeper."""
         self._outputs: list[Output] = []
         self._parts = parts
         self._stack = stack
@@ -100,10 +103,11 @@ class Assembly:
             scene.hand.fingers,
             self._parts.drivers[0],
             file,
-            on_exchange=pipeline.sensors_exchanged,
+            pipeline.sensors_exchanged,
             trust=pipeline.trust,
         )
         self._stack.callback(keeper.save)
+        self.keep = keeper.keep
         self.companions.insert(0, keeper)  # what it answers quietens the socket that is read next
         return True
 

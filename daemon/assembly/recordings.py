@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion
 from daemon.publish.messages import OutcomeMessage
 from daemon.record.mcap import header_of
-from daemon.record.player import McapReplayDriver
+from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.topics import Exchanged, Topic
 from daemon.scene import Scene, SceneError, parse
 from daemon.trust.ledger import GraspId
@@ -42,6 +43,7 @@ class RecordedRun:
         """Of the first file."""
         self._paths = tuple(paths)
         self._driver: McapReplayDriver | None = None
+        self._companion = Companion()
         self._same_grasps = True
         """Whether grasps are told apart as they were then; else outcomes are of none of them."""
         for path, header, former in zip(paths[1:], headers[1:], headers, strict=False):
@@ -97,16 +99,7 @@ class RecordedRun:
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
         if driver is not None:
-            driver.on_event = {
-                Topic.ASKED: pipeline.ask,
-                Topic.SKIPPED: pipeline.skip,
-            }
-            driver.on_exchange = lambda told: _exchange(pipeline, told)
-            if self._same_grasps:
-                driver.on_outcome = lambda told: pipeline.outcome(
-                    GraspId(told.grasp_boot_id or header.boot_id, told.grasp),
-                    slipped=told.outcome == "slip",
-                )
+            driver.on_event = partial(self._repeat, pipeline)
         pipeline.boot_id = header.boot_id
         return pipeline
 
@@ -127,22 +120,23 @@ class RecordedRun:
             raise SceneError(f"{self._paths[0]}: the session in it {error}") from error
 
     def tell(self, companion: Companion) -> None:
-        """Tell a companion outcomes of this run where they were told, once the judge is built."""
-        driver = self._driver
-        if driver is None or (learn := driver.on_outcome) is None:
-            return
+        """Tell a companion outcomes of this run where they were recorded."""
+        self._companion = companion
 
-        def both(told: OutcomeMessage) -> None:
-            learn(told)
-            if told.grasp_boot_id is None:
-                companion.on_outcome(told.grasp, told.outcome, told.object)
-
-        driver.on_outcome = both
-
-
-def _exchange(pipeline: Pipeline, told: Exchanged) -> None:
-    """Have the judge forget the sensors as it was recorded; another model knows nothing of them."""
-    try:
-        pipeline.sensors_exchanged(told.session, told.learned)
-    except ValueError:
-        pipeline.sensors_exchanged()
+    def _repeat(self, pipeline: Pipeline, event: RecordedEvent) -> None:
+        """Have the judge hear of an event as it did when it was recorded."""
+        match event:
+            case Topic.ASKED:
+                pipeline.ask()
+            case Topic.SKIPPED:
+                pipeline.skip()
+            case Exchanged():
+                try:
+                    pipeline.sensors_exchanged(event.session, event.learned)
+                except ValueError:  # what was known of the sensors is of another model
+                    pipeline.sensors_exchanged()
+            case OutcomeMessage() if self._same_grasps:
+                grasp = GraspId(event.grasp_boot_id or self.header.boot_id, event.grasp)
+                pipeline.outcome(grasp, slipped=event.outcome == "slip")
+                if event.grasp_boot_id is None:
+                    self._companion.on_outcome(event.grasp, event.outcome, event.object)

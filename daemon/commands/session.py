@@ -29,6 +29,7 @@ from daemon.session.file import (
     SessionFile,
     SessionFileError,
     former_of,
+    kept_now,
     load,
     others,
     read,
@@ -202,7 +203,7 @@ def _seed(wanted: scene.Scene, model: TactileModel, recordings: list[Path]) -> N
         # Of which sensors they are is not known before the daemon hears from them.
         state = None if session is None else session.state()
         learned = _learned_before(file) if trust is None else _taught(trust)
-        file.save(state, wanted.hand.fingers, {}, learned)
+        file.save(kept_now(state, wanted.hand.fingers, {}, learned))
         file.remove_former()
     grasps = outcomes if session is None else session.grasps
     sys.stdout.write(

@@ -1,14 +1,15 @@
-"""What goes along with the loop and is told what happens there: sockets, session keeper, recorder,
-printer, realtime mode, service manager."""
+"""Companions of the loop, which it tells what happens: sockets, session keeper, recorder, printer,
+realtime mode, service manager."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any, Concatenate, Literal, ParamSpec, Protocol, TypeVar
+from enum import Enum
+from typing import Any, Concatenate, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 
 from daemon.judge.pipeline import Judgement
 from daemon.publish.messages import Status, Verdict
-from drivers.base import JointReading, TactileReading
+from drivers.base import Reading, TactileReading
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -16,14 +17,41 @@ R = TypeVar("R")
 Answer = Callable[[str | None], None]
 """Takes None for yes, or why not."""
 CONTRADICTS = "contradicts: another outcome of this grasp was told before"
-"""Why an outcome is not taken: what was told first stays."""
+"""Why an outcome is refused: the first one stays."""
+
+
+def at_once(answer: Answer) -> None:
+    """Answer yes: outcomes are kept nowhere."""
+    answer(None)
+
+
+class LoopEvent(Enum):
+    """What a replay must know besides the readings, to judge them the same way."""
+
+    ASKED = "asked"
+    """A controller has asked for a verdict."""
+    SKIPPED = "skipped"
+    """Readings before the next one were skipped, because they came too fast."""
+
+
+class Published(NamedTuple):
+    """A verdict that was published."""
+
+    judgement: Judgement
+    verdict: Verdict
+    payload: bytes
+    """The verdict, encoded."""
+    reading: TactileReading | None
+    """What the verdict is about; None after silence."""
+    is_answer: bool
+    """True if this is the verdict that controllers who ask wait for."""
 
 
 class Requests(Protocol):
-    """Takes what others want of the loop."""
+    """Takes what peers want of the loop."""
 
     def ask(self) -> None:
-        """Somebody wants a verdict, by which to decide whether to lift."""
+        """Ask for a verdict, by which a controller decides whether to lift."""
 
     def outcome(
         self,
@@ -32,10 +60,11 @@ class Requests(Protocol):
         outcome: Literal["stable", "slip"],
         object_name: str | None = None,
     ) -> str | None:
-        """The lift of a grasp has ended so; None if that is of use, else why not."""
+        """Tell how the lift of a grasp has ended; return None if it is taken, else why not."""
 
-    def keep(self, answer: Answer) -> None:
-        """Call `answer` once what was told is kept, or is known not to be."""
+    @property
+    def keep(self) -> Callable[[Answer], None]:
+        """Calls its argument once all outcomes until now are on the disk, or cannot be."""
 
 
 class Companion:
@@ -45,61 +74,47 @@ class Companion:
     what they raise ends the loop.
     """
 
-    def filenos(self) -> list[int]:
-        """Descriptors that end the loop's wait when they become readable."""
-        return []
+    def before_wait(self, requests: Requests) -> None:
+        """Pass on to `requests` what has come from outside; the loop waits after this."""
 
     def due_ns(self) -> int | None:
-        """When the loop's wait is to end at the latest, monotonic ns; None if that is open."""
+        """Latest end of the loop's wait, monotonic ns; None: no limit."""
         return None
 
-    def before_wait(self, requests: Requests) -> None:
-        """The loop is about to wait. What has come from outside goes to `requests`."""
+    def filenos(self) -> list[int]:
+        """Return the descriptors that end the loop's wait when they become readable."""
+        return []
 
-    def before_readings(self) -> None:
-        """Readings are about to be judged, or a status is about to be made."""
+    def on_reading(self, reading: Reading) -> None:
+        """A reading has come, and is neither judged nor skipped yet."""
 
-    def on_joints(self, reading: JointReading) -> None:
-        """Joint angles have come."""
+    def on_event(self, event: LoopEvent) -> None:
+        """Something has happened before the next reading."""
 
-    def on_skipped(self) -> None:
-        """Readings before the next one were left out, because they came too fast."""
-
-    def on_asked(self) -> None:
-        """Somebody has asked for a verdict."""
+    def on_verdict(self, published: Published) -> None:
+        """A verdict was published."""
 
     def on_outcome(
         self, grasp: int, outcome: Literal["stable", "slip"], object_name: str | None
     ) -> None:
-        """The outcome of a judged grasp was told and published."""
-
-    def keep(self, answer: Answer) -> None:
-        """Call `answer` once what was told until now is on the disk, or is known not to be."""
-
-    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
-        """A verdict is about to be told that answers who has asked; `payload` is it, encoded."""
-
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        """A verdict was published; `reading` is what it is about, None where nothing has come."""
-
-    def on_judged(self, judgement: Judgement) -> None:
-        """The network judged a reading, and the verdict was published."""
+        """The outcome of a judged grasp was published."""
 
     def on_status(self, status: Status) -> None:
         """A status was published: once a second, and at the end."""
 
     def after_round(self) -> None:
-        """Drivers, timers and messages have been seen to, once."""
+        """The loop has been once around: drivers, timers and messages."""
 
-    def counters_by_part(self) -> dict[str, dict[str, int]]:
-        """What was counted since the start, for the status, under the names of the parts."""
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Counts since the start, for the status, by the name of the part."""
         return {}
 
 
-def overridden(
+def hooks(
     companions: Iterable[Companion], hook: Callable[Concatenate[Any, P], R]
 ) -> tuple[Callable[P, R], ...]:
-    """A hook of `Companion`, bound to each companion that overrides it: the others cost nothing."""
+    """Return a hook of `Companion`, bound to each companion that overrides it."""
     name = hook.__name__
     return tuple(
         getattr(companion, name)

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from daemon.publish.binding import Binding, OwnKeys, PublishError
-from daemon.publish.companion import Companion, Requests
-from daemon.publish.messages import Status, Verdict
+from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.messages import Status
 from daemon.publish.publisher import Publisher
 from daemon.scene import Curve, Scene, SceneError
 from daemon.trust.ledger import GraspId
-from drivers.base import TactileReading
 
 if TYPE_CHECKING:
     from daemon.publish.access import Authenticator
@@ -140,23 +139,21 @@ class Sockets(Companion):
         if self._guard is not None:
             self._guard.look(self._clock())
 
-    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
-        """Answer all who have asked."""
-        if self.questions is not None and self.questions.waiting:
-            grasp = GraspId(verdict.boot_id, verdict.grasp)
-            self.questions.answer(payload, grasp=grasp)
-
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        """Answer those who have waited too long for a better answer."""
-        if self.questions is not None and self.questions.waiting:
-            grasp = GraspId(verdict.boot_id, verdict.grasp)
-            self.questions.answer(payload, self._clock(), grasp)
+    def on_verdict(self, published: Published) -> None:
+        """Answer all who have asked, or only those who have waited too long for a better answer."""
+        if self.questions is None or not self.questions.waiting:
+            return
+        verdict = published.verdict
+        overdue_at_ns = None if published.is_answer else self._clock()
+        grasp = GraspId(verdict.boot_id, verdict.grasp)
+        self.questions.answer(published.payload, overdue_at_ns, grasp)
 
     def on_status(self, status: Status) -> None:
         """Take the list of those who may connect, if it has changed."""
         self.check_keys()
 
-    def counters_by_part(self) -> dict[str, dict[str, int]]:
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
         """What peers did, by the part that counted it."""
         parts = {"publish": self.publisher, "ask": self.questions, "keys": self.authenticator}
         return {name: dict(part.counters) for name, part in parts.items() if part is not None}

@@ -1,4 +1,4 @@
-"""Names of the files of a recording, and how many of them are kept."""
+"""Files of a recording: their names, how many are kept, and how they are put on the disk."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Final
 
 MODE: Final = 0o640
 """Of files: what a hand grasped is nobody else's business."""
@@ -68,7 +68,35 @@ class Retention:
         return found
 
 
-def create(path: Path) -> BinaryIO:
-    """Create a file and open it for writing. Raises `OSError` also if `path` exists."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
-    return open(os.open(path, flags, MODE), "wb")
+class RecordingFile:
+    """One file that is being written. All methods raise `OSError` if the disk does not take it."""
+
+    def __init__(self, path: Path) -> None:
+        """Create the file, which must not exist."""
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW
+        self._path = path
+        self._stream = os.fdopen(os.open(path, flags, MODE), "wb")
+
+    def flush(self) -> int:
+        """Put all that was written on the disk; return the file's size, bytes."""
+        self._stream.flush()
+        os.fdatasync(self._stream.fileno())
+        return self._stream.tell()
+
+    def close(self) -> None:
+        """Flush and close."""
+        try:
+            self.flush()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close after an error; what is buffered may be lost."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def remove(self) -> None:
+        """Close and delete the file, which has nothing but a header."""
+        self.abandon()
+        with contextlib.suppress(OSError):
+            self._path.unlink()

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from daemon.record.files import create
+from daemon.record.files import RecordingFile
 from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
 from drivers.can.frames import LOST
 
 if TYPE_CHECKING:
-    from daemon.record.recorder import LinkLogFile
     from drivers.can.frames import CanFrame, Stamped
     from drivers.spi.line import LineEvent
 
@@ -25,6 +23,14 @@ EARLY_MAX: Final = 1000
 
 Taker = Callable[[object, int], None]
 """Takes an entry and its monotonic time, ns."""
+
+
+class LinkLogFile(RecordingFile, ABC):
+    """Keeps what comes over a link."""
+
+    @abstractmethod
+    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
+        """Write what came over at monotonic `at_ns`; wall time is that plus `offset_ns`."""
 
 
 class Tap:
@@ -82,38 +88,13 @@ def tap_of(driver: Driver, section: Tactile) -> Tap | None:
     return None
 
 
-class _File:
-    """A file beside the recording. All methods raise `OSError` when there is no room."""
-
-    def __init__(self, name: Path, ending: str) -> None:
-        self._stream = create(name.with_name(name.name + ending))
-
-    def flush(self) -> int:
-        """Have the disk keep it; the file's size, bytes."""
-        self._stream.flush()
-        os.fdatasync(self._stream.fileno())
-        return self._stream.tell()
-
-    def close(self) -> None:
-        """Flush and close."""
-        try:
-            self.flush()
-        finally:
-            self.abandon()
-
-    def abandon(self) -> None:
-        """Close as it is."""
-        with contextlib.suppress(OSError):
-            self._stream.close()
-
-
-class CandumpFile(_File):
+class CandumpFile(LinkLogFile):
     """CAN frames as `candump -L` writes them. What the kernel lost has no line."""
 
     def __init__(
         self, name: Path, channel: str, line_of: Callable[[CanFrame, int, str], str]
     ) -> None:
-        super().__init__(name, ".can.log")
+        super().__init__(name.with_name(f"{name.name}.can.log"))
         self._line_of = line_of
         self._channel = channel.replace(" ", "_")
 
@@ -129,11 +110,11 @@ class CandumpFile(_File):
         self._stream.write("".join(lines).encode())
 
 
-class SerialFile(_File):
+class SerialFile(LinkLogFile):
     """Serial bytes in the frames of `drivers.recordings.serial_log`, with monotonic times."""
 
     def __init__(self, name: Path, encode: Callable[[LineEvent, int, bytes], bytes]) -> None:
-        super().__init__(name, ".serial")
+        super().__init__(name.with_name(f"{name.name}.serial"))
         self._encode = encode
 
     def write(self, entry: object, at_ns: int, offset_ns: int) -> None:

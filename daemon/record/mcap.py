@@ -5,8 +5,6 @@ A file that was cut off has no summary at its end, so the reader looks for none.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -25,7 +23,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import Writer
 
-from daemon.record.files import create
+from daemon.record.files import RecordingFile
 from daemon.record.header import RecordingHeader
 from daemon.record.topics import schemas
 from drivers.base import RecordingError
@@ -50,13 +48,12 @@ _DAMAGE = (
 beyond all memory."""
 
 
-class McapWriter:
-    """Writes one file. All methods raise `OSError` if the disk does not take it."""
+class McapWriter(RecordingFile):
+    """Writes one MCAP file."""
 
     def __init__(self, path: Path, header: RecordingHeader) -> None:
         """Create the file, which must not exist, with `header` at its beginning."""
-        self._path = path
-        self._stream = create(path)
+        super().__init__(path)
         self._offset_ns = header.wall_minus_monotonic_ns
         self._writer = Writer(self._stream)
         self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
@@ -85,29 +82,18 @@ class McapWriter:
         return self._writer.register_channel(topic, "json", schema)
 
     def flush(self) -> int:
-        """Put all that was written on the disk; returns the file's size, bytes."""
+        """Put all that was written on the disk; return the file's size, bytes."""
         self._writer.flush()
-        os.fdatasync(self._stream.fileno())
-        return self._stream.tell()
+        return super().flush()
 
     def close(self) -> None:
         """Write the summary, flush and close."""
         try:
             self._writer.finish()
-            self.flush()
-        finally:
+        except OSError:
             self.abandon()
-
-    def abandon(self) -> None:
-        """Close without a summary, after an error; what is buffered may be lost."""
-        with contextlib.suppress(OSError):
-            self._stream.close()
-
-    def remove(self) -> None:
-        """Close and delete the file, which has nothing but a header."""
-        self.abandon()
-        with contextlib.suppress(OSError):
-            self._path.unlink()
+            raise
+        super().close()
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,7 +24,9 @@ from drivers.recordings.player import RecordedDriver, Timeline
 
 _log = logging.getLogger(__name__)
 
-_Item = Reading | Topic | OutcomeMessage | Exchanged
+RecordedEvent = Topic | OutcomeMessage | Exchanged
+"""A topic without content (`ASKED` or `SKIPPED`), an outcome, or an exchange of sensors."""
+_Item = Reading | RecordedEvent
 
 
 @dataclass(slots=True)
@@ -64,12 +66,8 @@ class McapReplayDriver(RecordedDriver[_Item]):
         super().__init__(paths, Timeline(speed, clock))
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
-        self.on_event: Mapping[Topic, Callable[[], None]] = {}
-        """What to call at an event; events that are not in it are passed over."""
-        self.on_outcome: Callable[[OutcomeMessage], None] | None = None
-        """What to call where an outcome was told."""
-        self.on_exchange: Callable[[Exchanged], None] | None = None
-        """What to call where a sensor was exchanged."""
+        self.on_event: Callable[[RecordedEvent], None] | None = None
+        """Called where something other than a reading was recorded that concerns the judge."""
         self._reset()
 
     def _reset(self) -> None:
@@ -90,22 +88,14 @@ class McapReplayDriver(RecordedDriver[_Item]):
         self.timeline.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """The next reading if it is due. An event or outcome is told when it is, and gives none."""
+        """The next reading if it is due. An event that is due is told, and gives none."""
         taken = self.timeline.take()
         if taken is None:
             return ()
         at_ns, item, late_ns = taken
-        if isinstance(item, Topic):
-            if item in self.on_event:
-                self.on_event[item]()
-            return ()
-        if isinstance(item, OutcomeMessage):
-            if self.on_outcome is not None:
-                self.on_outcome(item)
-            return ()
-        if isinstance(item, Exchanged):
-            if self.on_exchange is not None:
-                self.on_exchange(item)
+        if isinstance(item, RecordedEvent):
+            if self.on_event is not None:
+                self.on_event(item)
             return ()
         if self.timeline.speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns

@@ -6,10 +6,7 @@ are counted, and no time of the loop.
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import sys
 import threading
 import time
 from collections import Counter, deque
@@ -17,23 +14,25 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from typing import TYPE_CHECKING, Final, cast
 
 import msgspec
 
-from daemon.publish.companion import Companion
-from daemon.record.files import Retention
+from daemon.process.worker import Worker
+from daemon.publish.companion import Companion, LoopEvent, Published
+from daemon.record.files import RecordingFile, Retention
 from daemon.record.flat import flat
 from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
 from daemon.record.viewers import ForPeople
 from daemon.scene import Record
+from drivers.base import JointReading, Reading
 
 if TYPE_CHECKING:
-    from daemon.judge.pipeline import Judgement
+    from daemon.publish.messages import Status
+    from daemon.record.link_log import LinkLogFile
     from daemon.trust.learner import LearnerState
-    from drivers.base import JointReading
     from models.session_statistics import SessionState
 
 log = logging.getLogger("graspd")
@@ -49,30 +48,11 @@ the interpreter when the loop does."""
 FLUSH_AFTER: Final = 0.8
 """Part of the flush interval after which a flush is due: with a round and the writing, nothing
 waits longer than the interval."""
-SWITCH_S: Final = 0.0005
-"""Python's switch interval while recording, s: how long the thread may keep the loop waiting for
-the interpreter. A tenth of the default."""
 CLOSE_S: Final = 0.5
 """How long `close` waits for the thread, s."""
 
 
-class LinkLogFile(Protocol):
-    """Keeps what came over a link."""
-
-    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
-        """Take what came over at monotonic `at_ns`; wall time is that plus `offset_ns`."""
-
-    def flush(self) -> int:
-        """Have the disk keep it; the file's size, bytes."""
-
-    def close(self) -> None:
-        """Flush and close."""
-
-    def abandon(self) -> None:
-        """Close as it is."""
-
-
-MakeLinkLog = Callable[[Path], LinkLogFile]
+MakeLinkLog = Callable[[Path], "LinkLogFile"]
 """Makes a link log by its name without ending."""
 
 MakeKnown = Callable[[], Known]
@@ -104,7 +84,7 @@ class _Open:
     unflushed: int = 0
     """Entries that are written to these files, but perhaps not yet on the disk."""
 
-    def all(self) -> list[McapWriter | LinkLogFile]:
+    def all(self) -> list[RecordingFile]:
         """One or two files."""
         return [self.messages] if self.link_log is None else [self.messages, self.link_log]
 
@@ -118,16 +98,16 @@ class Recorder(Companion):
         options: Record,
         header: RecordingHeader,
         *,
+        take_state: Callable[[], MakeKnown],
         make_link_log: MakeLinkLog | None = None,
-        take_state: Callable[[], MakeKnown] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
         """Start the thread, which creates the first file.
 
-        `header` is that of every file, but for `known` and what each file has of its own.
+        `header` is that of every file, except for `known` and what each file has of its own.
         `take_state` copies what is known; it is called in the loop, here and where a file is to
-        end: after a status, when no reading is being judged. Without it files end anywhere.
+        end: after a status, when no reading is being judged.
         """
         self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
@@ -149,16 +129,13 @@ class Recorder(Companion):
         self._number = 0
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
-        self._awaits_turn = take_state is not None
-        """Whether a `_Turn` is queued, or will be when the loop sees `_wants_turn`."""
+        self._awaits_turn = True
+        """True while a `_Turn` is queued, or will be when the loop sees `_wants_turn`."""
         self._wants_turn = False
-        if take_state is not None:
-            self._queue.append((clock(), b"", _Turn(take_state())))
+        self._queue.append((clock(), b"", _Turn(take_state())))
         self._stopping = threading.Event()
-        self._switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
-        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
-        self._thread.start()
+        self._worker: Worker[None] = Worker("recorder")
+        self._worker.submit(self._work)
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Record a published message."""
@@ -167,37 +144,41 @@ class Recorder(Companion):
             self._put(topic, partial(_asked, payload))
         else:
             self._put(topic, payload)
-        if self._wants_turn and self._take_state is not None and topic == self._names[Topic.STATUS]:
-            self._wants_turn = False
-            self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
     def wanted(self, topic: bytes) -> bool:
         """Always: what nobody subscribes to is recorded all the same."""
         return True
 
-    def on_joints(self, reading: JointReading) -> None:
-        """Record joint angles."""
-        self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
+    def on_reading(self, reading: Reading) -> None:
+        """Record joint angles; tactile readings come as messages."""
+        if isinstance(reading, JointReading):
+            self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
-    def on_judged(self, judgement: Judgement) -> None:
+    def on_verdict(self, published: Published) -> None:
         """Record the counts that the network judged."""
+        judgement = published.judgement
         if judgement.judged and judgement.judged_counts is not None:
             making = partial(Judged.of, self._header.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
-    def on_asked(self) -> None:
-        """Record, with the next reading, that the controller asks for a judgement."""
-        self._asked = True
+    def on_event(self, event: LoopEvent) -> None:
+        """Record that readings were skipped; or, with the next reading, that a controller asked."""
+        if event is LoopEvent.ASKED:
+            self._asked = True
+        else:
+            self._tell_asked()
+            self._put(self._names[Topic.SKIPPED], EVENT)
+
+    def on_status(self, status: Status) -> None:
+        """Copy the state if the thread waits for it to go on in new files."""
+        if self._wants_turn:
+            self._wants_turn = False
+            self._queue.append((self._clock(), b"", _Turn(self._take_state())))
 
     def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
         """Record that a sensor is another one than before, and what was known of the new ones."""
         self._tell_asked()
         self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
-
-    def on_skipped(self) -> None:
-        """Record that readings were left out before the next one."""
-        self._tell_asked()
-        self._put(self._names[Topic.SKIPPED], EVENT)
 
     def _tell_asked(self) -> None:
         """Record a question before what the judge does before the next reading."""
@@ -215,30 +196,23 @@ class Recorder(Companion):
         else:
             self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
 
-    def counters(self) -> dict[str, int]:
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
         """Since the start: entries `recorded`, `dropped` because the disk was too slow, and `lost`
         when it failed; `files` begun and `removed`, `failures`; `writing`, 1 while a file is open.
         """
-        writing = self._open is not None
-        return {**self._counted, "dropped": self._dropped, "writing": int(writing)}
-
-    def counters_by_part(self) -> dict[str, dict[str, int]]:
-        """The same, as part of the status."""
-        return {"record": self.counters()}
+        writing = int(self._open is not None)
+        return {"record": {**self._counted, "dropped": self._dropped, "writing": writing}}
 
     def close(self) -> None:
         """Write what is queued and end the files; give up if the disk does not answer in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
-        self._thread.join(CLOSE_S)
-        if self._thread.is_alive():
+        if not self._worker.close(CLOSE_S):
             log.warning("record: the disk does not answer, the end of the recording is lost")
-        sys.setswitchinterval(self._switch_s)
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError):  # never in the way of the loop, if that is realtime
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         try:
             while not self._stopping.wait(self._flush_ns / ROUNDS_PER_FLUSH / 1e9):
                 self.go_round()
@@ -246,6 +220,7 @@ class Recorder(Companion):
             self.go_round()
         except BaseException:
             self._counted["failures"] += 1  # a mistake of ours: the status must not say `writing`
+            log.exception("record: nothing is recorded any more")
             raise
         finally:
             self._finish()
@@ -255,7 +230,7 @@ class Recorder(Companion):
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
-            self._turn(now_ns)
+            self._turn()
         waiting: list[_Entry] = []
         for entry in entries:
             if isinstance(entry[2], _Turn):
@@ -268,16 +243,13 @@ class Recorder(Companion):
         if self._open is not None and now_ns >= self._flush_due_ns:
             self._flush(self._open, now_ns)
 
-    def _turn(self, now_ns: int) -> None:
-        """Go on in new files: now, or where the loop next copies its state."""
-        if self._take_state is None:
-            self._finish()
-            self._begin(now_ns, Known())
-        elif not self._awaits_turn:
+    def _turn(self) -> None:
+        """Go on in new files where the loop next copies its state."""
+        if not self._awaits_turn:
             self._awaits_turn = self._wants_turn = True
 
     def _take_turn(self, turn: _Turn, now_ns: int) -> None:
-        """Go on in new files, but not for the few entries that come after `close`."""
+        """Go on in new files, except for the few entries that come after `close`."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
@@ -346,7 +318,7 @@ class Recorder(Companion):
         files.unflushed = 0
         self._flush_due_ns = now_ns + round(self._flush_ns * FLUSH_AFTER)
         if files.size >= self._rotate_bytes or now_ns - files.since_ns >= self._rotate_ns:
-            self._turn(now_ns)
+            self._turn()
 
     def _finish(self) -> None:
         files = self._open

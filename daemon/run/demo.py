@@ -8,11 +8,9 @@ from daemon.judge.findings import Examined
 from daemon.judge.network import Network
 from daemon.judge.reasons import Decision
 from daemon.process.text import Colour, coloured
-from daemon.publish.companion import Companion
-from daemon.publish.messages import Verdict
+from daemon.publish.companion import Companion, Published
 from daemon.run.summary import Tally
 from daemon.trust.trust import Trust
-from drivers.base import TactileReading
 from models.runtime import TactileModel
 
 GRASPS = 25
@@ -46,8 +44,9 @@ class Demo(Companion):
             coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", Colour.BOLD),
         )
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
         """Count a grasp."""
+        verdict, reading = published.verdict, published.reading
         note = None if reading is None else reading.annotation
         if reading is None or note is None or note.slipped is None:
             return

@@ -1,8 +1,8 @@
-"""What the loop does when readings come faster than it can judge them: leave out, rest, say so.
+"""Load shedding: what the loop does when readings arrive faster than it can judge them.
 
-Judging all that piles up would make every verdict one on the past, and a loop that finds work in
-each round would never sleep: one in realtime would take the whole processor, until the kernel ends
-it (RLIMIT_RTTIME).
+A loop that judged the whole backlog would publish verdicts on the past. A loop that finds work in
+each round never sleeps: in realtime it would take the whole processor, until the kernel ends it
+(RLIMIT_RTTIME).
 """
 
 from __future__ import annotations
@@ -18,95 +18,97 @@ import numpy as np
 
 from drivers.base import ElectrodeFault, TactileReading
 
-WAIT_MAX_NS: Final = 10_000_000
-"""What is there at once is judged one by one if that takes so long at most, ns, or a period."""
-COSTS: Final = 4
-"""What judging a reading takes is the least of the last four times: a stall is none of it."""
-LASTING_NS: Final = 3_000_000_000
-APART_NS: Final = 1_000_000_000
-"""What leaves readings out for so long, ns, at most a second apart, is overload and no stall."""
-OVER_NS: Final = 5_000_000_000
-"""So long without a reading left out, ns, and the overload is over."""
-REST_AFTER_NS: Final = 10_000_000
-REST_AFTER_RECORDED_NS: Final = 1_000_000_000
-"""So long at work without a wait, ns, and the loop sleeps: seldom where nobody else waits."""
-REST_SHARE: Final = 10
-REST_MAX_NS: Final = 5_000_000
-"""It sleeps for a tenth of that time: in realtime, the kernel takes 5 % away in one go if nothing
-is left to others (sched(7), sched_rt_runtime_us)."""
+BACKLOG_MAX_NS: Final = 10_000_000
+"""Longest backlog, ns, that is judged completely; one sensor period if that is longer."""
+COST_SAMPLES: Final = 4
+"""The cost of a reading is the least of its last four times, so that a stall of the machine does
+not count."""
+REPORT_AFTER_NS: Final = 3_000_000_000
+"""Skipping for this long, ns, is reported as overload."""
+PAUSE_NS: Final = 1_000_000_000
+"""A pause of this length, ns, ends a run of skipping."""
+RECOVERED_AFTER_NS: Final = 5_000_000_000
+"""Time without a skipped reading, ns, after which the overload is over."""
+YIELD_AFTER_NS: Final = 10_000_000
+YIELD_AFTER_RECORDED_NS: Final = 1_000_000_000
+"""After this long without waiting, ns, the loop yields the processor. Recordings yield less often:
+nothing else is urgent then."""
+YIELD_SHARE: Final = 10
+YIELD_MAX_NS: Final = 5_000_000
+"""The loop yields for a tenth of the time it has worked, ns. In realtime, the kernel takes 5 % away
+in one go if nothing is left to others (sched(7), sched_rt_runtime_us)."""
 
 log = logging.getLogger("graspd")
 
 
-class Overload:
-    """Decides when readings are left out, and notices when that lasts."""
+class LoadShedder:
+    """Decide which readings to skip, and report a lasting overload."""
 
     def __init__(
         self, now_ns: int, *, live: bool, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        """`live` readings come whether they are judged or not; of a recording none is left out.
+        """`live` readings arrive whether they are judged or not; recorded ones are never skipped.
 
         `sleep` takes seconds, and must have the kernel put this thread to sleep.
         """
         self._live = live
         self._sleep = sleep
-        self._rest_after_ns = REST_AFTER_NS if live else REST_AFTER_RECORDED_NS
-        self._rested_ns = now_ns
-        self._costs_ns: deque[int] = deque(maxlen=COSTS)
-        self._skipping_since_ns = self._skipped_ns = now_ns - APART_NS
+        self._yield_after_ns = YIELD_AFTER_NS if live else YIELD_AFTER_RECORDED_NS
+        self._waited_ns = now_ns
+        self._costs_ns: deque[int] = deque(maxlen=COST_SAMPLES)
+        self._skipping_since_ns = self._skipped_ns = now_ns - PAUSE_NS
         self.skipped_readings = 0
-        """Tactile readings that were left out since the start."""
+        """Tactile readings that were skipped since the start."""
         self.overloaded = False
-        """Whether that lasts, or did within `OVER_NS`."""
+        """True while skipping lasts, and until `RECOVERED_AFTER_NS` after it."""
 
     def waited(self, now_ns: int) -> None:
-        """The loop had nothing to do and has slept until now."""
-        self._rested_ns = now_ns
-        self._look_for_the_end(now_ns)
+        """Call after the loop has waited for input."""
+        self._waited_ns = now_ns
+        self._check_recovered(now_ns)
 
-    def rest(self, now_ns: int) -> None:
-        """Sleep a little if the loop has been at work for long, whatever there is to do."""
-        worked_ns = now_ns - self._rested_ns
-        if worked_ns >= self._rest_after_ns:
-            self._sleep(min(worked_ns // REST_SHARE, REST_MAX_NS) / 1e9)
-            self._rested_ns = now_ns
-        self._look_for_the_end(now_ns)
+    def yield_processor(self, now_ns: int) -> None:
+        """Call after a round without a wait: sleep a little if the loop has worked for long."""
+        worked_ns = now_ns - self._waited_ns
+        if worked_ns >= self._yield_after_ns:
+            self._sleep(min(worked_ns // YIELD_SHARE, YIELD_MAX_NS) / 1e9)
+            self._waited_ns = now_ns
+        self._check_recovered(now_ns)
 
-    def is_too_much(self, waiting: int, elapsed_ns: int, period_ns: int | None) -> bool:
-        """Whether, of so many readings that wait, only the newest is to be judged.
+    def should_skip(self, backlog: int, age_ns: int, period_ns: int | None) -> bool:
+        """Return True if only the newest of `backlog` readings should be judged.
 
-        They came at once, `elapsed_ns` ago; `period_ns` is the time between readings, if known.
+        `age_ns`: time since they arrived. `period_ns`: sensor period, None if not known yet.
         """
-        if waiting < 2 or not self._live:
+        if backlog < 2 or not self._live:
             return False
         cost_ns = min(self._costs_ns, default=0)
-        return elapsed_ns + waiting * cost_ns > max(WAIT_MAX_NS, period_ns or 0)
+        return age_ns + backlog * cost_ns > max(BACKLOG_MAX_NS, period_ns or 0)
 
-    def judged(self, took_ns: int) -> None:
-        """A reading was judged and reported, which took so long."""
-        self._costs_ns.append(took_ns)
+    def record_cost(self, cost_ns: int) -> None:
+        """Add the time that one reading took to judge and publish."""
+        self._costs_ns.append(cost_ns)
 
     def skip(self, readings: int, now_ns: int) -> None:
-        """Readings are left out."""
+        """Count skipped readings, and report an overload if that lasts."""
         self.skipped_readings += readings
-        if now_ns - self._skipped_ns >= APART_NS:
+        if now_ns - self._skipped_ns >= PAUSE_NS:
             self._skipping_since_ns = now_ns
         self._skipped_ns = now_ns
-        if not self.overloaded and now_ns - self._skipping_since_ns >= LASTING_NS:
+        if not self.overloaded and now_ns - self._skipping_since_ns >= REPORT_AFTER_NS:
             self.overloaded = True
             log.warning("overloaded: readings come faster than they are judged; some are left out")
 
-    def _look_for_the_end(self, now_ns: int) -> None:
-        if self.overloaded and now_ns - self._skipped_ns >= OVER_NS:
+    def _check_recovered(self, now_ns: int) -> None:
+        if self.overloaded and now_ns - self._skipped_ns >= RECOVERED_AFTER_NS:
             self.overloaded = False
             log.info("overload is over: %d readings left out since start", self.skipped_readings)
 
 
-def after(skipped: TactileReading, newest: TactileReading) -> TactileReading:
-    """The newest reading, as it is to be judged when the one before it is not.
+def mark_repeats(newest: TactileReading, skipped: TactileReading) -> TactileReading:
+    """Return `newest` with the fingers flagged HELD that only repeat `skipped`.
 
-    Fingers that only repeat what they read before, as far as both were read, are held, as the judge
-    would have seen.
+    The judge never saw `skipped`, so it could not notice the repeat itself.
     """
     sound = (newest.faults | skipped.faults) == 0
     differs = newest.counts != skipped.counts

@@ -9,11 +9,11 @@ from typing import Literal
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.process.text import Colour, coloured, printable
-from daemon.publish.companion import Companion
+from daemon.publish.companion import Companion, Published
 from daemon.publish.messages import Verdict
 from daemon.run.summary import Summary
 from daemon.trust.trust import Trust
-from drivers.base import Annotation, TactileReading
+from drivers.base import Annotation
 
 NAME_MAX = 80
 """Characters of an object's name that are shown."""
@@ -34,13 +34,14 @@ class Printer(Companion):
         self._start_s = time.monotonic()
         self._gate: GateState | None = None
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
         """Write one verdict, and how the lift of its grasp ended if the recording says so."""
+        verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None
         self.result.add(verdict, annotation.slipped if annotation else None)
         if not self._as_json and not self._is_news(verdict):
             return
-        line = payload.decode() if self._as_json else _line(verdict, annotation)
+        line = published.payload.decode() if self._as_json else _line(verdict, annotation)
         sys.stdout.write(line + "\n")
         if self._prompt:
             sys.stdout.flush()

@@ -1,55 +1,40 @@
-"""A scene taken anew while the former one goes on: prepared in a thread, one after another."""
+"""Prepares the scene file again while the former scene runs: one preparation after another."""
 
 from __future__ import annotations
 
-import logging
-import os
 import signal
-import sys
-import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from typing import Final
 
 from daemon.assembly.parts import Parts
 from daemon.process.signals import StopSignal
+from daemon.process.worker import Worker
 from daemon.publish.companion import Companion
 
-log = logging.getLogger("graspd")
-
-PERIOD_S = 1.0
-"""From the beginning of one preparation to that of the next at least, s."""
-SWITCH_S = 0.0005
-"""How long the thread that prepares may keep Python from the loop, s, rather than 5 ms: the loop
-asks for it several times for each reading."""
-END_S = 0.5
-"""How long the end waits for a preparation, s: it is of no use any more."""
+PERIOD_NS: Final = 1_000_000_000
+"""Shortest time from the start of one preparation to that of the next, ns."""
+END_S: Final = 0.5
+"""How long `close` waits for a preparation, s: its result is of no use any more."""
 
 
 class Reload(Companion):
-    """Stands before a `StopSignal`: to the loop, a reload is asked for once there is what to run.
+    """Stands before a `StopSignal`: the loop hears of a reload once there is a scene to run.
 
-    Whoever asks while a scene is prepared has one more prepared after it, however often.
+    Requests that come during a preparation lead to one more preparation.
     """
 
     def __init__(
         self, stop: StopSignal, prepare: Callable[[], Parts], began: Callable[[], None]
     ) -> None:
-        """`prepare` is called in a thread of ordinary priority and may raise what it likes.
-
-        `began` is called in the loop's thread, before that.
-        """
+        """`prepare` is called in a thread and may raise anything; `began` in the loop's thread."""
         self._stop = stop
         self._prepare = prepare
         self._began = began
-        self._wanted = False
-        self._thread: threading.Thread | None = None
+        self._is_requested = False
+        self._not_before_ns = 0
+        self._worker: Worker[Parts] = Worker("reload")
         self._result: Parts | Exception | None = None
-        self._not_before_s = 0.0
-        self._switch_s = sys.getswitchinterval()
-        self._cancelled = threading.Event()
-        self._processors = os.sched_getaffinity(0)
-        self._ended = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
 
     @property
     def received(self) -> signal.Signals | None:
@@ -57,75 +42,46 @@ class Reload(Companion):
         return self._stop.received
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when a signal arrives."""
+        """Return the descriptor that becomes readable when a signal arrives."""
         return self._stop.fileno()
 
     def filenos(self) -> list[int]:
-        """Become readable when a preparation has ended."""
-        return [] if self._thread is None else [self._ended]
+        """Return the descriptor that becomes readable when a preparation has ended."""
+        return self._worker.filenos()
+
+    def due_ns(self) -> int | None:
+        """Time of the next preparation, monotonic ns, if one is requested and none runs."""
+        return self._not_before_ns if self._is_requested and not self._worker.busy else None
 
     def take_reload(self) -> bool:
-        """Whether a preparation has ended, for `take`; begins one where that was asked for."""
+        """Return True if `take` has a result; start a preparation if one is requested and due."""
         if self._stop.take_reload():
-            self._wanted = True
-        if self._thread is not None:
-            return self._result is not None
-        if self._wanted:
-            self._begin()
+            self._is_requested = True
+        if self._result is None:
+            self._result = self._worker.take()
+        if self._result is not None:
+            return True
+        due_ns = self.due_ns()
+        if due_ns is not None and time.monotonic_ns() >= due_ns:
+            self._start()
         return False
 
     def take(self) -> Parts | Exception:
-        """What has been prepared, or what was raised, once `take_reload` has said that it is there.
+        """Return the prepared parts, or what was raised, after `take_reload` has returned True.
 
         Raises `RuntimeError` otherwise.
         """
         result, self._result = self._result, None
-        if self._thread is None or result is None:
+        if result is None:
             raise RuntimeError("nothing has been prepared")
-        self._thread.join()
-        self._thread = None
-        os.eventfd_read(self._ended)
-        sys.setswitchinterval(self._switch_s)
         return result
 
     def close(self) -> None:
-        """Give up what is being prepared."""
-        self._cancelled.set()
-        if self._thread is not None:
-            self._thread.join(END_S)
-            sys.setswitchinterval(self._switch_s)
-            if self._thread.is_alive():
-                return  # it may still say that it has ended
-            self._thread = None
-        os.close(self._ended)
+        """Give up the current preparation."""
+        self._worker.close(END_S)
 
-    def _begin(self) -> None:
-        self._wanted = False
-        thread = threading.Thread(target=self._run, name="reload", daemon=True)
-        self._began()
-        try:
-            thread.start()
-        except RuntimeError as error:
-            log.error("the scene is not taken anew: %s", error)
-            return
-        self._thread = thread
-        sys.setswitchinterval(SWITCH_S)
-
-    def _run(self) -> None:
-        self._be_ordinary()
-        if self._cancelled.wait(max(self._not_before_s - time.monotonic(), 0.0)):
-            return
-        self._not_before_s = time.monotonic() + PERIOD_S
-        result: Parts | Exception
-        try:
-            result = self._prepare()
-        except Exception as error:  # noqa: BLE001 - MemoryError too: the running scene goes on
-            result = error
-        self._result = result
-        os.eventfd_write(self._ended, 1)
-
-    def _be_ordinary(self) -> None:
-        """Have neither the priority nor the processors that the loop's thread may have by now."""
-        with suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-            os.sched_setaffinity(0, self._processors)
+    def _start(self) -> None:
+        self._is_requested = False
+        self._not_before_ns = time.monotonic_ns() + PERIOD_NS
+        if self._worker.submit(self._prepare):
+            self._began()

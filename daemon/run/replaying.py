@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion, Requests
-from daemon.publish.messages import OBJECT_PATTERN, Verdict
+from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.messages import OBJECT_PATTERN
 from daemon.run.summary import Summary
-from drivers.base import TactileReading
 from models.runtime import TactileModel
 
 
@@ -44,8 +43,9 @@ class Controller(Companion):
         """Remember whom to tell."""
         self._requests = requests
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
         """Take note of a grasp; the lift of the one before it is over."""
+        verdict, reading = published.verdict, published.reading
         if self._lift is not None and self._lift.grasp != verdict.grasp:
             self.tell()
         note = None if reading is None else reading.annotation
@@ -90,8 +90,9 @@ class Comparison(Companion):
         self._result = result
         self._grasp: int | None = None
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
         """Count what the first verdict on a grasp would have been."""
+        verdict, reading = published.verdict, published.reading
         if reading is None:
             return
         if not verdict.judged or verdict.grasp == self._grasp:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,19 +33,20 @@ AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
 
 
 def prepare(path: Path) -> Parts:
-    """Read a scene, load its model and warm it.
+    """Read a scene, load its model and warm it; in realtime, rehearse a grasp too.
 
     Raises `SceneError`, `ModelError` or `RecordingError`.
     """
     wanted = scene.load(path)
-    return Parts.of(wanted, assembly.load_model(wanted))
+    parts = Parts.of(wanted, assembly.load_model(wanted))
+    if wanted.realtime is not None:
+        rehearse_grasp(parts)
+    return parts
 
 
 def rehearse_grasp(parts: Parts) -> None:
-    """Judge a synthetic grasp, if the scene wants realtime. Imported only where it does."""
-    if parts.scene.realtime is None:
-        return
-    from daemon.run.rehearsal import rehearse
+    """Judge a synthetic grasp."""
+    from daemon.run.rehearsal import rehearse  # only where a scene wants realtime
 
     # With a model of its own: how a model's inputs are scaled follows who judges with it.
     try:
@@ -56,18 +58,13 @@ def rehearse_grasp(parts: Parts) -> None:
         log.warning("no rehearsal: %s", error)
 
 
-def enter_realtime(
-    parts: Parts, stack: ExitStack, *, rehearsed: bool = False
-) -> RealtimeMode | None:
-    """Rehearse a grasp unless that is done, then be in realtime until `stack` closes; None if the
-    scene does not want that. Imported only where it does."""
-    if parts.scene.realtime is None:
+def enter_realtime(wanted: scene.Scene, stack: ExitStack) -> RealtimeMode | None:
+    """Enter realtime until `stack` closes; return None if the scene does not want that."""
+    if wanted.realtime is None:
         return None
-    from daemon.run.realtime import RealtimeMode
+    from daemon.run.realtime import RealtimeMode  # only where a scene wants realtime
 
-    if not rehearsed:
-        rehearse_grasp(parts)
-    return stack.enter_context(RealtimeMode(parts.scene.realtime))
+    return stack.enter_context(RealtimeMode(wanted.realtime))
 
 
 class Runner:
@@ -87,9 +84,8 @@ class Runner:
         self._printer = printer
         self._manager = manager
         self._sockets: Sockets | None = None
-        self._reload = Reload(stop, self._prepare_anew, self._say_reloading)
+        self._reload = Reload(stop, partial(prepare, path), self._say_reloading)
         self._running = False
-        self._rehearsed = False
         self._former: Parts | None = None
         """What ran before a reload, until what follows it runs."""
         self._trust: Trust | None = None
@@ -164,8 +160,7 @@ class Runner:
             around.add_sockets(sockets)
             around.open_drivers()
             around.keep_session()
-            realtime = enter_realtime(parts, stack, rehearsed=self._rehearsed)
-            self._rehearsed = True
+            realtime = enter_realtime(wanted, stack)
             around.record()
             companions = [
                 *(self._reload, self._manager, *around.companions, self._printer, realtime)
@@ -177,6 +172,7 @@ class Runner:
                 self._reload,
                 [companion for companion in companions if companion is not None],
                 Timing(wanted.max_age_ns),
+                around.keep,
             )
             stack.callback(sockets.publisher.forget)
             stack.callback(loop.close)
@@ -194,11 +190,6 @@ class Runner:
     def _say_reloading(self) -> None:
         if self._manager is not None:
             self._manager.reloading()
-
-    def _prepare_anew(self) -> Parts:
-        parts = prepare(self._path)
-        rehearse_grasp(parts)
-        return parts
 
     def _taken(self) -> Parts | None:
         """What the scene file says now; None, and an error in the log, if that is wrong."""

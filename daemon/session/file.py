@@ -12,7 +12,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Final, Self
 
 import msgspec
@@ -97,16 +96,9 @@ class SessionFile:
             os.close(lock)
 
     def __enter__(self) -> Self:
-        """Nothing to do: the file is taken from the start."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close."""
+    def __exit__(self, *_details: object) -> None:
         self.close()
 
     def load(self) -> KeptSession | None:
@@ -119,17 +111,11 @@ class SessionFile:
         self._newest_is_whole = path == self.path
         return kept
 
-    def save(
-        self,
-        statistics: SessionState | None,
-        fingers: Sequence[str],
-        serials: Mapping[str, str],
-        trust: TrustState | None = None,
-    ) -> None:
+    def save(self, kept: KeptSession) -> None:
         """Replace the file in one step, keeping the former one. Raises `SessionFileError`."""
         former = former_of(self.path) if self._newest_is_whole else None
         self._newest_is_whole = False
-        _write(self.path, kept_now(statistics, fingers, serials, trust), former)
+        _write(self.path, kept, former)
         self._newest_is_whole = True
 
     def put_aside(self, kept: KeptSession) -> None:

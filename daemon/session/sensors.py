@@ -1,4 +1,4 @@
-"""Notices that the hand's sensors are others than before, by their serial numbers."""
+"""Notices by their serial numbers that the hand's sensors were exchanged."""
 
 from __future__ import annotations
 
@@ -6,22 +6,27 @@ import logging
 from collections.abc import Callable, Mapping
 
 from daemon.publish.companion import Companion
-from drivers.base import Driver
+from daemon.trust.learner import LearnerState
+from drivers.base import Driver, Reading
+from models.session_statistics import SessionState
+
+OnExchange = Callable[[SessionState | None, LearnerState | None], None]
+"""Takes what is known of the new sensors, or None."""
 
 log = logging.getLogger("graspd")
 
 
 class SensorWatch(Companion):
-    """Has the judge forget sensors that were exchanged, before readings of the new ones come."""
+    """Has the judge forget sensors that were exchanged, before it judges the new ones."""
 
-    def __init__(self, tactile: Driver, on_exchange: Callable[[], None]) -> None:
+    def __init__(self, tactile: Driver, on_exchange: OnExchange) -> None:
         """`tactile` knows the serial numbers; `on_exchange` is called when one is another."""
         self._tactile = tactile
         self._on_exchange = on_exchange
         self._serials: dict[str, str] = {}
-        """What was known last of each finger."""
+        """Last known serial number by finger."""
 
-    def before_readings(self) -> None:
+    def on_reading(self, reading: Reading) -> None:
         """Compare the sensors with those before."""
         serials = self._tactile.serials
         if serials == self._serials:
@@ -33,9 +38,9 @@ class SensorWatch(Companion):
 
     def _exchange(self, changed: list[str], _serials: Mapping[str, str]) -> None:
         log.warning("new sensor on %s: the hand must be seen open first", ", ".join(changed))
-        self._on_exchange()
+        self._on_exchange(None, None)
 
 
 def exchanged(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Fingers whose sensor is known to be another one than before."""
+    """Return the fingers whose sensor is known to be another one than before."""
     return [finger for finger in now if before.get(finger, now[finger]) != now[finger]]

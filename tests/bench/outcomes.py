@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.publish.messages import decode_tactile, decode_verdict
-from daemon.session.file import SessionFile, load
+from daemon.session.file import SessionFile, kept_now, load
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.trust import Trust, TrustState, decode
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
@@ -148,7 +148,7 @@ class Bench:
         if pipeline.session is None:
             raise LostError("the model keeps no session")
         with SessionFile(self._scene.session_path) as file:
-            file.save(pipeline.session.state(), self._scene.hand.fingers, {})
+            file.save(kept_now(pipeline.session.state(), self._scene.hand.fingers, {}))
 
     def run(self, outcomes: int, kills: int) -> Found:
         """Tell so many; raises `LostError` if an acknowledged one is lost."""

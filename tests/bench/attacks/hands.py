@@ -17,7 +17,7 @@ import numpy as np
 from daemon.assembly import assembly
 from daemon.publish.messages import Verdict, decode_tactile, decode_verdict
 from daemon.scene import load as load_scene
-from daemon.session.file import SessionFile, load
+from daemon.session.file import SessionFile, kept_now, load
 from drivers.spi.messages import Hello
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaults
@@ -152,7 +152,7 @@ def keep_grasps(folder: Path, text: str) -> SessionFile:
         finger: f"BTSP-TWIN-{at}" for at, finger in enumerate(wanted.hand.fingers)
     }
     with SessionFile(wanted.session_path) as file:
-        file.save(session.state(), wanted.hand.fingers, serials)
+        file.save(kept_now(session.state(), wanted.hand.fingers, serials))
     return file
 
 

@@ -112,7 +112,7 @@ def test_sessions_of_other_sensors_are_named(tmp_path: Path) -> None:
     )
     fingers = ("ff", "mf", "th")
     with SessionFile(tmp_path / "right.session.json") as file:
-        file.save(None, fingers, {"ff": "BTSP-1"})
+        file.save(kept_now(None, fingers, {"ff": "BTSP-1"}))
         file.put_aside(kept_now(None, fingers, {"ff": "BTSP-2", "th": "BTSP-3"}))
     shown = graspd("session", "show", path)
     assert "0 grasps of ff BTSP-2, th BTSP-3" in shown.stdout

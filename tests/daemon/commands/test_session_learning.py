@@ -12,7 +12,7 @@ import pytest
 
 from daemon import scene as scenes
 from daemon.assembly import assembly
-from daemon.session.file import SessionFile, former_of, load
+from daemon.session.file import SessionFile, former_of, kept_now, load
 from daemon.trust.ledger import GraspId
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.recordings.csv_columns import SLIPPED
@@ -150,7 +150,7 @@ def test_a_run_that_prints_ends_with_what_outcomes_have_taught(tmp_path: Path) -
     trust.note(grasp, trust.judge(grasp, 0.01, -5.0, np.zeros(0)), stable=True)
     trust.outcome(grasp, slipped=True)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(None, FINGERS, {}, trust.state())
+        file.save(kept_now(None, FINGERS, {}, trust.state()))
     result = graspd("run", path, "--print")
     assert result.returncode == 0, result.stderr
     assert "\nlearned from 1 outcomes\n" in result.stdout
@@ -163,7 +163,7 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
     with SessionFile(kept) as file:
         first = file.load()
         assert first is not None
-        file.save(first.statistics, FINGERS, {})
+        file.save(kept_now(first.statistics, FINGERS, {}))
     assert shown(path)["former_saved_at"] == first.saved_at
     assert "  before   " in graspd("session", "show", path).stdout
     assert "  learned  nothing" in graspd("session", "show", path).stdout
@@ -182,8 +182,8 @@ def test_seeding_and_forgetting_leave_nothing_of_before(tmp_path: Path) -> None:
 def test_what_is_damaged_is_said(tmp_path: Path, damaged: tuple[str, ...]) -> None:
     path, kept = scene_at(tmp_path), tmp_path / "right.json"
     with SessionFile(kept) as file:
-        file.save(None, FINGERS, {})
-        file.save(None, FINGERS, {"ff": "A"})
+        file.save(kept_now(None, FINGERS, {}))
+        file.save(kept_now(None, FINGERS, {"ff": "A"}))
     for name in damaged:
         tmp_path.joinpath(name).write_bytes(b"?")
     result = graspd("session", "show", path)

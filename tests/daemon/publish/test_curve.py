@@ -76,7 +76,7 @@ def test_all_who_were_cut_off_connect_again(door: Door, caplog: pytest.LogCaptur
     time.sleep(LOOK_NS / 1e9)
     door.sockets.take()
     assert "hold too much memory" in caplog.text
-    assert door.sockets.counters_by_part()["publish"]["all_cut_off"] == 1
+    assert door.sockets.counters["publish"]["all_cut_off"] == 1
     while friend.poll(100):
         friend.recv_multipart()
     assert door.hears(friend, PATIENCE_S)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -20,6 +21,8 @@ from daemon.assembly.recorder import build_recorder
 from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateCause
+from daemon.publish.companion import LoopEvent, Published
+from daemon.publish.messages import Status, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import Known, RecordingHeader
@@ -33,6 +36,8 @@ from tests.daemon.record.recorded import messages
 BOOT = "0123456789abcdef" * 2
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12
+NO_VERDICT, NO_STATUS = cast(Verdict, None), cast(Status, None)
+"""The recorder gets both as messages."""
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -56,6 +61,8 @@ class Loop:
         payload = json.dumps({"number": self.sent}).encode()
         self.sent += 1
         recorder.send(topic, payload)
+        if topic == STATUS:
+            recorder.on_status(NO_STATUS)
 
 
 def make(folder: Path, loop: Loop, **options: float) -> Recorder:
@@ -75,7 +82,7 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
     loop = Loop()
     loop.sent = 7
     recorder = make(tmp_path, loop, rotate_minutes=0.01)
-    while recorder.counters()["files"] < 4:
+    while recorder.counters["record"]["files"] < 4:
         for _ in range(20):
             loop.send(recorder, VERDICT)
         loop.send(recorder, STATUS)
@@ -90,7 +97,7 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
         assert found[-1][0] == "status"
         number += len(found)
     assert number == loop.sent
-    assert recorder.counters()["recorded"] == loop.sent - 7
+    assert recorder.counters["record"]["recorded"] == loop.sent - 7
 
 
 def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
@@ -99,9 +106,9 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     for _ in range(90):
         loop.send(recorder, VERDICT)
         time.sleep(0.01)
-    assert recorder.counters()["files"] == 1
+    assert recorder.counters["record"]["files"] == 1
     loop.send(recorder, STATUS)
-    wait_until(lambda: recorder.counters()["files"] == 2)
+    wait_until(lambda: recorder.counters["record"]["files"] == 2)
     recorder.close()
     assert header_of(files(tmp_path)[1]).known.axis_ns == loop.sent
 
@@ -114,9 +121,9 @@ def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_th
     blocked.write_text("a file where the folder should be")
     loop = Loop()
     recorder = make(tmp_path, loop)
-    wait_until(lambda: recorder.counters()["failures"] == 1)
+    wait_until(lambda: recorder.counters["record"]["failures"] == 1)
     blocked.unlink()
-    while not recorder.counters()["writing"]:
+    while not recorder.counters["record"]["writing"]:
         loop.send(recorder, VERDICT)
         loop.send(recorder, STATUS)
         time.sleep(0.01)
@@ -125,7 +132,7 @@ def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_th
     (path,) = files(tmp_path)
     known = header_of(path).known.axis_ns
     assert [content["number"] for _, content in messages(path)] == [*range(known, loop.sent)]
-    assert recorder.counters()["lost"] == known > 0
+    assert recorder.counters["record"]["lost"] == known > 0
 
 
 class Daemon:
@@ -156,11 +163,12 @@ class Daemon:
         self._now_ns = reading.t_ns
         self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
-        self.recorder.on_judged(judgement)
+        self.recorder.on_verdict(Published(judgement, NO_VERDICT, b"", reading, is_answer=True))
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)
             self.recorder.send(STATUS, b"{}")
+            self.recorder.on_status(NO_STATUS)
         return judgement
 
 
@@ -283,7 +291,7 @@ def test_where_readings_were_left_out_the_replay_knows_too(
             continue
         if place == 98 or reading.seq % 370 == 6:
             daemon.pipeline.skip()
-            daemon.recorder.on_skipped()
+            daemon.recorder.on_event(LoopEvent.SKIPPED)
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
     gaps = [each for each in expected for change in each.changes if change.cause is GateCause.GAP]

@@ -12,15 +12,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from daemon import scene
+from daemon.publish.messages import Status
 from daemon.record import recorder as recorder_module
 from daemon.record.files import Retention
-from daemon.record.header import RecordingHeader
+from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.record.topics import schemas
@@ -36,6 +37,8 @@ HEADER = RecordingHeader(
     fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
 )
 TOPIC = b"verdict.right"
+NO_STATUS = cast(Status, None)
+"""The recorder gets it as a message."""
 
 
 def retention(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Retention:
@@ -51,7 +54,8 @@ def make(tmp_path: Path) -> Iterator[Make]:
 
     def new(where: Retention | None = None, **options: Any) -> Recorder:  # noqa: ANN401
         wanted = Record(**{"flush_ms": 100.0, **options})
-        made.append(Recorder(where or retention(tmp_path), wanted, HEADER))
+        place = where or retention(tmp_path)
+        made.append(Recorder(place, wanted, HEADER, take_state=lambda: Known))
         return made[-1]
 
     yield new
@@ -83,7 +87,7 @@ def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: 
         recorder.send(TOPIC, payload(number))
     recorder.close()
     assert numbers(tmp_path) == list(range(1000))
-    assert recorder.counters() == {
+    assert recorder.counters["record"] == {
         "recorded": 1000,
         "dropped": 0,
         "lost": 0,
@@ -117,7 +121,7 @@ def test_an_angle_that_there_is_not_is_left_out_and_its_joint_named(
     tmp_path: Path, make: Make
 ) -> None:
     recorder = make()
-    recorder.on_joints(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
+    recorder.on_reading(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
     recorder.close()
     (path,) = (tmp_path / "record").iterdir()
     assert messages(path) == [
@@ -146,7 +150,7 @@ def test_every_kind_of_message_has_a_schema_that_is_an_object() -> None:
 def test_what_was_sent_is_in_the_file_while_it_is_still_written(tmp_path: Path, make: Make) -> None:
     recorder = make()
     recorder.send(TOPIC, payload(7))
-    wait_until(lambda: recorder.counters()["recorded"] == 1)
+    wait_until(lambda: recorder.counters["record"]["recorded"] == 1)
     assert numbers(tmp_path) == [7]
 
 
@@ -157,7 +161,8 @@ def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
     for number in range(300):
         recorder.send(TOPIC, payload(number, 4000))
         if number % 30 == 29:
-            wait_until(lambda n=number: recorder.counters()["recorded"] > n)  # type: ignore[misc]
+            wait_until(lambda n=number: recorder.counters["record"]["recorded"] > n)  # type: ignore[misc]
+            recorder.on_status(NO_STATUS)
     recorder.close()
     paths = sorted((tmp_path / "record").iterdir())
     assert 4 <= len(paths) <= 12  # 300 of 2 kB each, compressed from hex
@@ -166,7 +171,9 @@ def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
 
 def test_files_follow_each_other_by_age(tmp_path: Path, make: Make) -> None:
     recorder = make(rotate_minutes=0.01)
-    wait_until(lambda: recorder.counters()["files"] == 3)
+    while recorder.counters["record"]["files"] < 3:
+        recorder.on_status(NO_STATUS)
+        time.sleep(0.01)
     recorder.close()
     assert len(list((tmp_path / "record").iterdir())) == 3
 
@@ -213,7 +220,7 @@ class StalledDisk:
             self.answers.wait(100)
             real(descriptor)
 
-        monkeypatch.setattr("daemon.record.mcap.os.fdatasync", stall)
+        monkeypatch.setattr("os.fdatasync", stall)
 
 
 def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
@@ -225,7 +232,7 @@ def test_a_stalled_disk_holds_nobody_up_and_what_finds_no_place_is_counted(
     assert disk.asked.wait(100)
     for number in range(QUEUE_MAX + 500):
         recorder.send(TOPIC, payload(number))
-    assert recorder.counters()["dropped"] == 500
+    assert recorder.counters["record"]["dropped"] == 500
     disk.answers.set()
     recorder.close()
     assert numbers(tmp_path) == list(range(QUEUE_MAX))
@@ -256,13 +263,17 @@ def test_a_disk_that_refuses_is_told_once_and_tried_again_every_minute(
     blocked = tmp_path / "record"
     blocked.write_text("a file where the folder should be")
     recorder = make()
-    wait_until(lambda: recorder.counters()["failures"] >= 3)
+    while recorder.counters["record"]["failures"] < 3:
+        recorder.on_status(NO_STATUS)
+        time.sleep(0.01)
     recorder.send(TOPIC, payload(1))
-    wait_until(lambda: recorder.counters()["lost"] == 1)
+    wait_until(lambda: recorder.counters["record"]["lost"] == 1)
     assert [r.levelname for r in caplog.records] == ["WARNING"]
-    assert recorder.counters()["writing"] == 0
+    assert recorder.counters["record"]["writing"] == 0
     blocked.unlink()
-    wait_until(lambda: recorder.counters()["writing"] == 1)
+    while not recorder.counters["record"]["writing"]:
+        recorder.on_status(NO_STATUS)
+        time.sleep(0.01)
     recorder.send(TOPIC, payload(2))
     recorder.close()
     assert numbers(tmp_path) == [2]
@@ -293,7 +304,7 @@ def test_all_that_a_disk_that_fills_up_does_not_keep_is_counted_as_lost(
     recorder.go_round()
     recorder.send(TOPIC, payload(0))
     recorder.close()
-    counted = recorder.counters()
+    counted = recorder.counters["record"]
     assert (counted["recorded"], counted["lost"], counted["failures"]) == (0, 31, 1)
 
 

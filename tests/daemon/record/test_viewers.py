@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.publish.companion import LoopEvent
 from daemon.publish.messages import Tactile, encode
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
-from daemon.record.header import RecordingHeader
+from daemon.record.header import Known, RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
-from daemon.record.player import McapReplayDriver
+from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.recorder import Recorder
 from daemon.record.topics import EVENT, Event, Exchanged, Topic, schemas
 from daemon.record.viewers import INFO, SCALE, WARNING, Journal, Painter, RawImage
@@ -274,7 +275,9 @@ def test_a_broken_message_is_not_said(kind: str) -> None:
 
 def recorder(folder: Path) -> Recorder:
     options = Record(flush_ms=100.0)
-    return Recorder(Retention(folder, "right", BOOT, 9, 10**9), options, HEADER)
+    return Recorder(
+        Retention(folder, "right", BOOT, 9, 10**9), options, HEADER, take_state=lambda: Known
+    )
 
 
 def tactile(number: int, counts: NDArray[np.int64] = REST) -> bytes:
@@ -300,8 +303,8 @@ def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
     writing = recorder(tmp_path)
     for number in range(3):
         if number:
-            writing.on_asked()
-            writing.on_asked()
+            writing.on_event(LoopEvent.ASKED)
+            writing.on_event(LoopEvent.ASKED)
         writing.send(b"tactile.right", tactile(number))
     writing.close()
     found = recorded(tmp_path)
@@ -312,9 +315,9 @@ def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("event", ["skipped", "exchanged"])
 def test_a_question_before_an_event_stays_before_it(tmp_path: Path, event: str) -> None:
     writing = recorder(tmp_path)
-    writing.on_asked()
+    writing.on_event(LoopEvent.ASKED)
     if event == "skipped":
-        writing.on_skipped()
+        writing.on_event(LoopEvent.SKIPPED)
     else:
         writing.exchanged(None, None)
     writing.send(b"tactile.right", tactile(0))
@@ -328,7 +331,7 @@ def play(path: Path) -> list[object]:
     """Readings and questions, in their order."""
     found: list[object] = []
     driver = McapReplayDriver([path], ("th", "ff"))
-    driver.on_event = {Topic.ASKED: lambda: found.append("asked")}
+    driver.on_event = found.append
     with driver:
         while not driver.exhausted:
             found.extend(driver.read_ready())
@@ -340,8 +343,8 @@ def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
     counts = np.arange(48).reshape(2, 24)
     writing = recorder(tmp_path)
     angles = JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan]))
-    writing.on_joints(angles)
-    writing.on_asked()
+    writing.on_reading(angles)
+    writing.on_event(LoopEvent.ASKED)
     writing.send(b"tactile.right", tactile(0, counts))
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
@@ -349,7 +352,7 @@ def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
     assert isinstance(joints, JointReading)
     assert joints.names == angles.names
     assert np.array_equal(joints.position_rad, angles.position_rad, equal_nan=True)
-    assert asked == "asked"
+    assert asked is Topic.ASKED
     assert isinstance(played, TactileReading)
     assert played.counts.tolist() == counts[::-1].tolist()
 
@@ -368,7 +371,7 @@ def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
     assert isinstance(angles, JointReading)
     assert angles.names == ("FFJ3", "THJ4")
     assert np.array_equal(angles.position_rad, [0.25, np.nan], equal_nan=True)
-    assert asked == "asked"
+    assert asked is Topic.ASKED
     assert isinstance(played, TactileReading)
     assert played.counts.tolist() == counts[::-1].tolist()
 
@@ -380,9 +383,9 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
     writing.exchanged(session, learned)
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
-    told: list[Exchanged] = []
+    told: list[RecordedEvent] = []
     driver = McapReplayDriver([path], ("ff",))
-    driver.on_exchange = told.append
+    driver.on_event = told.append
     with driver:
         while not driver.exhausted:
             driver.read_ready()
@@ -392,7 +395,7 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
 def test_an_event_has_a_schema_too(tmp_path: Path) -> None:
     assert {topic for topic in Topic if topic.message is Event} == {Topic.ASKED, Topic.SKIPPED}
     writing = recorder(tmp_path)
-    writing.on_skipped()
+    writing.on_event(LoopEvent.SKIPPED)
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
     with open_recording(path) as stream:

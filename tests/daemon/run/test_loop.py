@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 
 import numpy as np
@@ -14,10 +14,19 @@ import pytest
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
-from daemon.publish.companion import Answer, Companion, Requests, overridden
+from daemon.publish.companion import (
+    Answer,
+    Companion,
+    LoopEvent,
+    Published,
+    Requests,
+    at_once,
+    hooks,
+)
 from daemon.publish.messages import Lifts, State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
+from daemon.session.sensors import SensorWatch
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.trust import Trust
 from drivers.base import DriverError, JointReading, LinkCause, LinkError, Reading, TactileReading
@@ -62,6 +71,7 @@ class Bench(Companion):
         sleep: Sleep | None = None,
         boot_id: str | None = None,
         trust: Trust | None = None,
+        keep: Callable[[Answer], None] | None = None,
     ) -> None:
         self.output = TestOutput()
         self.verdicts: list[Verdict] = []
@@ -86,15 +96,16 @@ class Bench(Companion):
             stop,
             [self, *companions],
             Timing(100 * MS, clock, Sleep() if sleep is None else sleep),
+            keep or at_once,
         )
 
     def run(self) -> Ended:
         with closing(self.loop):
             return self.loop.run()
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
-        self.verdicts.append(verdict)
-        self.payloads.append(payload)
+    def on_verdict(self, published: Published) -> None:
+        self.verdicts.append(published.verdict)
+        self.payloads.append(published.payload)
 
 
 def test_every_reading_gets_one_verdict_in_order(stop: StopSignal) -> None:
@@ -438,16 +449,17 @@ class Peer(Companion):
         requests.ask()
         self.refused.append(requests.outcome(self.boot_id, 1, "slip", "mug"))
 
-    def on_asked(self) -> None:
-        self.heard.append("asked")
+    def on_event(self, event: LoopEvent) -> None:
+        self.heard.append(event)
 
     def on_outcome(self, grasp: int, outcome: str, object_name: str | None) -> None:
         self.heard.append((grasp, outcome, object_name))
 
-    def on_answer(self, verdict: Verdict, payload: bytes) -> None:
-        self.heard.append(payload)
+    def on_verdict(self, published: Published) -> None:
+        self.heard.append(published.payload)
 
-    def counters_by_part(self) -> dict[str, dict[str, int]]:
+    @property
+    def counters(self) -> dict[str, dict[str, int]]:
         return {"peer": {"outcomes": self.refused.count(None)}}
 
 
@@ -459,30 +471,22 @@ def test_a_companion_asks_and_tells_and_hears_what_comes_of_it(stop: StopSignal)
     bench.run()
     first, second = bench.payloads
     assert peer.refused == ["unknown grasp: not judged, or too long ago", None]
-    assert peer.heard == ["asked", first, "asked", (1, "slip", "mug"), second]
+    assert peer.heard == [LoopEvent.ASKED, first, LoopEvent.ASKED, (1, "slip", "mug"), second]
     assert [topic for topic, _ in bench.output.sent[:-1]].count(b"outcome.right") == 1
     assert bench.output.statuses()[-1].drivers["peer"] == {"outcomes": 1}
 
 
-class Keeper(Companion):
-    """Keeps what was told, and says so later."""
-
-    def __init__(self) -> None:
-        self.waiting: list[Answer] = []
-
-    def keep(self, answer: Answer) -> None:
-        self.waiting.append(answer)
-
-
-def test_what_was_told_is_kept_by_whoever_keeps_it_and_at_once_by_nobody(stop: StopSignal) -> None:
-    keeper = Keeper()
+def test_an_outcome_is_kept_by_the_keeper_and_answered_at_once_without_one(
+    stop: StopSignal,
+) -> None:
     heard: list[str | None] = []
-    for companions in ([], [keeper]):
-        clock = Clock()
-        bench = Bench(FakeDriver([], clock), clock, stop, companions=companions)
+    waiting: list[Answer] = []
+    clock = Clock()
+    for keep in (None, waiting.append):
+        bench = Bench(FakeDriver([], clock), clock, stop, keep=keep)
         bench.loop.keep(heard.append)
     assert heard == [None]
-    assert keeper.waiting == [heard.append]
+    assert waiting == [heard.append]
 
 
 def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status(stop: StopSignal) -> None:
@@ -536,8 +540,29 @@ def test_the_opposite_of_what_an_earlier_start_was_told_is_counted_and_not_publi
     assert [topic for topic, _ in bench.output.sent] == [b"outcome.right"]
 
 
+class Exchanging(FakeDriver):
+    """Whose sensor is another one from the third reading on."""
+
+    @property
+    def serials(self) -> dict[str, str]:
+        return {"ff": "A" if self.counters.readings < 3 else "B"}
+
+
+def test_an_exchanged_sensor_is_noticed_before_its_first_reading_is_published_or_judged(
+    stop: StopSignal,
+) -> None:
+    clock = Clock()
+    driver = Exchanging([reading(clock(), seed) for seed in range(4)], clock)
+    published_at_exchange: list[int] = []
+    watch = SensorWatch(driver, lambda *_: published_at_exchange.append(len(bench.output.sent)))
+    bench = Bench(driver, clock, stop, companions=[watch])
+    bench.output.wants = True
+    bench.run()
+    assert published_at_exchange == [4]  # two readings and their verdicts
+
+
 def test_companions_are_called_in_their_order_and_only_for_hooks_of_their_own() -> None:
     first, second = Watchdog(), Watchdog()
-    hooks = overridden([first, Companion(), second], Companion.after_round)
-    assert hooks == (first.after_round, second.after_round)
-    assert overridden([first, second], Companion.on_status) == ()
+    bound = hooks([first, Companion(), second], Companion.after_round)
+    assert bound == (first.after_round, second.after_round)
+    assert hooks([first, second], Companion.on_status) == ()

@@ -16,11 +16,11 @@ import pytest
 from daemon.judge.limits import ContactLimits, GateLimits, GripLimits
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion
+from daemon.publish.companion import Companion, LoopEvent, Published
 from daemon.publish.messages import Status, Verdict, decode_status
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import DRAINS_MAX, Loop, Timing
-from daemon.run.overload import REST_AFTER_NS, REST_MAX_NS, Overload, after
+from daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 from tests.daemon.judge.test_only_stable_if import POSES
@@ -101,16 +101,17 @@ class Bench(Companion):
         self.rests_s.append(seconds)
         self.clock.now_ns += round(seconds * 1e9)
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
         self.clock.now_ns += self.cost_ns()
-        if reading is not None:
-            self.judged.append((verdict, reading))
+        if published.reading is not None:
+            self.judged.append((published.verdict, published.reading))
 
-    def on_joints(self, reading: JointReading) -> None:
-        self.angles.append(reading.seq)
+    def on_reading(self, reading: Reading) -> None:
+        if isinstance(reading, JointReading):
+            self.angles.append(reading.seq)
 
-    def on_skipped(self) -> None:
-        self.gaps += 1
+    def on_event(self, event: LoopEvent) -> None:
+        self.gaps += event is LoopEvent.SKIPPED
 
     def after_round(self) -> None:
         self.rounds_ns.append(self.clock())
@@ -183,7 +184,7 @@ def test_the_loop_sleeps_feeds_the_watchdog_and_tells_its_status_in_every_overlo
     bench = flood(30 * MS, 10.0)
     worked_ns = 10 * SECOND_NS
     assert sum(bench.rests_s) * 1e9 == pytest.approx(worked_ns / 11, rel=0.2)
-    assert max(bench.rests_s) * 1e9 <= REST_MAX_NS
+    assert max(bench.rests_s) * 1e9 <= YIELD_MAX_NS
     assert len(bench.rests_s) >= len(bench.judged) - 2
     assert max(np.diff(bench.rounds_ns)) < 200 * MS
     assert len(bench.statuses) == 10
@@ -249,20 +250,20 @@ def test_a_driver_that_always_has_more_does_not_hold_the_loop() -> None:
 
 def test_a_loop_at_work_sleeps_now_and_then_and_an_idle_one_is_left_alone() -> None:
     slept: list[float] = []
-    overload = Overload(0, live=True, sleep=slept.append)
+    shedder = LoadShedder(0, live=True, sleep=slept.append)
     for now_ns in range(0, SECOND_NS, MS):
-        overload.waited(now_ns)
-        overload.rest(now_ns + MS)
+        shedder.waited(now_ns)
+        shedder.yield_processor(now_ns + MS)
     assert slept == []
-    overload.rest(SECOND_NS + REST_AFTER_NS)
-    assert slept == [pytest.approx(REST_AFTER_NS / 10 / 1e9, rel=0.2)]
+    shedder.yield_processor(SECOND_NS + YIELD_AFTER_NS)
+    assert slept == [pytest.approx(YIELD_AFTER_NS / 10 / 1e9, rel=0.2)]
 
 
 def test_a_finger_that_repeats_what_was_left_out_is_held() -> None:
     former, newest = reading(0, 1), reading(PERIOD_NS, 2, 1)
-    assert after(former, newest) is newest
+    assert mark_repeats(newest, former) is newest
     newest.counts[1] = former.counts[1]
-    found = after(former, newest)
+    found = mark_repeats(newest, former)
     assert found.faults[1].tolist() == [ElectrodeFault.HELD] * 24
     assert not found.faults[[0, 2]].any()
     assert not newest.faults.any()
@@ -385,7 +386,7 @@ def test_a_finger_that_repeats_itself_is_held_whatever_is_read_of_its_flagged_el
     counts[0, 5] += 7
     faults = np.zeros((3, 24), np.uint8)
     faults[0, 5] = ElectrodeFault.PARITY
-    found = after(former, msgspec.structs.replace(newest, counts=counts, faults=faults))
+    found = mark_repeats(msgspec.structs.replace(newest, counts=counts, faults=faults), former)
     held = (found.faults & ElectrodeFault.HELD) != 0
     assert held[0].sum() == 23
     assert not held[0, 5]
@@ -399,10 +400,10 @@ def test_a_finger_of_which_nothing_is_read_is_missing_and_not_held() -> None:
     counts[2], faults[2] = 0, ElectrodeFault.MISSING
     gone = msgspec.structs.replace(newest, counts=counts, faults=faults)
     assert (
-        after(msgspec.structs.replace(gone, counts=counts.copy()), gone).faults[2].tolist()
+        mark_repeats(gone, msgspec.structs.replace(gone, counts=counts.copy())).faults[2].tolist()
         == [ElectrodeFault.MISSING] * 24
     )
-    assert after(former, gone) is gone
+    assert mark_repeats(gone, former) is gone
 
 
 class BusySelector(selectors.SelectSelector):
@@ -439,5 +440,5 @@ def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> N
         with closing(loop):
             loop.run()
     assert len(rests_s) == 1
-    assert 0.0 < rests_s[0] <= REST_MAX_NS / 1e9
-    assert time.monotonic_ns() - began_ns >= REST_AFTER_NS
+    assert 0.0 < rests_s[0] <= YIELD_MAX_NS / 1e9
+    assert time.monotonic_ns() - began_ns >= YIELD_AFTER_NS

@@ -25,7 +25,7 @@ from daemon.judge.reasons import GateState
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
 from daemon.run.realtime import RealtimeMode
 from daemon.run.rehearsal import rehearse
-from daemon.run.runner import enter_realtime, prepare
+from daemon.run.runner import rehearse_grasp
 from daemon.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
@@ -189,11 +189,11 @@ def test_the_rehearsal_leaves_the_judge_as_it_was(as_before: None, tmp_path: Pat
     rows = list(itertools.islice(recorded_counts(DEMO_TABLE), 80))
     judged = []
     for rehearsed in (False, True):
-        parts = prepare(path)
+        wanted = scene.load(path)
+        parts = Parts.of(wanted, assembly.load_model(wanted))
         judged.append(p_slips(parts, rows[:40]))
         if rehearsed:
-            with ExitStack() as stack:
-                assert enter_realtime(parts, stack) is not None
+            rehearse_grasp(parts)
         judged[-1] += p_slips(parts, rows[40:])
     assert judged[0] == judged[1]
 
@@ -275,17 +275,17 @@ def test_the_kernel_takes_the_rests_of_an_overloaded_loop_for_sleep(tmp_path: Pa
     said = in_a_process(
         f"""
 import time
-from daemon.run.overload import Overload
+from daemon.run.overload import LoadShedder
 RLIMIT_RTTIME = 15  # linux/asm-generic/resource.h
 resource.setrlimit(RLIMIT_RTTIME, ({RTTIME_US // 2}, {RTTIME_US}))
 with RealtimeMode(Realtime(priority=1, cpus=(max(os.sched_getaffinity(0)),), lock_memory=False)):
-    overload = Overload(time.monotonic_ns(), live=True)
+    shedder = LoadShedder(time.monotonic_ns(), live=True)
     end_s = time.monotonic() + 2.5
     while time.monotonic() < end_s:
         judged_s = time.monotonic() + 0.03
         while time.monotonic() < judged_s:
             pass
-        overload.rest(time.monotonic_ns())
+        shedder.yield_processor(time.monotonic_ns())
 print("lives on")
 """,
         tmp_path,

@@ -10,7 +10,7 @@ import pytest
 
 from daemon.judge.reasons import Decision, Reason
 from daemon.judge.recurrence import SWEEPS
-from daemon.publish.companion import Answer
+from daemon.publish.companion import Answer, Published
 from daemon.publish.messages import decode_verdict
 from daemon.run.replaying import Comparison, Controller
 from daemon.run.summary import WITHOUT_SESSION, Summary
@@ -54,7 +54,9 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     controller.before_wait(requests)
     note = Annotation(Path("any.csv"), 1, in_the_table, slipped=True)
     verdict = decode_verdict(GOLDEN.read_bytes())
-    controller.on_verdict(verdict, b"", msgspec.structs.replace(reading(0), annotation=note))
+    lifted = msgspec.structs.replace(reading(0), annotation=note)
+    judgement = pipeline(FakeModel(), Clock()).judge(lifted)
+    controller.on_verdict(Published(judgement, verdict, b"", lifted, is_answer=True))
     controller.tell()
     assert requests.told == [("slip", told)]
 
@@ -73,7 +75,7 @@ def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
         last = run.judge(new)
         judged = seq in (0, len(seeds) - 1)
         told = msgspec.structs.replace(verdict, judged=judged, grasp=1 + seq)
-        comparison.on_verdict(told, b"", new)
+        comparison.on_verdict(Published(last, told, b"", new, is_answer=True))
     tally = result.compared[WITHOUT_SESSION]
     assert tally.decisions.total() == 2
     assert tally.decisions[Decision.UNKNOWN] == tally.reasons[Reason.FROZEN] == (not fresh)

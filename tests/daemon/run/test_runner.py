@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.assembly.parts import Parts
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
 from daemon.run import runner
+from daemon.scene import Scene
 from tests.clients.building import sleep_at_will
 from tests.daemon.processes import GRASPD, put_first
 
@@ -254,11 +254,10 @@ def test_what_fails_while_it_takes_over_leaves_the_scene_to_the_former_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     wanted = Running(tmp_path)
-    entered: list[Parts] = []
+    entered: list[Scene] = []
 
-    def enter(parts: Parts, _stack: object, *, rehearsed: bool) -> None:
-        assert rehearsed == bool(entered)
-        entered.append(parts)
+    def enter(scene: Scene, _stack: object) -> None:
+        entered.append(scene)
         if len(entered) == 2:
             raise MemoryError("no more")
         if len(entered) == 3:

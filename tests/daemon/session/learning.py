@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.calibration import SessionCalibration
-from daemon.session.file import KeptSession
-from daemon.trust.learner import sigmoid
+from daemon.publish.companion import Companion, Requests
+from daemon.session.file import KeptSession, SessionFile
+from daemon.session.keeper import SessionKeeper
+from daemon.trust.learner import LearnerState, sigmoid
 from daemon.trust.ledger import GraspId, Told
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
+from drivers.base import Driver
 from models.contract import Finger, SessionInput, Sharpness
-from tests.daemon.fakes import Clock, FakeDriver
+from models.session_statistics import SessionState
+from tests.daemon.fakes import Clock, FakeDriver, reading
 
 FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
 SHARPNESS = (Sharpness(0.0, 3.0), Sharpness(5.0, 2.0), Sharpness(20.0, 1.0))
 BOOT = "0123456789abcdef" * 2
 INPUTS = 78
+NOBODY = cast(Requests, None)
+"""Of whom nothing is requested."""
 
 
 def counts(number: int, seed: int = 0) -> NDArray[np.uint16]:
@@ -30,8 +38,8 @@ def calibration() -> SessionCalibration:
 
 
 def observe(session: SessionCalibration, number: int, seed: int = 0) -> None:
-    for reading in counts(number, seed):
-        session.observe(reading)
+    for row in counts(number, seed):
+        session.observe(row)
 
 
 def trust(model: str = "model", inputs: int = INPUTS) -> Trust:
@@ -73,3 +81,31 @@ def sensors(**serials: str) -> SensorDriver:
     driver = SensorDriver([], Clock())
     driver.known = serials
     return driver
+
+
+def read_once(companion: Companion) -> None:
+    """Tell a companion of one reading and of the next wait, as the loop does."""
+    companion.on_reading(reading(0))
+    companion.before_wait(NOBODY)
+
+
+def session_keeper(
+    session: SessionCalibration | None,
+    tactile: Driver,
+    file: SessionFile,
+    clock: Clock | None = None,
+    part: Trust | None = None,
+) -> SessionKeeper:
+    """A keeper that resets session and trust at an exchange, as the pipeline does."""
+
+    def exchanged(known: SessionState | None, learned: LearnerState | None) -> None:
+        if session is not None:
+            session.reset()
+            if known is not None:
+                session.restore(known)
+        if part is not None:
+            part.sensors_exchanged(learned)
+
+    return SessionKeeper(
+        session, FINGERS, tactile, file, exchanged, trust=part, clock=clock or Clock()
+    )

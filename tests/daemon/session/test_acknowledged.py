@@ -13,8 +13,7 @@ import pytest
 import zmq
 
 from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion
-from daemon.publish.messages import Verdict
+from daemon.publish.companion import Companion, Published
 from daemon.publish.outbox import Outbox
 from daemon.publish.sockets import Sockets
 from daemon.run.loop import Ended, Loop, Timing
@@ -22,7 +21,6 @@ from daemon.scene import parse
 from daemon.session.file import SessionFile, load
 from daemon.session.keeper import WAIT_S, SessionKeeper
 from daemon.trust.trust import Trust, decode
-from drivers.base import TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 from tests.daemon.session.learning import BOOT, sensors
 from tests.daemon.session.test_keeping import Disk
@@ -49,10 +47,10 @@ class Controller(Companion):
         self.answered_at: int | None = None
         self.answer: dict[str, Any] | None = None
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
         self.verdicts += 1
         if self.verdicts == 3:
-            self.socket.send(f"outcome {BOOT} {verdict.grasp} slip".encode())
+            self.socket.send(f"outcome {BOOT} {published.verdict.grasp} slip".encode())
         if self.verdicts == self.goes_on_at:
             assert self.answer is None
             self.disk.goes_on.set()
@@ -85,12 +83,19 @@ class Lab:
             self.controller = Controller(f"ipc://{folder}/ask", disk, goes_on_at)
             with SessionFile(self.path) as file:
                 keeper = SessionKeeper(
-                    None, FINGERS, sensors(), file, clock, judge.sensors_exchanged, self.trust
+                    None,
+                    FINGERS,
+                    sensors(),
+                    file,
+                    judge.sensors_exchanged,
+                    trust=self.trust,
+                    clock=clock,
                 )
                 driver = FakeDriver([reading(clock(), seed) for seed in range(READINGS)], clock)
                 outbox = Outbox("right", FINGERS, "fake", "0" * 64, [sockets], clock, boot_id=BOOT)
                 companions = [sockets, keeper, self.controller]
-                loop = Loop([driver], judge, outbox, stop, companions, Timing(100 * MS, clock))
+                timing = Timing(100 * MS, clock)
+                loop = Loop([driver], judge, outbox, stop, companions, timing, keeper.keep)
                 with closing(loop):
                     self.ended = loop.run()
                 self.at_the_end = self.controller.answer

@@ -11,29 +11,28 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 import pytest
 
-from daemon.publish.companion import Requests
-from daemon.session.file import SessionFile, load
-from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAITING_MAX, SessionKeeper
+from daemon.session.file import SessionFile, kept_now, load
+from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAIT_S, WAITING_MAX, SessionKeeper
 from daemon.trust.ledger import GRASPS_MAX, Told
 from daemon.trust.trust import Trust, TrustState, decode
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
     FINGERS,
+    NOBODY,
     calibration,
     judge,
     observe,
+    read_once,
     sensors,
+    session_keeper,
     tell,
     trust,
 )
 
 KeeperOf = Callable[..., SessionKeeper]
-NOBODY = cast(Requests, None)
-"""Of whom nothing is requested here."""
 
 
 class Disk:
@@ -74,7 +73,7 @@ def keeper_of(file: SessionFile) -> Iterator[Callable[..., SessionKeeper]]:
     made: list[SessionKeeper] = []
 
     def make(part: Trust, clock: Clock | None = None) -> SessionKeeper:
-        made.append(SessionKeeper(None, FINGERS, sensors(), file, clock or Clock(), trust=part))
+        made.append(session_keeper(None, sensors(), file, clock or Clock(), part=part))
         return made[-1]
 
     yield make
@@ -112,8 +111,7 @@ def test_an_outcome_is_answered_when_it_is_on_the_disk(
     disk.goes_on.clear()
     keeper.keep(lambda why: found.append((why, kept_trust(file))))
     for _ in range(3):
-        keeper.before_wait(NOBODY)
-        keeper.before_readings()
+        read_once(keeper)
     assert found == []
     disk.goes_on.set()
     go_round(keeper)
@@ -253,9 +251,9 @@ def test_what_is_kept_of_other_fingers_is_not_kept_on_under_the_names_of_these(
     session = calibration()
     observe(session, 30)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None)
+        file.save(kept_now(session.state(), ("ff", "mf", "rf"), {"rf": "A"}, None))
         part = trust()
-        keeper = SessionKeeper(None, FINGERS, sensors(), file, Clock(), trust=part)
+        keeper = session_keeper(None, sensors(), file, Clock(), part=part)
         judge(part, 0)
         keeper.keep(lambda _: None)
         keeper.save()
@@ -270,12 +268,12 @@ def test_whoever_waits_is_answered_whatever_ends_the_writing(
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
     part, found = trust(), list[str | None]()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(None, FINGERS, sensors(), file, Clock(), trust=part)
+        keeper = session_keeper(None, sensors(), file, Clock(), part=part)
         save = file.save
         monkeypatch.setattr(file, "save", lambda *_: 1 // 0)
         judge(part, 0)
         keeper.keep(found.append)
-        keeper.wait()
+        keeper.wait(WAIT_S)
         assert found == ["not kept: it could not be written"]
         monkeypatch.setattr(file, "save", save)
         keeper.keep(found.append)
@@ -286,7 +284,7 @@ def test_whoever_waits_is_answered_whatever_ends_the_writing(
 def test_session_and_what_was_learned_are_restored_together(tmp_path: Path) -> None:
     path, session, part = tmp_path / "right.json", calibration(), trust()
     with SessionFile(path) as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(), file, Clock(), trust=part)
+        keeper = session_keeper(session, sensors(), file, Clock(), part=part)
         observe(session, 30)
         for grasp in range(20):
             judge(part, grasp)
@@ -295,7 +293,7 @@ def test_session_and_what_was_learned_are_restored_together(tmp_path: Path) -> N
         keeper.save()
     again, other = calibration(), trust()
     with SessionFile(path) as file:
-        SessionKeeper(again, FINGERS, sensors(), file, Clock(), trust=other)
+        session_keeper(again, sensors(), file, Clock(), part=other)
     assert (again.state(), other.state()) == (session.state(), part.state())
     assert tell(other, 20) is Told.TAKEN  # of a grasp of the former start
     assert tell(other, 3) is Told.REPEATED
@@ -309,9 +307,9 @@ def test_with_another_model_the_session_stays_and_learning_begins_anew(
     judge(part, 1)
     tell(part, 1)
     with SessionFile(path) as file:
-        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
         again, other = calibration(), trust("b")
-        SessionKeeper(again, FINGERS, sensors(), file, Clock(), trust=other)
+        session_keeper(again, sensors(), file, Clock(), part=other)
     assert again.state() == session.state()
     assert other.state() == trust("b").state()
     assert caplog.text.count("what was learned is of another model; learning begins anew") == 1
@@ -323,11 +321,9 @@ def test_what_a_run_has_no_use_for_is_kept_as_it_is(tmp_path: Path) -> None:
     judge(part, 1)
     tell(part, 1)
     with SessionFile(path) as file:
-        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
         image = trust("of images", inputs=0)
-        keeper = SessionKeeper(
-            None, FINGERS, sensors(), file, clock, trust=image
-        )  # a model without session
+        keeper = session_keeper(None, sensors(), file, clock, part=image)  # a model without session
         judge(image, 2)
         tell(image, 2)
         keeper.save()
@@ -336,12 +332,12 @@ def test_what_a_run_has_no_use_for_is_kept_as_it_is(tmp_path: Path) -> None:
         assert kept.statistics == session.state()
         assert kept_trust(file) == image.state()
         off = calibration()
-        keeper = SessionKeeper(off, FINGERS, sensors(), file, clock)  # learning is switched off
+        keeper = session_keeper(off, sensors(), file, clock)  # learning is switched off
         observe(off, 1, seed=5)
         keeper.save()
         assert kept_trust(file) == image.state()
-        keeper = SessionKeeper(off, FINGERS, sensors(ff="B"), file, clock)
-        keeper.before_readings()  # and none of it is left once a sensor is exchanged
+        keeper = session_keeper(off, sensors(ff="B"), file, clock)
+        read_once(keeper)  # and none of it is left once a sensor is exchanged
         keeper.save()
     assert (off.grasps, kept_trust(file)) == (0, None)
 
@@ -350,19 +346,19 @@ def test_an_exchanged_sensor_ends_what_was_learned(tmp_path: Path) -> None:
     path, session, part = tmp_path / "right.json", calibration(), trust()
     driver = sensors(ff="A")
     with SessionFile(path) as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock(), trust=part)
-        keeper.before_readings()
+        keeper = session_keeper(session, driver, file, Clock(), part=part)
+        read_once(keeper)
         observe(session, 30)
         for grasp in range(20):
             judge(part, grasp)
             tell(part, grasp)
         lifts = part.risk.lifts
         driver.known = {"ff": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     again, other = calibration(), trust()
     with SessionFile(path) as file:
-        SessionKeeper(again, FINGERS, driver, file, Clock(), trust=other)
+        session_keeper(again, driver, file, Clock(), part=other)
     assert (again.grasps, other.learner.outcomes, other.risk.proven) == (0, 0, 0)
     assert other.risk.lifts == lifts > 0  # slips that were counted stay counted
 
@@ -372,8 +368,8 @@ def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
 ) -> None:
     driver, part = sensors(ff="A"), trust()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(None, FINGERS, driver, file, Clock(), trust=part)
-        keeper.before_readings()
+        keeper = session_keeper(None, driver, file, Clock(), part=part)
+        read_once(keeper)
         for first, sensor in ((0, "B"), (20, "A")):
             for grasp in range(first, first + 20):
                 judge(part, grasp)
@@ -382,7 +378,7 @@ def test_sensors_that_are_back_bring_what_they_taught_but_no_slip_is_forgotten(
             if first == 0:
                 taught = learned
             driver.known = {"ff": sensor}
-            keeper.before_readings()
+            read_once(keeper)
             lifts = part.risk.state().lifts, part.risk.state().slips
             assert lifts == (counted.lifts, counted.slips)
             assert part.risk.proven == 0
@@ -397,11 +393,11 @@ def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
     part, clock = trust(), Clock()
     keeper = keeper_of(part, clock)
     judge(part, 1)
-    keeper.before_readings()
+    read_once(keeper)
     assert not keeper.filenos()
     for _ in range(3):
         clock.now_ns += SAVE_PERIOD_NS
-        keeper.before_readings()
+        read_once(keeper)
         go_round(keeper)
     assert disk.written == 1  # nothing is written where nothing is new
     assert kept_trust(file) == part.state()
@@ -415,7 +411,7 @@ def test_two_damaged_files_are_one_warning_and_a_new_beginning(
     path.write_bytes(content)
     path.with_name("right.json.former").write_bytes(content)
     with SessionFile(path) as file:
-        keeper = SessionKeeper(calibration(), FINGERS, sensors(), file, Clock(), trust=part)
+        keeper = session_keeper(calibration(), sensors(), file, Clock(), part=part)
         assert [record.levelname for record in caplog.records] == ["WARNING"]
         judge(part, 1)
         keeper.save()

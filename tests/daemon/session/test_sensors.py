@@ -13,14 +13,14 @@ from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.judge.pipeline import Pipeline
 from daemon.session.sensors import SensorWatch
-from tests.daemon.session.learning import sensors
+from tests.daemon.session.learning import read_once, sensors
 
 
 def test_another_sensor_is_told_once_and_before_its_readings(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     driver, exchanges = sensors(), []
-    watch = SensorWatch(driver, lambda: exchanges.append(dict(driver.known)))
+    watch = SensorWatch(driver, lambda *_: exchanges.append(dict(driver.known)))
     steps: list[dict[str, str]] = [
         {},
         {"ff": "A", "mf": "B"},
@@ -33,7 +33,7 @@ def test_another_sensor_is_told_once_and_before_its_readings(
     with caplog.at_level(logging.WARNING):
         for known in steps:
             driver.known = known
-            watch.before_readings()
+            read_once(watch)
     assert exchanges == [steps[4], steps[6]]
     assert caplog.text.count("new sensor on mf") == 2
 
@@ -58,7 +58,7 @@ def test_tare_and_grasp_are_forgotten_whether_or_not_a_session_is_kept(
         around = Assembly(parts, stack)
         assert around.keep_session() is (keep == "true")
         (watch,) = around.companions
-        watch.before_readings()
+        read_once(watch)
         driver.known = {"ff": "B"}
-        watch.before_readings()
+        read_once(watch)
     assert forgotten == [parts.pipeline]

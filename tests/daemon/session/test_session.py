@@ -22,7 +22,7 @@ from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
-from daemon.session.keeper import SAVE_PERIOD_NS, SessionKeeper
+from daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S
 from daemon.session.sensors import exchanged
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
@@ -32,7 +32,16 @@ from models.inputs import SessionBuilder, raw_features
 from models.runtime import TactileModel
 from models.training.data.datasets import read_table
 from tests.daemon.fakes import Clock
-from tests.daemon.session.learning import FINGERS, calibration, counts, grasps_of, observe, sensors
+from tests.daemon.session.learning import (
+    FINGERS,
+    calibration,
+    counts,
+    grasps_of,
+    observe,
+    read_once,
+    sensors,
+    session_keeper,
+)
 
 
 def test_the_input_follows_the_session() -> None:
@@ -64,18 +73,18 @@ def test_a_young_session_is_less_sure(grasps: int, temperature: float, calibrate
 def test_a_session_is_restored_at_the_next_start(tmp_path: Path) -> None:
     clock, first = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(first, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
+        keeper = session_keeper(first, sensors(ff="A", mf="B", th="C"), file, clock)
         observe(first, 30)
-        keeper.before_readings()
+        read_once(keeper)
         assert load(file.path) is None  # not every second
         clock.now_ns += SAVE_PERIOD_NS
-        keeper.before_readings()
-        keeper.wait()
+        read_once(keeper)
+        keeper.wait(WAIT_S)
         assert load(file.path) is not None
         keeper.save()
     second = calibration()
     with SessionFile(tmp_path / "right.json") as file:
-        SessionKeeper(second, FINGERS, sensors(), file, clock)
+        session_keeper(second, sensors(), file, clock)
     assert second.state() == first.state()
     assert second.calibrated
 
@@ -85,22 +94,22 @@ def test_an_exchanged_sensor_ends_the_session(
 ) -> None:
     clock, session = Clock(), calibration()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
-        keeper.before_readings()
+        keeper = session_keeper(session, sensors(ff="A", mf="B", th="C"), file, clock)
+        read_once(keeper)
         observe(session, 30)
         keeper.save()
     again = calibration()
     driver = sensors()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
-        keeper.before_readings()
+        keeper = session_keeper(again, driver, file, clock)
+        read_once(keeper)
         assert again.grasps == 30  # nothing is known of the sensors yet
         driver.known = {"ff": "A", "mf": "B", "th": "C"}
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 30
         driver.known = {"ff": "A", "mf": "X", "th": "C"}
-        keeper.before_readings()
-        keeper.wait()
+        read_once(keeper)
+        keeper.wait(WAIT_S)
         assert again.grasps == 0
         assert "new sensor on mf" in caplog.text
         kept = file.load()
@@ -113,30 +122,30 @@ def test_an_exchanged_sensor_ends_the_session(
 def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
     clock, session, driver = Clock(), calibration(), sensors(ff="A", mf="B")
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, clock)
-        keeper.before_readings()
+        keeper = session_keeper(session, driver, file, clock)
+        read_once(keeper)
         observe(session, 30)
         known = session.state()
         driver.known = {"ff": "A", "mf": "X"}
-        keeper.before_readings()
+        read_once(keeper)
         assert session.grasps == 0
         observe(session, 7, seed=1)
         driver.known = {"ff": "A"}  # the other one does not answer yet
-        keeper.before_readings()
+        read_once(keeper)
         driver.known = {"ff": "A", "mf": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         assert session.state() == known
         observe(session, 1, seed=2)
         keeper.save()
     again = calibration()
     driver.known = {"ff": "A", "mf": "X"}  # between two starts
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(again, FINGERS, driver, file, clock)
+        keeper = session_keeper(again, driver, file, clock)
         assert again.grasps == 31
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 7
         driver.known = {"ff": "A", "mf": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         assert again.grasps == 31
         keeper.save()
 
@@ -144,19 +153,19 @@ def test_sensors_that_are_back_have_their_session_again(tmp_path: Path) -> None:
 def test_of_other_sensors_the_newest_four_are_kept(tmp_path: Path) -> None:
     session, driver = calibration(), sensors(ff="0")
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        keeper = session_keeper(session, driver, file, Clock())
+        read_once(keeper)
         for number in range(1, 8):
             observe(session, 30 + number, seed=number)
             driver.known = {"ff": str(number)}
-            keeper.before_readings()
+            read_once(keeper)
             keeper.save()
             assert session.grasps == 0
         kept = [(each.serials["ff"], grasps_of(each)) for each in others(file.path)]
         assert kept == [(str(6 - at), 37 - at) for at in range(4)]
         for number in (2, 6):
             driver.known = {"ff": str(number)}
-            keeper.before_readings()
+            read_once(keeper)
             assert session.grasps == (37 if number == 6 else 0)
         keeper.save()
         assert len(list(tmp_path.iterdir())) == 4 + 3  # the session, the former one, the lock
@@ -170,11 +179,11 @@ def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
 ) -> None:
     session, driver = calibration(), sensors(ff="A")
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        keeper = session_keeper(session, driver, file, Clock())
+        read_once(keeper)
         observe(session, 30)
         driver.known = {"ff": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     (path,) = tmp_path.glob("right.json.of-*")
     data = path.read_bytes()
@@ -183,8 +192,8 @@ def test_a_damaged_session_of_other_sensors_is_named_and_counts_for_nothing(
     again = calibration()
     driver.known = {"ff": "A"}
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(again, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        keeper = session_keeper(again, driver, file, Clock())
+        read_once(keeper)
         assert again.grasps == 0
         keeper.save()
     assert f"{path}: not a session" in caplog.text
@@ -199,10 +208,10 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
     odd = msgspec.structs.replace(state, mean=state.mean[:-1], squares=state.squares[:-1])
     with SessionFile(tmp_path / "right.json") as file:
         file.put_aside(kept_now(odd, FINGERS, {"ff": "B"}))
-        keeper = SessionKeeper(session, FINGERS, driver, file, Clock())
-        keeper.before_readings()
+        keeper = session_keeper(session, driver, file, Clock())
+        read_once(keeper)
         driver.known = {"ff": "B"}
-        keeper.before_readings()
+        read_once(keeper)
         keeper.save()
     assert session.grasps == 0
     assert "a new session begins" in caplog.text
@@ -246,7 +255,7 @@ def test_what_is_no_session_is_one_line_and_a_new_session(
     assert "\n" not in str(error.value)
     session = calibration()
     with SessionFile(path) as file:
-        SessionKeeper(session, FINGERS, sensors(), file)
+        session_keeper(session, sensors(), file)
     assert session.grasps == 0
     assert "a new session begins" in caplog.text
 
@@ -257,8 +266,8 @@ def test_a_session_of_other_fingers_begins_anew(
     other, session = calibration(), calibration()
     observe(other, 9)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(other.state(), ("ff", "mf"), {})
-        SessionKeeper(session, FINGERS, sensors(), file)
+        file.save(kept_now(other.state(), ("ff", "mf"), {}))
+        session_keeper(session, sensors(), file)
     assert "is of the fingers ff, mf, the hand has" in caplog.text
     assert session.grasps == 0
 
@@ -284,7 +293,7 @@ def test_a_full_disk_is_one_warning_and_no_crash(
 ) -> None:
     session, clock = calibration(), Clock()
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+        keeper = session_keeper(session, sensors(), file, clock)
 
         def full(descriptor: int) -> None:
             raise OSError(28, "No space left on device")
@@ -293,8 +302,8 @@ def test_a_full_disk_is_one_warning_and_no_crash(
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
-            keeper.before_readings()
-            keeper.wait()
+            read_once(keeper)
+            keeper.wait(WAIT_S)
         assert caplog.text.count("No space left on device") == 1
         monkeypatch.undo()
         keeper.save()
@@ -315,11 +324,11 @@ def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr(os, "fsync", slow)
     with SessionFile(tmp_path / "right.json") as file:
-        keeper = SessionKeeper(session, FINGERS, sensors(), file, clock)
+        keeper = session_keeper(session, sensors(), file, clock)
         for seed in range(3):
             observe(session, 3, seed)
             clock.now_ns += SAVE_PERIOD_NS
-            keeper.before_readings()  # comes back, though nothing is on the disk yet
+            read_once(keeper)  # comes back, though nothing is on the disk yet
         assert file.load() is None
         hangs.set()
         keeper.save()
@@ -333,13 +342,13 @@ KILLED = """
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from daemon.session.file import SessionFile
+from daemon.session.file import SessionFile, kept_now
 from tests.daemon.session.test_session import FINGERS, calibration, observe
 session = calibration()
 with SessionFile(Path(sys.argv[1])) as file:
     while True:
         observe(session, 1, session.grasps)
-        file.save(session.state(), FINGERS, {})
+        file.save(kept_now(session.state(), FINGERS, {}))
         print(session.grasps, flush=True)
 """
 
@@ -530,16 +539,16 @@ def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path)
     seeded = calibration()
     observe(seeded, 30)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(seeded.state(), FINGERS, {})
-        keeper = SessionKeeper(calibration(), FINGERS, sensors(ff="A", mf="B", th="C"), file, clock)
-        keeper.before_readings()
+        file.save(kept_now(seeded.state(), FINGERS, {}))
+        keeper = session_keeper(calibration(), sensors(ff="A", mf="B", th="C"), file, clock)
+        read_once(keeper)
         keeper.save()
         kept = file.load()
         assert kept is not None
         assert kept.serials == {"ff": "A", "mf": "B", "th": "C"}
         later = calibration()
-        keeper = SessionKeeper(later, FINGERS, sensors(mf="X"), file, clock)
-        keeper.before_readings()
+        keeper = session_keeper(later, sensors(mf="X"), file, clock)
+        read_once(keeper)
         keeper.save()
     assert later.grasps == 0
 

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.session.file import SessionFile, SessionFileError, former_of, load, read
+from daemon.session.file import SessionFile, SessionFileError, former_of, kept_now, load, read
 from daemon.trust.ledger import GRASPS_MAX
 from daemon.trust.trust import decode
 from models.session_statistics import SessionState
@@ -71,7 +71,7 @@ def state(grasps: int) -> SessionState:
 
 
 def save(file: SessionFile, grasps: int) -> None:
-    file.save(state(grasps), FINGERS, {})
+    file.save(kept_now(state(grasps), FINGERS, {}))
 
 
 def test_a_kill_at_any_step_of_a_save_leaves_the_former_or_the_new_one(tmp_path: Path) -> None:
@@ -141,7 +141,7 @@ def learned(path: Path) -> bytes:
         if grasp % 4:
             tell(part, grasp)
     with SessionFile(path) as file:
-        file.save(session.state(), FINGERS, {"ff": "A"}, part.state())
+        file.save(kept_now(session.state(), FINGERS, {"ff": "A"}, part.state()))
     return path.read_bytes()
 
 
@@ -222,7 +222,7 @@ def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_pat
     for grasp in range(GRASPS_MAX + 1):
         judge(part, grasp)
     with SessionFile(tmp_path / "right.json") as file:
-        file.save(calibration().state(), FINGERS, {}, part.state())
+        file.save(kept_now(calibration().state(), FINGERS, {}, part.state()))
         kept = file.load()
     assert kept is not None
     assert kept.trust is not None
@@ -236,6 +236,6 @@ def test_what_is_nested_too_deeply_gives_way_to_the_former_file(tmp_path: Path) 
         for number in (20, 21):
             session = calibration()
             observe(session, number)
-            file.save(session.state(), FINGERS, {}, None)
+            file.save(kept_now(session.state(), FINGERS, {}, None))
     path.write_bytes(b'{"version":2,"sha256":"a","kept":' + b"[" * 100_000)
     assert grasps_of(load(path)) == 20

@@ -1,0 +1,127 @@
+"""A thread for slow jobs, so that neither a disk nor a parser holds up the loop."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from queue import SimpleQueue
+from typing import ClassVar, Final, Generic, TypeVar
+
+R = TypeVar("R")
+
+SWITCH_S: Final = 0.0005
+"""Python's switch interval while a worker has a thread, s: how long that thread may keep the loop
+waiting for the interpreter. The default is ten times as long."""
+ORDINARY_SWITCH_S: Final = sys.getswitchinterval()
+PROCESSORS: Final = frozenset(os.sched_getaffinity(0))
+"""Processors of the process at its start, before realtime mode pins the loop to some of them."""
+
+log = logging.getLogger("graspd")
+
+
+class Worker(Generic[R]):
+    """Runs one job at a time in a thread of ordinary priority, on any processor.
+
+    The thread starts with the first job. All methods are for the loop's thread.
+    """
+
+    _with_thread: ClassVar[int] = 0
+    """Workers that have a thread."""
+
+    def __init__(self, name: str) -> None:
+        """`name` is that of the thread."""
+        self._name = name
+        self._thread: threading.Thread | None = None
+        self._jobs: SimpleQueue[Callable[[], R] | None]
+        """Jobs of this thread; None ends it."""
+        self._results: SimpleQueue[R | Exception]
+        """What its jobs returned or raised."""
+        self._ended: int
+        """Descriptor that counts the results; the thread closes it."""
+        self.busy = False
+        """True from `submit` until the result is taken."""
+
+    def submit(self, job: Callable[[], R]) -> bool:
+        """Start a job; return False if the worker is busy, or the system has no thread for it."""
+        if self.busy or (self._thread is None and not self._start_thread()):
+            return False
+        self.busy = True
+        self._jobs.put(job)
+        return True
+
+    def filenos(self) -> list[int]:
+        """Descriptor that is readable once the job has ended; empty while there is no job."""
+        return [self._ended] if self.busy else []
+
+    def take(self, wait_s: float = 0.0) -> R | Exception | None:
+        """Return what the job returned or raised; None if it has not ended within `wait_s`."""
+        if not self.busy:
+            return None
+        poll = select.poll()
+        poll.register(self._ended, select.POLLIN)
+        if not poll.poll(wait_s * 1e3):
+            return None
+        os.eventfd_read(self._ended)
+        self.busy = False
+        return self._results.get()
+
+    def close(self, wait_s: float) -> bool:
+        """End the thread; return False if its job has not ended within `wait_s`.
+
+        The thread of such a job ends with it, or with the process.
+        """
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return True
+        self._jobs.put(None)
+        thread.join(wait_s if self.busy else None)
+        self.busy = False
+        Worker._with_thread -= 1
+        if not Worker._with_thread:
+            sys.setswitchinterval(ORDINARY_SWITCH_S)
+        return not thread.is_alive()
+
+    def _start_thread(self) -> bool:
+        """Start the thread; return False if the system refuses it."""
+        self._jobs, self._results, self._ended = SimpleQueue(), SimpleQueue(), -1
+        try:
+            self._ended = os.eventfd(0, os.EFD_CLOEXEC)
+            ends = self._jobs, self._results, self._ended
+            thread = threading.Thread(target=_run, args=ends, name=self._name, daemon=True)
+            thread.start()
+        except (OSError, RuntimeError) as error:
+            log.error("no thread for %s: %s", self._name, error)
+            if self._ended >= 0:
+                os.close(self._ended)
+            return False
+        self._thread = thread
+        Worker._with_thread += 1
+        sys.setswitchinterval(SWITCH_S)
+        return True
+
+
+def _run(
+    jobs: SimpleQueue[Callable[[], R] | None], results: SimpleQueue[R | Exception], ended: int
+) -> None:
+    """Do the jobs, and close `ended` after the last one."""
+    while (job := jobs.get()) is not None:
+        _be_ordinary()
+        try:
+            results.put(job())
+        except Exception as error:  # noqa: BLE001 - MemoryError too: the loop goes on
+            results.put(error)
+        del job  # with all that it holds, which may be much
+        os.eventfd_write(ended, 1)
+    os.close(ended)
+
+
+def _be_ordinary() -> None:
+    """Give up the priority and the processors of the loop, which a new thread inherits."""
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, PROCESSORS)

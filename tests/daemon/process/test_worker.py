@@ -1,0 +1,161 @@
+"""One slow job at a time in a thread, whatever becomes of it."""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Iterator
+
+import pytest
+
+from daemon.process.worker import SWITCH_S, Worker
+
+PATIENCE_S = 100.0
+
+
+@pytest.fixture
+def worker() -> Iterator[Worker[object]]:
+    made: Worker[object] = Worker("slow")
+    yield made
+    made.close(PATIENCE_S)
+
+
+def named_slow() -> list[threading.Thread]:
+    return [thread for thread in threading.enumerate() if thread.name == "slow"]
+
+
+def test_a_job_makes_the_descriptor_readable_and_gives_its_result_once(
+    worker: Worker[object],
+) -> None:
+    assert worker.filenos() == []
+    assert worker.submit(lambda: 7)
+    readable, _, _ = select.select(worker.filenos(), [], [], PATIENCE_S)
+    assert readable == worker.filenos() != []
+    assert worker.take() == 7
+    assert worker.take() is None
+    assert worker.filenos() == []
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(5), KeyError()])
+def test_what_a_job_raises_is_its_result_and_the_next_job_runs(
+    worker: Worker[object], error: Exception
+) -> None:
+    def fail() -> object:
+        raise error
+
+    assert worker.submit(fail)
+    assert worker.take(PATIENCE_S) is error
+    assert worker.submit(lambda: 1)
+    assert worker.take(PATIENCE_S) == 1
+
+
+def test_a_job_is_refused_until_the_result_before_it_is_taken(worker: Worker[object]) -> None:
+    go = threading.Event()
+    assert worker.submit(go.wait)
+    assert worker.take() is None
+    assert not worker.submit(lambda: 2)
+    go.set()
+    readable, _, _ = select.select(worker.filenos(), [], [], PATIENCE_S)
+    assert readable
+    assert not worker.submit(lambda: 2)
+    assert worker.take() is True
+    assert worker.submit(lambda: 3)
+    assert worker.take(PATIENCE_S) == 3
+
+
+def test_close_leaves_a_job_that_hangs_and_its_thread_ends_with_it() -> None:
+    worker: Worker[object] = Worker("slow")
+    descriptors = set(os.listdir("/proc/self/fd"))
+    go = threading.Event()
+    assert worker.submit(go.wait)
+    began_s = time.monotonic()
+    assert not worker.close(0.05)
+    assert time.monotonic() - began_s < 5.0
+    assert worker.filenos() == []
+    assert worker.take() is None
+    go.set()
+    for thread in named_slow():
+        thread.join(PATIENCE_S)
+    assert set(os.listdir("/proc/self/fd")) == descriptors
+
+
+def test_a_worker_that_was_closed_can_start_again() -> None:
+    worker: Worker[object] = Worker("slow")
+    go = threading.Event()
+    assert worker.submit(go.wait)
+    assert not worker.close(0.0)
+    assert worker.submit(lambda: 2)  # the first thread must not get this job
+    assert worker.take(PATIENCE_S) == 2
+    go.set()
+    assert worker.close(PATIENCE_S)
+    for thread in named_slow():
+        thread.join(PATIENCE_S)
+
+
+def test_the_switch_interval_is_short_until_the_last_worker_is_closed() -> None:
+    ordinary_s = sys.getswitchinterval()
+    first, second = Worker[object]("slow"), Worker[object]("slow")
+    for worker in (first, second):
+        assert worker.submit(lambda: 1)
+    first.close(PATIENCE_S)
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+    second.close(PATIENCE_S)
+    assert sys.getswitchinterval() == ordinary_s
+    second.close(PATIENCE_S)
+    assert first.submit(lambda: 1)
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
+    first.close(PATIENCE_S)
+    assert sys.getswitchinterval() == ordinary_s
+
+
+class _Large:
+    def run(self) -> int:
+        return 1
+
+
+def test_an_idle_worker_holds_nothing_of_its_last_job(worker: Worker[object]) -> None:
+    large = _Large()
+    known = weakref.ref(large)
+    assert worker.submit(large.run)
+    del large
+    assert worker.take(PATIENCE_S) == 1
+    gc.collect()
+    assert known() is None
+
+
+def test_where_the_system_refuses_a_thread_a_job_is_refused(
+    worker: Worker[object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(threading.Thread, "start", refuse)
+        assert not worker.submit(lambda: 1)
+    assert "no thread for slow: can't start new thread" in caplog.text
+    assert worker.filenos() == []
+    assert worker.submit(lambda: 1)
+    assert worker.take(PATIENCE_S) == 1
+
+
+def test_a_job_has_neither_priority_nor_processors_of_a_realtime_loop(
+    worker: Worker[object],
+) -> None:
+    processors = os.sched_getaffinity(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        pytest.skip("SCHED_FIFO is refused here")
+    try:
+        os.sched_setaffinity(0, {max(processors)})
+        assert worker.submit(lambda: (os.sched_getscheduler(0), os.sched_getaffinity(0)))
+        found = worker.take(PATIENCE_S)
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, processors)
+    assert found == (os.SCHED_OTHER, processors)
