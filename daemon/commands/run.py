@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from daemon.process.signals import StopSignal
 from daemon.process.text import complain
-from daemon.publish.binding import PublishError
+from daemon.publish.door import PublishError
 from daemon.run.runner import Runner
 from daemon.scene import SceneError
 from drivers.base import DriverError, RecordingError

@@ -10,8 +10,6 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-import zmq.auth
-
 from daemon.process.files import read_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
@@ -47,6 +45,8 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
 
     Raises `KeysError`.
     """
+    from zmq.auth import create_certificates  # the daemon itself makes none
+
     if not NAME.fullmatch(name) or name.startswith("."):
         raise KeysError(f"{name!r} is no name for a key: letters, digits, '_', '-' and '.'")
     public, secret = folder / f"{name}{PUBLIC}", folder / f"{name}{SECRET}"
@@ -56,7 +56,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
     former = os.umask(0o077)  # before there is anything to read
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        zmq.auth.create_certificates(folder, name)
+        create_certificates(folder, name)
         public.chmod(0o644)
     except OSError as error:
         raise KeysError(f"{folder}: cannot make keys: {error.strerror}") from error

@@ -12,7 +12,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.process.signals import StopSignal
-from daemon.publish.binding import PublishError
+from daemon.publish.door import PublishError
 from daemon.publish.sockets import Sockets, plan
 from daemon.run.loop import Ended, Loop, Timing
 from daemon.run.reload import Reload
@@ -178,7 +178,6 @@ class Runner:
                 [companion for companion in companions if companion is not None],
                 Timing(wanted.max_age_ns),
             )
-            stack.callback(sockets.publisher.forget)
             stack.callback(loop.close)
             self._running, self._former = True, None
             self._trust = parts.pipeline.trust

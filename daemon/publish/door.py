@@ -1,0 +1,343 @@
+"""The ZeroMQ sockets of a scene. libzmq serves them in threads of its own, beside the loop.
+
+A PUB, XPUB or ROUTER in the loop's thread would not be safe: its calls do not come back while peers
+flood it. The loop therefore has sockets within the process (`inproc`) only, and `zmq.proxy` copies
+messages between those and the peers' sockets, in C and without the interpreter.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import zmq
+
+from daemon.publish.socket_file import OccupiedError, SocketFile
+
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
+
+log = logging.getLogger("graspd")
+
+Message = list[bytes]
+Socket = zmq.Socket[bytes]
+
+STATUS = b"status."
+"""Prefix of the topics whose messages come back to the loop. The last of them ends `close`."""
+MESSAGE_MAX_BYTES: Final = 1024
+"""Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
+HANDSHAKE_MS: Final = 5000
+"""A peer that does not end its handshake in this time, ms, is disconnected."""
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
+"""Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
+SUBSCRIPTIONS_QUEUED: Final = 2
+"""Subscriptions of one peer that wait in the PUB socket. More wait in the kernel."""
+ASK_QUEUE: Final = 16
+"""Questions, and answers, of one peer that wait in the ROUTER socket."""
+FRAMES_A_ROUND: Final = 32
+"""Frames of questions that the loop takes in one round."""
+FRAMES_MAX: Final = 4
+"""Frames kept of one message: routing id, delimiter, text, and one by which it is malformed."""
+ANSWERS_QUEUED: Final = 512
+"""Answers on their way to the ROUTER socket: to 256 questions, and to as many outcomes."""
+LINGER_MS: Final = 500
+"""How long closing waits for peers to take what is queued, ms."""
+CLOSE_S: Final = 2.0
+"""How long closing waits for libzmq's threads, s. A flood may hold them."""
+SUBSCRIBES_S: Final = 0.1
+"""Time from a peer's handshake to its first subscription, s, at most."""
+ZAP_DOMAIN: Final = "graspd"
+"""Sent with each question to the authenticator. libzmq asks no question without it (RFC 27)."""
+
+
+class PublishError(Exception):
+    """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
+
+
+class Stop(Protocol):
+    """Ends a wait: its descriptor becomes readable."""
+
+    def fileno(self) -> int:
+        """Descriptor to wait on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """An endpoint, and the socket file of an `ipc://` one."""
+
+    endpoint: str
+    file: SocketFile | None
+
+    @classmethod
+    def of(cls, endpoint: str, mode: int | None = None, group: str | None = None) -> Listener:
+        """Take the file of an `ipc://` endpoint. Raises `PublishError`."""
+        if not endpoint.startswith("ipc://"):
+            return cls(endpoint, None)
+        path = Path(endpoint.removeprefix("ipc://"))
+        try:
+            return cls(endpoint, SocketFile(path, mode, group))
+        except (OccupiedError, LookupError) as error:
+            raise PublishError(f"cannot publish on {endpoint}: {error}") from None
+        except OSError as error:
+            why = error.strerror or str(error)
+            if isinstance(error, FileNotFoundError) and not path.parent.exists():
+                why = f"there is no folder {path.parent}; `graspd doctor SCENE` says who makes it"
+            raise PublishError(f"cannot publish on {endpoint}: {why}") from error
+
+    def close(self) -> None:
+        """Remove the file."""
+        if self.file is not None:
+            self.file.close()
+
+
+@dataclass(slots=True)
+class Admission:
+    """CURVE keys for `tcp://`, Z85: the daemon's own pair, and those of peers that may connect."""
+
+    public: bytes
+    secret: bytes
+    admitted: Mapping[bytes, str]
+    """Names of peers, by public key. Another list may be put here at any time."""
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Return True if the key may connect. pyzmq's authenticator calls this in its thread."""
+        name = self.admitted.get(key)
+        if name is None:
+            log.warning("turned away a peer: its key %s is not on the list", key.decode())
+            return False
+        log.info("admitted a peer with the key of %s", name)
+        return True
+
+
+class Proxy(threading.Thread):
+    """Copies messages between two sockets until their context ends, and closes them."""
+
+    def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
+        """The thread owns both sockets from `start` on."""
+        super().__init__(name=f"proxy {endpoint}", daemon=True)
+        self.endpoint = endpoint
+        self._front, self._back = front, back
+
+    def run(self) -> None:
+        """Copy messages, in C."""
+        try:
+            zmq.proxy(self._front, self._back)
+        except zmq.ContextTerminated:
+            pass
+        except zmq.ZMQError as error:
+            log.error("%s: %s", self.endpoint, error.strerror)
+        finally:
+            self._front.close()
+            self._back.close()
+
+
+class Door:
+    """The sockets, open until `close`. All methods are for the loop's thread."""
+
+    def __init__(
+        self,
+        publish: Listener,
+        ask: Listener | None = None,
+        high_water_mark: int = 1000,
+        admission: Admission | None = None,
+        *,
+        awaits_subscriber: bool = False,
+    ) -> None:
+        """Queue at most `high_water_mark` messages for each subscriber.
+
+        With an `admission`, only peers with its keys may connect over TCP. `awaits_subscriber`:
+        `wait_for_subscriber` will be called. Raises `PublishError`.
+        """
+        self._admission = admission
+        self._context: zmq.Context[Socket] = zmq.Context()
+        self._authenticator: ThreadAuthenticator | None = None
+        self._proxies: list[Proxy] = []
+        self._last_status = b""
+        self._frames: Message = []
+        """Frames that were read of the question at hand."""
+        self._out = self._socket(zmq.PUSH, sent=high_water_mark)
+        self._echo = self._socket(zmq.SUB)
+        self._ask = self._socket(zmq.DEALER, sent=ANSWERS_QUEUED, received=ASK_QUEUE)
+        self._subscribers = self._socket(zmq.PUB, high_water_mark, SUBSCRIPTIONS_QUEUED)
+        self._monitor: Socket | None = None
+        if awaits_subscriber:
+            self._monitor = self._subscribers.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        try:
+            self._authenticate()
+            self._serve_subscribers(publish)
+            if ask is not None:
+                self._serve_questions(ask)
+        except BaseException:
+            self._stop_authenticator()
+            self._context.destroy()
+            raise
+        for proxy in self._proxies:
+            proxy.start()
+
+    def _socket(self, kind: int, sent: int = 1, received: int = 1) -> Socket:
+        """Return a socket that queues at most so many messages a peer in each direction."""
+        made = self._context.socket(kind)
+        made.linger = 0
+        made.sndhwm, made.rcvhwm = sent, received
+        return made
+
+    def _authenticate(self) -> None:
+        if self._admission is None:
+            return
+        from zmq.auth.thread import ThreadAuthenticator  # only where there are keys
+
+        self._authenticator = ThreadAuthenticator(self._context)
+        self._authenticator.configure_curve_callback(ZAP_DOMAIN, self._admission)
+        self._authenticator.start()
+
+    def _serve_subscribers(self, listener: Listener) -> None:
+        messages = self._socket(zmq.PULL)
+        messages.bind("inproc://messages")
+        self._out.connect("inproc://messages")
+        self._subscribers.bind("inproc://echo")
+        self._echo.subscribe(STATUS)
+        self._echo.connect("inproc://echo")
+        self._listen(self._subscribers, listener)
+        self._proxies.append(Proxy(listener.endpoint, messages, self._subscribers))
+
+    def _serve_questions(self, listener: Listener) -> None:
+        peers = self._socket(zmq.ROUTER, ASK_QUEUE, ASK_QUEUE)
+        peers.router_handover = True  # a client that reconnects keeps its routing id
+        questions = self._socket(zmq.DEALER, ASK_QUEUE, ASK_QUEUE)
+        questions.bind("inproc://questions")
+        self._ask.connect("inproc://questions")
+        self._listen(peers, listener)
+        self._proxies.append(Proxy(listener.endpoint, peers, questions))
+
+    def _listen(self, made: Socket, listener: Listener) -> None:
+        made.linger = LINGER_MS
+        made.maxmsgsize = MESSAGE_MAX_BYTES
+        made.handshake_ivl = HANDSHAKE_MS
+        if listener.file is not None:
+            made.use_fd = os.dup(listener.file.listener.fileno())  # libzmq closes it
+        else:
+            made.ipv6 = "[" in listener.endpoint
+            made.heartbeat_ivl = HEARTBEAT_MS
+            made.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+            self._demand_keys(made)
+        try:
+            made.bind(listener.endpoint)
+        except zmq.ZMQError as error:
+            raise PublishError(f"cannot bind {listener.endpoint}: {error.strerror}") from error
+
+    def _demand_keys(self, made: Socket) -> None:
+        if self._admission is None:
+            return
+        made.curve_publickey = self._admission.public
+        made.curve_secretkey = self._admission.secret
+        made.curve_server = True
+        made.zap_domain = ZAP_DOMAIN.encode()
+
+    def fileno(self) -> int:
+        """Return a descriptor that becomes readable when a question comes.
+
+        Call `receive` before waiting for it: sending quietens it.
+        """
+        return int(self._ask.fileno())
+
+    def send(self, topic: bytes, payload: bytes) -> bool:
+        """Publish one message; False if the proxy is behind and the message is dropped."""
+        if topic.startswith(STATUS):
+            self._last_status = payload
+        return _sent(self._out, (topic, payload))
+
+    def answer(self, frames: Sequence[bytes]) -> bool:
+        """Send an answer with its routing id; False if the proxy is behind and it is dropped."""
+        return _sent(self._ask, frames)
+
+    def receive(self) -> list[Message]:
+        """Return the questions that have come, each with its routing id.
+
+        At most `FRAMES_A_ROUND` frames are read; the others wait for the next round.
+        """
+        received = []
+        for _ in range(FRAMES_A_ROUND):
+            try:
+                frame = self._ask.recv(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            if len(self._frames) < FRAMES_MAX:
+                self._frames.append(frame)
+            if not self._ask.rcvmore:
+                received.append(self._frames)
+                self._frames = []
+        return received
+
+    def check(self) -> None:
+        """Raise `PublishError` if a proxy has ended. Call it after each status message."""
+        for proxy in self._proxies:
+            if not proxy.is_alive():
+                raise PublishError(f"{proxy.endpoint}: libzmq no longer serves it")
+        while self._echo.poll(0):
+            self._echo.recv_multipart()
+
+    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+        """Wait until a peer has connected to hear messages.
+
+        False if there is none within `timeout_s` seconds, or when `stop` becomes readable.
+        """
+        if self._monitor is None:
+            raise RuntimeError("the door was not opened to wait")
+        poller = zmq.Poller()
+        poller.register(self._monitor, zmq.POLLIN)
+        if stop is not None:
+            poller.register(stop.fileno(), zmq.POLLIN)
+        came = self._monitor in dict(poller.poll(round(timeout_s * 1e3)))
+        self._close_monitor()
+        if came:
+            time.sleep(SUBSCRIBES_S)
+        return came
+
+    def _close_monitor(self) -> None:
+        if self._monitor is not None:
+            self._subscribers.disable_monitor()
+            self._monitor.close(0)
+            self._monitor = None
+
+    def close(self) -> bool:
+        """Disconnect all peers, after they had `LINGER_MS` to take what is queued.
+
+        False if libzmq's threads have not ended within `CLOSE_S`. May be called again.
+        """
+        self._await_last_status()
+        self._close_monitor()
+        for own in (self._out, self._echo, self._ask):
+            own.close()
+        self._stop_authenticator()
+        ending = threading.Thread(target=self._context.term, name="close", daemon=True)
+        ending.start()
+        ending.join(CLOSE_S)
+        return not ending.is_alive()
+
+    def _await_last_status(self) -> None:
+        """Wait until the proxy has published all messages: they are lost when its context ends."""
+        if self._echo.closed or not self._last_status:
+            return
+        until_s = time.monotonic() + LINGER_MS / 1e3
+        while (left_s := until_s - time.monotonic()) > 0 and self._echo.poll(round(left_s * 1e3)):
+            if self._echo.recv_multipart()[1] == self._last_status:
+                return
+
+    def _stop_authenticator(self) -> None:
+        if self._authenticator is not None:
+            self._authenticator.stop()
+            self._authenticator = None
+
+
+def _sent(to: Socket, frames: Sequence[bytes]) -> bool:
+    try:
+        to.send_multipart(frames, flags=zmq.NOBLOCK)
+    except zmq.Again:
+        return False
+    return True
