@@ -30,6 +30,9 @@ NOT_YOURS = "not yours: another peer asks whether it may lift here"
 
 Peer = bytes
 """Routing id of a connection."""
+NAME_BYTES: Final = 16
+"""A client with several connections begins their routing ids with the same 16 random bytes. It is
+the owner of its grasps by them."""
 Send = Callable[[Sequence[bytes]], bool]
 """Sends one message to a peer; False if it is dropped."""
 TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
@@ -57,7 +60,7 @@ class _Lift:
     """A grasp that a peer wants to lift, or whose outcome was reported."""
 
     owner: Peer | None
-    """First peer that was answered about it; None: no peer asked."""
+    """Name of the first peer that was answered about it; None: no peer asked to lift it."""
     outcome: str | None = None
 
 
@@ -181,7 +184,7 @@ class Questions:
         outcome: Literal["stable", "slip"] = "slip" if report[3] == b"slip" else "stable"
         object_name = None if report[4] is None else report[4].decode()
         grasp = GraspId(report[1].decode(), int(report[2]))
-        refusal = self._book.objection(grasp, peer, outcome)
+        refusal = self._book.objection(grasp, peer[:NAME_BYTES], outcome)
         if refusal is None:
             refusal = take_outcome(*grasp, outcome, object_name)
         if refusal is None:
@@ -212,4 +215,4 @@ class Questions:
             self.counters["answered"] += 1
             self._answer(question.envelope, payload)
             if question.lifts and grasp is not None and grasp.grasp:
-                self._book.own(grasp, peer)
+                self._book.own(grasp, peer[:NAME_BYTES])

@@ -55,6 +55,7 @@ class Sockets(Companion):
         self.questions: Questions | None = None
         self._publish: Listener | None = None
         self._ask: Listener | None = None
+        self._filenos: list[int] = []
         try:
             self._listen(wanted)
             self._open()
@@ -80,6 +81,8 @@ class Sockets(Companion):
             self._admission,
             awaits_subscriber=self._awaits_subscriber,
         )
+        if self.questions is not None:
+            self._filenos = [self._door.fileno()]
 
     def _load_keys(self, curve: Curve) -> Admission:
         self._keys_seen = _state(curve.clients)
@@ -113,7 +116,7 @@ class Sockets(Companion):
 
     def filenos(self) -> list[int]:
         """Return what becomes readable when a question comes, if `before_wait` is called."""
-        return [] if self._door is None or self.questions is None else [self._door.fileno()]
+        return self._filenos
 
     def before_wait(self, requests: Requests) -> None:
         """Pass on what peers ask and report."""
@@ -188,7 +191,7 @@ class Sockets(Companion):
 
     def _disconnect_all(self) -> None:
         """Close the door: libzmq cannot disconnect a single peer. The others reconnect."""
-        door, self._door = self._door, None
+        door, self._door, self._filenos = self._door, None, []
         if door is not None and not door.close():
             raise PublishError(f"{self.endpoint}: cannot disconnect a peer whose key was removed")
 
