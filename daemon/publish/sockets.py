@@ -8,16 +8,18 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from daemon.publish.companion import Companion, Requests
 from daemon.publish.door import Admission, Door, Listener, PublishError, Stop
-from daemon.publish.keys import Clients, KeysError, load_clients, load_own
 from daemon.publish.messages import Status, Verdict
-from daemon.publish.questions import Questions
 from daemon.scene import Curve, Scene, SceneError
 from daemon.trust.ledger import GraspId
 from drivers.base import TactileReading
+
+if TYPE_CHECKING:
+    from daemon.publish.keys import Clients
+    from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
 
@@ -69,6 +71,8 @@ class Sockets(Companion):
         self._publish = Listener.of(wanted.endpoint, mode, publish.group)
         if wanted.ask_endpoint is not None:
             self._ask = Listener.of(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            from daemon.publish.questions import Questions  # only where peers may ask
+
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))
 
     def _open(self) -> None:
@@ -85,6 +89,12 @@ class Sockets(Companion):
             self._filenos = [self._door.fileno()]
 
     def _load_keys(self, curve: Curve) -> Admission:
+        from daemon.publish.keys import (  # only where there are keys
+            KeysError,
+            load_clients,
+            load_own,
+        )
+
         self._keys_seen = _state(curve.clients)
         try:
             pair, clients = load_own(curve.secret_key), load_clients(curve.clients)
@@ -178,6 +188,8 @@ class Sockets(Companion):
                 log.error("%s; no peer can connect", error)
 
     def _take_keys(self, curve: Curve, admission: Admission) -> None:
+        from daemon.publish.keys import Clients, KeysError, load_clients
+
         try:
             clients = load_clients(curve.clients)
         except KeysError as error:

@@ -41,7 +41,8 @@ def scene_for(kind: str, folder: Path) -> Path:
     scene = folder / "scene.toml"
     scene.write_text(
         f"[tactile]\n{SCENES[kind].format(folder=folder, port=PORT)}\n"
-        f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{folder}/graspd"\ntactile_hz = 10000\n'
+        f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        "tactile_hz = 10000\n"
     )
     return scene
 

@@ -244,7 +244,7 @@ def test_a_flood_of_questions_is_read_a_few_a_round(asked: tuple[Door, str], pee
     asker = peers.connect(zmq.DEALER, endpoint)
     for _ in range(100):
         asker.send(b"judge")
-    rounds = []
+    rounds: list[int] = []
     while sum(rounds) < 100:
         rounds.append(len(door.receive()))
     assert max(rounds) <= FRAMES_A_ROUND / 2
