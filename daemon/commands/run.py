@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
-DESCRIPTORS = 4096
-"""For all peers of both sockets, and as many again for peers with keys, files and devices."""
+DESCRIPTORS = 65_536
+"""Descriptors for all peers: libzmq 4.3.5 ends the process where a Unix socket finds none left."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -260,7 +260,7 @@ def test_a_scene_with_joints_and_questions_has_them_and_says_what_they_cost(
     assert HALL | ASK | {"daemon.judge.joint_motion"} <= set(found.modules)
     assert below({"drivers.joints.driver", *BUSES["spi"], *BUSES["can"]}, found.modules) == []
     assert parts["joints"].modules > 0
-    assert parts["sockets"].threads == 0
+    assert parts["sockets"].threads == ZMQ_THREADS + 1
     assert parts["sockets"].descriptors == SOCKET + ASK_SOCKET
     assert found.timed.judged is not None
 
