@@ -159,7 +159,8 @@ class Door:
         self._context: zmq.Context[Socket] = zmq.Context()
         self._authenticator: ThreadAuthenticator | None = None
         self._proxies: list[Proxy] = []
-        self._last_status = b""
+        self._unheard = b""
+        """Last status, until it has come back from the proxy."""
         self._frames: Message = []
         """Frames that were read of the question at hand."""
         self._out = self._socket(zmq.PUSH, sent=high_water_mark)
@@ -250,7 +251,7 @@ class Door:
     def send(self, topic: bytes, payload: bytes) -> bool:
         """Publish one message; False if the proxy is behind and the message is dropped."""
         if topic.startswith(STATUS):
-            self._last_status = payload
+            self._unheard = payload
         return _sent(self._out, (topic, payload))
 
     def answer(self, frames: Sequence[bytes]) -> bool:
@@ -281,7 +282,11 @@ class Door:
             if not proxy.is_alive():
                 raise PublishError(f"{proxy.endpoint}: libzmq no longer serves it")
         while self._echo.poll(0):
-            self._echo.recv_multipart()
+            self._hear_echo()
+
+    def _hear_echo(self) -> None:
+        if self._echo.recv_multipart()[1] == self._unheard:
+            self._unheard = b""
 
     def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
         """Wait until a peer has connected to hear messages.
@@ -311,7 +316,8 @@ class Door:
 
         False if libzmq's threads have not ended within `CLOSE_S`. May be called again.
         """
-        self._await_last_status()
+        if not self._echo.closed:
+            self._await_last_status()
         self._close_monitor()
         for own in (self._out, self._echo, self._ask):
             own.close()
@@ -323,12 +329,10 @@ class Door:
 
     def _await_last_status(self) -> None:
         """Wait until the proxy has published all messages: they are lost when its context ends."""
-        if self._echo.closed or not self._last_status:
-            return
         until_s = time.monotonic() + LINGER_MS / 1e3
-        while (left_s := until_s - time.monotonic()) > 0 and self._echo.poll(round(left_s * 1e3)):
-            if self._echo.recv_multipart()[1] == self._last_status:
-                return
+        while self._unheard and (left_s := until_s - time.monotonic()) > 0:
+            if self._echo.poll(round(left_s * 1e3)):
+                self._hear_echo()
 
     def _stop_authenticator(self) -> None:
         if self._authenticator is not None:
