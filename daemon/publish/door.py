@@ -1,8 +1,10 @@
 """The ZeroMQ sockets of a scene. libzmq serves them in threads of its own, beside the loop.
 
 A PUB, XPUB or ROUTER in the loop's thread would not be safe: its calls do not come back while peers
-flood it. The loop therefore has sockets within the process (`inproc`) only, and `zmq.proxy` copies
-messages between those and the peers' sockets, in C and without the interpreter.
+flood it. The loop therefore has sockets within the process (`inproc`) only. `zmq.proxy` copies
+messages to the subscribers, in C and without the interpreter. `Courier` carries questions and
+answers: it takes few questions at a time, while `zmq.proxy` takes a thousand and lets no answer
+pass until the loop has read them.
 """
 
 from __future__ import annotations
@@ -40,9 +42,11 @@ SUBSCRIPTIONS_QUEUED: Final = 2
 """Subscriptions of one peer that wait in the PUB socket. More wait in the kernel."""
 ASK_QUEUE: Final = 16
 """Questions, and answers, of one peer that wait in the ROUTER socket."""
-FRAMES_A_ROUND: Final = 16
-"""Frames of questions that the loop takes in one round: eight questions, which take 0.3 ms on a
-slow, busy computer. More wait for the next round, with the next reading at the latest."""
+QUESTIONS_A_ROUND: Final = 8
+"""Questions that the loop takes in one round: they take 0.3 ms on a slow, busy computer. More wait
+for the next round, with the next reading at the latest."""
+QUESTIONS_A_TURN, PAUSE_MS = 8, 2
+"""Questions that are carried to the loop at a time, and the pause, ms, until the next ones."""
 FRAMES_MAX: Final = 4
 """Frames kept of one message: routing id, delimiter, text, and one by which it is malformed."""
 ANSWERS_QUEUED: Final = 512
@@ -121,14 +125,14 @@ class Proxy(threading.Thread):
 
     def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
         """The thread owns both sockets from `start` on."""
-        super().__init__(name=f"proxy {endpoint}", daemon=True)
+        super().__init__(name=f"serve {endpoint}", daemon=True)
         self.endpoint = endpoint
         self._front, self._back = front, back
 
     def run(self) -> None:
-        """Copy messages, in C."""
+        """Copy messages."""
         try:
-            zmq.proxy(self._front, self._back)
+            self._copy()
         except zmq.ContextTerminated:
             pass
         except zmq.ZMQError as error:
@@ -136,6 +140,42 @@ class Proxy(threading.Thread):
         finally:
             self._front.close()
             self._back.close()
+
+    def _copy(self) -> None:
+        zmq.proxy(self._front, self._back)
+
+
+class Courier(Proxy):
+    """Carries questions of the peers to the loop, a few at a time, and all answers back."""
+
+    def _copy(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._front, zmq.POLLIN)
+        poller.register(self._back, zmq.POLLIN)
+        while True:
+            poller.poll()
+            self._carry_answers()
+            for _ in range(QUESTIONS_A_TURN):
+                if not self._carry_question():
+                    break
+            if self._back.poll(PAUSE_MS):  # meanwhile more questions wait
+                self._carry_answers()
+
+    def _carry_answers(self) -> None:
+        while self._back.poll(0):
+            self._front.send_multipart(self._back.recv_multipart(), zmq.NOBLOCK)
+
+    def _carry_question(self) -> bool:
+        """Carry one, without the frames beyond `FRAMES_MAX`; False if there is none or no room."""
+        if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
+            return False
+        frames = [self._front.recv()]
+        while self._front.getsockopt(zmq.RCVMORE):
+            frame = self._front.recv()
+            if len(frames) < FRAMES_MAX:
+                frames.append(frame)
+        self._back.send_multipart(frames)
+        return True
 
 
 class Door:
@@ -161,8 +201,6 @@ class Door:
         self._proxies: list[Proxy] = []
         self._unheard = b""
         """Last status, until it has come back from the proxy."""
-        self._frames: Message = []
-        """Frames that were read of the question at hand."""
         self._out = self._socket(zmq.PUSH, sent=high_water_mark)
         self._echo = self._socket(zmq.SUB)
         self._ask = self._socket(zmq.DEALER, sent=ANSWERS_QUEUED, received=ASK_QUEUE)
@@ -211,11 +249,11 @@ class Door:
     def _serve_questions(self, listener: Listener) -> None:
         peers = self._socket(zmq.ROUTER, ASK_QUEUE, ASK_QUEUE)
         peers.router_handover = True  # a client that reconnects keeps its routing id
-        questions = self._socket(zmq.DEALER, ASK_QUEUE, ASK_QUEUE)
+        questions = self._socket(zmq.DEALER)
         questions.bind("inproc://questions")
         self._ask.connect("inproc://questions")
         self._listen(peers, listener)
-        self._proxies.append(Proxy(listener.endpoint, peers, questions))
+        self._proxies.append(Courier(listener.endpoint, peers, questions))
 
     def _listen(self, made: Socket, listener: Listener) -> None:
         made.linger = LINGER_MS
@@ -259,25 +297,19 @@ class Door:
         return _sent(self._ask, frames)
 
     def receive(self) -> list[Message]:
-        """Return the questions that have come, each with its routing id.
-
-        At most `FRAMES_A_ROUND` frames are read; the others wait for the next round.
-        """
-        received = []
-        for _ in range(FRAMES_A_ROUND):
+        """Return at most `QUESTIONS_A_ROUND` questions that have come, each with its routing id."""
+        received: list[Message] = []
+        while len(received) < QUESTIONS_A_ROUND:
             try:
-                frame = self._ask.recv(zmq.NOBLOCK)
+                received.append(self._ask.recv_multipart(zmq.NOBLOCK))
             except zmq.Again:
                 break
-            if len(self._frames) < FRAMES_MAX:
-                self._frames.append(frame)
-            if not self._ask.getsockopt(zmq.RCVMORE):
-                received.append(self._frames)
-                self._frames = []
         return received
 
     def check(self) -> None:
-        """Raise `PublishError` if a proxy has ended. Call it after each status message."""
+        """Raise `PublishError` if a thread has ended. Call it after each status message."""
+        if self._authenticator is not None and not self._authenticator.is_alive():
+            raise PublishError("pyzmq's authenticator has ended")
         for proxy in self._proxies:
             if not proxy.is_alive():
                 raise PublishError(f"{proxy.endpoint}: libzmq no longer serves it")
