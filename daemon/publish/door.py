@@ -14,9 +14,10 @@ import os
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import zmq
 
@@ -24,6 +25,8 @@ from daemon.publish.socket_file import OccupiedError, SocketFile
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
+
+    from daemon.process.signals import Stop
 
 log = logging.getLogger("graspd")
 
@@ -38,10 +41,8 @@ HANDSHAKE_MS: Final = 5000
 """A peer that does not end its handshake in this time, ms, is disconnected."""
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
-SUBSCRIPTIONS_QUEUED: Final = 2
-"""Subscriptions of one peer that wait in the PUB socket. More wait in the kernel."""
-ASK_QUEUE: Final = 16
-"""Questions, and answers, of one peer that wait in the ROUTER socket."""
+SUBSCRIPTIONS_QUEUED, ASK_QUEUE = 2, 16
+"""Messages of one peer that wait in the PUB and in the ROUTER socket. More wait in the kernel."""
 QUESTIONS_A_ROUND: Final = 8
 """Questions that the loop takes in one round: they take 0.3 ms on a slow, busy computer. More wait
 for the next round, with the next reading at the latest."""
@@ -53,8 +54,8 @@ ANSWERS_QUEUED: Final = 512
 """Answers on their way to the ROUTER socket: to 256 questions, and to as many outcomes."""
 LINGER_MS: Final = 500
 """How long closing waits for peers to take what is queued, ms."""
-CLOSE_S: Final = 2.0
-"""How long closing waits for libzmq's threads, s. A flood may hold them."""
+CLOSE_S: Final = 1.0
+"""How long closing waits for libzmq's threads, s. A flood may hold them. The watchdog waits 2 s."""
 SUBSCRIBES_S: Final = 0.1
 """Time from a peer's handshake to its first subscription, s, at most."""
 ZAP_DOMAIN: Final = "graspd"
@@ -63,13 +64,6 @@ ZAP_DOMAIN: Final = "graspd"
 
 class PublishError(Exception):
     """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
-
-
-class Stop(Protocol):
-    """Ends a wait: its descriptor becomes readable."""
-
-    def fileno(self) -> int:
-        """Descriptor to wait on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,6 +229,7 @@ class Door:
         self._authenticator = ThreadAuthenticator(self._context)
         self._authenticator.configure_curve_callback(ZAP_DOMAIN, self._admission)
         self._authenticator.start()
+        self._authenticator.pipe.sndtimeo = LINGER_MS  # to a thread that has ended it would wait
 
     def _serve_subscribers(self, listener: Listener) -> None:
         messages = self._socket(zmq.PULL)
@@ -265,19 +260,15 @@ class Door:
             made.ipv6 = "[" in listener.endpoint
             made.heartbeat_ivl = HEARTBEAT_MS
             made.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
-            self._demand_keys(made)
+            if self._admission is not None:
+                made.curve_publickey = self._admission.public
+                made.curve_secretkey = self._admission.secret
+                made.curve_server = True
+                made.zap_domain = ZAP_DOMAIN.encode()
         try:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:
             raise PublishError(f"cannot bind {listener.endpoint}: {error.strerror}") from error
-
-    def _demand_keys(self, made: Socket) -> None:
-        if self._admission is None:
-            return
-        made.curve_publickey = self._admission.public
-        made.curve_secretkey = self._admission.secret
-        made.curve_server = True
-        made.zap_domain = ZAP_DOMAIN.encode()
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when a question comes.
@@ -299,11 +290,9 @@ class Door:
     def receive(self) -> list[Message]:
         """Return at most `QUESTIONS_A_ROUND` questions that have come, each with its routing id."""
         received: list[Message] = []
-        while len(received) < QUESTIONS_A_ROUND:
-            try:
+        with suppress(zmq.Again):
+            while len(received) < QUESTIONS_A_ROUND:
                 received.append(self._ask.recv_multipart(zmq.NOBLOCK))
-            except zmq.Again:
-                break
         return received
 
     def check(self) -> None:
@@ -368,13 +357,13 @@ class Door:
 
     def _stop_authenticator(self) -> None:
         if self._authenticator is not None:
-            self._authenticator.stop()
+            with suppress(zmq.Again):
+                self._authenticator.stop()
             self._authenticator = None
 
 
 def _sent(to: Socket, frames: Sequence[bytes]) -> bool:
-    try:
+    with suppress(zmq.Again):
         to.send_multipart(frames, flags=zmq.NOBLOCK)
-    except zmq.Again:
-        return False
-    return True
+        return True
+    return False

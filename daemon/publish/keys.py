@@ -73,9 +73,9 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
     public, secret = _load(path, "the key")
     if secret is None:
         raise KeysError(f"{path}: has no secret key; name the {SECRET} file")
-    loose = _looser_than_0600(path)
-    if loose:
-        raise KeysError(f"{path}: {loose}; others may read it: chmod 600")
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise KeysError(f"{path}: mode {mode:04o}; others may read it: chmod 600")
     return public, secret
 
 
@@ -178,9 +178,3 @@ def _refuse_owner(path: Path, status: os.stat_result) -> None:
         owner = str(status.st_uid)
     if os.geteuid() or owner != SERVICE:
         raise KeysError(f"{path}: belongs to {owner}, who may put another key there")
-
-
-def _looser_than_0600(path: Path) -> str:
-    """The file's mode, if it gives others anything; empty otherwise."""
-    mode = stat.S_IMODE(path.stat().st_mode)
-    return f"mode {mode:04o}" if mode & 0o077 else ""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, Literal
 
-from daemon.publish.companion import CONTRADICTS, Answer
+from daemon.publish.companion import CONTRADICTS, Requests
 from daemon.publish.door import Message
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.trust.ledger import GRASPS_MAX, GraspId
@@ -25,7 +25,6 @@ _REPORT = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
 )
 MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
-NOBODY = "nobody takes outcomes here"
 NOT_YOURS = "not yours: another peer asks whether it may lift here"
 
 Peer = bytes
@@ -33,18 +32,6 @@ Peer = bytes
 NAME_BYTES: Final = 16
 """A client with several connections begins their routing ids with the same 16 random bytes. It is
 the owner of its grasps by them."""
-Send = Callable[[Sequence[bytes]], bool]
-"""Sends one message to a peer; False if it is dropped."""
-TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
-"""Takes boot id, grasp, outcome, and the object if it was named. Returns None, or why it refuses
-the outcome."""
-Keep = Callable[[Answer], None]
-"""Calls the answer once the outcome is on the disk, or is known not to be."""
-
-
-def at_once(answer: Answer) -> None:
-    """Answer at once: outcomes are not kept on a disk."""
-    answer(None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,16 +85,17 @@ class LiftBook:
 
     def _entry(self, grasp: GraspId, owner: Peer | None) -> _Lift:
         """Return the entry of a grasp; a new one gets this owner."""
-        if grasp not in self._lifts and len(self._lifts) >= GRASPS_MAX:
+        lift = self._lifts.setdefault(grasp, _Lift(owner))
+        if len(self._lifts) > GRASPS_MAX:
             del self._lifts[next(iter(self._lifts))]
-        return self._lifts.setdefault(grasp, _Lift(owner))
+        return lift
 
 
 class Questions:
     """Takes questions and outcomes, and answers them. A peer has one question at a time."""
 
-    def __init__(self, send: Send, patience_ns: int) -> None:
-        """`send` passes answers on. A question waits at most `patience_ns`."""
+    def __init__(self, send: Callable[[Sequence[bytes]], bool], patience_ns: int) -> None:
+        """`send` returns False if it drops an answer. Questions wait at most `patience_ns`."""
         self.counters: Counter[str] = Counter()
         """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken, and kept where
         that is wanted, and `outcomes_refused`; `dropped` answers."""
@@ -122,34 +110,22 @@ class Questions:
         """Number of questions without an answer."""
         return len(self._waiting)
 
-    def due_ns(self) -> int | None:
-        """Return when the oldest question must be answered, monotonic ns."""
-        return next(iter(self._waiting.values())).due_ns if self._waiting else None
-
-    def take(
-        self,
-        messages: Iterable[Message],
-        now_ns: int,
-        outcome: TakeOutcome | None = None,
-        keep: Keep = at_once,
-    ) -> int:
-        """Take the messages of peers, and return how many of them are questions.
-
-        Outcomes go to `outcome`. Those that it takes are answered by way of `keep`.
-        """
+    def take(self, messages: Iterable[Message], now_ns: int, requests: Requests) -> None:
+        """Take the messages of peers, and pass on to `requests` what they want."""
         asked = 0
         for peer, *envelope, text in messages:
             well_formed = envelope in ([], [b""])
             if well_formed and text.partition(b" ")[0] == OUTCOME:
-                self._take_outcome(peer, [peer, *envelope], text, outcome, keep)
+                self._take_outcome([peer, *envelope], text, requests)
             elif well_formed and text in (JUDGE, LIFT):
                 due_ns = now_ns + self._patience_ns
                 self._wait(peer, _Question([peer, *envelope], due_ns, text == LIFT))
                 asked += 1
             else:
                 self.counters["malformed"] += 1
-        self.counters["asked"] += asked
-        return asked
+        if asked:
+            self.counters["asked"] += asked
+            requests.ask()
 
     def _wait(self, peer: Peer, question: _Question) -> None:
         if self._waiting.pop(peer, None) is not None:
@@ -159,34 +135,25 @@ class Questions:
             self.counters["given_up"] += 1
         self._waiting[peer] = question
 
-    def _take_outcome(
-        self,
-        peer: Peer,
-        envelope: Message,
-        text: bytes,
-        take_outcome: TakeOutcome | None,
-        keep: Keep,
-    ) -> None:
-        refusal = self._refusal(peer, text, take_outcome)
+    def _take_outcome(self, envelope: Message, text: bytes, requests: Requests) -> None:
+        refusal = self._refusal(envelope[0], text, requests)
         answer = partial(self._answer_outcome, envelope)
         if refusal is None:
-            keep(answer)
+            requests.keep(answer)
         else:
             answer(refusal)
 
-    def _refusal(self, peer: Peer, text: bytes, take_outcome: TakeOutcome | None) -> str | None:
+    def _refusal(self, peer: Peer, text: bytes, requests: Requests) -> str | None:
         """Pass an outcome on. Return None, or why it is refused."""
         report = _REPORT.fullmatch(text)
         if report is None:
             return MALFORMED
-        if take_outcome is None:
-            return NOBODY
         outcome: Literal["stable", "slip"] = "slip" if report[3] == b"slip" else "stable"
         object_name = None if report[4] is None else report[4].decode()
         grasp = GraspId(report[1].decode(), int(report[2]))
         refusal = self._book.objection(grasp, peer[:NAME_BYTES], outcome)
         if refusal is None:
-            refusal = take_outcome(*grasp, outcome, object_name)
+            refusal = requests.outcome(*grasp, outcome, object_name)
         if refusal is None:
             self._book.report(grasp, outcome)
         return refusal

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from daemon.publish.companion import Companion, Requests
-from daemon.publish.door import Admission, Door, Listener, PublishError, Stop
+from daemon.publish.door import Admission, Door, Listener, PublishError
 from daemon.publish.messages import Status, Verdict
 from daemon.scene import Curve, Scene, SceneError
 from daemon.trust.ledger import GraspId
 from drivers.base import TactileReading
 
 if TYPE_CHECKING:
+    from daemon.process.signals import Stop
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
@@ -47,7 +48,8 @@ class Sockets(Companion):
         self._awaits_subscriber = awaits_subscriber
         self._high_water_mark = wanted.publish.high_water_mark
         self._counters = Counter(dropped=0)
-        self._tactile_period_ns = _period_ns(wanted.publish.tactile_hz)
+        tactile_hz = wanted.publish.tactile_hz
+        self._tactile_period_ns = round(1e9 / tactile_hz) if tactile_hz else None
         self._tactile_due_ns = 0
         self._curve = wanted.curve
         self._keys_seen: object = None
@@ -89,16 +91,12 @@ class Sockets(Companion):
             self._filenos = [self._door.fileno()]
 
     def _load_keys(self, curve: Curve) -> Admission:
-        from daemon.publish.keys import (  # only where there are keys
-            KeysError,
-            load_clients,
-            load_own,
-        )
+        from daemon.publish import keys  # only where there are any
 
         self._keys_seen = _state(curve.clients)
         try:
-            pair, clients = load_own(curve.secret_key), load_clients(curve.clients)
-        except KeysError as error:
+            pair, clients = keys.load_own(curve.secret_key), keys.load_clients(curve.clients)
+        except keys.KeysError as error:
             raise SceneError(str(error)) from error
         _log_refused(clients)
         return Admission(*pair, clients.admitted)
@@ -130,11 +128,8 @@ class Sockets(Companion):
 
     def before_wait(self, requests: Requests) -> None:
         """Pass on what peers ask and report."""
-        if self.questions is None or self._door is None:
-            return
-        messages = self._door.receive()
-        if self.questions.take(messages, self._clock(), requests.outcome, requests.keep):
-            requests.ask()
+        if self.questions is not None and self._door is not None:
+            self.questions.take(self._door.receive(), self._clock(), requests)
 
     def on_answer(self, verdict: Verdict, payload: bytes) -> None:
         """Answer all questions."""
@@ -188,12 +183,12 @@ class Sockets(Companion):
                 log.error("%s; no peer can connect", error)
 
     def _take_keys(self, curve: Curve, admission: Admission) -> None:
-        from daemon.publish.keys import Clients, KeysError, load_clients
+        from daemon.publish import keys
 
         try:
-            clients = load_clients(curve.clients)
-        except KeysError as error:
-            clients = Clients({}, [str(error)])
+            clients = keys.load_clients(curve.clients)
+        except keys.KeysError as error:
+            clients = keys.Clients({}, [str(error)])
         _log_refused(clients)
         log.info("%d keys may connect", len(clients.admitted))
         removed = admission.admitted.keys() - clients.admitted.keys()
@@ -222,11 +217,6 @@ class Sockets(Companion):
 
     def __exit__(self, *_details: object) -> None:
         self.close()
-
-
-def _period_ns(rate_hz: float) -> int | None:
-    """Return the time between two messages; None for no message at all."""
-    return round(1e9 / rate_hz) if rate_hz else None
 
 
 def _log_refused(clients: Clients) -> None:

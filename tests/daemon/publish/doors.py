@@ -1,12 +1,14 @@
-"""An open door with one socket for messages, and sockets of peers."""
+"""An open door with one socket for messages, sockets of peers, and what stands for the loop."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Self
 
 import zmq
 
+from daemon.publish.companion import Answer
 from daemon.publish.door import Door, Listener
 
 WAIT_MS = 100_000
@@ -37,6 +39,31 @@ class Publisher:
 
     def __exit__(self, *_details: object) -> None:
         self.close()
+
+
+class Asked:
+    """Stands for the loop: counts questions, takes outcomes, and keeps them at once."""
+
+    def __init__(self, why: Callable[..., str | None] = lambda *_told: None) -> None:
+        """`why` says why an outcome is refused; None: it is taken."""
+        self.times = 0
+        self.outcomes: list[tuple[object, ...]] = []
+        self.waiting: list[Answer] | None = None
+        """Answers that wait until the outcomes are kept; None: they are kept at once."""
+        self._why = why
+
+    def ask(self) -> None:
+        self.times += 1
+
+    def outcome(self, *told: object) -> str | None:
+        self.outcomes.append(told)
+        return self._why(*told)
+
+    def keep(self, answer: Answer) -> None:
+        if self.waiting is None:
+            answer(None)
+        else:
+            self.waiting.append(answer)
 
 
 class Peers:

@@ -22,7 +22,7 @@ from daemon.publish.sockets import Sockets
 from daemon.scene import SceneError
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
-from tests.daemon.publish.test_sockets import Asked
+from tests.daemon.publish.doors import Asked
 from tests.ports import free_port
 
 PATIENCE_S = 100.0

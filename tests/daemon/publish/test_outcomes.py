@@ -17,10 +17,11 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
-from daemon.publish.questions import Questions, TakeOutcome
+from daemon.publish.questions import Questions
 from daemon.trust.ledger import GRASPS_MAX, GraspId, Told
 from daemon.trust.trust import Trust
 from tests.daemon.fakes import FINGERS, Clock
+from tests.daemon.publish.doors import Asked as Requests
 
 BOOT = "0123456789abcdef" * 2
 NOW_NS = 10**12
@@ -144,14 +145,14 @@ class Asked:
 
     def ask_about(self, grasp: int, *peers: bytes, text: bytes = b"lift") -> None:
         """Ask, and be answered about a grasp."""
-        assert self.questions.take([[peer, text] for peer in peers], 0) == len(peers)
+        self.questions.take([[peer, text] for peer in peers], 0, Requests())
         self.questions.answer(b"{}", grasp=GraspId(BOOT, grasp))
 
-    def tell(
-        self, peer: bytes, *frames: bytes, outcome: TakeOutcome | None = None
-    ) -> dict[str, Any]:
+    def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
         """Tell an outcome, which is no question."""
-        assert self.questions.take([[peer, *frames]], 0, outcome or takes_the_seventh) == 0
+        requests = requests or Requests(takes_the_seventh)
+        self.questions.take([[peer, *frames]], 0, requests)
+        assert requests.times == 0
         answer: dict[str, Any] = json.loads(self.sent[-1][-1])
         assert self.sent[-1] == (peer, *frames[:-1], self.sent[-1][-1])
         return answer
@@ -186,10 +187,12 @@ def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
 
 
 def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(asked: Asked) -> None:
+    requests = Requests(takes_the_seventh)
     waiting: list[Answer] = []
+    requests.waiting = waiting
     texts = [f"outcome {BOOT} {grasp} slip".encode() for grasp in (7, 8, 7)]
     messages = [[TELLER, text] for text in texts]
-    assert asked.questions.take(messages, 0, takes_the_seventh, waiting.append) == 0
+    asked.questions.take(messages, 0, requests)
     assert [json.loads(frames[-1]) for frames in asked.sent] == [
         {"v": 1, "ok": False, "why": "no such"}
     ]
@@ -227,7 +230,8 @@ def test_a_peer_that_asks_judge_tells_of_grasps_where_no_peer_asks_lift(asked: A
 
 
 def test_a_question_that_is_replaced_owns_nothing(asked: Asked) -> None:
-    asked.questions.take([[OTHER, b"lift"], [OTHER, b"judge"], [TELLER, b"lift"]], 0)
+    messages = [[OTHER, b"lift"], [OTHER, b"judge"], [TELLER, b"lift"]]
+    asked.questions.take(messages, 0, Requests())
     asked.questions.answer(b"{}", grasp=GraspId(BOOT, 7))
     assert asked.refusal(OTHER, SLIP) == "not yours"
     assert asked.refusal(TELLER, SLIP) == ""
@@ -285,11 +289,11 @@ NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", 
 
 @pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "_.-", "x" * 64, "Z"])
 def test_the_object_arrives_as_it_was_told(asked: Asked, name: str | None) -> None:
-    heard: list[tuple[object, ...]] = []
+    requests = Requests()
     text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
-    answer = asked.tell(TELLER, text.encode(), outcome=lambda *told: heard.append(told))
+    answer = asked.tell(TELLER, text.encode(), requests=requests)
     assert answer == {"v": 1, "ok": True}
-    assert heard == [(BOOT, 7, "slip", name)]
+    assert requests.outcomes == [(BOOT, 7, "slip", name)]
 
 
 @pytest.mark.parametrize(
@@ -327,16 +331,11 @@ def test_an_outcome_that_is_malformed_is_answered_and_counted(asked: Asked, text
     assert asked.questions.counters["malformed"] == 1
 
 
-def test_without_a_part_that_takes_outcomes_the_controller_hears_so(asked: Asked) -> None:
-    asked.questions.take([[TELLER, SLIP]], 0, None)
-    assert json.loads(asked.sent[-1][-1])["ok"] is False
-
-
 @given(st.lists(st.binary(max_size=200), min_size=1, max_size=20))
 def test_all_texts_after_the_word_get_an_answer(texts: list[bytes]) -> None:
     asked = Asked()
     for text in texts:
-        answer = asked.tell(TELLER, b"outcome " + text, outcome=lambda *_told: None)
+        answer = asked.tell(TELLER, b"outcome " + text, requests=Requests())
         assert answer["v"] == 1
     counters = asked.questions.counters
     assert counters["malformed"] + counters["outcomes"] == len(texts)

@@ -16,6 +16,7 @@ from daemon.publish.messages import Verdict, decode_verdict
 from daemon.publish.questions import WAITING_MAX, Questions
 from drivers.recordings.csv_player import DEMO_RECORDING
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+from tests.daemon.publish.doors import Asked
 
 PATIENCE_NS = 1_000_000_000
 
@@ -60,13 +61,13 @@ def connect() -> Iterator[Connect]:
 def test_a_question_gets_one_answer(
     questions: Questions, sent: list[Message], delimiter: list[bytes], text: bytes
 ) -> None:
-    assert questions.take([[b"asker", *delimiter, text]], 0) == 1
-    assert questions.due_ns() == PATIENCE_NS
+    requests = Asked()
+    questions.take([[b"asker", *delimiter, text]], 0, requests)
+    assert (requests.times, questions.waiting) == (1, 1)
     questions.answer(b"{}")
     questions.answer(b"{}")
     assert sent == [[b"asker", *delimiter, b"{}"]]
     assert questions.waiting == 0
-    assert questions.due_ns() is None
     assert questions.counters == {"asked": 1, "answered": 1, "dropped": 0}
 
 
@@ -86,7 +87,10 @@ def test_a_question_gets_one_answer(
 def test_what_is_no_question_is_counted_and_not_answered(
     questions: Questions, sent: list[Message], frames: list[bytes]
 ) -> None:
-    assert questions.take([[b"asker", *frames], [b"asker", b"judge"]], 0) == 1
+    requests = Asked()
+    questions.take([[b"asker", *frames]], 0, requests)
+    assert requests.times == 0
+    questions.take([[b"asker", b"judge"]], 0, requests)
     questions.answer(b"{}")
     assert sent == [[b"asker", b"{}"]]
     assert questions.counters["malformed"] == 1
@@ -96,7 +100,7 @@ def test_a_flood_of_questions_is_bounded_and_each_peers_newest_is_answered(
     questions: Questions, sent: list[Message]
 ) -> None:
     for _ in range(5):
-        assert questions.take([[b"%d" % peer, b"judge"] for peer in range(10)], 0) == 10
+        questions.take([[b"%d" % peer, b"judge"] for peer in range(10)], 0, Asked())
     assert questions.waiting == 10
     assert questions.counters["given_up"] == 40
     questions.answer(b"{}")
@@ -107,7 +111,7 @@ def test_the_oldest_question_makes_place_for_a_newer_one(
     questions: Questions, sent: list[Message]
 ) -> None:
     for peer in range(WAITING_MAX + 20):
-        questions.take([[b"%d" % peer, b"judge"]], 0)
+        questions.take([[b"%d" % peer, b"judge"]], 0, Asked())
     assert questions.waiting == WAITING_MAX
     questions.answer(b"{}")
     assert sent[0] == [b"20", b"{}"]
@@ -116,8 +120,8 @@ def test_the_oldest_question_makes_place_for_a_newer_one(
 def test_when_time_is_up_only_the_peers_that_waited_that_long_are_answered(
     questions: Questions, sent: list[Message]
 ) -> None:
-    questions.take([[b"first", b"judge"]], 0)
-    questions.take([[b"second", b"judge"]], 500)
+    questions.take([[b"first", b"judge"]], 0, Asked())
+    questions.take([[b"second", b"judge"]], 500, Asked())
     questions.answer(b"early", PATIENCE_NS - 1)
     assert questions.waiting == 2
     questions.answer(b"late", PATIENCE_NS)
@@ -128,7 +132,7 @@ def test_when_time_is_up_only_the_peers_that_waited_that_long_are_answered(
 
 def test_an_answer_that_is_dropped_is_counted() -> None:
     questions = Questions(lambda _frames: False, PATIENCE_NS)
-    questions.take([[b"asker", b"judge"]], 0)
+    questions.take([[b"asker", b"judge"]], 0, Asked())
     questions.answer(b"{}")
     assert questions.counters["dropped"] == 1
 

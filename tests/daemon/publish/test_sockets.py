@@ -16,12 +16,11 @@ import pytest
 import zmq
 
 from daemon import scene
-from daemon.publish.companion import Answer
 from daemon.publish.door import PublishError
 from daemon.publish.messages import decode_status
 from daemon.publish.sockets import Sockets, plan
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.doors import Peers
+from tests.daemon.publish.doors import Asked, Peers
 
 PATIENCE_MS = 100_000
 HOSTILE_MESSAGES = 10_000
@@ -43,24 +42,6 @@ def wanted(
         "ask": {"endpoint": f"ipc://{folder}/ask", **(ask or {})},
     }
     return scene.parse(text, folder / "scene.toml")
-
-
-class Asked:
-    """Takes what the sockets pass on to the loop."""
-
-    def __init__(self) -> None:
-        self.times = 0
-        self.outcomes: list[tuple[object, ...]] = []
-
-    def ask(self) -> None:
-        self.times += 1
-
-    def outcome(self, *told: object) -> str | None:
-        self.outcomes.append(told)
-        return None
-
-    def keep(self, answer: Answer) -> None:
-        answer(None)
 
 
 STATUS = decode_status((Path(__file__).parent / "golden" / "status.json").read_bytes())
@@ -153,7 +134,7 @@ def test_a_proxy_that_has_ended_ends_the_loop(
 def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:
     sockets = Sockets(wanted(tmp_path))
     assert sockets.questions is not None
-    sockets.questions.take([[b"asker", b"judge"]], 0)
+    sockets.questions.take([[b"asker", b"judge"]], 0, Asked())
     sockets.close()
     sockets.close()
     sockets.send(b"verdict.right", b"{}")
