@@ -136,7 +136,7 @@ class Loop:
                     return Ended.EXHAUSTED
                 if self._stop.take_reload():
                     return Ended.RELOAD
-                if self._sleep.has_slept():  # before anything is repeated for who comes late
+                if self._sleep.has_slept():
                     return self._wake()
                 self._go_round(selector)
         if self._tactile.fileno() is not None:

@@ -7,6 +7,8 @@ import os
 import random
 import select
 import stat
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +21,7 @@ from daemon import scene
 from daemon.publish.door import PublishError
 from daemon.publish.messages import decode_status
 from daemon.publish.sockets import Sockets, plan
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
 
@@ -129,6 +132,24 @@ def test_a_proxy_that_has_ended_ends_the_loop(
         time.sleep(0.1)
         with pytest.raises(PublishError, match="no longer serves"):
             sockets.on_status(STATUS)
+
+
+def test_a_daemon_whose_proxy_ends_ends_with_an_error(tmp_path: Path) -> None:
+    """So systemd starts it again: only the code 2 of a wrong scene forbids that."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n'
+    )
+    code = (
+        "import sys, time, zmq; zmq.proxy = lambda *_sockets: time.sleep(1.0); "
+        f"from daemon.cli import main; sys.exit(main(['run', {str(scene)!r}]))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100
+    )
+    assert ended.returncode == 1
+    assert "libzmq no longer serves it" in ended.stderr
 
 
 def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:
