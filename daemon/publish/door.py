@@ -43,11 +43,11 @@ HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
 """Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
 SUBSCRIPTIONS_QUEUED, ASK_QUEUE = 2, 16
 """Messages of one peer that wait in the PUB and in the ROUTER socket. More wait in the kernel."""
-QUESTIONS_A_ROUND: Final = 8
+QUESTIONS_MAX: Final = 8
 """Questions that the loop takes in one round: they take 0.3 ms on a slow, busy computer. More wait
-for the next round, with the next reading at the latest."""
-QUESTIONS_A_TURN, PAUSE_MS = 8, 2
-"""Questions that are carried to the loop at a time, and the pause, ms, until the next ones."""
+for the next round, with the next reading at the latest. As many are carried at a time."""
+PAUSE_MS: Final = 2
+"""Time until more questions are carried, ms."""
 FRAMES_MAX: Final = 4
 """Frames kept of one message: routing id, delimiter, text, and one by which it is malformed."""
 ANSWERS_QUEUED: Final = 512
@@ -149,7 +149,7 @@ class Courier(Proxy):
         while True:
             poller.poll()
             self._carry_answers()
-            for _ in range(QUESTIONS_A_TURN):
+            for _ in range(QUESTIONS_MAX):
                 if not self._carry_question():
                     break
             if self._back.poll(PAUSE_MS):  # meanwhile more questions wait
@@ -288,10 +288,10 @@ class Door:
         return _sent(self._ask, frames)
 
     def receive(self) -> list[Message]:
-        """Return at most `QUESTIONS_A_ROUND` questions that have come, each with its routing id."""
+        """Return at most `QUESTIONS_MAX` questions that have come, each with its routing id."""
         received: list[Message] = []
         with suppress(zmq.Again):
-            while len(received) < QUESTIONS_A_ROUND:
+            while len(received) < QUESTIONS_MAX:
                 received.append(self._ask.recv_multipart(zmq.NOBLOCK))
         return received
 

@@ -193,14 +193,11 @@ class Sockets(Companion):
         log.info("%d keys may connect", len(clients.admitted))
         removed = admission.admitted.keys() - clients.admitted.keys()
         admission.admitted = clients.admitted
-        if removed:
-            self._disconnect_all()
-
-    def _disconnect_all(self) -> None:
-        """Close the door: libzmq cannot disconnect a single peer. The others reconnect."""
-        door, self._door, self._filenos = self._door, None, []
-        if door is not None and not door.close():
-            raise PublishError(f"{self.endpoint}: cannot disconnect a peer whose key was removed")
+        if removed and self._door is not None:
+            # libzmq cannot disconnect a single peer. The others reconnect.
+            door, self._door, self._filenos = self._door, None, []
+            if not door.close():
+                raise PublishError(f"{self.endpoint}: cannot disconnect a peer with a removed key")
 
     def close(self) -> None:
         """Close all sockets. May be called again."""

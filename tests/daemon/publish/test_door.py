@@ -15,7 +15,7 @@ import pytest
 import zmq
 
 from daemon.process.signals import StopSignal
-from daemon.publish.door import QUESTIONS_A_ROUND, Door, Listener, Message, PublishError
+from daemon.publish.door import QUESTIONS_MAX, Door, Listener, Message, PublishError
 from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
 from tests.ports import free_port
 from tests.threads import at_work
@@ -245,7 +245,7 @@ def test_a_flood_of_questions_is_read_a_few_a_round(asked: tuple[Door, str], pee
     rounds: list[int] = []
     while sum(rounds) < 100:
         rounds.append(len(door.receive()))
-    assert max(rounds) <= QUESTIONS_A_ROUND
+    assert max(rounds) <= QUESTIONS_MAX
 
 
 def test_a_peer_that_sends_too_much_is_disconnected_and_others_are_not(
