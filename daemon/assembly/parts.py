@@ -66,7 +66,7 @@ class Assembly:
 
     def add_sockets(self, sockets: Sockets) -> None:
         """Send messages to `sockets`, which whoever opened them closes."""
-        self._outputs.append(sockets.publisher)
+        self._outputs.append(sockets)
         self.companions.append(sockets)
 
     def open_drivers(self) -> None:

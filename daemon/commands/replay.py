@@ -19,8 +19,8 @@ from daemon.process.extras import needs
 from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.process.text import complain
-from daemon.publish.binding import PublishError
 from daemon.publish.companion import Companion
+from daemon.publish.door import PublishError
 from daemon.publish.sockets import Sockets
 from daemon.run.demo import PUBLISHED, Demo
 from daemon.run.loop import Loop, Timing
@@ -210,8 +210,10 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     )
     with ExitStack() as stack:
         around = Assembly(Parts(wanted, model, pipeline, drivers, pipeline.boot_id or None), stack)
-        sockets = None if args.publish is None else stack.enter_context(Sockets(wanted))
-        if sockets is not None:
+        sockets = None
+        if args.publish is not None:
+            waits = args.wait is not None
+            sockets = stack.enter_context(Sockets(wanted, awaits_subscriber=waits))
             around.add_sockets(sockets)
         around.open_drivers()
         if sockets is not None and args.wait is not None:
@@ -350,10 +352,9 @@ def _begin(
 
 
 def _wait(sockets: Sockets, timeout_s: float, stop: StopSignal) -> None:
-    """Raises `PublishError` if nobody subscribes in time."""
-    publisher = sockets.publisher
-    if not publisher.wait_for_subscriber(timeout_s, stop) and stop.received is None:
-        raise PublishError(f"nobody subscribed to {publisher.endpoint} within {timeout_s:g} s")
+    """Wait for a subscriber. Raises `PublishError` if there is none in time."""
+    if not sockets.wait_for_subscriber(timeout_s, stop) and stop.received is None:
+        raise PublishError(f"nobody subscribed to {sockets.endpoint} within {timeout_s:g} s")
 
 
 def _scene(args: argparse.Namespace, recorded: Recorded | None) -> Scene:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from daemon.process.signals import StopSignal
 from daemon.process.text import complain
-from daemon.publish.binding import PublishError
+from daemon.publish.door import PublishError
 from daemon.run.runner import Runner
 from daemon.scene import SceneError
 from drivers.base import DriverError, RecordingError
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from daemon.run.printer import Printer
     from daemon.run.systemd import Systemd
 
-DESCRIPTORS = 4096
-"""For all peers of both sockets, and as many again for peers with keys, files and devices."""
+DESCRIPTORS = 65_536
+"""Descriptors for all peers: libzmq 4.3.5 ends the process where a Unix socket finds none left."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,8 +10,6 @@ import stat
 from pathlib import Path
 from typing import NamedTuple
 
-import zmq.auth
-
 from daemon.process.files import read_regular
 
 PUBLIC, SECRET = ".key", ".key_secret"
@@ -47,6 +45,8 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
 
     Raises `KeysError`.
     """
+    from zmq.auth import create_certificates  # the daemon itself makes none
+
     if not NAME.fullmatch(name) or name.startswith("."):
         raise KeysError(f"{name!r} is no name for a key: letters, digits, '_', '-' and '.'")
     public, secret = folder / f"{name}{PUBLIC}", folder / f"{name}{SECRET}"
@@ -56,7 +56,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
     former = os.umask(0o077)  # before there is anything to read
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        zmq.auth.create_certificates(folder, name)
+        create_certificates(folder, name)
         public.chmod(0o644)
     except OSError as error:
         raise KeysError(f"{folder}: cannot make keys: {error.strerror}") from error
@@ -73,9 +73,9 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
     public, secret = _load(path, "the key")
     if secret is None:
         raise KeysError(f"{path}: has no secret key; name the {SECRET} file")
-    loose = _looser_than_0600(path)
-    if loose:
-        raise KeysError(f"{path}: {loose}; others may read it: chmod 600")
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise KeysError(f"{path}: mode {mode:04o}; others may read it: chmod 600")
     return public, secret
 
 
@@ -178,9 +178,3 @@ def _refuse_owner(path: Path, status: os.stat_result) -> None:
         owner = str(status.st_uid)
     if os.geteuid() or owner != SERVICE:
         raise KeysError(f"{path}: belongs to {owner}, who may put another key there")
-
-
-def _looser_than_0600(path: Path) -> str:
-    """The file's mode, if it gives others anything; empty otherwise."""
-    mode = stat.S_IMODE(path.stat().st_mode)
-    return f"mode {mode:04o}" if mode & 0o077 else ""

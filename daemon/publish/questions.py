@@ -1,218 +1,185 @@
-"""The socket on which a grasp controller asks whether it may lift, and tells how lifts ended."""
+"""Questions of grasp controllers whether they may lift, and what they report of their lifts."""
 
 from __future__ import annotations
 
 import json
 import re
-import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Literal
 
-from daemon.publish.binding import Binding, Peer
-from daemon.publish.bound import Bound
-from daemon.publish.companion import CONTRADICTS, Answer
+from daemon.publish.companion import CONTRADICTS, Requests
+from daemon.publish.door import Message
 from daemon.publish.messages import OBJECT_PATTERN
-from daemon.publish.zmtp import Message, Role
 from daemon.trust.ledger import GRASPS_MAX, GraspId
 
-QUESTION = b"judge"
-TELLING = b"outcome"
+JUDGE, LIFT = b"judge", b"lift"
+"""Questions. The answer is the same, but only `lift` makes the peer the owner of the grasp."""
+OUTCOME = b"outcome"
 """First word of `outcome <boot_id> <grasp> <stable|slip> [<object>]`."""
-MESSAGE_MAX_BYTES = 128
-"""The longest outcome; a peer that sends more asks nothing and is disconnected."""
 WAITING_MAX: Final = 256
-"""Questions that wait for an answer, one of each peer; the oldest is given up for a newer one."""
-QUEUE_MAX = 16
-"""Answers queued per peer."""
-_TOLD = re.compile(
+"""Questions that wait for an answer, one of each peer. A newer one replaces the oldest."""
+_REPORT = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
 )
 MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
-NOBODY = "nobody takes outcomes here"
-TOO_EARLY = "too early: who asked about this grasp is still there"
-HELD_MAX = 16
-"""Outcomes that are held because they are too early."""
-GRACE_NS = 100_000_000
-"""For how long: who asks, closes, connects again and tells may be heard of in another order."""
-NOT_YOURS = "not yours: somebody else asks about grasps here"
+NOT_YOURS = "not yours: another peer asks whether it may lift here"
 
-TakeOutcome = Callable[[str, int, Literal["stable", "slip"], str | None], str | None]
-"""Takes a boot id, a grasp, how its lift ended, and the object if it was named; None, or why it
-does not."""
-Keep = Callable[[Answer], None]
-"""Calls the answer once what was told is kept, or is known not to be."""
-
-
-def at_once(answer: Answer) -> None:
-    """Keep nothing: what was told is answered as it is told."""
-    answer(None)
+Peer = bytes
+"""Routing id of a connection."""
+NAME_BYTES: Final = 16
+"""A client with several connections begins their routing ids with the same 16 random bytes. It is
+the owner of its grasps by them."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Question:
     envelope: Message
+    """Routing id, and the delimiter of a REQ socket."""
     due_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Told:
-    peer: Peer
-    envelope: Message
-    text: bytes
-    due_ns: int
-    """When it is no longer held, monotonic ns."""
+    lifts: bool
 
 
 @dataclass(slots=True)
 class _Lift:
-    """A grasp that was asked about, or whose outcome was told."""
+    """A grasp that a peer wants to lift, or whose outcome was reported."""
 
     owner: Peer | None
-    """Who asked first; None: nobody."""
+    """Name of the first peer that was answered about it; None: no peer asked to lift it."""
     outcome: str | None = None
 
 
-class Questions(Bound):
-    """Takes questions and answers them; never blocks.
+class LiftBook:
+    """Which peer may report the outcome of which grasp, for the last `GRASPS_MAX` grasps."""
 
-    A peer has one question at a time; another one replaces it. Who was first to get an answer about
-    a grasp is the one who tells its outcome: nobody else may, unless it stands for who is gone.
-    What was told stays.
-    """
+    def __init__(self) -> None:
+        self._lifts: dict[GraspId, _Lift] = {}
+        """Oldest first."""
 
-    def __init__(self, endpoint: str, patience_ns: int, binding: Binding | None = None) -> None:
-        """Bind to `endpoint`; a question waits `patience_ns` at most. Raises `PublishError`."""
-        super().__init__(endpoint, Role.ROUTER, QUEUE_MAX, binding)
-        self._counted: Counter[str] = Counter()
+    def own(self, grasp: GraspId, peer: Peer) -> None:
+        """Make the peer the owner of a grasp that is not in the book yet."""
+        self._entry(grasp, peer)
+
+    def report(self, grasp: GraspId, outcome: str) -> None:
+        """Note an outcome that was taken."""
+        self._entry(grasp, None).outcome = outcome
+
+    def objection(self, grasp: GraspId, peer: Peer, outcome: str) -> str | None:
+        """Return why the peer may not report this outcome; None if it may.
+
+        A grasp with an owner is reported by its owner. A grasp without one is reported by the
+        owners of other grasps, or by all peers if there are no owners.
+        """
+        lift = self._lifts.get(grasp)
+        if lift is None or lift.owner is None:
+            owners = {each.owner for each in self._lifts.values() if each.owner is not None}
+        else:
+            owners = {lift.owner}
+        if owners and peer not in owners:
+            return NOT_YOURS
+        if lift is not None and lift.outcome not in (None, outcome):
+            return CONTRADICTS
+        return None
+
+    def _entry(self, grasp: GraspId, owner: Peer | None) -> _Lift:
+        """Return the entry of a grasp; a new one gets this owner."""
+        lift = self._lifts.setdefault(grasp, _Lift(owner))
+        if len(self._lifts) > GRASPS_MAX:
+            del self._lifts[next(iter(self._lifts))]
+        return lift
+
+
+class Questions:
+    """Takes questions and outcomes, and answers them. A peer has one question at a time."""
+
+    def __init__(self, send: Callable[[Sequence[bytes]], bool], patience_ns: int) -> None:
+        """`send` returns False if it drops an answer. Questions wait at most `patience_ns`."""
+        self.counters: Counter[str] = Counter()
+        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken, and kept where
+        that is wanted, and `outcomes_refused`; `dropped` answers."""
+        self._send = send
         self._patience_ns = patience_ns
         self._waiting: dict[Peer, _Question] = {}
         """Oldest first."""
-        self._lifts: dict[GraspId, _Lift] = {}
-        """Oldest first, as many as outcomes are taken of."""
-        self._held: list[_Told] = []
-
-    @property
-    def counters(self) -> Counter[str]:
-        """`asked`, `answered`, `given_up`, `malformed`; `outcomes` that were taken, and kept where
-        that is wanted, and `outcomes_refused`; and what the door counts."""
-        return self._with_the_doors(self._counted)
+        self._book = LiftBook()
 
     @property
     def waiting(self) -> int:
-        """Questions without an answer."""
+        """Number of questions without an answer."""
         return len(self._waiting)
 
-    def due_ns(self) -> int | None:
-        """When the oldest question must be answered, monotonic ns."""
-        return next(iter(self._waiting.values())).due_ns if self._waiting else None
-
-    def take(self, now_ns: int, outcome: TakeOutcome | None = None, keep: Keep = at_once) -> int:
-        """Take in what has come; how many questions it was.
-
-        Outcomes go to `outcome`; those that it takes are answered when `keep` says so.
-        """
-        taken = 0
-        held, self._held = self._held, []
-        for told in held:
-            self._take_outcome(told, outcome, keep)
-        for peer, message in self.door.receive():
-            *envelope, question = message
-            well = envelope in ([], [b""])
-            if well and question.partition(b" ")[0] == TELLING:
-                due_ns = time.monotonic_ns() + GRACE_NS
-                self._take_outcome(_Told(peer, envelope, question, due_ns), outcome, keep)
-            elif well and question == QUESTION:
-                self._wait(peer, _Question(envelope, now_ns + self._patience_ns))
-                taken += 1
+    def take(self, messages: Iterable[Message], now_ns: int, requests: Requests) -> None:
+        """Take the messages of peers, and pass on to `requests` what they want."""
+        asked = 0
+        for peer, *envelope, text in messages:
+            well_formed = envelope in ([], [b""])
+            if well_formed and text.partition(b" ")[0] == OUTCOME:
+                self._take_outcome([peer, *envelope], text, requests)
+            elif well_formed and text in (JUDGE, LIFT):
+                due_ns = now_ns + self._patience_ns
+                self._wait(peer, _Question([peer, *envelope], due_ns, text == LIFT))
+                asked += 1
             else:
-                self._counted["malformed"] += 1
-        self._counted["asked"] += taken
-        return taken
-
-    def _take_outcome(self, told: _Told, outcome: TakeOutcome | None, keep: Keep) -> None:
-        why = self._pass_on(told.peer, told.text, outcome)
-        if why == TOO_EARLY:
-            if len(self._held) < HELD_MAX and time.monotonic_ns() < told.due_ns:
-                self._held.append(told)
-                return
-            why = NOT_YOURS
-        answer = partial(self._answer_outcome, told.peer, told.envelope)
-        if why is None:
-            keep(answer)
-        else:
-            answer(why)
+                self.counters["malformed"] += 1
+        if asked:
+            self.counters["asked"] += asked
+            requests.ask()
 
     def _wait(self, peer: Peer, question: _Question) -> None:
         if self._waiting.pop(peer, None) is not None:
-            self._counted["given_up"] += 1
+            self.counters["given_up"] += 1
         elif len(self._waiting) >= WAITING_MAX:
-            gone = (each for each in self._waiting if not each.is_open)
-            del self._waiting[next(gone, next(iter(self._waiting)))]
-            self._counted["given_up"] += 1
+            del self._waiting[next(iter(self._waiting))]
+            self.counters["given_up"] += 1
         self._waiting[peer] = question
 
-    def _pass_on(self, peer: Peer, text: bytes, take_outcome: TakeOutcome | None) -> str | None:
-        """Pass on how a lift ended; None, or why that is of no use."""
-        told = _TOLD.fullmatch(text)
-        if told is None:
+    def _take_outcome(self, envelope: Message, text: bytes, requests: Requests) -> None:
+        refusal = self._refusal(envelope[0], text, requests)
+        answer = partial(self._answer_outcome, envelope)
+        if refusal is None:
+            requests.keep(answer)
+        else:
+            answer(refusal)
+
+    def _refusal(self, peer: Peer, text: bytes, requests: Requests) -> str | None:
+        """Pass an outcome on. Return None, or why it is refused."""
+        report = _REPORT.fullmatch(text)
+        if report is None:
             return MALFORMED
-        if take_outcome is None:
-            return NOBODY
-        outcome: Literal["stable", "slip"] = "slip" if told[3] == b"slip" else "stable"
-        named = None if told[4] is None else told[4].decode()
-        grasp = GraspId(told[1].decode(), int(told[2]))
-        owners = self._owners(grasp)
-        if owners and not any(map(peer.stands_for, owners)):
-            return TOO_EARLY if any(map(peer.may_follow, owners)) else NOT_YOURS
-        lift = self._lifts.get(grasp)
-        if lift is not None and lift.outcome not in (None, outcome):
-            return CONTRADICTS
-        why = take_outcome(*grasp, outcome, named)
-        if why is None:
-            self._lift(grasp, None).outcome = outcome
-        return why
+        outcome: Literal["stable", "slip"] = "slip" if report[3] == b"slip" else "stable"
+        object_name = None if report[4] is None else report[4].decode()
+        grasp = GraspId(report[1].decode(), int(report[2]))
+        refusal = self._book.objection(grasp, peer[:NAME_BYTES], outcome)
+        if refusal is None:
+            refusal = requests.outcome(*grasp, outcome, object_name)
+        if refusal is None:
+            self._book.report(grasp, outcome)
+        return refusal
 
-    def _owners(self, grasp: GraspId) -> set[Peer]:
-        """Who asked about a grasp; if nobody has, whoever asks here; nobody if nobody does."""
-        lift = self._lifts.get(grasp)
-        if lift is not None and lift.owner is not None:
-            return {lift.owner}
-        return {each.owner for each in self._lifts.values() if each.owner is not None}
+    def _answer_outcome(self, envelope: Message, refusal: str | None) -> None:
+        """Tell the peer whether its outcome was taken. A peer that has gone misses it."""
+        refused = "malformed" if refusal == MALFORMED else "outcomes_refused"
+        self.counters["outcomes" if refusal is None else refused] += 1
+        said = {"v": 1, "ok": True} if refusal is None else {"v": 1, "ok": False, "why": refusal}
+        self._answer(envelope, json.dumps(said, separators=(",", ":")).encode())
 
-    def _lift(self, grasp: GraspId, owner: Peer | None) -> _Lift:
-        """What is known of a grasp; it gets this owner if nothing is."""
-        if grasp not in self._lifts and len(self._lifts) >= GRASPS_MAX:
-            del self._lifts[next(iter(self._lifts))]
-        return self._lifts.setdefault(grasp, _Lift(owner))
-
-    def _answer_outcome(self, peer: Peer, envelope: Message, why: str | None) -> None:
-        """Say whether an outcome was of use. Whoever is gone misses it."""
-        refused = "malformed" if why == MALFORMED else "outcomes_refused"
-        self._counted["outcomes" if why is None else refused] += 1
-        said = {"v": 1, "ok": True} if why is None else {"v": 1, "ok": False, "why": why}
-        answer = json.dumps(said, separators=(",", ":")).encode()
-        self.door.send(peer, (*envelope, answer))
+    def _answer(self, envelope: Message, payload: bytes) -> None:
+        self.counters["dropped"] += not self._send((*envelope, payload))
 
     def answer(
         self, payload: bytes, now_ns: int | None = None, grasp: GraspId | None = None
     ) -> None:
         """Answer all questions, or with `now_ns` those that can wait no longer.
 
-        `grasp` is the one that the answer is about. Whoever is gone misses it.
+        `grasp` is the one that the answer is about: it gets its owner here.
         """
-        answered = []
-        for peer, question in self._waiting.items():
+        for peer, question in list(self._waiting.items()):
             if now_ns is not None and question.due_ns > now_ns:
-                break
-            self.door.send(peer, (*question.envelope, payload))
-            answered.append(peer)
-        if not answered:
-            return
-        for peer in answered:
+                return
             del self._waiting[peer]
-        self._counted["answered"] += len(answered)
-        if grasp is not None and grasp.grasp:
-            self._lift(grasp, answered[0])
+            self.counters["answered"] += 1
+            self._answer(question.envelope, payload)
+            if question.lifts and grasp is not None and grasp.grasp:
+                self._book.own(grasp, peer[:NAME_BYTES])

@@ -65,7 +65,7 @@ class SocketFile:
         self.listener.listen(BACKLOG)
 
     def close(self) -> None:
-        """Stop listening, unless the listener was detached, and remove what was put there."""
+        """Stop listening, and remove both files."""
         self.listener.close()
         with contextlib.suppress(OSError):  # a folder that has gone or was locked: no harm
             if self._identity is not None and _identity(self.path) == self._identity:

@@ -1,146 +1,137 @@
-"""All sockets of a scene: for messages, for questions, and for the check of keys."""
+"""The sockets of a scene, for messages and questions, and the keys of peers that may connect."""
 
 from __future__ import annotations
 
 import logging
 import os
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from daemon.publish.binding import Binding, OwnKeys, PublishError
 from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.door import Admission, Door, Listener, PublishError
 from daemon.publish.messages import Status
-from daemon.publish.publisher import Publisher
 from daemon.scene import Curve, Scene, SceneError
 from daemon.trust.ledger import GraspId
 
 if TYPE_CHECKING:
-    from daemon.publish.access import Authenticator
-    from daemon.publish.curve import CurveDoor, Guard
+    from daemon.process.signals import Stop
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
 log = logging.getLogger("graspd")
 
+TACTILE = b"tactile."
+"""Prefix of the topics that are sent seldom."""
+
 
 class Sockets(Companion):
-    """Open from the start until `close`."""
+    """The sockets, open until `close`."""
 
-    def __init__(self, wanted: Scene, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        """`clock` gives monotonic ns.
+    def __init__(
+        self,
+        wanted: Scene,
+        clock: Callable[[], int] = time.monotonic_ns,
+        *,
+        awaits_subscriber: bool = False,
+    ) -> None:
+        """`clock` gives monotonic ns. `awaits_subscriber`: `wait_for_subscriber` will be called.
 
         Raises `PublishError`, and `SceneError` for keys that are wrong.
         """
         self.plan = plan(wanted)
+        self.endpoint = wanted.endpoint
         self._clock = clock
+        self._awaits_subscriber = awaits_subscriber
+        self._high_water_mark = wanted.publish.high_water_mark
+        self._counters = Counter(dropped=0)
+        tactile_hz = wanted.publish.tactile_hz
+        self._tactile_period_ns = round(1e9 / tactile_hz) if tactile_hz else None
+        self._tactile_due_ns = 0
         self._curve = wanted.curve
         self._keys_seen: object = None
-        self._lost = False
-        """Whether a port could not be had again."""
-        self._own_keys: OwnKeys | None = None
-        self.authenticator: Authenticator | None = None
-        self._guard: Guard | None = None
-        self.publisher: Publisher
+        self._admission = None if wanted.curve is None else self._load_keys(wanted.curve)
+        self._door: Door | None = None
+        """None after `close`, and while an endpoint cannot be had again."""
         self.questions: Questions | None = None
+        self._publish: Listener | None = None
+        self._ask: Listener | None = None
         self._filenos: list[int] = []
         try:
-            self._open(wanted)
+            self._listen(wanted)
+            self._open()
         except BaseException:
             self.close()
             raise
 
-    def _open(self, wanted: Scene) -> None:
-        if wanted.curve is not None:
-            self._let_in_only_known(wanted.curve)
+    def _listen(self, wanted: Scene) -> None:
         publish = wanted.publish
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
-        binding = Binding(mode, publish.group, self._own_keys)
-        self.publisher = Publisher(wanted.endpoint, publish.high_water_mark, binding)
+        self._publish = Listener.of(wanted.endpoint, mode, publish.group)
         if wanted.ask_endpoint is not None:
-            from daemon.publish.questions import Questions
+            self._ask = Listener.of(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            from daemon.publish.questions import Questions  # only where peers may ask
 
-            patience_ns = round(wanted.gate.request_ms * 1e6)
-            asked = replace(binding, file_mode=wanted.ask_file_mode, group=wanted.ask_group)
-            self.questions = Questions(wanted.ask_endpoint, patience_ns, asked)
-        self._watch()
-        if self._with_keys():
-            from daemon.publish.curve import Guard
+            self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))
 
-            self._guard = Guard(self._cut_off_greedy)
+    def _open(self) -> None:
+        if self._publish is None:
+            return
+        self._door = Door(
+            self._publish,
+            self._ask,
+            self._high_water_mark,
+            self._admission,
+            awaits_subscriber=self._awaits_subscriber,
+        )
+        if self.questions is not None:
+            self._filenos = [self._door.fileno()]
 
-    def _let_in_only_known(self, curve: Curve) -> None:
-        import zmq  # only where there are keys
-
-        from daemon.publish.access import Authenticator
-        from daemon.publish.keys import KeysError, load_clients, load_own
+    def _load_keys(self, curve: Curve) -> Admission:
+        from daemon.publish import keys  # only where there are any
 
         self._keys_seen = _state(curve.clients)
         try:
-            pair, clients = load_own(curve.secret_key), load_clients(curve.clients)
-        except KeysError as error:
+            pair, clients = keys.load_own(curve.secret_key), keys.load_clients(curve.clients)
+        except keys.KeysError as error:
             raise SceneError(str(error)) from error
-        self._own_keys = OwnKeys(zmq.Context(io_threads=1), *pair)
-        self.authenticator = Authenticator(self._own_keys.context, clients.admitted)
-        self._tell_refused(self.authenticator, clients)
-
-    @staticmethod
-    def _tell_refused(authenticator: Authenticator, clients: Clients) -> None:
-        authenticator.counters["files_refused"] += len(clients.refused)
-        for why in clients.refused:
-            log.error("%s; no key there may connect", why)
-
-    def _watch(self) -> None:
-        self._filenos = [each.fileno() for each in self._bound() if each.is_open]
-        if self.authenticator is not None:
-            for door in self._with_keys():
-                if door.is_open:
-                    self.authenticator.watch(door.socket)
-            self._filenos += self.authenticator.filenos()
-
-    def _with_keys(self) -> list[CurveDoor]:
-        if self._curve is None:
-            return []
-        from daemon.publish.curve import CurveDoor
-
-        return [bound.door for bound in self._bound() if isinstance(bound.door, CurveDoor)]
-
-    def _bound(self) -> list[Publisher | Questions]:
-        wanted = (getattr(self, "publisher", None), self.questions)
-        return [each for each in wanted if each is not None]
+        _log_refused(clients)
+        return Admission(*pair, clients.admitted)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Publish one message."""
-        self.publisher.send(topic, payload)
+        """Publish one message. It is dropped, and counted, where libzmq is behind."""
+        if self._door is None or not self._door.send(topic, payload):
+            self._counters["dropped"] += 1
 
     def wanted(self, topic: bytes) -> bool:
-        """Whether somebody subscribes to a topic."""
-        return self.publisher.wanted(topic)
+        """Return True if a message of this topic is to be sent now: readings are sent seldom."""
+        if not topic.startswith(TACTILE):
+            return True
+        if self._tactile_period_ns is None:
+            return False
+        now_ns = self._clock()
+        # Half a period early is in time: readings at this very rate jitter.
+        if now_ns < self._tactile_due_ns - self._tactile_period_ns // 2:
+            return False
+        self._tactile_due_ns = max(self._tactile_due_ns, now_ns) + self._tactile_period_ns
+        return True
+
+    def _answer(self, frames: Sequence[bytes]) -> bool:
+        return self._door is not None and self._door.answer(frames)
 
     def filenos(self) -> list[int]:
-        """Become readable when a peer may want something, as long as `before_wait` is called."""
+        """Return what becomes readable when a question comes, if `before_wait` is called."""
         return self._filenos
 
     def before_wait(self, requests: Requests) -> None:
-        """See to peers that come; pass on what they ask and tell."""
-        self.take()
-        if self.questions is not None and self.questions.take(
-            self._clock(), requests.outcome, requests.keep
-        ):
-            requests.ask()
-
-    def take(self) -> None:
-        """See to peers that come; questions are taken by `before_wait`."""
-        self.publisher.take()
-        if self.authenticator is not None:
-            self.authenticator.take()
-        if self._guard is not None:
-            self._guard.look(self._clock())
+        """Pass on what peers ask and report."""
+        if self.questions is not None and self._door is not None:
+            self.questions.take(self._door.receive(), self._clock(), requests)
 
     def on_verdict(self, published: Published) -> None:
-        """Answer all who have asked, or only those who have waited too long for a better answer."""
+        """Answer all questions, or those alone that have waited too long for a better answer."""
         if self.questions is None or not self.questions.waiting:
             return
         verdict = published.verdict
@@ -149,70 +140,71 @@ class Sockets(Companion):
         self.questions.answer(published.payload, overdue_at_ns, grasp)
 
     def on_status(self, status: Status) -> None:
-        """Take the list of those who may connect, if it has changed."""
+        """Check that libzmq still serves the sockets, and look at the list of keys.
+
+        Raises `PublishError`, which ends the daemon.
+        """
+        if self._door is not None:
+            self._door.check()
         self.check_keys()
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """What peers did, by the part that counted it."""
-        parts = {"publish": self.publisher, "ask": self.questions, "keys": self.authenticator}
-        return {name: dict(part.counters) for name, part in parts.items() if part is not None}
+        """What was counted, by part."""
+        counters = {"publish": dict(self._counters)}
+        if self.questions is not None:
+            counters["ask"] = dict(self.questions.counters)
+        return counters
+
+    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+        """Wait until a peer has connected to hear messages; see `Door`."""
+        return self._door is not None and self._door.wait_for_subscriber(timeout_s, stop)
 
     def check_keys(self) -> None:
-        """If the list of those who may connect has changed, take it; who is off it is cut off.
+        """Take the list of keys if it has changed. A peer whose key is removed is disconnected.
 
-        A list that cannot be read, or that others may write, lets nobody in, and is tried again
-        when it changes. A port that somebody else has taken meanwhile is left to them, and tried
-        again.
+        A list that cannot be read, or that others may write, admits no peer, and is tried again
+        when it changes. An endpoint that another program has taken meanwhile is tried again, too.
+        Raises `PublishError` if peers cannot be disconnected.
         """
-        if self._curve is None or self.authenticator is None:
+        if self._curve is None or self._admission is None:
             return
         now = _state(self._curve.clients)
-        if now == self._keys_seen and not self._lost:
-            return
-        from daemon.publish.keys import Clients, KeysError, load_clients
+        if now != self._keys_seen:
+            self._keys_seen = now
+            self._take_keys(self._curve, self._admission)
+        if self._door is None:
+            try:
+                self._open()
+            except PublishError as error:
+                log.error("%s; no peer can connect", error)
+
+    def _take_keys(self, curve: Curve, admission: Admission) -> None:
+        from daemon.publish import keys
 
         try:
-            clients = load_clients(self._curve.clients)
-        except KeysError as error:
-            clients = Clients({}, [str(error)])
-        if now != self._keys_seen:
-            self._tell_refused(self.authenticator, clients)
-            log.info("%d keys may connect", len(clients.admitted))
-        self._keys_seen = now
-        if self.authenticator.admit(clients.admitted) or self._lost:
-            self._cut_off()
-
-    def _cut_off(self) -> None:
-        """Close all connections by TCP: libzmq cannot cut off one peer alone."""
-        if self.authenticator is not None:
-            self.authenticator.unwatch()
-        self._lost = False
-        for door in self._with_keys():
-            try:
-                door.renew()
-            except PublishError as error:
-                log.error("%s; nobody can connect there", error)
-                self._lost = True
-        self._watch()
-
-    def _cut_off_greedy(self) -> None:
-        log.error("peers with keys hold too much memory: all of them have to connect again")
-        for door in self._with_keys():
-            door.counters["all_cut_off"] += 1
-        self._cut_off()
+            clients = keys.load_clients(curve.clients)
+        except keys.KeysError as error:
+            clients = keys.Clients({}, [str(error)])
+        _log_refused(clients)
+        log.info("%d keys may connect", len(clients.admitted))
+        removed = admission.admitted.keys() - clients.admitted.keys()
+        admission.admitted = clients.admitted
+        if removed and self._door is not None:
+            # libzmq cannot disconnect a single peer. The others reconnect.
+            door, self._door, self._filenos = self._door, None, []
+            if not door.close():
+                raise PublishError(f"{self.endpoint}: cannot disconnect a peer with a removed key")
 
     def close(self) -> None:
-        """Close them all. May be called again."""
-        if self._guard is not None:
-            self._guard.close()
-            self._guard = None
-        for bound in self._bound():
-            bound.close()
-        if self.authenticator is not None:
-            self.authenticator.close()
-        if self._own_keys is not None:
-            self._own_keys.context.term()
+        """Close all sockets. May be called again."""
+        if self._door is not None and not self._door.close():
+            log.warning("%s: peers keep libzmq from closing", self.endpoint)
+        self._door = None
+        for listener in (self._publish, self._ask):
+            if listener is not None:
+                listener.close()
+        self._publish = self._ask = None
 
     def __enter__(self) -> Self:
         return self
@@ -221,16 +213,20 @@ class Sockets(Companion):
         self.close()
 
 
+def _log_refused(clients: Clients) -> None:
+    for why in clients.refused:
+        log.error("%s; no key there may connect", why)
+
+
 def plan(wanted: Scene) -> object:
-    """What of a scene is about its sockets: equal for scenes that can share them."""
+    """Return the parts of a scene that its sockets depend on. Scenes with equal ones share them."""
     asked = (wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group, wanted.gate.request_ms)
     own_key = None if wanted.curve is None else _state(wanted.curve.secret_key.parent)
     return wanted.hand.name, wanted.publish, wanted.curve, own_key, asked
 
 
 def _state(folder: Path) -> object:
-    """Differs from one look to the next when a file in the folder was put, changed or removed, or
-    who may write there."""
+    """Return a value that changes when a file in the folder, or its rights, change."""
     try:
         with os.scandir(folder) as entries:
             found = {entry.name: _signature(entry) for entry in entries}
@@ -241,9 +237,9 @@ def _state(folder: Path) -> object:
 
 
 def _signature(entry: os.DirEntry[str]) -> object:
-    """Differs when a file was replaced or changed, or its rights."""
+    """Return a value that changes when a file is replaced or changed, or its rights."""
     try:
         about = entry.stat()
-    except OSError as error:  # such as a link that leads nowhere
+    except OSError as error:  # a link that leads nowhere, for example
         return error.errno
     return about.st_ino, about.st_mtime_ns, about.st_ctime_ns, about.st_size

@@ -141,7 +141,7 @@ class Loop:
                     return Ended.EXHAUSTED
                 if self._stop.take_reload():
                     return Ended.RELOAD
-                if self._sleep.has_slept():  # before a late subscriber gets an old message again
+                if self._sleep.has_slept():
                     self._report_silence(self._clock(), is_answer=True)
                     return Ended.SLEPT
                 self._go_round(selector)

@@ -26,7 +26,9 @@ CAP_IPC_LOCK = 14
 class RealtimeMode(Companion):
     """Has the process run in realtime from `__enter__` to `__exit__`.
 
-    What the system refuses is left out; one warning says which rights to grant.
+    Only the thread that enters, the loop's, gets the priority: it comes before libzmq's threads,
+    which copy messages. What the system refuses is left out; one warning says which rights to
+    grant.
     """
 
     def __init__(self, wanted: Realtime) -> None:
@@ -37,7 +39,7 @@ class RealtimeMode(Companion):
         """What was refused, and the right to grant."""
 
     def __enter__(self) -> Self:
-        """Take what the scene wants, for all threads that exist now."""
+        """Take what the scene wants: the priority for this thread, the rest for the process."""
         wanted = self._wanted
         if wanted.cpus is not None:
             self._pin(set(wanted.cpus))
@@ -62,9 +64,10 @@ class RealtimeMode(Companion):
         """Be an ordinary process again."""
         gc.enable()
         gc.unfreeze()
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
         for thread in _threads():
             with suppress(OSError):
-                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
                 os.sched_setaffinity(thread, self._processors)
         _libc().munlockall()
 
@@ -82,8 +85,9 @@ class RealtimeMode(Companion):
 
     def _raise(self, priority: int) -> None:
         try:
-            for thread in _threads():
-                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(priority))
+            # Threads that this one starts later are ordinary. Only root may take the flag back.
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            os.sched_setscheduler(0, policy, os.sched_param(priority))
         except OSError as error:
             self.lacking[f"realtime.priority {priority}: {error.strerror}"] = (
                 f"grant LimitRTPRIO={priority} in the unit, or `rtprio {priority}` in limits.conf"

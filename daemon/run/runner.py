@@ -13,7 +13,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.process.signals import StopSignal
-from daemon.publish.binding import PublishError
+from daemon.publish.door import PublishError
 from daemon.publish.sockets import Sockets, plan
 from daemon.run.loop import Ended, Loop, Timing
 from daemon.run.reload import Reload
@@ -174,7 +174,6 @@ class Runner:
                 Timing(wanted.max_age_ns),
                 around.keep,
             )
-            stack.callback(sockets.publisher.forget)
             stack.callback(loop.close)
             self._running, self._former = True, None
             self._trust = parts.pipeline.trust

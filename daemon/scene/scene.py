@@ -189,6 +189,9 @@ class Publish(Section):
     addresses."""
     high_water_mark: Annotated[int, Field(ge=1, le=100_000), Unit("messages")] = 1000
     """Messages kept for a subscriber that is slow; those that come then are lost to it."""
+    tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), Unit("1/s")] = 25.0
+    """Readings published a second on `tactile.<hand>`; 0 publishes none. At the sensor's rate or
+    above, every reading goes. Recordings always have every reading."""
     file_mode: FileMode | None = None
     """Of the file of an `ipc://` socket, as in chmod: who may write may connect. As the umask has
     it unless given."""

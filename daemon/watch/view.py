@@ -110,7 +110,7 @@ class View:
         last = self._verdict
         if last is not None and verdict.boot_id == last.boot_id:
             if verdict.seq <= last.seq:
-                return  # repeated for somebody else: no sign of life
+                return  # old or repeated: no sign of life
             self._lost += verdict.seq - last.seq - 1
         self._received += 1
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate

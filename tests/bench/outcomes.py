@@ -117,7 +117,7 @@ class Bench:
             f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
             f"rate_hz = {RATE_HZ}\n[risk]\nmax_slip_when_stable = 0.2\n"
             '[session]\nfile = "right.session.json"\nkeep = true\nlearn = false\n'
-            f'[publish]\nendpoint = "ipc://{folder}/graspd"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
+            f'[publish]\nendpoint = "ipc://{folder}/graspd"\ntactile_hz = 10000\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
         )
         self._scene = scene.load(self._path)
         self._seed_session()

@@ -99,11 +99,9 @@ class Turn:
     """The last one."""
 
     def add(self, payload: bytes, received_ns: int) -> None:
-        """Take in a verdict; one that was repeated for others is none."""
-        verdict = decode_verdict(payload)
-        if not self.verdicts or verdict.seq > self.verdicts[-1].seq:
-            self.verdicts.append(verdict)
-            self.received_ns.append(received_ns)
+        """Take in a verdict."""
+        self.verdicts.append(decode_verdict(payload))
+        self.received_ns.append(received_ns)
 
     @property
     def lost(self) -> int:

@@ -76,7 +76,7 @@ def _serve(
             if asked.poll(PERIOD_MS):
                 who, *question = asked.recv_multipart()
                 told_of = question[0].startswith(b"outcome ")
-                assert told_of or question == [b"judge"]
+                assert told_of or question == [b"lift"]
                 asked.send_multipart([who, *(TAKEN_FRAMES if told_of else answer(message))])
 
 

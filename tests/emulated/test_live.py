@@ -50,7 +50,7 @@ def live(image: Image, tmp_path: Path) -> Iterator[Live]:
     link, scene = tmp_path / "port", tmp_path / "scene.toml"
     scene.write_text(
         f'[tactile]\ndriver = "spi"\nport = "{link}"\n[model]\nname = "cnn1"\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\ntactile_hz = 10000\n'
     )
     counts = write_counts(tmp_path / "counts", grasps())
     command = [sys.executable, "-m", "tests.emulated.live", "--link", link, "--counts", counts]

@@ -15,15 +15,14 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.recorder import header_of, state_of
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion, Requests
-from daemon.publish.messages import Verdict
+from daemon.publish.companion import Companion, Published, Requests
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
 from daemon.record.recorder import Recorder
 from daemon.run.loop import Loop, Timing
 from daemon.scene import Scene
-from drivers.base import DriverCounters, Reading, TactileReading
+from drivers.base import DriverCounters, Fact, Reading, TactileReading
 from tests.process_replay.streams import FINGERS, PERIOD_NS, Clock
 
 BOOT_ID: Final = "0123456789abcdef" * 2
@@ -136,7 +135,7 @@ class _Driver:
     def exhausted(self) -> bool:
         return self._next is None
 
-    def describe(self) -> dict[str, str]:
+    def describe(self) -> dict[str, Fact]:
         return {}
 
     def open(self) -> None:
@@ -180,7 +179,8 @@ class _World(Companion):
     def wanted(self, _topic: bytes) -> bool:
         return self._verdicts == 0
 
-    def on_verdict(self, verdict: Verdict, payload: bytes, reading: TactileReading | None) -> None:
+    def on_verdict(self, published: Published) -> None:
+        verdict = published.verdict
         self._verdicts += 1
         self._asking = self._case.asks and self._verdicts % ASKED_EVERY == 0
         if self._lifted not in (0, verdict.grasp):
@@ -188,7 +188,7 @@ class _World(Companion):
             self._lifted = 0
         if verdict.judged and self._case.tells:
             self._lifted = verdict.grasp
-        if self._case.slow and reading is not None:
+        if self._case.slow and published.reading is not None:
             phase = self._verdicts % SLOW_EVERY
             self._clock.now_ns += SLOW_NS if phase < SLOW_FOR else 0
             self._clock.now_ns += STALL_NS if phase == STALL_AT else 0

@@ -46,7 +46,7 @@ ELSEWHERE = (
     ("session", ("daemon.judge.calibration",)),
     ("session file", ("daemon.session.keeper",)),
     ("questions", ("daemon.publish.questions",)),
-    ("keys", ("daemon.publish.curve", "daemon.publish.access", "daemon.publish.keys")),
+    ("keys", ("daemon.publish.keys", "zmq.auth.thread")),
 )
 """Part and modules: what only some scenes import."""
 READINGS = 300
@@ -108,7 +108,7 @@ def main(arguments: list[str]) -> int:
     from pathlib import Path
 
     from daemon.process.text import complain
-    from daemon.publish.binding import PublishError
+    from daemon.publish.door import PublishError
     from daemon.scene import SceneError
     from drivers.base import DriverError
     from models.contract import ModelError

@@ -17,7 +17,8 @@ from daemon.judge.limits import GripLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.plausibility import Plausibility
 from daemon.publish.outbox import Outbox
-from daemon.publish.publisher import Publisher
+from daemon.publish.sockets import Sockets
+from daemon.scene import Scene, parse
 from drivers.base import TactileReading
 from drivers.recordings.csv_columns import electrode_columns
 from drivers.recordings.csv_rows import Recording
@@ -35,9 +36,9 @@ def measure(
     times: dict[str, list[float]] = {}
     with (
         tempfile.TemporaryDirectory() as folder,
-        Publisher(f"ipc://{folder}/verdicts") as publisher,
+        Sockets(_scene(Path(folder))) as sockets,
     ):
-        steps = _stages(model, chosen, publisher)
+        steps = _stages(model, chosen, sockets)
         for index in range(readings):
             for name, step in steps.items():
                 began_ns = time.perf_counter_ns()
@@ -49,8 +50,17 @@ def measure(
     }
 
 
+def _scene(folder: Path) -> Scene:
+    """A scene that publishes in a folder."""
+    text = {
+        "tactile": {"driver": "replay", "recordings": ["none.csv"]},
+        "publish": {"endpoint": f"ipc://{folder}/verdicts"},
+    }
+    return parse(text, folder / "scene.toml")
+
+
 def _stages(
-    model: TactileModel, counts: NDArray[np.uint16], publisher: Publisher
+    model: TactileModel, counts: NDArray[np.uint16], sockets: Sockets
 ) -> dict[str, Callable[[int], object]]:
     fingers = model.contract.fingers
     now = [time.monotonic_ns()]
@@ -59,9 +69,7 @@ def _stages(
     electrodes = Electrodes(model.contract.seen)
     plausibility = Plausibility(fingers, model.contract.seen, electrodes)
     pipeline = Pipeline(model, fingers, limits, time.monotonic_ns, learns=False)
-    outbox = Outbox(
-        "report", model.contract.fingers, model.contract.name, model.sha256, [publisher]
-    )
+    outbox = Outbox("report", model.contract.fingers, model.contract.name, model.sha256, [sockets])
     readings = [
         TactileReading(now[0] + i * PERIOD_NS, i, row, np.zeros(row.shape, dtype=np.uint8))
         for i, row in enumerate(counts)

@@ -25,6 +25,7 @@
 #include <iterator>
 #include <map>
 #include <optional>
+#include <random>
 #include <set>
 #include <stdexcept>
 #include <string>
@@ -65,6 +66,7 @@ constexpr std::size_t FORMER_MAX = 16;  // starts of the daemon that are remembe
 // On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 constexpr int HEARTBEAT_MS = 1000, HEARTBEAT_TIMEOUT_MS = 3000;
 constexpr std::size_t OBJECT_MAX = 64;  // characters of an object's name
+constexpr std::size_t NAME_BYTES = 16;   // of a client's name
 constexpr std::size_t LIFTS_MAX = 256;  // that are remembered: as many as graspd takes outcomes of
 constexpr std::int64_t WARN_EVERY = 10;  // lifts whose outcome was never told
 
@@ -608,12 +610,24 @@ private:
         }
         if (kind == zmq::socket_type::sub)
             made.set(zmq::sockopt::subscribe, "verdict." + options_.hand);
+        else  // graspd knows the client by the name, and each connection by the number after it
+            made.set(zmq::sockopt::routing_id, name_ + std::to_string(++calls_));
         made.connect(endpoint);
         return made;
     }
 
+    // 16 bytes that routing ids begin with: random, the first not zero.
+    static std::string random_name() {
+        std::random_device random;
+        std::string name = "g";
+        while (name.size() < NAME_BYTES) name += static_cast<char>(random() & 0xffU);
+        return name;
+    }
+
     Options options_;
     zmq::context_t context_;
+    std::string name_ = random_name();
+    std::uint64_t calls_ = 0;
     zmq::socket_t socket_;
 
 public:
@@ -664,7 +678,7 @@ public:
             answer_.reset();
         }
         if (!asked_ && !answer_) {
-            link_.ask(link_.asking, "judge");
+            link_.ask(link_.asking, "lift");
             asked_ = true;
         }
         if (newest.decision == Decision::unknown && !permits(newest)) return newest;

@@ -17,6 +17,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import re
 import time
 from collections import deque
@@ -66,6 +67,7 @@ DRIFT = 1e-3
 FORMER_MAX = 16  # starts of the daemon that are remembered as over
 # On TCP: between two signs of life, and when a daemon that gives none is connected to anew.
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
+NAME_BYTES = 16  # of a client's name, which routing ids begin with: random, the first not zero
 OBJECT_MAX = 64  # characters of an object's name
 LIFTS_MAX = 256  # that are remembered: as many as graspd takes outcomes of
 WARN_EVERY = 10  # lifts whose outcome was never told
@@ -614,7 +616,7 @@ class _Question:
                 return newest
             self._answer = None
         if not self._asked and self._answer is None:
-            self._asking.ask(b"judge")
+            self._asking.ask(b"lift")
             self._asked = True
         if newest.decision == Decision.UNKNOWN and not self.permits(newest):
             return newest
@@ -645,6 +647,7 @@ class _Link:
     def __init__(self, endpoint: str, topic: bytes, ask: str | None, keys: Keys | None) -> None:
         self._endpoint, self._topic, self._keys = endpoint, topic, keys
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._name, self._calls = b"g" + os.urandom(NAME_BYTES - 1), 0
         self.asking, self.telling = _Call(self, ask or ""), _Call(self, ask or "")
         try:
             self._socket = self.connected(zmq.SUB, endpoint)
@@ -683,6 +686,9 @@ class _Link:
             made.heartbeat_ivl, made.heartbeat_timeout = HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS
         if kind == zmq.SUB:
             made.subscribe(self._topic)
+        else:  # graspd knows the client by the name, and each connection by the number after it
+            self._calls += 1
+            made.routing_id = self._name + self._calls.to_bytes(8, "big")
         made.connect(endpoint)
         return made
 

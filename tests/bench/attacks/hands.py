@@ -64,7 +64,7 @@ def daemon_of(folder: Path, tactile: str, model: str, more: str = "") -> Iterato
     scene = folder / "scene.toml"
     scene.write_text(
         f'{tactile}[hand]\nname = "right"\n[model]\nname = "{model}"\n'
-        f'[publish]\nendpoint = "{endpoint}"\n{more}'
+        f'[publish]\nendpoint = "{endpoint}"\ntactile_hz = 10000\n{more}'
     )
     with start_daemon(scene, folder / "log") as daemon, Subscriber(endpoint) as subscriber:
         yield subscriber

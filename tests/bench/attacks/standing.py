@@ -146,7 +146,7 @@ def scene_text(folder: Path, gate: str) -> str:
     return (
         tactile_section("spi", str(folder / "bridge"))
         + f'[model]\nname = "{MODEL}"\n[session]\nkeep = false\n[gate]\n{gate}\n'
-        f'[publish]\nendpoint = "ipc://{folder}/v"\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
+        f'[publish]\nendpoint = "ipc://{folder}/v"\ntactile_hz = 10000\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
     )
 
 

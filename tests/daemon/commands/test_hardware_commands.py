@@ -42,6 +42,7 @@ def scene_for(kind: str, folder: Path) -> Path:
     scene.write_text(
         f"[tactile]\n{SCENES[kind].format(folder=folder, port=PORT)}\n"
         f'[model]\nname = "cnn1"\n[publish]\nendpoint = "ipc://{folder}/graspd"\n'
+        "tactile_hz = 10000\n"
     )
     return scene
 

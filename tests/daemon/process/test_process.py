@@ -146,7 +146,7 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("allowed", "taken"),
-    [("512:8192", (4096, 8192)), ("5000:8192", (5000, 8192)), ("512:1000", (1000, 1000))],
+    [("512:8192", (8192, 8192)), ("8192:8192", (8192, 8192)), ("512:1000", (1000, 1000))],
 )
 def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
     tmp_path: Path, allowed: str, taken: tuple[int, int]

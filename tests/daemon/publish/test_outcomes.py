@@ -3,21 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
-import socket
-import subprocess
-import tempfile
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import jsonschema
 import numpy as np
 import pytest
-import zmq
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement
@@ -25,12 +17,11 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
-from daemon.publish.peer import PlainPeer
-from daemon.publish.questions import MESSAGE_MAX_BYTES, Questions, TakeOutcome
-from daemon.publish.zmtp import Role
-from daemon.trust.ledger import GraspId, Told
+from daemon.publish.questions import Questions
+from daemon.trust.ledger import GRASPS_MAX, GraspId, Told
 from daemon.trust.trust import Trust
 from tests.daemon.fakes import FINGERS, Clock
+from tests.daemon.publish.doors import Asked as Requests
 
 BOOT = "0123456789abcdef" * 2
 NOW_NS = 10**12
@@ -138,201 +129,158 @@ def test_only_so_many_grasps_are_remembered() -> None:
     assert sender.outcome(BOOT, JUDGED_MAX + 1, "slip") is None
 
 
-@pytest.fixture
-def questions(tmp_path: Path) -> Iterator[Questions]:
-    with Questions(f"ipc://{tmp_path}/ask", 10**9) as taker:
-        yield taker
+TELLER, OTHER, THIRD = b"teller", b"other", b"third"
+
+
+class Asked:
+    """Questions, and what was answered to whom."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bytes, ...]] = []
+        self.questions = Questions(self._send, 10**9)
+
+    def _send(self, frames: Sequence[bytes]) -> bool:
+        self.sent.append(tuple(frames))
+        return True
+
+    def ask_about(self, grasp: int, *peers: bytes, text: bytes = b"lift") -> None:
+        """Ask, and be answered about a grasp."""
+        self.questions.take([[peer, text] for peer in peers], 0, Requests())
+        self.questions.answer(b"{}", grasp=GraspId(BOOT, grasp))
+
+    def tell(self, peer: bytes, *frames: bytes, requests: Requests | None = None) -> dict[str, Any]:
+        """Tell an outcome, which is no question."""
+        requests = requests or Requests(takes_the_seventh)
+        self.questions.take([[peer, *frames]], 0, requests)
+        assert requests.times == 0
+        answer: dict[str, Any] = json.loads(self.sent[-1][-1])
+        assert self.sent[-1] == (peer, *frames[:-1], self.sent[-1][-1])
+        return answer
+
+    def refusal(self, peer: bytes, text: bytes) -> str:
+        """First words of the refusal; empty if it is taken."""
+        why: str = self.tell(peer, text).get("why", "")
+        return why.partition(":")[0]
 
 
 def takes_the_seventh(boot_id: str, grasp: int, *_told: object) -> str | None:
     return None if (boot_id, grasp) == (BOOT, 7) else "no such"
 
 
-@contextmanager
-def peer(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
-    """Who asks and tells over a connection of its own."""
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
-        socket.linger = 0
-        socket.connect(questions.endpoint)
-        yield socket
-
-
 @pytest.fixture
-def teller(questions: Questions) -> Iterator[zmq.Socket[bytes]]:
-    with peer(questions) as socket:
-        yield socket
+def asked() -> Asked:
+    return Asked()
 
 
-def told(
-    questions: Questions,
-    teller: zmq.Socket[bytes],
-    *frames: bytes,
-    outcome: TakeOutcome | None = takes_the_seventh,
-) -> dict[str, Any]:
-    teller.send_multipart(frames)
-    deadline_s = time.monotonic() + 100.0
-    while not teller.poll(1):
-        assert questions.take(0, outcome) == 0  # it is no question: nobody is judged for it
-        assert time.monotonic() < deadline_s
-    answer: dict[str, Any] = json.loads(teller.recv_multipart()[-1])
-    return answer
+SLIP, STABLE = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
 
 
-def test_an_outcome_is_answered_at_once(questions: Questions, teller: zmq.Socket[bytes]) -> None:
-    text = f"outcome {BOOT} 7 stable".encode()
-    assert told(questions, teller, text) == {"v": 1, "ok": True}
-    assert told(questions, teller, b"", text) == {"v": 1, "ok": True}
-    refused = told(questions, teller, f"outcome {BOOT} 8 slip".encode())
+def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
+    assert asked.tell(TELLER, STABLE) == {"v": 1, "ok": True}
+    assert asked.tell(TELLER, b"", STABLE) == {"v": 1, "ok": True}
+    refused = asked.tell(TELLER, f"outcome {BOOT} 8 slip".encode())
     assert refused == {"v": 1, "ok": False, "why": "no such"}
-    assert questions.waiting == 0
-    assert questions.counters["outcomes"] == 2
-    assert questions.counters["outcomes_refused"] == 1
-    assert questions.counters["malformed"] == 0
+    assert asked.questions.waiting == 0
+    assert asked.questions.counters["outcomes"] == 2
+    assert asked.questions.counters["outcomes_refused"] == 1
+    assert asked.questions.counters["malformed"] == 0
 
 
-def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
+def test_an_outcome_that_is_to_be_kept_is_answered_when_it_is(asked: Asked) -> None:
+    requests = Requests(takes_the_seventh)
     waiting: list[Answer] = []
-    deadline_s = time.monotonic() + 100.0
-    for grasp in (7, 8, 7):
-        teller.send(f"outcome {BOOT} {grasp} slip".encode())
-    while len(waiting) < 2:
-        assert questions.take(0, takes_the_seventh, waiting.append) == 0
-        assert time.monotonic() < deadline_s
-    assert json.loads(teller.recv()) == {"v": 1, "ok": False, "why": "no such"}
-    assert not teller.poll(50)
-    assert questions.counters == {"asked": 0, "outcomes_refused": 1}
+    requests.waiting = waiting
+    texts = [f"outcome {BOOT} {grasp} slip".encode() for grasp in (7, 8, 7)]
+    messages = [[TELLER, text] for text in texts]
+    asked.questions.take(messages, 0, requests)
+    assert [json.loads(frames[-1]) for frames in asked.sent] == [
+        {"v": 1, "ok": False, "why": "no such"}
+    ]
     waiting[0]("not kept: full")
     waiting[1](None)
-    assert json.loads(teller.recv()) == {"v": 1, "ok": False, "why": "not kept: full"}
-    assert json.loads(teller.recv()) == {"v": 1, "ok": True}
-    assert questions.counters == {"asked": 0, "outcomes_refused": 2, "outcomes": 1}
-    questions.close()
-    waiting[0](None)  # nobody hears it, and nothing breaks
+    assert [json.loads(frames[-1]) for frames in asked.sent[1:]] == [
+        {"v": 1, "ok": False, "why": "not kept: full"},
+        {"v": 1, "ok": True},
+    ]
+    assert asked.questions.counters["outcomes_refused"] == 2
+    assert asked.questions.counters["outcomes"] == 1
 
 
-def test_answers_are_on_their_way_before_the_socket_closes(tmp_path: Path) -> None:
-    waiting: list[Answer] = []
-    with zmq.Context() as context, context.socket(zmq.DEALER) as teller:
-        teller.linger = 0
-        with Questions(f"ipc://{tmp_path}/ask", 10**9) as taker:
-            teller.connect(taker.endpoint)
-            teller.send(f"outcome {BOOT} 7 slip".encode())
-            while not waiting:
-                taker.take(0, takes_the_seventh, waiting.append)
-            waiting[0](None)
-        assert teller.poll(100_000)
-        assert json.loads(teller.recv()) == {"v": 1, "ok": True}
+def test_a_grasp_that_a_peer_asked_to_lift_is_told_of_by_that_peer_alone(asked: Asked) -> None:
+    asked.ask_about(7, TELLER, OTHER)
+    asked.ask_about(7, OTHER)  # the second peer owns nothing
+    assert asked.refusal(OTHER, SLIP) == "not yours"
+    assert asked.refusal(TELLER, STABLE) == ""
+    assert asked.refusal(OTHER, STABLE) == "not yours"
+    assert asked.questions.counters["outcomes_refused"] == 2
+    assert asked.questions.counters["outcomes"] == 1
 
 
-def ask_about(questions: Questions, asker: zmq.Socket[bytes], grasp: int) -> None:
-    """Ask, and be answered about a grasp."""
-    asker.send(b"judge")
-    deadline_s = time.monotonic() + 100.0
-    while not questions.take(0):
-        assert time.monotonic() < deadline_s
-    questions.answer(b"{}", grasp=GraspId(BOOT, grasp))
-    assert asker.recv() == b"{}"
+def test_a_peer_that_asks_judge_takes_no_grasp_over(asked: Asked) -> None:
+    asked.ask_about(7, OTHER, text=b"judge")
+    asked.ask_about(7, TELLER)
+    assert asked.refusal(OTHER, SLIP) == "not yours"
+    assert asked.refusal(TELLER, STABLE) == ""
 
 
-def test_a_grasp_that_somebody_asked_about_is_told_of_by_nobody_else(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
-    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    with peer(questions) as other:
-        ask_about(questions, teller, 7)
-        ask_about(questions, other, 7)  # who comes second owns nothing
-        refused = told(questions, other, slip)
-        assert (refused["ok"], refused["why"].partition(":")[0]) == (False, "not yours")
-        assert told(questions, teller, stable)["ok"]
-        assert not told(questions, other, stable)["ok"]
-    assert questions.counters["outcomes_refused"] == 2
-    assert questions.counters["outcomes"] == 1
+def test_a_peer_that_asks_judge_tells_of_grasps_where_no_peer_asks_lift(asked: Asked) -> None:
+    """Clients of before `lift`."""
+    asked.ask_about(7, OTHER, text=b"judge")
+    assert asked.refusal(OTHER, STABLE) == ""
 
 
-def test_who_owns_a_grasp_and_has_gone_is_stood_for_by_another_connection_of_its(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
-    with peer(questions) as former:
-        ask_about(questions, former, 7)
-    deadline_s = time.monotonic() + 100.0
-    while not told(questions, teller, f"outcome {BOOT} 7 slip".encode())["ok"]:
-        assert time.monotonic() < deadline_s
+def test_a_question_that_is_replaced_owns_nothing(asked: Asked) -> None:
+    messages = [[OTHER, b"lift"], [OTHER, b"judge"], [TELLER, b"lift"]]
+    asked.questions.take(messages, 0, Requests())
+    asked.questions.answer(b"{}", grasp=GraspId(BOOT, 7))
+    assert asked.refusal(OTHER, SLIP) == "not yours"
+    assert asked.refusal(TELLER, SLIP) == ""
 
 
-def test_who_tells_before_its_former_connection_is_seen_to_go_is_heard(
-    questions: Questions, teller: zmq.Socket[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("daemon.publish.questions.GRACE_NS", 5_000_000_000)
-    with peer(questions) as former:
-        ask_about(questions, former, 7)
-        teller.send(f"outcome {BOOT} 7 slip".encode())
-        for _ in range(100):
-            questions.take(0, takes_the_seventh)
-            time.sleep(0.001)
-        assert not teller.poll(0)
-    deadline_s = time.monotonic() + 100.0
-    while not teller.poll(1):
-        questions.take(0, takes_the_seventh)
-        assert time.monotonic() < deadline_s
-    assert json.loads(teller.recv()) == {"v": 1, "ok": True}
+def test_no_grasp_is_owned_by_an_answer_that_is_about_none(asked: Asked) -> None:
+    asked.ask_about(0, OTHER)
+    assert asked.refusal(TELLER, SLIP) == ""
 
 
-def test_what_was_told_stays_and_may_be_told_again(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
-    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    ask_about(questions, teller, 7)
-    assert told(questions, teller, slip)["ok"]
-    assert told(questions, teller, slip)["ok"]
-    refused = told(questions, teller, stable)
-    assert (refused["ok"], refused["why"].partition(":")[0]) == (False, "contradicts")
+def test_connections_of_one_client_are_one_owner(asked: Asked) -> None:
+    """By the first 16 bytes of their routing ids."""
+    name = bytes(range(1, 17))
+    asked.ask_about(7, name + b"1")
+    assert asked.refusal(name[:-1] + b"\xff2", SLIP) == "not yours"
+    assert asked.refusal(name[:-1], SLIP) == "not yours"
+    assert asked.refusal(name + b"2", SLIP) == ""
 
 
-def test_a_grasp_that_nobody_asked_about_is_told_of_by_anybody_in_one_word(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
-    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    with peer(questions) as other:
-        assert told(questions, other, slip)["ok"]
-        assert told(questions, teller, slip)["ok"]
-        assert not told(questions, teller, stable)["ok"]
-        assert not told(questions, other, stable)["ok"]
+def test_what_was_told_stays_and_may_be_told_again(asked: Asked) -> None:
+    asked.ask_about(7, TELLER)
+    assert asked.refusal(TELLER, SLIP) == ""
+    assert asked.refusal(TELLER, SLIP) == ""
+    assert asked.refusal(TELLER, STABLE) == "contradicts"
 
 
-def test_who_asks_about_grasps_is_not_forestalled_by_who_does_not(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
+def test_a_grasp_without_an_owner_is_told_of_by_all_in_one_word(asked: Asked) -> None:
+    assert asked.refusal(OTHER, SLIP) == ""
+    assert asked.refusal(TELLER, SLIP) == ""
+    assert asked.refusal(TELLER, STABLE) == "contradicts"
+    assert asked.refusal(OTHER, STABLE) == "contradicts"
+
+
+def test_a_grasp_without_an_owner_is_told_of_by_owners_of_others(asked: Asked) -> None:
     """A grasp is known to all once it is judged, and may be asked about later."""
-    slip, stable = (f"outcome {BOOT} 7 {how}".encode() for how in ("slip", "stable"))
-    with peer(questions) as other:
-        ask_about(questions, teller, 6)
-        assert told(questions, other, slip)["why"].startswith("not yours")
-        ask_about(questions, teller, 7)
-        assert told(questions, teller, stable)["ok"]
+    asked.ask_about(6, TELLER)
+    asked.ask_about(5, THIRD)
+    assert asked.refusal(OTHER, SLIP) == "not yours"
+    assert asked.refusal(THIRD, SLIP) == ""
+    asked.ask_about(7, TELLER)
+    assert asked.refusal(TELLER, STABLE) == "contradicts"
 
 
-def test_who_stands_for_whom() -> None:
-    """By process and user, as the kernel tells them for Unix sockets."""
-    with subprocess.Popen(["true"]) as ended:
-        pass
-    left, right = socket.socketpair()
-    with left, right:
-        owner, other = (PlainPeer(each, Role.ROUTER, 0) for each in (left, right))
-        assert (owner.process, owner.user) == (os.getpid(), os.getuid())
-        assert owner.stands_for(owner)
-        assert not other.stands_for(owner)  # which is there, and speaks for itself
-        owner.socket = None
-        assert other.stands_for(owner)
-        other.process = 1
-        assert not other.stands_for(owner)  # its process still runs, and could have connected again
-        owner.process = ended.pid
-        assert other.stands_for(owner)
-        other.user += 1
-        assert not other.stands_for(owner)
-        other.process = owner.process
-        assert not other.stands_for(owner)
+def test_owners_are_forgotten_with_the_last_of_their_grasps(asked: Asked) -> None:
+    asked.ask_about(1000, OTHER)
+    for grasp in range(1001, 1001 + GRASPS_MAX):
+        asked.ask_about(grasp, TELLER)
+    assert asked.refusal(OTHER, SLIP) == "not yours"
+    assert asked.refusal(TELLER, SLIP) == ""
 
 
 NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", "a=1", "a|b", "~")
@@ -340,14 +288,12 @@ NO_NAMES = ("=HYPERLINK(0)", "-1", "+1", "@SUM(1)", "..", ".mug", "a/b", "a;b", 
 
 
 @pytest.mark.parametrize("name", [None, "mug", "035_power-drill", "_.-", "x" * 64, "Z"])
-def test_the_object_arrives_as_it_was_told(
-    questions: Questions, teller: zmq.Socket[bytes], name: str | None
-) -> None:
-    heard: list[tuple[object, ...]] = []
+def test_the_object_arrives_as_it_was_told(asked: Asked, name: str | None) -> None:
+    requests = Requests()
     text = f"outcome {BOOT} 7 slip" + (f" {name}" if name else "")
-    answer = told(questions, teller, text.encode(), outcome=lambda *told: heard.append(told))
+    answer = asked.tell(TELLER, text.encode(), requests=requests)
     assert answer == {"v": 1, "ok": True}
-    assert heard == [(BOOT, 7, "slip", name)]
+    assert requests.outcomes == [(BOOT, 7, "slip", name)]
 
 
 @pytest.mark.parametrize(
@@ -378,35 +324,18 @@ def test_the_object_arrives_as_it_was_told(
         *(f"outcome {BOOT} 7 slip {name}" for name in NO_NAMES),
     ],
 )
-def test_an_outcome_that_is_malformed_is_answered_and_counted(
-    questions: Questions, teller: zmq.Socket[bytes], text: str
-) -> None:
-    answer = told(questions, teller, text.encode("latin-1"))
+def test_an_outcome_that_is_malformed_is_answered_and_counted(asked: Asked, text: str) -> None:
+    answer = asked.tell(TELLER, text.encode("latin-1"))
     assert answer["ok"] is False
     assert answer["why"].startswith("malformed")
-    assert questions.counters["malformed"] == 1
+    assert asked.questions.counters["malformed"] == 1
 
 
-def test_the_longest_outcome_fits_into_a_message() -> None:
-    assert len(f"outcome {BOOT} {10**15 - 1} stable " + "x" * 64) <= MESSAGE_MAX_BYTES
-
-
-def test_without_anybody_who_takes_outcomes_the_controller_hears_so(
-    questions: Questions, teller: zmq.Socket[bytes]
-) -> None:
-    text = f"outcome {BOOT} 7 slip".encode()
-    assert told(questions, teller, text, outcome=None)["ok"] is False
-
-
-@settings(max_examples=20)
-@given(st.lists(st.binary(max_size=MESSAGE_MAX_BYTES - 8), min_size=1, max_size=20))
-def test_whatever_follows_the_word_nothing_breaks(texts: list[bytes]) -> None:
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Questions(f"ipc://{folder}/ask", 10**9) as taker,
-        peer(taker) as socket,
-    ):
-        for text in texts:
-            answer = told(taker, socket, b"outcome " + text, outcome=lambda *_told: None)
-            assert answer["v"] == 1
-        assert taker.counters["malformed"] + taker.counters["outcomes"] == len(texts)
+@given(st.lists(st.binary(max_size=200), min_size=1, max_size=20))
+def test_all_texts_after_the_word_get_an_answer(texts: list[bytes]) -> None:
+    asked = Asked()
+    for text in texts:
+        answer = asked.tell(TELLER, b"outcome " + text, requests=Requests())
+        assert answer["v"] == 1
+    counters = asked.questions.counters
+    assert counters["malformed"] + counters["outcomes"] == len(texts)

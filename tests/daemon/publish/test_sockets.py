@@ -1,11 +1,14 @@
-"""Who comes late, who may connect, and hostile peers at every door."""
+"""Rates, rights of socket files, questions for the loop, and hostile peers."""
 
 from __future__ import annotations
 
 import grp
 import os
 import random
+import select
 import stat
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,11 +18,12 @@ import pytest
 import zmq
 
 from daemon import scene
-from daemon.publish.binding import PublishError
-from daemon.publish.publisher import REPEAT_NS, VERDICT_REPEATED_NS, Publisher
+from daemon.publish.door import PublishError
+from daemon.publish.messages import decode_status
 from daemon.publish.sockets import Sockets, plan
+from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.fakes import Clock
-from tests.daemon.publish.test_publisher import Peers
+from tests.daemon.publish.doors import Asked, Peers
 
 PATIENCE_MS = 100_000
 HOSTILE_MESSAGES = 10_000
@@ -43,84 +47,122 @@ def wanted(
     return scene.parse(text, folder / "scene.toml")
 
 
-def until(done: Callable[[], object], sockets: Sockets) -> None:
+STATUS = decode_status((Path(__file__).parent / "golden" / "status.json").read_bytes())
+
+
+def until(done: Callable[[], object]) -> None:
     deadline_s = time.monotonic() + PATIENCE_MS / 1e3
     while not done():
         assert time.monotonic() < deadline_s
-        sockets.take()
         time.sleep(0.002)
 
 
-def until_heard(publisher: Publisher, late: zmq.Socket[bytes], seconds: float = 10.0) -> bool:
-    deadline_s = time.monotonic() + seconds
-    while time.monotonic() < deadline_s:
-        publisher.take()
-        if late.poll(2):
-            return True
-    return False
-
-
-def test_who_comes_late_gets_the_last_verdict_and_status_that_it_wants_at_once(
-    tmp_path: Path, peers: Peers
+@pytest.mark.parametrize(
+    ("sensor_hz", "tactile_hz", "published"),
+    [(100, 25.0, 25), (100, 100.0, 100), (100, 400.0, 100), (100, 10.0, 10), (100, 0.0, 0)],
+)
+def test_readings_are_published_at_the_rate_of_the_scene(
+    tmp_path: Path, sensor_hz: int, tactile_hz: float, published: int
 ) -> None:
     clock = Clock()
-    endpoint = f"ipc://{tmp_path}/v"
-    with Publisher(endpoint, clock=clock) as publisher:
-        for number in range(3):
-            publisher.send(b"verdict.right", b"%d" % number)
-            publisher.send(b"status.right", b"s%d" % number)
-        clock.now_ns += VERDICT_REPEATED_NS
-        late = peers.subscribe(endpoint, "verdict.")
-        assert until_heard(publisher, late)
-        assert late.recv_multipart() == [b"verdict.right", b"2"]
-        assert not late.poll(100)
+    jitter = random.Random(3)
+    with Sockets(wanted(tmp_path, tactile_hz=tactile_hz), clock) as sockets:
+        times = 0
+        for number in range(10 * sensor_hz):
+            clock.now_ns = number * 10**9 // sensor_hz + jitter.randrange(1_000_000)
+            times += sockets.wanted(b"tactile.right")
+    assert times == pytest.approx(10 * published, abs=1)
 
 
-def test_an_old_verdict_is_not_repeated_as_if_it_were_new(tmp_path: Path, peers: Peers) -> None:
+def test_readings_go_on_after_a_pause_and_do_not_catch_up(tmp_path: Path) -> None:
     clock = Clock()
-    endpoint = f"ipc://{tmp_path}/v"
-    with Publisher(endpoint, clock=clock) as publisher:
-        publisher.send(b"verdict.right", b"stable")
-        publisher.send(b"status.right", b"s")
-        clock.now_ns += VERDICT_REPEATED_NS + 1
-        late = peers.subscribe(endpoint)
-        assert until_heard(publisher, late)
-        assert late.recv_multipart() == [b"status.right", b"s"]
-        assert not until_heard(publisher, late, 0.2)
+    with Sockets(wanted(tmp_path, tactile_hz=10.0), clock) as sockets:
+        assert sockets.wanted(b"tactile.right")
+        clock.now_ns += 10 * 10**9
+        assert [sockets.wanted(b"tactile.right") for _ in range(3)] == [True, False, False]
 
 
-def test_nothing_is_repeated_of_a_run_that_has_ended(tmp_path: Path, peers: Peers) -> None:
-    endpoint = f"ipc://{tmp_path}/v"
-    with Publisher(endpoint, clock=Clock()) as publisher:
-        publisher.send(b"verdict.right", b"stable")
-        publisher.forget()
-        assert not until_heard(publisher, peers.subscribe(endpoint), 0.3)
+def test_all_other_topics_are_always_wanted(tmp_path: Path) -> None:
+    with Sockets(wanted(tmp_path, tactile_hz=0.0)) as sockets:
+        assert sockets.wanted(b"verdict.right")
+        assert sockets.wanted(b"verdict.right")
 
 
-@pytest.mark.parametrize("topic", [b"tactile.right", b"gate.right", b"outcome.right"])
-def test_what_happened_once_is_never_repeated(tmp_path: Path, peers: Peers, topic: bytes) -> None:
-    endpoint = f"ipc://{tmp_path}/v"
-    with Publisher(endpoint, clock=Clock()) as publisher:
-        publisher.send(topic, b"old")
-        assert not until_heard(publisher, peers.subscribe(endpoint), 0.3)
-
-
-def test_nothing_is_repeated_before_anything_was_sent(tmp_path: Path, peers: Peers) -> None:
+def test_questions_and_outcomes_reach_the_loop_and_are_answered(
+    tmp_path: Path, peers: Peers
+) -> None:
+    requests = Asked()
     with Sockets(wanted(tmp_path)) as sockets:
-        early = peers.subscribe(f"ipc://{tmp_path}/v")
-        until(lambda: sockets.publisher.counters["subscriptions"], sockets)
-        assert not early.poll(100)
-        assert sockets.publisher.counters["repeated"] == 0
+        asker = peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask")
+        asker.send(b"lift")
+        asker.send(b"outcome " + b"0" * 32 + b" 7 slip")
+
+        def has_come() -> bool:
+            sockets.before_wait(requests)
+            return bool(requests.times and requests.outcomes)
+
+        until(has_come)
+        assert requests.outcomes == [("0" * 32, 7, "slip", None)]
+        assert asker.recv() == b'{"v":1,"ok":true}'
+        assert sockets.questions is not None
+        sockets.questions.answer(b"{}")
+        assert asker.recv() == b"{}"
+        counters = sockets.counters
+    assert counters["publish"] == {"dropped": 0}
+    assert (counters["ask"]["asked"], counters["ask"]["outcomes"]) == (1, 1)
 
 
-def test_many_who_come_at_once_do_not_make_a_storm(tmp_path: Path, peers: Peers) -> None:
+def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers: Peers) -> None:
+    requests = Asked()
     with Sockets(wanted(tmp_path)) as sockets:
-        sockets.send(b"status.right", b"1")
-        start_s = time.monotonic()
-        late = [peers.subscribe(f"ipc://{tmp_path}/v") for _ in range(30)]
-        until(lambda: all(each.poll(0) for each in late), sockets)
-        elapsed_ns = (time.monotonic() - start_s) * 1e9
-        assert sockets.publisher.counters["repeated"] <= elapsed_ns / REPEAT_NS + 2
+        sockets.before_wait(requests)
+        peers.connect(zmq.DEALER, f"ipc://{tmp_path}/ask").send(b"judge")
+        deadline_s = time.monotonic() + PATIENCE_MS / 1e3
+        while not requests.times:  # it may be ready for less
+            assert select.select(sockets.filenos(), [], [], PATIENCE_MS / 1e3)[0]
+            assert time.monotonic() < deadline_s
+            sockets.before_wait(requests)
+
+
+def test_a_proxy_that_has_ended_ends_the_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: None)
+    with Sockets(wanted(tmp_path)) as sockets:
+        time.sleep(0.1)
+        with pytest.raises(PublishError, match="no longer serves"):
+            sockets.on_status(STATUS)
+
+
+def test_a_daemon_whose_proxy_ends_ends_with_an_error(tmp_path: Path) -> None:
+    """So systemd starts it again: only the code 2 of a wrong scene forbids that."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
+        f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n'
+    )
+    code = (
+        "import sys, time, zmq; zmq.proxy = lambda *_sockets: time.sleep(1.0); "
+        f"from daemon.cli import main; sys.exit(main(['run', {str(scene)!r}]))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=100
+    )
+    assert ended.returncode == 1
+    assert "libzmq no longer serves it" in ended.stderr
+
+
+def test_sockets_that_are_closed_drop_what_is_sent_and_answered(tmp_path: Path) -> None:
+    sockets = Sockets(wanted(tmp_path))
+    assert sockets.questions is not None
+    sockets.questions.take([[b"asker", b"judge"]], 0, Asked())
+    sockets.close()
+    sockets.close()
+    sockets.send(b"verdict.right", b"{}")
+    sockets.questions.answer(b"{}")
+    counters = sockets.counters
+    assert (counters["publish"]["dropped"], counters["ask"]["dropped"]) == (1, 1)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_files_of_sockets_have_the_mode_and_the_group_of_the_scene(tmp_path: Path) -> None:
@@ -193,7 +235,7 @@ def junk(rng: random.Random) -> list[bytes]:
 def test_ten_thousand_hostile_messages_do_no_harm(
     tmp_path: Path, peers: Peers, door: str, kind: int
 ) -> None:
-    rng = random.Random(1)
+    rng, requests = random.Random(1), Asked()
     with Sockets(wanted(tmp_path)) as sockets:
         questions = sockets.questions
         assert questions is not None
@@ -203,11 +245,10 @@ def test_ten_thousand_hostile_messages_do_no_harm(
             try:
                 hostile.send_multipart(junk(rng), zmq.NOBLOCK)
                 sent += 1
-            except zmq.Again:  # it is cut off for a moment, or not read so fast
+            except zmq.Again:  # it is disconnected for a moment, or not read so fast
                 pass
             if sent % 20 == 0:
-                sockets.take()
-                questions.take(time.monotonic_ns())
+                sockets.before_wait(requests)
                 questions.answer(b"{}")
         friend = peers.subscribe(f"ipc://{tmp_path}/v", "verdict.")
         asker = peers.connect(zmq.REQ, f"ipc://{tmp_path}/ask")
@@ -215,15 +256,12 @@ def test_ten_thousand_hostile_messages_do_no_harm(
 
         def served() -> bool:
             sockets.send(b"verdict.right", b"{}")
-            questions.take(time.monotonic_ns())
+            sockets.before_wait(requests)
             questions.answer(b"{}")
             return bool(friend.poll(0) and asker.poll(0))
 
-        until(served, sockets)
+        until(served)
         assert friend.recv_multipart() == [b"verdict.right", b"{}"]
         assert asker.recv() == b"{}"
-        counted = sockets.counters
         if door == "ask":
-            assert counted["ask"]["malformed"] > HOSTILE_MESSAGES / 100
-        else:
-            assert counted["publish"]["subscriptions"] > 1
+            assert questions.counters["malformed"] > HOSTILE_MESSAGES / 100

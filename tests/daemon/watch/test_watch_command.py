@@ -25,12 +25,12 @@ from daemon import scene
 from daemon.judge.reasons import Decision
 from daemon.publish.keys import KeysError, make
 from daemon.publish.messages import decode_verdict
-from daemon.publish.publisher import Publisher
 from daemon.publish.sockets import Sockets
 from daemon.watch.feed import Feed, load_keys
 from daemon.watch.view import View
 from tests.daemon.fakes import Clock
 from tests.daemon.processes import GRASPD, graspd, start
+from tests.daemon.publish.doors import Publisher
 from tests.daemon.watch.watch_fakes import MS, Talker, verdict
 from tests.ports import free_port
 
@@ -202,7 +202,6 @@ def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
             deadline_s = time.monotonic() + PATIENCE_S
             while not (found := [payload for _, payload in feed.take()]):
                 assert time.monotonic() < deadline_s
-                publisher.take()
                 publisher.send(b"verdict.right", verdict(seq, decision))
                 time.sleep(0.01)
             return found
@@ -211,7 +210,6 @@ def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
         for seq in range(1, 50):
             publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
         time.sleep(0.1)
-        publisher.forget()
         clock.now_ns += 1001 * MS
         assert list(feed.take()) == []
         for payload in came(Decision.SLIP, 50):
@@ -224,7 +222,6 @@ def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoi
         deadline_s, seq = time.monotonic() + PATIENCE_S, 0
         while not list(feed.take()):
             assert time.monotonic() < deadline_s
-            publisher.take()
             publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
             seq += 1
             time.sleep(0.01)
@@ -422,7 +419,6 @@ def hears(door: Sockets, feed: Feed, until: Callable[[bool], bool]) -> None:
     heard = False
     while not until(heard):
         assert time.monotonic() < deadline_s, feed.link
-        door.take()
         door.send(b"verdict.right", verdict(0))
         time.sleep(0.01)
         heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())

@@ -10,12 +10,12 @@ from rich.console import Console
 
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
-from daemon.publish.publisher import Publisher
 from daemon.trust.risk import RiskReport
 from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.terminal import draw
 from daemon.watch.view import View
+from tests.daemon.publish.doors import Publisher
 
 RISK = RiskReport(target=0.1, lifts=41, slips=2, outstanding=1, bound=9.5, warm_up_left=0)
 """Enough to show `stable` as a promise: the lifts are more than 1 / target, 4.9 % slipped."""
@@ -142,7 +142,6 @@ class Talker:
     def _talk(self) -> None:
         seq = 0
         while not self._over.wait(PERIOD_S):
-            self._publisher.take()
             decision = self.decision
             if decision is None:
                 continue

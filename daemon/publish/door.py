@@ -1,0 +1,369 @@
+"""The ZeroMQ sockets of a scene. libzmq serves them in threads of its own, beside the loop.
+
+A PUB, XPUB or ROUTER in the loop's thread would not be safe: its calls do not come back while peers
+flood it. The loop therefore has sockets within the process (`inproc`) only. `zmq.proxy` copies
+messages to the subscribers, in C and without the interpreter. `Courier` carries questions and
+answers: it takes few questions at a time, while `zmq.proxy` takes a thousand and lets no answer
+pass until the loop has read them.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import zmq
+
+from daemon.publish.socket_file import OccupiedError, SocketFile
+
+if TYPE_CHECKING:
+    from zmq.auth.thread import ThreadAuthenticator
+
+    from daemon.process.signals import Stop
+
+log = logging.getLogger("graspd")
+
+Message = list[bytes]
+Socket = zmq.Socket[bytes]
+
+STATUS = b"status."
+"""Prefix of the topics whose messages come back to the loop. The last of them ends `close`."""
+MESSAGE_MAX_BYTES: Final = 1024
+"""Longest frame of a peer. An outcome has 128 bytes, the handshake with keys 257 (RFC 26)."""
+HANDSHAKE_MS: Final = 5000
+"""A peer that does not end its handshake in this time, ms, is disconnected."""
+HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
+"""Time between two heartbeats over TCP, and the silence after which a peer is gone, ms."""
+SUBSCRIPTIONS_QUEUED, ASK_QUEUE = 2, 16
+"""Messages of one peer that wait in the PUB and in the ROUTER socket. More wait in the kernel."""
+QUESTIONS_MAX: Final = 8
+"""Questions that the loop takes in one round: they take 0.3 ms on a slow, busy computer. More wait
+for the next round, with the next reading at the latest. As many are carried at a time."""
+PAUSE_MS: Final = 2
+"""Time until more questions are carried, ms."""
+FRAMES_MAX: Final = 4
+"""Frames kept of one message: routing id, delimiter, text, and one by which it is malformed."""
+ANSWERS_QUEUED: Final = 512
+"""Answers on their way to the ROUTER socket: to 256 questions, and to as many outcomes."""
+LINGER_MS: Final = 500
+"""How long closing waits for peers to take what is queued, ms."""
+CLOSE_S: Final = 1.0
+"""How long closing waits for libzmq's threads, s. A flood may hold them. The watchdog waits 2 s."""
+SUBSCRIBES_S: Final = 0.1
+"""Time from a peer's handshake to its first subscription, s, at most."""
+ZAP_DOMAIN: Final = "graspd"
+"""Sent with each question to the authenticator. libzmq asks no question without it (RFC 27)."""
+
+
+class PublishError(Exception):
+    """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """An endpoint, and the socket file of an `ipc://` one."""
+
+    endpoint: str
+    file: SocketFile | None
+
+    @classmethod
+    def of(cls, endpoint: str, mode: int | None = None, group: str | None = None) -> Listener:
+        """Take the file of an `ipc://` endpoint. Raises `PublishError`."""
+        if not endpoint.startswith("ipc://"):
+            return cls(endpoint, None)
+        path = Path(endpoint.removeprefix("ipc://"))
+        try:
+            return cls(endpoint, SocketFile(path, mode, group))
+        except (OccupiedError, LookupError) as error:
+            raise PublishError(f"cannot publish on {endpoint}: {error}") from None
+        except OSError as error:
+            why = error.strerror or str(error)
+            if isinstance(error, FileNotFoundError) and not path.parent.exists():
+                why = f"there is no folder {path.parent}; `graspd doctor SCENE` says who makes it"
+            raise PublishError(f"cannot publish on {endpoint}: {why}") from error
+
+    def close(self) -> None:
+        """Remove the file."""
+        if self.file is not None:
+            self.file.close()
+
+
+@dataclass(slots=True)
+class Admission:
+    """CURVE keys for `tcp://`, Z85: the daemon's own pair, and those of peers that may connect."""
+
+    public: bytes
+    secret: bytes
+    admitted: Mapping[bytes, str]
+    """Names of peers, by public key. Another list may be put here at any time."""
+
+    def callback(self, _domain: str, key: bytes) -> bool:
+        """Return True if the key may connect. pyzmq's authenticator calls this in its thread."""
+        name = self.admitted.get(key)
+        if name is None:
+            log.warning("turned away a peer: its key %s is not on the list", key.decode())
+            return False
+        log.info("admitted a peer with the key of %s", name)
+        return True
+
+
+class Proxy(threading.Thread):
+    """Copies messages between two sockets until their context ends, and closes them."""
+
+    def __init__(self, endpoint: str, front: Socket, back: Socket) -> None:
+        """The thread owns both sockets from `start` on."""
+        super().__init__(name=f"serve {endpoint}", daemon=True)
+        self.endpoint = endpoint
+        self._front, self._back = front, back
+
+    def run(self) -> None:
+        """Copy messages."""
+        try:
+            self._copy()
+        except zmq.ContextTerminated:
+            pass
+        except zmq.ZMQError as error:
+            log.error("%s: %s", self.endpoint, error.strerror)
+        finally:
+            self._front.close()
+            self._back.close()
+
+    def _copy(self) -> None:
+        zmq.proxy(self._front, self._back)
+
+
+class Courier(Proxy):
+    """Carries questions of the peers to the loop, a few at a time, and all answers back."""
+
+    def _copy(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._front, zmq.POLLIN)
+        poller.register(self._back, zmq.POLLIN)
+        while True:
+            poller.poll()
+            self._carry_answers()
+            for _ in range(QUESTIONS_MAX):
+                if not self._carry_question():
+                    break
+            if self._back.poll(PAUSE_MS):  # meanwhile more questions wait
+                self._carry_answers()
+
+    def _carry_answers(self) -> None:
+        while self._back.poll(0):
+            self._front.send_multipart(self._back.recv_multipart(), zmq.NOBLOCK)
+
+    def _carry_question(self) -> bool:
+        """Carry one, without the frames beyond `FRAMES_MAX`; False if there is none or no room."""
+        if not self._back.poll(0, zmq.POLLOUT) or not self._front.poll(0):
+            return False
+        frames = [self._front.recv()]
+        while self._front.getsockopt(zmq.RCVMORE):
+            frame = self._front.recv()
+            if len(frames) < FRAMES_MAX:
+                frames.append(frame)
+        self._back.send_multipart(frames)
+        return True
+
+
+class Door:
+    """The sockets, open until `close`. All methods are for the loop's thread."""
+
+    def __init__(
+        self,
+        publish: Listener,
+        ask: Listener | None = None,
+        high_water_mark: int = 1000,
+        admission: Admission | None = None,
+        *,
+        awaits_subscriber: bool = False,
+    ) -> None:
+        """Queue at most `high_water_mark` messages for each subscriber.
+
+        With an `admission`, only peers with its keys may connect over TCP. `awaits_subscriber`:
+        `wait_for_subscriber` will be called. Raises `PublishError`.
+        """
+        self._admission = admission
+        self._context: zmq.Context[Socket] = zmq.Context()
+        self._authenticator: ThreadAuthenticator | None = None
+        self._proxies: list[Proxy] = []
+        self._unheard = b""
+        """Last status, until it has come back from the proxy."""
+        self._out = self._socket(zmq.PUSH, sent=high_water_mark)
+        self._echo = self._socket(zmq.SUB)
+        self._ask = self._socket(zmq.DEALER, sent=ANSWERS_QUEUED, received=ASK_QUEUE)
+        self._subscribers = self._socket(zmq.PUB, high_water_mark, SUBSCRIPTIONS_QUEUED)
+        self._monitor: Socket | None = None
+        if awaits_subscriber:
+            self._monitor = self._subscribers.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
+        try:
+            self._authenticate()
+            self._serve_subscribers(publish)
+            if ask is not None:
+                self._serve_questions(ask)
+        except BaseException:
+            self._stop_authenticator()
+            self._context.destroy()
+            raise
+        for proxy in self._proxies:
+            proxy.start()
+
+    def _socket(self, kind: int, sent: int = 1, received: int = 1) -> Socket:
+        """Return a socket that queues at most so many messages a peer in each direction."""
+        made = self._context.socket(kind)
+        made.linger = 0
+        made.sndhwm, made.rcvhwm = sent, received
+        return made
+
+    def _authenticate(self) -> None:
+        if self._admission is None:
+            return
+        from zmq.auth.thread import ThreadAuthenticator  # only where there are keys
+
+        self._authenticator = ThreadAuthenticator(self._context)
+        self._authenticator.configure_curve_callback(ZAP_DOMAIN, self._admission)
+        self._authenticator.start()
+        self._authenticator.pipe.sndtimeo = LINGER_MS  # to a thread that has ended it would wait
+
+    def _serve_subscribers(self, listener: Listener) -> None:
+        messages = self._socket(zmq.PULL)
+        messages.bind("inproc://messages")
+        self._out.connect("inproc://messages")
+        self._subscribers.bind("inproc://echo")
+        self._echo.subscribe(STATUS)
+        self._echo.connect("inproc://echo")
+        self._listen(self._subscribers, listener)
+        self._proxies.append(Proxy(listener.endpoint, messages, self._subscribers))
+
+    def _serve_questions(self, listener: Listener) -> None:
+        peers = self._socket(zmq.ROUTER, ASK_QUEUE, ASK_QUEUE)
+        peers.router_handover = True  # a client that reconnects keeps its routing id
+        questions = self._socket(zmq.DEALER)
+        questions.bind("inproc://questions")
+        self._ask.connect("inproc://questions")
+        self._listen(peers, listener)
+        self._proxies.append(Courier(listener.endpoint, peers, questions))
+
+    def _listen(self, made: Socket, listener: Listener) -> None:
+        made.linger = LINGER_MS
+        made.maxmsgsize = MESSAGE_MAX_BYTES
+        made.handshake_ivl = HANDSHAKE_MS
+        if listener.file is not None:
+            made.use_fd = os.dup(listener.file.listener.fileno())  # libzmq closes it
+        else:
+            made.ipv6 = "[" in listener.endpoint
+            made.heartbeat_ivl = HEARTBEAT_MS
+            made.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
+            if self._admission is not None:
+                made.curve_publickey = self._admission.public
+                made.curve_secretkey = self._admission.secret
+                made.curve_server = True
+                made.zap_domain = ZAP_DOMAIN.encode()
+        try:
+            made.bind(listener.endpoint)
+        except zmq.ZMQError as error:
+            raise PublishError(f"cannot bind {listener.endpoint}: {error.strerror}") from error
+
+    def fileno(self) -> int:
+        """Return a descriptor that becomes readable when a question comes.
+
+        Call `receive` before waiting for it: sending quietens it.
+        """
+        return int(self._ask.getsockopt(zmq.FD))
+
+    def send(self, topic: bytes, payload: bytes) -> bool:
+        """Publish one message; False if the proxy is behind and the message is dropped."""
+        if topic.startswith(STATUS):
+            self._unheard = payload
+        return _sent(self._out, (topic, payload))
+
+    def answer(self, frames: Sequence[bytes]) -> bool:
+        """Send an answer with its routing id; False if the proxy is behind and it is dropped."""
+        return _sent(self._ask, frames)
+
+    def receive(self) -> list[Message]:
+        """Return at most `QUESTIONS_MAX` questions that have come, each with its routing id."""
+        received: list[Message] = []
+        with suppress(zmq.Again):
+            while len(received) < QUESTIONS_MAX:
+                received.append(self._ask.recv_multipart(zmq.NOBLOCK))
+        return received
+
+    def check(self) -> None:
+        """Raise `PublishError` if a thread has ended. Call it after each status message."""
+        if self._authenticator is not None and not self._authenticator.is_alive():
+            raise PublishError("pyzmq's authenticator has ended")
+        for proxy in self._proxies:
+            if not proxy.is_alive():
+                raise PublishError(f"{proxy.endpoint}: libzmq no longer serves it")
+        while self._echo.poll(0):
+            self._hear_echo()
+
+    def _hear_echo(self) -> None:
+        if self._echo.recv_multipart()[1] == self._unheard:
+            self._unheard = b""
+
+    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+        """Wait until a peer has connected to hear messages.
+
+        False if there is none within `timeout_s` seconds, or when `stop` becomes readable.
+        """
+        if self._monitor is None:
+            raise RuntimeError("the door was not opened to wait")
+        poller = zmq.Poller()
+        poller.register(self._monitor, zmq.POLLIN)
+        if stop is not None:
+            poller.register(stop.fileno(), zmq.POLLIN)
+        came = self._monitor in dict(poller.poll(round(timeout_s * 1e3)))
+        self._close_monitor()
+        if came:
+            time.sleep(SUBSCRIBES_S)
+        return came
+
+    def _close_monitor(self) -> None:
+        if self._monitor is not None:
+            self._subscribers.disable_monitor()
+            self._monitor.close(0)
+            self._monitor = None
+
+    def close(self) -> bool:
+        """Disconnect all peers, after they had `LINGER_MS` to take what is queued.
+
+        False if libzmq's threads have not ended within `CLOSE_S`. May be called again.
+        """
+        if not self._echo.closed:
+            self._await_last_status()
+        self._close_monitor()
+        for own in (self._out, self._echo, self._ask):
+            own.close()
+        self._stop_authenticator()
+        ending = threading.Thread(target=self._context.term, name="close", daemon=True)
+        ending.start()
+        ending.join(CLOSE_S)
+        return not ending.is_alive()
+
+    def _await_last_status(self) -> None:
+        """Wait until the proxy has published all messages: they are lost when its context ends."""
+        until_s = time.monotonic() + LINGER_MS / 1e3
+        while self._unheard and (left_s := until_s - time.monotonic()) > 0:
+            if self._echo.poll(round(left_s * 1e3)):
+                self._hear_echo()
+
+    def _stop_authenticator(self) -> None:
+        if self._authenticator is not None:
+            with suppress(zmq.Again):
+                self._authenticator.stop()
+            self._authenticator = None
+
+
+def _sent(to: Socket, frames: Sequence[bytes]) -> bool:
+    with suppress(zmq.Again):
+        to.send_multipart(frames, flags=zmq.NOBLOCK)
+        return True
+    return False

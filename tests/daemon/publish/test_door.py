@@ -1,0 +1,294 @@
+"""The sockets: what peers get, and that nothing they send holds up the loop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import stat
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon.process.signals import StopSignal
+from daemon.publish.door import QUESTIONS_MAX, Door, Listener, Message, PublishError
+from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
+from tests.ports import free_port
+from tests.threads import at_work
+
+SCHEMES = ("ipc", "tcp", "ip6")
+
+
+@pytest.fixture
+def peers() -> Iterator[Peers]:
+    peers = Peers()
+    yield peers
+    peers.close()
+
+
+@pytest.fixture
+def asked(tmp_path: Path) -> Iterator[tuple[Door, str]]:
+    """A door with a socket for questions, and its endpoint."""
+    listeners = [Listener.of(f"ipc://{tmp_path}/{name}") for name in ("v", "ask")]
+    door = Door(listeners[0], listeners[1])
+    yield door, listeners[1].endpoint
+    assert door.close()
+    for listener in listeners:
+        listener.close()
+
+
+def endpoint_of(scheme: str, folder: Path) -> str:
+    """A place for a socket that is free."""
+    if scheme == "ipc":
+        return f"ipc://{folder}/v"
+    return f"tcp://{'[::1]' if scheme == 'ip6' else '127.0.0.1'}:{free_port()}"
+
+
+def has_ipv6() -> bool:
+    with socket.socket(socket.AF_INET6) as probe:
+        try:
+            probe.bind(("::1", 0))
+        except OSError:
+            return False
+    return True
+
+
+def receive(door: Door, wanted: int) -> list[Message]:
+    """Questions, once there are enough."""
+    deadline_s = time.monotonic() + WAIT_MS / 1e3
+    received: list[Message] = []
+    while len(received) < wanted:
+        assert time.monotonic() < deadline_s
+        received += door.receive()
+    return received
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_plain_subscriber_gets_two_frames_in_order(
+    tmp_path: Path, peers: Peers, scheme: str
+) -> None:
+    if scheme == "ip6" and not has_ipv6():
+        pytest.skip("this computer has no IPv6")
+    endpoint = endpoint_of(scheme, tmp_path)
+    with Publisher(endpoint, awaits=True) as publisher:
+        subscriber = peers.subscribe(endpoint, "verdict.")
+        assert publisher.door.wait_for_subscriber(WAIT_MS / 1e3)
+        publisher.send(b"status.right", b"not wanted")
+        for number in range(100):
+            assert publisher.send(b"verdict.right", b"%d" % number)
+        received = [subscriber.recv_multipart() for _ in range(100)]
+    assert received == [[b"verdict.right", b"%d" % number] for number in range(100)]
+
+
+def test_no_subscriber_to_wait_for_is_said(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v", awaits=True) as publisher:
+        assert not publisher.door.wait_for_subscriber(0.01)
+
+
+def test_waiting_for_a_subscriber_must_be_announced(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v") as publisher, pytest.raises(RuntimeError):
+        publisher.door.wait_for_subscriber(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_wait_for_a_subscriber(tmp_path: Path, number: signal.Signals) -> None:
+    with StopSignal() as stop, Publisher(f"ipc://{tmp_path}/v", awaits=True) as publisher:
+        timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
+        timer.start()
+        start_s = time.monotonic()
+        assert not publisher.door.wait_for_subscriber(30.0, stop)
+        assert time.monotonic() - start_s < 5
+        timer.join()
+        assert stop.received is number
+
+
+def test_sending_without_a_subscriber_does_not_block(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v", high_water_mark=1) as publisher:
+        for _ in range(1000):
+            publisher.send(b"verdict.right", b"{}")
+
+
+def test_a_message_that_the_proxy_is_too_slow_for_is_dropped_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ended = threading.Event()
+    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: ended.wait(WAIT_MS / 1e3))
+    with Publisher(f"ipc://{tmp_path}/v", high_water_mark=5) as publisher:
+        sent = [publisher.send(b"verdict.right", b"{}") for _ in range(10)]
+        ended.set()
+    assert sent == [True] * 6 + [False] * 4  # five, and one at the proxy's end
+
+
+def test_a_subscriber_that_does_not_read_loses_messages_and_nothing_else(
+    tmp_path: Path, peers: Peers
+) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint, high_water_mark=10) as publisher:
+        subscriber = peers.subscribe(endpoint, high_water_mark=10)
+        first_message(publisher, subscriber)
+        for number in range(20_000):
+            publisher.send(b"verdict.right", b"%d" % number + b" " * 1000)
+        received = []
+        while subscriber.poll(200):
+            received.append(subscriber.recv_multipart()[1])
+    numbers = [int(payload) for payload in received if payload != b"first"]
+    assert 0 < len(numbers) < 20_000
+    assert numbers == sorted(set(numbers))
+
+
+def test_all_messages_before_the_last_status_are_heard_when_the_door_closes(
+    tmp_path: Path, peers: Peers
+) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+    with Publisher(endpoint) as publisher:
+        subscriber = peers.subscribe(endpoint)
+        first_message(publisher, subscriber)
+        for number in range(500):
+            publisher.send(b"verdict.right", b"%d" % number)
+        publisher.send(b"status.right", b"stopping")
+    heard = []
+    while subscriber.poll(500):
+        heard.append(subscriber.recv_multipart())
+    assert heard[-501:] == [
+        *([b"verdict.right", b"%d" % number] for number in range(500)),
+        [b"status.right", b"stopping"],
+    ]
+
+
+def test_a_door_on_a_port_that_is_taken_is_refused(tmp_path: Path) -> None:
+    endpoint = endpoint_of("tcp", tmp_path)
+    with Publisher(endpoint), pytest.raises(PublishError, match="in use"):
+        Publisher(endpoint)
+
+
+def test_a_door_on_a_path_that_is_taken_is_refused(tmp_path: Path) -> None:
+    endpoint = endpoint_of("ipc", tmp_path)
+    with Publisher(endpoint), pytest.raises(PublishError, match="another graspd"):
+        Publisher(endpoint)
+
+
+def test_the_socket_file_keeps_its_mode_and_survives_opening_again(
+    tmp_path: Path, peers: Peers
+) -> None:
+    listener = Listener.of(f"ipc://{tmp_path}/v", 0o640)
+    for _ in range(2):
+        door = Door(listener)
+        subscriber = peers.subscribe(listener.endpoint)
+        deadline_s = time.monotonic() + WAIT_MS / 1e3
+        while not subscriber.poll(10):
+            assert time.monotonic() < deadline_s
+            door.send(b"verdict.right", b"{}")
+        assert door.close()
+        assert stat.S_IMODE((tmp_path / "v").stat().st_mode) == 0o640
+    listener.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_proxy_that_has_ended_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zmq, "proxy", lambda _front, _back: None)
+    with Publisher(f"ipc://{tmp_path}/v") as publisher:
+        time.sleep(0.1)
+        with pytest.raises(PublishError, match="no longer serves"):
+            publisher.door.check()
+
+
+def test_a_living_proxy_passes_the_check(tmp_path: Path) -> None:
+    with Publisher(f"ipc://{tmp_path}/v") as publisher:
+        publisher.send(b"status.right", b"{}")
+        publisher.door.check()
+
+
+@pytest.mark.parametrize("kind", [zmq.REQ, zmq.DEALER])
+def test_a_question_comes_with_its_routing_id_and_gets_its_answer(
+    asked: tuple[Door, str], peers: Peers, kind: int
+) -> None:
+    door, endpoint = asked
+    asker = peers.connect(kind, endpoint, name=b"controller")
+    asker.send(b"judge")
+    delimiter = [b""] if kind == zmq.REQ else []
+    assert receive(door, 1) == [[b"controller", *delimiter, b"judge"]]
+    assert door.answer([b"controller", *delimiter, b"{}"])
+    assert asker.recv_multipart() == [b"{}"]
+
+
+def test_a_client_that_reconnects_takes_its_routing_id_along(
+    asked: tuple[Door, str], peers: Peers
+) -> None:
+    door, endpoint = asked
+    for number in range(2):
+        asker = peers.connect(zmq.DEALER, endpoint, name=b"controller")
+        asker.send(b"judge")
+        assert receive(door, 1) == [[b"controller", b"judge"]]
+        door.answer([b"controller", b"%d" % number])
+        assert asker.recv() == b"%d" % number
+
+
+def test_a_message_of_many_frames_is_cut(asked: tuple[Door, str], peers: Peers) -> None:
+    door, endpoint = asked
+    asker = peers.connect(zmq.DEALER, endpoint, name=b"controller")
+    asker.send_multipart([b"x"] * 1000)
+    asker.send(b"judge")
+    long, question = receive(door, 2)
+    assert long == [b"controller", b"x", b"x", b"x"]
+    assert question == [b"controller", b"judge"]
+
+
+def test_a_flood_of_questions_is_read_a_few_a_round(asked: tuple[Door, str], peers: Peers) -> None:
+    door, endpoint = asked
+    asker = peers.connect(zmq.DEALER, endpoint)
+    for _ in range(100):
+        asker.send(b"judge")
+    rounds: list[int] = []
+    while sum(rounds) < 100:
+        rounds.append(len(door.receive()))
+    assert max(rounds) <= QUESTIONS_MAX
+
+
+def test_a_peer_that_sends_too_much_is_disconnected_and_others_are_not(
+    asked: tuple[Door, str], peers: Peers
+) -> None:
+    door, endpoint = asked
+    loud, polite = (peers.connect(zmq.DEALER, endpoint, name=name) for name in (b"loud", b"polite"))
+    loud.send(b"x" * 100_000)
+    polite.send(b"judge")
+    assert receive(door, 1) == [[b"polite", b"judge"]]
+
+
+FLOODS: dict[str, Callable[[int], bytes]] = {
+    "no subscription": lambda _number: b"\x05" + b"x" * 100,
+    "one topic": lambda _number: b"\x01verdict.right",
+    "on and off": lambda number: b"\x01v" if number % 2 else b"\x00v",
+}
+
+
+@pytest.mark.parametrize("kind", FLOODS)
+def test_a_flood_of_subscriptions_does_not_hold_up_the_loop(
+    tmp_path: Path, peers: Peers, kind: str
+) -> None:
+    endpoint = f"ipc://{tmp_path}/v"
+
+    def flood(stop: threading.Event) -> None:
+        hostile = peers.connect(zmq.XSUB, endpoint)
+        number = 0
+        while not stop.is_set():
+            number += 1
+            try:
+                hostile.send(FLOODS[kind](number), zmq.NOBLOCK)
+            except zmq.Again:
+                time.sleep(0.001)
+
+    with Publisher(endpoint) as publisher:
+        subscriber = peers.subscribe(endpoint)
+        first_message(publisher, subscriber)
+        slowest_s = 0.0
+        with at_work(flood):
+            for _ in range(100):
+                began_s = time.thread_time()
+                publisher.send(b"verdict.right", b"{}")
+                slowest_s = max(slowest_s, time.thread_time() - began_s)
+                subscriber.recv_multipart()
+    assert slowest_s < 0.02
