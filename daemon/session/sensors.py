@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 from daemon.publish.companion import Companion
-from daemon.trust.learner import LearnerState
 from drivers.base import Driver, Reading
-from models.session_statistics import SessionState
 
-OnExchange = Callable[[SessionState | None, LearnerState | None], None]
+if TYPE_CHECKING:
+    from daemon.trust.learner import LearnerState
+    from models.session_statistics import SessionState
+
+OnExchange = Callable[["SessionState | None", "LearnerState | None"], None]
 """Takes what is known of the new sensors, or None."""
 
 log = logging.getLogger("graspd")

@@ -223,7 +223,6 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
     stack.callback(stop.close)
     timing = Timing(parts.scene.max_age_ns)
-    stack.callback(timing.selector().close)
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")
     return outbox

@@ -104,8 +104,6 @@ STANDARD = 3
 """Descriptors of standard input, output and error."""
 SIGNALS = 2
 """Descriptors of the pipe by which a signal wakes the loop."""
-LOOP = 2
-"""What wakes it at an exact time, and what tells it that a scene has been prepared."""
 SOCKET = 13
 """Descriptors of a socket at a path, and of the threads of libzmq that serve it."""
 ASK_SOCKET = 5
@@ -179,7 +177,7 @@ def test_threads_and_descriptors_of_an_example_scene_are_all_accounted_for(
 ) -> None:
     found = measured(scene)
     assert found.whole.threads == 1 + ZMQ_THREADS
-    assert found.whole.descriptors == STANDARD + SIGNALS + LOOP + SOCKET + FILE
+    assert found.whole.descriptors == STANDARD + SIGNALS + SOCKET + FILE
     socket = next(part for part in found.parts if part.name == "sockets")
     assert (socket.threads, socket.descriptors) == (ZMQ_THREADS, SOCKET)
 
