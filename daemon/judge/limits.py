@@ -65,7 +65,7 @@ class JointLimits:
 
 
 @dataclass(frozen=True)
-class GripLimits:
+class HandLimits:
     """All conditions of the moment before the lift."""
 
     on_request: bool = False

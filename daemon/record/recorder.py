@@ -181,7 +181,7 @@ class Recorder(Companion):
 
     def on_judged(self, judgement: Judgement) -> None:
         """Record the counts that the network judged."""
-        if judgement.judged and judgement.judged_counts is not None:
+        if judgement.moment.judged and judgement.judged_counts is not None:
             making = partial(Judged.of, self._header.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 

@@ -305,7 +305,7 @@ class Loop:
         self._silence_due_ns = received_ns + silence_ns
         self._readings_since_status += 1
         self._tell(verdict, payload, reading)
-        if judgement.judged:
+        if judgement.moment.judged:
             for on_judged in self._on_judged:
                 on_judged(judgement)
         return True

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from daemon.judge.decision import Limits
-from daemon.judge.limits import GripLimits
+from daemon.judge.limits import HandLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.trust.trust import Trust
 from drivers.base import DriverCounters, DriverError, Reading, TactileReading
@@ -95,7 +95,7 @@ def pipeline(
     clock: Clock,
     fingers: Sequence[str] = FINGERS,
     *,
-    grip: GripLimits | None = None,
+    hand: HandLimits | None = None,
     trust: Trust | None = None,
     **limits: float,
 ) -> Pipeline:
@@ -108,7 +108,7 @@ def pipeline(
             min_confidence=limits.get("min_confidence", 0.0),
         ),
         clock,
-        grip=grip,
+        hand=hand,
         trust=trust,
     )
 
