@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import ContactLimits, GateLimits, HandLimits, JointLimits
+from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
 from daemon.scene import GateMode, Scene, SceneError

@@ -22,7 +22,7 @@ from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.limits import GateLimits, HandLimits
+    from daemon.judge.decision import GateLimits, HandLimits
     from daemon.measure.cost.tables import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])

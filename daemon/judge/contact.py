@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.decision import ContactLimits
 from daemon.judge.health import Number
-from daemon.judge.limits import ContactLimits
 from drivers.base import COUNT_MAX, ELECTRODES
 
 WINDOW = 100

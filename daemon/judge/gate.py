@@ -23,7 +23,7 @@ from itertools import compress
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.limits import HandLimits
+from daemon.judge.decision import HandLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
 from daemon.judge.stillness import Motion, mean_distance
 from daemon.judge.windows import LONG_NS, SHORT_NS

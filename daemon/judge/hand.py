@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
+from daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from daemon.judge.gate import Gate
 from daemon.judge.health import NO_COUNT, Checked, all_of, any_of
-from daemon.judge.limits import MEDIAN_SWEEPS, HandLimits
 from daemon.judge.reasons import Moment, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger

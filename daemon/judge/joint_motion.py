@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.limits import JointLimits
+from daemon.judge.decision import JointLimits
 from daemon.judge.reasons import Reason
 from drivers.base import JointReading
 

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from daemon.judge.decision import (
     NO_RECENT_VERDICT,
     WITHHELD,
+    HandLimits,
     Limits,
     RecentVerdict,
     decide,
     without_gate,
 )
 from daemon.judge.health import Checked, Health, Number, any_of
-from daemon.judge.limits import HandLimits
 from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
 from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from daemon.trust.ledger import GraspId

@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import GateLimits, HandLimits, JointLimits
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision
 from drivers.base import JointReading, TactileReading

@@ -8,8 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import HandLimits
+from daemon.judge.decision import HandLimits, Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.trust.trust import Trust
 from drivers.base import DriverCounters, DriverError, Reading, TactileReading

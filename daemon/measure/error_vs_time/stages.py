@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import HELD, Limits, decide
+from daemon.judge.decision import HELD, HandLimits, Limits, decide
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Health
-from daemon.judge.limits import HandLimits
 from daemon.judge.network import Plausibility
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.outbox import Outbox

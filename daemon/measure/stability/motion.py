@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.decision import HandLimits, JointLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
 from daemon.judge.joint_motion import JointMotion
-from daemon.judge.limits import HandLimits, JointLimits
 from daemon.judge.reasons import Reason
 from daemon.measure.stability.steps import StepRow
 from drivers.base import COUNT_MAX, ELECTRODES, JointReading, TactileReading

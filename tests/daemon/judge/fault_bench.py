@@ -12,8 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import GateLimits, HandLimits, JointLimits
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import JointReading, TactileReading

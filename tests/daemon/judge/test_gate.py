@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
-from daemon.judge.limits import GateLimits, HandLimits, JointLimits
 from daemon.judge.reasons import GateChange, GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger

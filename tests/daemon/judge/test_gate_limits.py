@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits
 from daemon.judge.gate import Gate
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
-from daemon.judge.limits import GateLimits, HandLimits, JointLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from daemon.judge.stillness import Motion
 from tests.daemon.judge.test_gate import (

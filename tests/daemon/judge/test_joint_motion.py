@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
+from daemon.judge.decision import HandLimits, JointLimits, Limits
 from daemon.judge.joint_motion import JointMemory, JointMotion
-from daemon.judge.limits import HandLimits, JointLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Reason
 from drivers.base import JointReading

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.decision import HandLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
-from daemon.judge.limits import HandLimits
 from daemon.judge.reasons import GateState
 from drivers.base import TactileReading
 from tests.daemon.judge.test_contact import PRESSED, Hand, at_rest, noisy, still

@@ -19,7 +19,7 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon.judge.limits import ContactLimits, GateLimits, HandLimits, JointLimits
+from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision
 from drivers.base import ElectrodeFault, JointReading, TactileReading

@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
+from daemon.judge.decision import HandLimits, Limits
 from daemon.judge.health import Health, PastSweeps
-from daemon.judge.limits import HandLimits
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import ElectrodeFault, TactileReading

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.judge.limits import ContactLimits, GateLimits, HandLimits
+from daemon.judge.decision import ContactLimits, GateLimits, HandLimits
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.publish.companion import Companion

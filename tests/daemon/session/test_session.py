@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import HandLimits
+from daemon.judge.decision import HandLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
