@@ -53,13 +53,6 @@ class NoveltyCheck:
         never: NDArray[np.bool_] = outside | ~within
         return never
 
-    def is_seen(self, values: NDArray[np.float64], repaired: int = 0) -> bool:
-        """The opposite of `never_seen` for one reading, (fingers, 24), in a third of the time."""
-        inside = (values >= self._low) & (values <= self._high)
-        return np.count_nonzero(inside) == self._electrodes and self.is_near(
-            self.square(values, repaired)
-        )
-
     def is_near(self, square: float, contradicted: int = 0) -> bool:
         """Whether a reading of this `square` fits the training covariance; ranges do not matter.
 

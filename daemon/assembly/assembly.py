@@ -9,8 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import ContactLimits, GateLimits, GripLimits, JointLimits
+from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
 from daemon.scene import GateMode, Scene, SceneError
@@ -83,7 +82,7 @@ def build_pipeline(
         scene.hand.fingers,
         limits,
         clock,
-        grip=grip_limits(scene),
+        hand=hand_limits(scene),
         learns=learns,
         needs_session=scene.session.required,
         trust=_trust(scene, model),
@@ -138,16 +137,16 @@ def gate_mode(scene: Scene) -> GateMode:
     return "settled" if True in streams else "every"
 
 
-def grip_limits(scene: Scene) -> GripLimits | None:
+def hand_limits(scene: Scene) -> HandLimits | None:
     """What must hold before a grasp is judged; None with mode `every`: each reading is one."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
         if gate.sweeps == 3:
             raise SceneError("gate.sweeps 3: readings that are each a grasp have no median")
         return None
-    return GripLimits(
+    return HandLimits(
         on_request=mode == "request",
-        sweeps=GripLimits.sweeps if gate.sweeps is None else gate.sweeps,
+        sweeps=HandLimits.sweeps if gate.sweeps is None else gate.sweeps,
         required=gate.fingers,
         contact=ContactLimits(counts=gate.contact_counts, sigmas=gate.contact_sigmas),
         gate=GateLimits(

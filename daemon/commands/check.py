@@ -22,7 +22,7 @@ from models.contract import Finger, ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from daemon.judge.limits import GateLimits, GripLimits
+    from daemon.judge.decision import GateLimits, HandLimits
     from daemon.measure.cost.tables import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
@@ -73,7 +73,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         wanted = scene.load(path)
         model = assembly.load_model(wanted)
         assembly.build_pipeline(wanted, model)
-        limits = assembly.grip_limits(wanted)
+        limits = assembly.hand_limits(wanted)
         period_ns = _try_drivers(wanted)
         _try_keys(wanted)
     except (scene.SceneError, ModelError, DriverError) as error:
@@ -178,7 +178,7 @@ def _try_keys(wanted: scene.Scene) -> None:
 
 
 def _what_is_in(
-    wanted: scene.Scene, model: TactileModel, limits: GripLimits | None, period_ns: int | None
+    wanted: scene.Scene, model: TactileModel, limits: HandLimits | None, period_ns: int | None
 ) -> dict[str, str]:
     contract = model.contract
     figures = ", ".join(
@@ -232,7 +232,7 @@ def _realtime(wanted: scene.Realtime) -> str:
     return f"{priority}{cpus}{memory}, no garbage collection on the hot path"
 
 
-def _gate(wanted: scene.Scene, limits: GripLimits | None) -> str:
+def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
     gate = wanted.gate
     age = f"not older than {gate.max_age_ms:g} ms"
     if limits is None:
@@ -295,7 +295,7 @@ def _section(section: scene_drivers.Section) -> str:
 
 
 def _what_is_left_out(
-    wanted: scene.Scene, model: TactileModel, limits: GripLimits | None
+    wanted: scene.Scene, model: TactileModel, limits: HandLimits | None
 ) -> dict[str, str]:
     left_out = {}
     drivers = [get_args(kind.model_fields["driver"].annotation)[0] for kind in TACTILE_SECTIONS]

@@ -280,12 +280,12 @@ def _judge(wanted: scene.Scene, pipeline: Pipeline) -> list[Judgement]:
             pipeline.observe_joints(reading)
             continue
         judgement = pipeline.judge(reading)
-        if not judgement.judged:
+        if not judgement.moment.judged:
             continue
         judgements.append(judgement)
         slipped = None if reading.annotation is None else reading.annotation.slipped
         if slipped is not None:
-            pipeline.outcome(GraspId(pipeline.boot_id, judgement.grasp), slipped=slipped)
+            pipeline.outcome(GraspId(pipeline.boot_id, judgement.moment.grasp), slipped=slipped)
     pipeline.learn()
     return judgements
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number, all_of
-from daemon.judge.limits import ContactLimits
+from daemon.judge.decision import ContactLimits
+from daemon.judge.health import Number
 from drivers.base import COUNT_MAX, ELECTRODES
 
 WINDOW = 100
@@ -180,11 +180,11 @@ class Window:
         shape = (WINDOW, fingers, ELECTRODES)
         return cls(np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.bool_))
 
-    def add(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_]) -> None:
-        """Take in a sweep, shape (fingers, 24)."""
+    def add(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
+        """Take in a sweep, shape (fingers, 24), and which electrodes are usable; None: all."""
         place = self.number % WINDOW
         self.counts[place] = counts
-        self.usable[place] = usable
+        self.usable[place] = True if usable is None else usable
         self.number += 1
 
     def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
@@ -281,11 +281,11 @@ class Contact:
         t_ns: int,
         counts: NDArray[np.uint16],
         median: NDArray[np.uint16],
-        usable: NDArray[np.bool_],
+        usable: NDArray[np.bool_] | None,
     ) -> None:
         """Take in one sweep and its `FreshMedian`, shape (fingers, 24), read at `t_ns`.
 
-        Electrodes that are not `usable` count for nothing.
+        Electrodes that are not `usable` count for nothing; None: all are usable.
         """
         memory = self.memory
         falls, numbers = self._falls(median, usable)
@@ -321,12 +321,12 @@ class Contact:
                     self._settle(finger, rest, t_ns)
 
     def _falls(
-        self, median: NDArray[np.uint16], usable: NDArray[np.bool_]
+        self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
         """Falls of each finger's electrodes, ascending, and how many of them count, the first."""
         falls, numbers = median.astype(np.float64), self.memory.numbers
         np.subtract(self.memory.rest, falls, out=falls)
-        if not all_of(usable):
+        if usable is not None:
             falls[~usable] = np.inf
             numbers = (usable & self.memory.known).sum(axis=1).tolist()
         falls.sort(axis=1)

@@ -6,185 +6,96 @@
     closing, settled, judged -> released -> idle   (or, touched at once again, -> closing)
 
 A grasp begins with the first touch and ends when nothing touches any more. It is judged when all
-fingers touch and everything has kept still for so long that nothing can slide unseen; where `early`
-is wanted, first as soon as nothing moves fast. From then on it is judged anew, without leaving
-`judged`, many times a second and when somebody asks. When it has changed or moved on it must settle
-anew. Times are those of the readings, so a stall or a burst of old readings settles nothing.
+fingers touch and everything has kept still until nothing can slide unseen; where `early` is wanted,
+first as soon as nothing moves fast. From then on the verdict is refreshed, without leaving
+`judged`, many times a second and when the controller asks. A grasp that has changed or moved on
+must settle again. Times are those of the readings, so a stall or a burst of old readings settles
+nothing.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.limits import GateLimits
-from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
+from daemon.judge.decision import HandLimits
+from daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
 from daemon.judge.stillness import Motion, mean_distance
 from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
+from models.contract import Finger
 
-RENEWED_NS = 50_000_000
-"""A standing verdict is judged anew when it is so old, ns: half of what it may be, so that it never
-is older, however slow the readings are, and though one of them is lost."""
+REFRESH_NS = 50_000_000
+"""Age at which a verdict is refreshed, ns: half of `STANDS_NS`, so that it never grows older,
+however slow the readings are, and though one of them is lost."""
 STANDS_NS = 100_000_000
-"""A verdict does not stand longer without being judged anew, ns."""
-CHANGES_MAX = 64
-"""Changes kept until somebody takes them; a reading makes three at most."""
+"""Age above which a verdict no longer stands, ns."""
 
 
 @dataclass(slots=True, eq=False)
 class GateMemory:
-    """The grasp at hand; but changes that nobody took yet are not for another judge to tell."""
+    """The current grasp. Changes that no moment told yet are not for another judge to tell."""
 
     reference: NDArray[np.float32]
     """Shape (fingers, 24): counts where it had settled; means nothing before."""
     judged_ns: int = 0
-    """When it was judged last."""
+    """Time of the last judgement."""
     last_ns: int | None = None
     """Time of the last reading."""
     touched_ns: int = 0
-    """Since when all required fingers touch, if they do."""
+    """Time at which all required fingers touched; means nothing unless `in_contact`."""
     still_since_ns: int | None = None
-    """Since when touch and stillness have lasted, as far as that can be told; None if something
-    moves."""
+    """Time since which touch and stillness have lasted, as well as that can be told. None:
+    something moves."""
     moved_since_ns: int | None = None
-    """Since when a judged grasp has moved; None if it does not."""
+    """Time since which a judged grasp has moved. None: it does not move."""
     early: bool = False
-    """Whether a grasp that was judged had then only not moved fast: the sure one comes unasked."""
+    """True if nothing moved fast when the grasp was judged, but something might slide slowly. It
+    is judged once more, unasked."""
     released_ns: int = 0
-    """When nothing touched any more."""
+    """Time of the end of the last touch."""
     asked: bool = False
-    """Whether somebody waits for a judgement."""
+    """True while the controller waits for a judgement."""
     asked_until_ns: int | None = None
     """None until the first reading after the question."""
     state: GateState = GateState.IDLE
     grasp: int = 0
-    """Touches so far; the number of the grasp at hand."""
+    """Touches until now; the number of the current grasp."""
     in_contact: bool = False
-    """Whether all required fingers touch."""
-    against: tuple[Reason, ...] = (Reason.NO_CONTACT,)
+    """True if all required fingers touch."""
+    objections: tuple[Reason, ...] = (Reason.NO_CONTACT,)
     """What the last reading said against settling."""
 
 
 class Gate:
     """Follows the grasps of one hand."""
 
-    def __init__(
-        self, required: NDArray[np.bool_], limits: GateLimits, *, on_request: bool = False
-    ) -> None:
-        """`required`, shape (fingers,), are the fingers that must touch.
-
-        With `on_request` a settled grasp waits until somebody asks.
-        """
-        self._required: list[int] = np.flatnonzero(required).tolist()
-        self._limits = limits
-        self._on_request = on_request
-        self.motion = Motion(len(required), limits.false_alarms, early=limits.early)
-        self.memory = GateMemory(np.zeros((len(required), ELECTRODES), dtype=np.float32))
+    def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
+        """`fingers` are those of the readings, in their order."""
+        required = fingers if limits.required is None else limits.required
+        self._fingers = tuple(fingers)
+        self._required = [place for place, finger in enumerate(fingers) if finger in required]
+        self._limits = limits.gate
+        self._on_request = limits.on_request
+        self.motion = Motion(len(fingers), self._limits.false_alarms, early=self._limits.early)
+        self.memory = GateMemory(np.zeros((len(fingers), ELECTRODES), dtype=np.float32))
         self._changes: list[GateChange] = []
-
-    @property
-    def state(self) -> GateState:
-        """Where in a grasp the hand is."""
-        return self.memory.state
-
-    @property
-    def grasp(self) -> int:
-        """Number of the grasp at hand, from 1; 0 before the first."""
-        return self.memory.grasp
-
-    @property
-    def in_contact(self) -> bool:
-        """Whether all required fingers touch."""
-        return self.memory.in_contact
-
-    @property
-    def still_ns(self) -> int:
-        """For how long the hand has touched and kept still, ns; 0 if something moves.
-
-        Less than the long window as long as something may slide slowly.
-        """
-        memory = self.memory
-        if memory.still_since_ns is None or memory.last_ns is None:
-            return 0
-        return max(memory.last_ns - memory.still_since_ns, 0)
-
-    @property
-    def early(self) -> bool:
-        """Whether the grasp was judged while something might still slide slowly."""
-        return self.memory.state is GateState.JUDGED and self.memory.early
-
-    @property
-    def settled(self) -> bool:
-        """Whether the grasp at hand has settled, was judged, and still keeps still."""
-        return self.memory.state is GateState.JUDGED and not self.memory.against
-
-    @property
-    def reasons(self) -> tuple[Reason, ...]:
-        """Why it is not so; none if it is."""
-        if self.memory.against or self.memory.state is GateState.JUDGED:
-            return self.memory.against
-        return (Reason.SETTLING if self._is_asked else Reason.NOT_ASKED,)
-
-    @property
-    def wants_judgement(self) -> bool:
-        """Whether the reading at hand is the one to judge."""
-        memory = self.memory
-        if memory.against:
-            return False
-        if memory.state is GateState.JUDGED:
-            return memory.asked or self._judged_before_ns >= RENEWED_NS
-        return memory.state is GateState.SETTLED and self._is_asked
-
-    @property
-    def renews(self) -> bool:
-        """Whether to judge now only keeps a verdict new that stands already."""
-        asked = self.memory.asked and self._on_request
-        return self.memory.state is GateState.JUDGED and not asked
-
-    @property
-    def overdue(self) -> bool:
-        """Whether the verdict of a judged grasp is too old to stand: judge what there is."""
-        return self.memory.state is GateState.JUDGED and self._judged_before_ns > STANDS_NS
-
-    @property
-    def _is_asked(self) -> bool:
-        return self.memory.asked or self.memory.early or not self._on_request
-
-    @property
-    def _judged_before_ns(self) -> int:
-        """How long before the last reading the grasp was judged, ns."""
-        return (self.memory.last_ns or 0) - self.memory.judged_ns
+        """Those since the last moment: three of a reading, and one of a restart before it."""
+        unknown: dict[Finger, float | None] = dict.fromkeys(fingers)
+        self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
-        """The controller wants a judgement of what settles within `request_ns` of the next reading.
+        """Judge the grasp that settles within `request_ns` of the next reading.
 
         A grasp that was judged is judged again.
         """
         self.memory.asked = True
         self.memory.asked_until_ns = None
-
-    def judged(self, t_ns: int, median: NDArray[np.uint16]) -> None:
-        """The grasp was judged, by the reading of `t_ns` with these counts; maybe anew.
-
-        It is still the same as long as it is near to where it settled, and not to where it was
-        judged last: what creeps would never be another.
-        """
-        self.memory.judged_ns = t_ns
-        self.memory.asked = False
-        if self.memory.state is GateState.JUDGED:
-            return
-        self.memory.reference = median.astype(np.float32)
-        self.memory.early = self.still_ns < LONG_NS
-        self.memory.moved_since_ns = None
-        self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
-
-    def take_changes(self) -> list[GateChange]:
-        """Changes since the last call, oldest first."""
-        changes, self._changes = self._changes, []
-        return changes
 
     def skip(self, t_ns: int) -> None:
         """Take in the time of a reading that cannot be used, ns."""
@@ -197,13 +108,19 @@ class Gate:
         t_ns: int,
         counts: NDArray[np.uint16],
         median: NDArray[np.uint16],
-        usable: NDArray[np.bool_],
+        usable: NDArray[np.bool_] | None,
         touching: NDArray[np.bool_],
-        against: tuple[Reason, ...] = (),
-    ) -> None:
-        """Take in one usable reading of `t_ns`, its `FreshMedian` and which fingers touch.
+        objections: tuple[Reason, ...] = (),
+        *,
+        in_time: bool = True,
+        fresh: bool = True,
+    ) -> Moment:
+        """Take in one usable reading of `t_ns` and its median; return where in a grasp it is.
 
-        `against` speaks against settling for reasons of others: no tare, joints that move.
+        `usable`, shape (fingers, 24), None for all, are its electrodes that can be used; `touching`
+        are the fingers that touch. `objections` of other parts keep the grasp from settling: no
+        tare, joints that move. The grasp is judged only `in_time`, and by values that are all
+        `fresh`, or by the newest ones once the verdict is too old to stand.
         """
         memory = self.memory
         self.skip(t_ns)
@@ -215,7 +132,7 @@ class Gate:
         if in_contact and not memory.in_contact:
             memory.touched_ns = t_ns
         memory.in_contact = in_contact
-        reasons = self._disturbances(against)
+        reasons = self._disturbances(objections)
         self._follow_stillness(t_ns, bool(reasons))
         self._follow_contact(t_ns, any(touches))
         if memory.state is GateState.JUDGED:
@@ -223,7 +140,115 @@ class Gate:
         elif memory.state is GateState.SETTLED and (reasons or not self._is_still):
             cause = GateCause.MOVED if memory.in_contact else GateCause.CONTACT_LOST
             self._enter(GateState.CLOSING, t_ns, cause)
-        memory.against = (*reasons, *self._settle(t_ns, bool(reasons)))
+        memory.objections = (*reasons, *self._settle(t_ns, bool(reasons)))
+        if in_time and self._wants_judgement(fresh=fresh):
+            return self._judge(t_ns, median, touches)
+        return self.moment(touches)
+
+    def moment(
+        self, touches: Sequence[bool], *, judges: bool = False, judged: bool = False
+    ) -> Moment:
+        """Return where in a grasp the hand is, and forget the changes that led there.
+
+        `touches` says of each finger whether it touches; see `Moment` for the others.
+        """
+        memory = self.memory
+        is_judged, reasons = memory.state is GateState.JUDGED, memory.objections
+        if not (reasons or is_judged):
+            reasons = (Reason.SETTLING if self._is_asked else Reason.NOT_ASKED,)
+        changes, self._changes = self._changes, []
+        motion, motion_limits = self._nearest_to_limit()
+        return Moment(
+            grasp=memory.grasp,
+            state=memory.state,
+            judges=judges,
+            judged=judged,
+            in_contact=memory.in_contact,
+            settled=is_judged and not reasons,
+            reasons=reasons,
+            touching=tuple(compress(self._fingers, touches)),
+            changes=tuple(changes),
+            still_ms=self._still_ns / 1e6,
+            early=is_judged and memory.early,
+            motion=motion,
+            motion_limits=motion_limits,
+        )
+
+    def restart(self, t_ns: int) -> None:
+        """Have the grasp settle again: readings are missing, or time went back."""
+        memory = self.memory
+        if memory.last_ns is not None and t_ns < memory.last_ns:
+            memory.released_ns = t_ns
+            memory.asked_until_ns = None
+        memory.last_ns = t_ns
+        memory.still_since_ns = None
+        memory.touched_ns = min(memory.touched_ns, t_ns)
+        self.motion.reset()
+        memory.objections = (Reason.SEQUENCE_GAP,)
+        if memory.state in (GateState.SETTLED, GateState.JUDGED):
+            self._enter(GateState.CLOSING, t_ns, GateCause.GAP)
+
+    @property
+    def _is_asked(self) -> bool:
+        return self.memory.asked or self.memory.early or not self._on_request
+
+    @property
+    def _still_ns(self) -> int:
+        """Time for which the hand has touched and kept still, ns; 0 if something moves.
+
+        Less than the long window while something may slide slowly.
+        """
+        memory = self.memory
+        if memory.still_since_ns is None or memory.last_ns is None:
+            return 0
+        return max(memory.last_ns - memory.still_since_ns, 0)
+
+    @property
+    def _is_still(self) -> bool:
+        """True if the hand has kept still for long enough to be judged."""
+        return self._still_ns >= (SHORT_NS if self._limits.early else LONG_NS)
+
+    def _wants_judgement(self, *, fresh: bool) -> bool:
+        """Return True if this reading is the one to judge."""
+        memory = self.memory
+        if memory.objections:
+            return False
+        if memory.state is GateState.JUDGED:
+            age_ns = (memory.last_ns or 0) - memory.judged_ns
+            return age_ns > STANDS_NS or (fresh and (memory.asked or age_ns >= REFRESH_NS))
+        return fresh and memory.state is GateState.SETTLED and self._is_asked
+
+    def _judge(self, t_ns: int, median: NDArray[np.uint16], touches: Sequence[bool]) -> Moment:
+        """Enter `judged`, or stay there.
+
+        A grasp is the same while it is near to where it settled. Where it was judged last does not
+        matter: a grasp that creeps would never be another.
+        """
+        memory = self.memory
+        refreshes = memory.state is GateState.JUDGED and not (memory.asked and self._on_request)
+        memory.judged_ns = t_ns
+        memory.asked = False
+        if memory.state is not GateState.JUDGED:
+            memory.reference = median.astype(np.float32)
+            memory.early = self._still_ns < LONG_NS
+            memory.moved_since_ns = None
+            self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
+        return self.moment(touches, judges=True, judged=not refreshes)
+
+    def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
+        """Per finger: motion in the window closer to its limit, and that limit."""
+        motion: dict[Finger, float | None] = {}
+        limits: dict[Finger, float] = {}
+        now = self.motion
+        if not now.looked:
+            return self._not_looked
+        windows = now.fast, now.fast_limits, now.slow, now.slow_limits
+        for finger, moves, limit, slides, slide_limit in zip(self._fingers, *windows, strict=True):
+            if slides < math.inf and slides * limit > moves * slide_limit:
+                moves, limit = slides, slide_limit
+            motion[finger] = round(moves, 2) if moves < math.inf else None
+            limits[finger] = round(limit, 2)
+        return motion, limits
 
     def _follow_question(self, t_ns: int) -> None:
         memory = self.memory
@@ -234,20 +259,13 @@ class Gate:
         elif t_ns > memory.asked_until_ns:
             memory.asked = False
 
-    def _disturbances(self, against: tuple[Reason, ...]) -> tuple[Reason, ...]:
+    def _disturbances(self, objections: tuple[Reason, ...]) -> tuple[Reason, ...]:
         if not self.memory.in_contact:
-            return (
-                *(reason for reason in against if reason is Reason.NOT_TARED),
-                Reason.NO_CONTACT,
-            )
+            not_tared = tuple(reason for reason in objections if reason is Reason.NOT_TARED)
+            return (*not_tared, Reason.NO_CONTACT)
         if not self.motion.known:
-            return (*against, Reason.SEQUENCE_GAP)
-        return against if self.motion.early else (*against, Reason.MOVING)
-
-    @property
-    def _is_still(self) -> bool:
-        """Whether it is for long enough to judge."""
-        return self.still_ns >= (SHORT_NS if self._limits.early else LONG_NS)
+            return (*objections, Reason.SEQUENCE_GAP)
+        return objections if self.motion.early else (*objections, Reason.MOVING)
 
     def _follow_stillness(self, t_ns: int, disturbed: bool) -> None:
         """The windows say for how long nothing has moved; the touch must have lasted as long."""
@@ -276,9 +294,9 @@ class Gate:
             self._enter(GateState.RELEASED, t_ns, GateCause.CONTACT_LOST)
 
     def _follow_judged(
-        self, t_ns: int, counts: NDArray[np.float32], usable: NDArray[np.bool_]
+        self, t_ns: int, counts: NDArray[np.float32], usable: NDArray[np.bool_] | None
     ) -> tuple[Reason, ...]:
-        """Whether the judged grasp is still the same; what else is against it."""
+        """Check that the judged grasp is still the same; return what else is against it."""
         memory = self.memory
         if not memory.in_contact:
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
@@ -289,7 +307,7 @@ class Gate:
             return ()
         if self.motion.early if memory.early else self.motion.sure:
             memory.moved_since_ns = None
-            if memory.early and self.still_ns >= LONG_NS:
+            if memory.early and self._still_ns >= LONG_NS:
                 self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
             return ()
         if memory.moved_since_ns is None:
@@ -299,7 +317,7 @@ class Gate:
         return (Reason.MOVING,) if self.motion.early else ()
 
     def _settle(self, t_ns: int, disturbed: bool) -> tuple[Reason, ...]:
-        """Settle once everything is still; what speaks against it besides what disturbs."""
+        """Settle once everything is still; return what is against it besides what disturbs."""
         if disturbed or self.memory.state is not GateState.CLOSING:
             return ()
         if not self._is_still:
@@ -307,24 +325,9 @@ class Gate:
         self._enter(GateState.SETTLED, t_ns, GateCause.STILL)
         return ()
 
-    def restart(self, t_ns: int) -> None:
-        """Have the grasp settle anew: readings are missing, or time went back."""
-        memory = self.memory
-        if memory.last_ns is not None and t_ns < memory.last_ns:
-            memory.released_ns = t_ns
-            memory.asked_until_ns = None
-        memory.last_ns = t_ns
-        memory.still_since_ns = None
-        memory.touched_ns = min(memory.touched_ns, t_ns)
-        self.motion.reset()
-        memory.against = (Reason.SEQUENCE_GAP,)
-        if memory.state in (GateState.SETTLED, GateState.JUDGED):
-            self._enter(GateState.CLOSING, t_ns, GateCause.GAP)
-
     def _enter(self, state: GateState, t_ns: int, cause: GateCause) -> None:
         memory = self.memory
-        if len(self._changes) < CHANGES_MAX:
-            self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
+        self._changes.append(GateChange(t_ns, memory.grasp, memory.state, state, cause))
         memory.state = state
         if state not in (GateState.SETTLED, GateState.JUDGED):
             memory.early, memory.moved_since_ns = False, None

@@ -1,16 +1,23 @@
-"""Whether a reading can be used, and which of its electrodes are broken."""
+"""Check whether a reading can be used, and which of its electrodes are broken.
+
+A finger whose sweep was read before is frozen: a sender that repeats old sweeps gives them new
+numbers.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number, Watched, any_of
 from daemon.judge.reasons import Reason
-from daemon.judge.recurrence import NO_COUNT, PastSweeps
 from drivers.base import COUNT_MAX, ELECTRODES, ElectrodeFault, TactileReading
+
+Number = Annotated[int, msgspec.Meta(ge=0, le=1 << 62)]
+"""A count of readings or grasps; bounded, because a part's memory may come from a recording."""
 
 REASON_OF_FAULT: dict[ElectrodeFault, Reason] = {
     ElectrodeFault.MISSING: Reason.SENSOR_MISSING,
@@ -54,6 +61,74 @@ JUMPS_FORGOTTEN, JUMPS_LOOKED_AT = 1e-9, 16
 LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
 """Above them are a count less 1 that is at a rail, a step and `JUMP_COUNTS` that is far, and a step
 that is one at all. Modulo 2**16, so that what is below zero is large."""
+SWEEPS = 128
+"""Different sweeps of each finger that are remembered: rings up to this length are seen at once. Of
+any two real sweeps of a finger at most 14 electrodes of 24 were equal, in 1.4 million pairs."""
+READ_MIN = 12
+"""Electrodes that must have been read in both sweeps: by chance one in 14 is equal."""
+NO_COUNT = 0x8000
+"""In place of a count: far from every one of 12 bits, upwards and, modulo 2**16, downwards."""
+SWEEP_BYTES = ELECTRODES * 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Checked:
+    """What is wrong with a reading and its electrodes."""
+
+    reasons: tuple[Reason, ...]
+    """Against using it at all."""
+    broken: NDArray[np.bool_]
+    """Shape (fingers, 24): electrodes that mean nothing in it."""
+
+
+@dataclass(slots=True, eq=False)
+class PastSweeps:
+    """The last sweeps of each finger of a hand."""
+
+    past: list[dict[bytes, None]]
+    """Different ones, 24 counts of 16 bits each, oldest first; `NO_COUNT` where none was read."""
+    lacking: list[int]
+    """Sweeps of the finger to come until one with a `NO_COUNT` is forgotten."""
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for what cannot have been read."""
+        if len(self.past) != len(self.lacking) or max(map(len, self.past), default=0) > SWEEPS:
+            raise ValueError(f"at most {SWEEPS} sweeps of each finger are remembered")
+        if any(set(map(len, past)) - {SWEEP_BYTES} for past in self.past):
+            raise ValueError(f"a sweep has {ELECTRODES} counts")
+
+    @classmethod
+    def none(cls, fingers: int) -> PastSweeps:
+        """Return those of a hand that has sent nothing yet."""
+        return cls([{} for _ in range(fingers)], [0] * fingers)
+
+    def recurs(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None = None) -> bool:
+        """Take in a sweep, shape (fingers, 24). Return True if some finger sent the same before.
+
+        `sound` tells which of the counts were read; None: all. The others may be anything.
+        """
+        if sound is not None or any(self.lacking):
+            return self._recurs_in_part(counts, sound)
+        sweeps, found = counts.tobytes(), False
+        for finger, past in enumerate(self.past):
+            found |= _known(past, sweeps[finger * SWEEP_BYTES : (finger + 1) * SWEEP_BYTES])
+        return found
+
+    def _recurs_in_part(self, counts: NDArray[np.uint16], sound: NDArray[np.bool_] | None) -> bool:
+        """Do the same where some counts, of this sweep or of one before, were not read."""
+        found = False
+        for finger, past in enumerate(self.past):
+            read = np.full(ELECTRODES, True) if sound is None else sound[finger]
+            number = np.count_nonzero(read)
+            left = max(self.lacking[finger] - 1, 0)
+            self.lacking[finger] = SWEEPS if number < ELECTRODES else left
+            if number < READ_MIN:
+                continue
+            now = np.where(read, counts[finger], np.uint16(NO_COUNT))
+            if self.lacking[finger]:
+                found |= _equals_one(np.frombuffer(b"".join(past), np.uint16), now)
+            found |= _known(past, now.tobytes())
+        return found
 
 
 @dataclass(slots=True, eq=False)
@@ -63,13 +138,13 @@ class HealthMemory:
     previous: NDArray[np.uint16]
     """Counts of the last reading."""
     number: Number
-    """Of the last reading."""
+    """Number of the last reading."""
     changed: NDArray[np.int64]
     """Number of the reading in which each electrode changed last."""
     jumps: NDArray[np.float64]
     """Recent jumps of each electrode, fading."""
     has_jumped: bool
-    """Whether there are any."""
+    """True if there are any."""
     faults: NDArray[np.uint8]
     """What the driver flagged in the last reading."""
     sweeps: PastSweeps
@@ -97,37 +172,36 @@ class Health:
         self._no_faults = self.memory.faults.tobytes()
         nothing = np.zeros(shape, dtype=np.bool_)
         nothing.flags.writeable = False  # one for all sound readings
-        self._sound = Watched((), nothing)
+        self._sound = Checked((), nothing)
         # Constants of full shape, and buffers: numpy takes half the time.
         self._one, self._jump, *limits = (
             np.full(shape, number, dtype=np.uint16) for number in (1, JUMP_COUNTS, *LIMITS)
         )
         self._limits = np.stack(limits)
         self._above = np.empty_like(self._limits)
-        self._live_until = 0
-        """Number of the reading before which no electrode can have kept its count for too long."""
 
-    def watch(self, reading: TactileReading) -> Watched:
-        """What is wrong with a reading and its electrodes, by it and by those before it."""
+    def check(self, reading: TactileReading) -> Checked:
+        """Return what is wrong with a reading and its electrodes, by it and by those before it."""
         counts = reading.counts
         if counts.shape != self._shape:
-            return Watched((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
+            return Checked((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
         self.memory.faults = reading.faults
         # Nearly all readings are sound, and that is seen with a few cheap operations.
         if reading.faults.tobytes() != self._no_faults:
-            return self._watch_flagged(counts, reading.faults)
+            return self._check_flagged(counts, reading.faults)
         railed, differs = self._compare(counts)
         repeats = self.memory.sweeps.recurs(counts)
         if differs.tobytes().count(0) >= ELECTRODES:
             repeats |= not differs.any(axis=1).all()
-        if not repeats and self._all_live() and not any_of(railed):
+        broken = railed | self._worn_out()
+        if not repeats and not any_of(broken):
             return self._sound
-        return self._found(0, railed, railed | self._worn_out(), repeats=repeats)
+        return self._found(0, railed, broken, repeats=repeats)
 
-    def _watch_flagged(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> Watched:
-        """The same for a reading in which the driver has flagged electrodes.
+    def _check_flagged(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> Checked:
+        """Do the same for a reading in which the driver has flagged electrodes.
 
-        What is flagged was not read: it neither repeats anything nor hides that others do.
+        Flagged counts were not read: they neither repeat anything nor hide that others do.
         """
         sound = flags == 0
         railed, differs = self._compare(counts)
@@ -137,41 +211,43 @@ class Health:
         repeats = self.memory.sweeps.recurs(counts, sound)
         faults = int(np.bitwise_or.reduce(flags, axis=None))
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
-            return Watched(_fault_reasons(faults), broken)
+            return Checked(_fault_reasons(faults), broken)
         repeats |= bool((sound.any(axis=1) & ~(differs & sound).any(axis=1)).any())
         return self._found(faults, railed, broken, repeats=repeats)
 
     def _found(
         self, faults: int, railed: NDArray[np.bool_], broken: NDArray[np.bool_], *, repeats: bool
-    ) -> Watched:
-        """What these findings come to."""
+    ) -> Checked:
+        """Decide what these findings come to."""
         if repeats:
             also = (Reason.SATURATED,) if too_many(railed) else ()
-            return Watched((Reason.FROZEN, *also), broken)
+            return Checked((Reason.FROZEN, *also), broken)
         if too_many(broken):
             reasons = [*_fault_reasons(faults)]
             if railed.any():
                 reasons.append(Reason.SATURATED)
-            return Watched((*reasons, Reason.ELECTRODES_BROKEN), broken)
-        return Watched((), broken)
+            return Checked((*reasons, Reason.ELECTRODES_BROKEN), broken)
+        return Checked((), broken)
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
-        """What is wrong with which electrode, (finger, 0..23), by the last reading."""
-        found: dict[tuple[int, int], Reason] = {}
+        """Return what is wrong with which electrode, (finger, 0..23), by the last reading."""
+        findings: dict[tuple[int, int], Reason] = {}
         memory = self.memory
         for where, reason in (
             (memory.jumps > JUMPS_MAX, Reason.ELECTRODE_JUMPS),
             (memory.changed <= memory.number - UNCHANGED_MAX, Reason.ELECTRODE_DEAD),
             (_railed(memory.previous) & (memory.previous != NO_COUNT), Reason.SATURATED),
         ):
-            found |= dict.fromkeys(_places(where), reason)
+            findings |= dict.fromkeys(_places(where), reason)
         for finger, electrode in _places(memory.faults != 0):
-            found[finger, electrode] = _fault_reasons(int(memory.faults[finger, electrode]))[0]
-        return found
+            findings[finger, electrode] = _fault_reasons(int(memory.faults[finger, electrode]))[0]
+        return findings
 
     def _compare(self, counts: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Take in how the counts have changed; which are at a rail and which differ from before,
-        each of shape (fingers, 24)."""
+        """Take in how the counts have changed.
+
+        Return which are at a rail and which differ from before, each of shape (fingers, 24).
+        """
         memory, previous = self.memory, self.memory.previous
         memory.number += 1
         above = self._above
@@ -195,17 +271,8 @@ class Health:
         memory.previous = counts
         return railed, differs
 
-    def _all_live(self) -> bool:
-        """Whether no electrode is broken by what it did in the last readings."""
-        memory = self.memory
-        if memory.has_jumped and any_of(memory.jumps > JUMPS_MAX):
-            return False
-        if memory.number >= self._live_until:
-            self._live_until = int(memory.changed.min()) + UNCHANGED_MAX
-        return memory.number < self._live_until
-
     def _worn_out(self) -> NDArray[np.bool_]:
-        """Electrodes that are broken by what they did in the last readings, (fingers, 24)."""
+        """Return the electrodes, (fingers, 24), that the last readings show to be broken."""
         memory = self.memory
         worn_out: NDArray[np.bool_] = memory.changed <= memory.number - UNCHANGED_MAX
         if memory.has_jumped:
@@ -213,8 +280,18 @@ class Health:
         return worn_out
 
 
+def any_of(which: NDArray[np.bool_]) -> bool:
+    """Return True if any is true. To search the bytes takes a tenth of the time of `any()`."""
+    return 1 in which.tobytes()
+
+
+def all_of(which: NDArray[np.bool_]) -> bool:
+    """Return True if all are true; see `any_of`."""
+    return 0 not in which.tobytes()
+
+
 def too_many(broken: NDArray[np.bool_]) -> bool:
-    """Whether so many electrodes, shape (fingers, 24), are more than can be repaired."""
+    """Return True if more than 12 electrodes of the hand, or 8 of one finger, are broken."""
     if np.count_nonzero(broken) <= BROKEN_FINGER_MAX:
         return False
     per_finger = broken.sum(axis=1)
@@ -235,4 +312,23 @@ def _fault_reasons(bits: int) -> tuple[Reason, ...]:
     if not bits:
         return ()
     known = tuple(reason for fault, reason in REASON_OF_FAULT.items() if bits & fault)
-    return known or (Reason.NOT_A_COUNT,)  # a flag that nobody explained is still a flag
+    return known or (Reason.NOT_A_COUNT,)  # an unknown flag is still a flag
+
+
+def _known(past: dict[bytes, None], sweep: bytes) -> bool:
+    """Return True if `past` contains the sweep; move it to the newest place."""
+    known = sweep in past
+    if known:
+        del past[sweep]
+    elif len(past) >= SWEEPS:
+        del past[next(iter(past))]
+    past[sweep] = None
+    return known
+
+
+def _equals_one(past: NDArray[np.uint16], now: NDArray[np.uint16]) -> bool:
+    """Return True if the sweep equals some other in all electrodes that were read in both."""
+    others = past.reshape(-1, ELECTRODES)
+    equal = (others == now) | (others == NO_COUNT) | (now == NO_COUNT)
+    alike = others[equal.all(axis=1)]
+    return any(np.count_nonzero((one != NO_COUNT) & (now != NO_COUNT)) >= READ_MIN for one in alike)

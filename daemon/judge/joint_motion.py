@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.limits import JointLimits
+from daemon.judge.decision import JointLimits
 from daemon.judge.reasons import Reason
 from drivers.base import JointReading
 
@@ -83,8 +83,8 @@ class JointMotion:
             if changed or memory.changed_ns is None or t_ns < memory.changed_ns:
                 memory.changed_ns = t_ns
 
-    def against(self, t_ns: int) -> Reason | None:
-        """What the joints say against settling at `t_ns`; None if they are still, or are lost."""
+    def objection(self, t_ns: int) -> Reason | None:
+        """Return what the joints say against settling at `t_ns`. None: they are still, or lost."""
         self._drop_lost(t_ns)
         memory = self.memory
         if not memory.past:
@@ -97,10 +97,9 @@ class JointMotion:
             return Reason.MOVING
         return Reason.JOINTS_FROZEN if self.is_frozen else None
 
-    @property
-    def some_lost(self) -> bool:
-        """Whether judging goes on without a joint that came once."""
-        return bool(set(self.memory.lost).difference(*self.memory.past))
+    def misses_some(self, t_ns: int) -> bool:
+        """Return True if judging goes on at `t_ns` without joints that should be there."""
+        return self.is_lost(t_ns) or bool(set(self.memory.lost).difference(*self.memory.past))
 
     @property
     def is_frozen(self) -> bool:
@@ -111,7 +110,7 @@ class JointMotion:
         return max(memory.latest_ns.values()) - memory.changed_ns > self._limits.frozen_ns
 
     def is_lost(self, t_ns: int) -> bool:
-        """Whether judging goes on without any joints at `t_ns`."""
+        """Return True if judging goes on without any joints at `t_ns`."""
         memory = self.memory
         return (
             not memory.past

@@ -1,12 +1,12 @@
-"""What a judge knows between two readings, as bytes and back: where it goes on, another one can.
+"""Save and restore the judge's state, so that a replay can start in the middle of a run.
 
-Each part has a `memory`, a dataclass of all that readings change in it; copying these is quick.
+Each part has a `memory`, a dataclass of all that readings change in it. One codec serves them all.
 """
 
 from __future__ import annotations
 
 import zlib
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass
 from typing import Any, Final
 
 import msgspec
@@ -19,28 +19,28 @@ MAX_BYTES: Final = 1 << 20  # before it is compressed; three fingers take 80 kB
 KINDS: Final = {np.dtype(kind).str: np.dtype(kind) for kind in ("u1", "u2", "i8", "f4", "f8", "?")}
 
 
-def remember(pipeline: Pipeline) -> object:
-    """A copy of what it knows now, with all grasps that are over learnt, but for its session."""
+def remember(pipeline: Pipeline) -> bytes:
+    """Return all that a judge knows now but its session, with all grasps that are over learnt."""
     pipeline.learn()
-    return _copied(pipeline.memories())
+    return _packed(pipeline.memories())
 
 
-def encode(memory: object) -> bytes:
-    """What `remember` gave, as `recall` wants it; some 25 kB."""
-    return zlib.compress(_packed(memory))
+def encode(memory: bytes) -> bytes:
+    """Return what `remember` gave as `recall` wants it; some 25 kB."""
+    return zlib.compress(memory)
 
 
 def recall(pipeline: Pipeline, data: bytes, *, same_model: bool) -> None:
     """Let a judge that has judged nothing yet go on from there.
 
-    With another model or gate, what was said of the grasp at hand no longer counts. Raises
-    `ValueError`, and changes nothing, for what is no memory, or not of these fingers.
+    With another model or gate, the verdict of the current grasp is discarded. Raises `ValueError`,
+    and changes nothing, for what is no memory, or not of these fingers.
     """
     own = pipeline.memories()
     try:
         plain = zlib.decompressobj().decompress(data, MAX_BYTES)
         known = msgspec.msgpack.decode(plain, type=dict[str, dict[str, msgspec.Raw]])
-        found = [
+        recalled = [
             (part, _part(known[group][name], part))
             for group, parts in own.items()
             if group in known or group == "judge"
@@ -48,44 +48,30 @@ def recall(pipeline: Pipeline, data: bytes, *, same_model: bool) -> None:
         ]
     except (zlib.error, msgspec.DecodeError, KeyError) as error:
         raise ValueError(f"is no memory of a judge: {error}") from error
-    for part, recalled in found:
+    for part, memory in recalled:
         for each in fields(part):
-            setattr(part, each.name, getattr(recalled, each.name))
+            setattr(part, each.name, getattr(memory, each.name))
     if not same_model or ("hand" in known) != ("hand" in own):
         pipeline.restart()
 
 
 def _part(raw: msgspec.Raw, own: Any) -> Any:  # noqa: ANN401 (each part has a memory of its own)
-    """The memory of a part as it was written, checked against the one that it has now."""
-    found = msgspec.msgpack.decode(raw, type=type(own), dec_hook=_array)
-    if _packed(found) != bytes(raw):
+    """Return the memory of a part as it was written, checked against the one that it has now."""
+    memory = msgspec.msgpack.decode(raw, type=type(own), dec_hook=_array)
+    if _packed(memory) != bytes(raw):
         raise ValueError("holds what this graspd does not write")
-    if _shape(found) != _shape(own):
+    if _shape(memory) != _shape(own):
         raise ValueError("an array of another shape than this hand's")
-    return found
+    return memory
 
 
 def _shape(value: object) -> object:
-    """Types and shapes of all arrays, and how many fingers there are."""
+    """Return types and shapes of all arrays, and the number of fingers."""
     if isinstance(value, np.ndarray):
         return value.dtype, value.shape
     if is_dataclass(value):
         return [_shape(getattr(value, each.name)) for each in fields(value)]
     return [_shape(each) for each in value if is_dataclass(each)] if isinstance(value, list) else 0
-
-
-def _copied(value: Any) -> Any:  # noqa: ANN401
-    """Copied as far as a judge changes it: what lies deeper is replaced, never changed."""
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    if isinstance(value, list):
-        return [_copied(each) for each in value]
-    if isinstance(value, dict):
-        return {key: None if each is None else _copied(each) for key, each in value.items()}
-    if not is_dataclass(value):
-        return value
-    copies = {each.name: _copied(getattr(value, each.name)) for each in fields(value) if each.init}
-    return replace(value, **copies)  # type: ignore[type-var]
 
 
 def _packed(memory: object) -> bytes:

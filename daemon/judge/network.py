@@ -1,30 +1,139 @@
-"""Counts in, probability of slip out: image or features, network, and how sharp it may be."""
+"""Examine counts, repair what contradicts, and ask the network for the probability of slip."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Examined, Opinion, all_of
+from daemon.judge.health import all_of, any_of, too_many
 from daemon.judge.reasons import Reason
-from models.contract import ModelError
+from daemon.trust.trust import Assessment
+from drivers.base import COUNT_MAX, ELECTRODES
+from models.contract import Finger, ModelError, SeenCounts
+from models.electrodes import Electrodes
 from models.inputs import SessionBuilder
+from models.novelty import CONTRADICTING_MAX, NoveltyCheck
 from models.runtime import TactileModel
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import Calibration
 
+FLAT_SPREAD_COUNTS = 70.0
+"""Standard deviation of a finger's electrodes below which it is not touching, or not working: half
+of the smallest of 4682 real grasps, 148."""
+ONES = np.ones(ELECTRODES)
 NO_FEATURES = np.empty(0, np.float32)
 TINY = 1e-12
-"""Stands for a probability of zero, whose logarithm there is not."""
+"""Used for a probability of zero, which has no logarithm."""
+
+
+class Examined(msgspec.Struct, frozen=True, eq=False, gc=False):
+    """Whether counts look like a grasp of the training, with what was broken repaired."""
+
+    reasons: tuple[Reason, ...]
+    """Against judging it; empty if it is sound, or has been repaired."""
+    counts: NDArray[np.generic]
+    """Shape (fingers, 24), with the broken electrodes repaired; as read where there are reasons."""
+    repaired: tuple[str, ...] = ()
+    """Electrodes that were replaced, such as `ff_7`."""
+    grasp: NDArray[np.generic] | None = None
+    """Shape (fingers, 24): what a session may take in, even if it is like nothing that was seen
+    before, because that is how a drifted sensor starts. Only electrodes that are certainly broken
+    are repaired in it. None where the reading tells nothing."""
+
+
+class Opinion(msgspec.Struct, frozen=True, gc=False):
+    """What the network said of a grasp, or why it was not asked."""
+
+    p_slip: float | None
+    """Probability of slip by the network, softened while its session is young."""
+    reasons: tuple[Reason, ...]
+    repaired: tuple[str, ...] = ()
+    margin: float = 0.0
+    """The network's log-odds of slip, before softening; 0 where it was not asked."""
+    assessment: Assessment | None = None
+    """What `p_slip` was worth when it was judged. None: nothing learns and no risk is set."""
+
+
+NO_OPINION = Opinion(None, ())
+
+
+class Plausibility:
+    """Compares counts with the training's."""
+
+    def __init__(self, fingers: Sequence[Finger], seen: SeenCounts, electrodes: Electrodes) -> None:
+        """`seen` is what the model was trained on, `electrodes` what follows from it."""
+        self._fingers = tuple(fingers)
+        self._novelty = NoveltyCheck(seen)
+        self._electrodes = electrodes
+
+    def examine(
+        self,
+        counts: NDArray[np.uint16],
+        broken: NDArray[np.bool_],
+        session: Calibration | None = None,
+    ) -> Examined:
+        """Return reasons against judging these counts, or the counts to judge by.
+
+        Shapes are (fingers, 24). `session` says how today's sensors differ from the training's.
+        """
+        values = counts.astype(np.float64)
+        if _is_flat(values, broken):
+            return Examined((Reason.FLAT,), counts)
+        if session is not None:
+            values = session.to_training(values)
+        grasp, values = self._repair(counts, values, broken, session)
+        known = int(np.count_nonzero(broken))
+        at_most = known + CONTRADICTING_MAX + 1
+        implausible = self._electrodes.implausible(values, broken, at_most)
+        number = int(np.count_nonzero(implausible))
+        # With more than that, the reading as a whole is like nothing in the training.
+        seen = learned = number < at_most and not too_many(implausible)
+        if seen:
+            repaired, values = self._repair(counts, values, implausible, session)
+            if session is None:
+                seen = not self._novelty.never_seen(values[np.newaxis], number).any()
+            elif self._electrodes.moved_finger(values):
+                seen = learned = False
+            else:
+                square = self._novelty.square(values, number)
+                learned = self._novelty.is_learned(square)
+                seen = self._novelty.is_near(square, number - known) and not session.odd
+        if not seen:
+            # A young session learns from all, for that is how drift begins; later on a sensor that
+            # fails would slowly become its own standard.
+            learned |= session is None or not session.calibrated
+            return Examined((Reason.NEVER_SEEN,), counts, (), grasp if learned else None)
+        return Examined((), repaired, self._names(implausible) if number else (), grasp)
+
+    def _repair(
+        self,
+        counts: NDArray[np.uint16],
+        values: NDArray[np.float64],
+        broken: NDArray[np.bool_],
+        session: Calibration | None,
+    ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
+        """Return counts, and their values with the training's sensors, with `broken` repaired."""
+        if not any_of(broken):
+            return counts, values
+        values = self._electrodes.repaired(values, broken)
+        expected = values if session is None else session.from_training(values)
+        expected = np.minimum(np.maximum(expected, 0.0), COUNT_MAX)
+        return np.where(broken, expected, counts), values
+
+    def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
+        places = np.argwhere(which).tolist()
+        return tuple(electrode_name(self._fingers[finger], place) for finger, place in places)
 
 
 class Network:
-    """Runs one model, softened as far as its session is known."""
+    """Runs one model, softened while its session is young."""
 
     def __init__(self, model: TactileModel, slip_threshold: float) -> None:
         """`slip_threshold` is the probability, 0..1, that softening must not cross."""
@@ -32,23 +141,23 @@ class Network:
         self._threshold = slip_threshold
 
     def judge(self, examined: Examined, session: Calibration | None = None) -> Opinion:
-        """Probability of slip of what was examined, or None and why there is none.
+        """Return the probability of slip of examined counts, or why there is none.
 
         `session` is what is known of it, for a model that needs one.
         """
-        against = examined.reasons
-        if not against:
-            found = self._ask(examined.counts, session)
-            if isinstance(found, tuple):
-                return Opinion(found[0], (), examined.repaired, found[1])
-            against = (found,)
-        return Opinion(None, against, examined.repaired)
+        if examined.reasons:
+            return Opinion(None, examined.reasons, examined.repaired)
+        answer = self._ask(examined.counts, session)
+        if isinstance(answer, Reason):
+            return Opinion(None, (answer,), examined.repaired)
+        p_slip, margin = answer
+        return Opinion(p_slip, (), examined.repaired, margin)
 
     @property
     def features(self) -> NDArray[np.float32]:
         """What the network was asked about last, shape (inputs,), standardised by the session.
 
-        None, shape (0,), for models without a session: what they take is not of unit size.
+        Empty for models without a session: what they take is not of unit size.
         """
         model = self._model
         return model.input if isinstance(model.inputs, SessionBuilder) else NO_FEATURES
@@ -56,12 +165,12 @@ class Network:
     def _ask(
         self, counts: NDArray[np.generic], session: Calibration | None
     ) -> tuple[float, float] | Reason:
-        """Probability of slip and margin, or why there are none."""
+        """Return probability of slip and margin, or why there are none."""
         model = self._model
         if session is not None and isinstance(model.inputs, SessionBuilder):
             model.inputs.use(session.features_mean, session.features_spread)
         spread = model.inputs.build(counts, model.input)
-        if not all_of(spread >= SPREAD_FLOOR_COUNTS):
+        if not all_of(spread >= SPREAD_FLOOR_COUNTS):  # also for NaN
             return Reason.FLAT
         try:
             p_stable, p_slip = model.run()
@@ -76,8 +185,28 @@ class Network:
         return p_slip, margin
 
 
+def electrode_name(finger: Finger, place: int) -> str:
+    """Return the name, such as `ff_7`, of the electrode at place 6 of 0..23."""
+    return f"{finger}_{place + 1}"
+
+
+def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_]) -> bool:
+    """Return True if the sound electrodes of a finger read about the same; `values` are counts."""
+    numbers = [ELECTRODES] * len(values)
+    if any_of(broken):
+        values = np.where(broken, 0.0, values)
+        numbers = (~broken).sum(axis=1).tolist()
+    sums = values.dot(ONES).tolist()
+    squares = np.square(values).dot(ONES).tolist()
+    # Sums of whole numbers are exact, so nothing is lost when they cancel.
+    return any(
+        number * square - total * total < (number * FLAT_SPREAD_COUNTS) ** 2
+        for number, total, square in zip(numbers, sums, squares, strict=True)
+    )
+
+
 def _softened(margin: float, temperature: float, threshold: float) -> float:
-    """The slip probability with its log-odds, counted from the threshold, over the temperature.
+    """Divide the slip probability's log-odds, counted from the threshold, by the temperature.
 
     So it is less sure, and on the same side of the threshold as before.
     """

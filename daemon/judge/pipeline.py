@@ -1,31 +1,29 @@
-"""Reading in, judgement out: health, grip, plausibility, network, decision, in this order."""
+"""Reading in, judgement out: health, hand, plausibility, network, decision, in this order."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import NO_DOUBT, WITHHELD, Case, Doubt, Limits, alone, decide
-from daemon.judge.findings import (
-    NO_OPINION,
-    Felt,
-    Opinion,
-    PipelineMemory,
-    Watched,
-    any_of,
-    electrode_name,
+from daemon.judge.decision import (
+    NO_RECENT_VERDICT,
+    WITHHELD,
+    HandLimits,
+    Limits,
+    RecentVerdict,
+    decide,
+    without_gate,
 )
-from daemon.judge.health import Health
-from daemon.judge.limits import GripLimits
-from daemon.judge.network import Network
-from daemon.judge.plausibility import Plausibility
-from daemon.judge.reasons import WATCHED_LIFT, Decision, GateChange, GateState, Reason
+from daemon.judge.health import Checked, Health, Number, any_of
+from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
+from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from daemon.trust.ledger import GraspId
-from daemon.trust.risk import RiskReport
+from daemon.trust.trust import Assessment
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
 from models.electrodes import Electrodes
@@ -33,13 +31,13 @@ from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import SessionCalibration
-    from daemon.judge.grip import Grip
+    from daemon.judge.hand import HandTracker
     from daemon.trust.learner import LearnerState
     from daemon.trust.trust import Trust
     from models.session_statistics import SessionState
 
 NOT_HELD: Final = {GateState.IDLE, GateState.RELEASED}
-"""Where a grasp is over."""
+"""States in which a grasp is over."""
 
 
 class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW1641 (holds dicts)
@@ -47,41 +45,20 @@ class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW16
 
     t_ns: int
     """Monotonic time, ns, of the reading's last byte."""
-    grasp: int
     decision: Decision
+    reasons: tuple[Reason, ...]
     p_slip: float | None
     """After what outcomes have taught; None exactly when the decision is unknown."""
-    reasons: tuple[Reason, ...]
-    judged: bool = True
-    """Whether the network judged, or would have judged, this very reading, because the grasp had
-    settled or somebody waits; not where it only keeps a standing verdict new."""
-    repaired: tuple[str, ...] = ()
-    """Electrodes that were replaced before judging, such as `ff_7`."""
-    session_calibrated: bool | None = None
-    """Whether the session is known well enough; None for a model that needs none."""
-    gate: GateState | None = None
-    """None where each reading is a grasp."""
-    contact: tuple[Finger, ...] | None = None
-    """Fingers that touch; None where nobody looks."""
-    changes: tuple[GateChange, ...] = ()
-    """What the gate did at this reading, oldest first."""
-    still_ms: float | None = None
-    """For how long the hand has touched and kept still; None where each reading is a grasp."""
-    early: bool = False
-    """Whether it was judged while something might still slide slowly; only where it is known."""
-    motion: dict[Finger, float | None] | None = None
-    """How each finger moves, in units of its noise, None where that is not known; all None where
-    nobody looks."""
-    motion_limits: dict[Finger, float] | None = None
-    """What it may be at most for a finger that is still."""
-    p_slip_model: float | None = None
-    """What the network alone says; None exactly when the decision is unknown."""
-    outcomes: int = 0
-    """How many `p_slip` rests on."""
+    moment: Moment
+    """Where in a grasp the hand was."""
+    opinion: Opinion
+    """What the network said of the grasp, maybe at an earlier reading."""
+    assessment: Assessment | None = None
+    """What that is worth now. None: nothing learns and no risk is set."""
     supervised: bool = False
-    """Whether its lift, watched, would teach what is not known: ask for it."""
-    risk: RiskReport | None = None
-    """What lifts of `stable` verdicts came to; None where nothing learns and no risk is set."""
+    """True if its lift, watched, would teach what is not known: ask for it."""
+    session_calibrated: bool | None = None
+    """True if the session is known well enough; None for a model that needs none."""
     judged_counts: NDArray[np.uint16] | None = None
     """Shape (fingers, 24): what the network judged, before any repair; None if it did not judge
     this very reading, or if electrodes of it are broken. Not compared."""
@@ -90,6 +67,25 @@ class Judgement(msgspec.Struct, frozen=True, gc=False, eq=False):  # noqa: PLW16
         if not isinstance(other, Judgement):
             return NotImplemented
         return msgspec.structs.astuple(self)[:-1] == msgspec.structs.astuple(other)[:-1]
+
+
+@dataclass(slots=True, eq=False)
+class PipelineMemory:
+    """What is known of the grasps judged so far."""
+
+    to_learn: NDArray[np.float64]
+    """Shape (fingers, 24): counts that the session is to take in; means nothing if none are."""
+    is_to_learn: bool = False
+    to_learn_slip: bool | None = None
+    """True if they were judged to slip."""
+    readings: Number = 0
+    learnt_grasp: Number = 0
+    """The grasp that the session took in last, or is about to."""
+    opinion: Opinion = NO_OPINION
+    """Of the current grasp."""
+    assessment: Assessment | None = None
+    """What `opinion` was worth when it was given."""
+    recent: RecentVerdict = NO_RECENT_VERDICT
 
 
 class Pipeline:
@@ -102,12 +98,12 @@ class Pipeline:
         limits: Limits,
         clock: Callable[[], int],
         *,
-        grip: GripLimits | None = None,
+        hand: HandLimits | None = None,
         learns: bool = True,
         needs_session: bool = False,
         trust: Trust | None = None,
     ) -> None:
-        """`clock` gives monotonic ns; without `grip` each reading is a grasp.
+        """`clock` gives monotonic ns; without `hand` each reading is a grasp.
 
         `trust` learns from outcomes and keeps the risk that is set. With `learns` false the session
         stays what it is; with `needs_session` nothing is judged before it is calibrated. Raises
@@ -137,13 +133,15 @@ class Pipeline:
         self.trust = trust
         """What outcomes have taught; None where nothing learns and no risk is set."""
         self.boot_id = ""
-        """Of the start of the daemon, which names its grasps for ever."""
-        self.grip: Grip | None = None
+        """Identifies the start of the daemon in the names of its grasps."""
+        self.hand: HandTracker | None = None
         """None where each reading is a grasp."""
-        if grip is not None:
-            from daemon.judge.grip import Grip  # only where it is needed
+        self.on_request = False
+        """True if a settled grasp is judged only when the controller asks."""
+        if hand is not None:
+            from daemon.judge.hand import HandTracker  # only where it is needed
 
-            self.grip = Grip(fingers, grip)
+            self.hand, self.on_request = HandTracker(fingers, hand), hand.on_request
         self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))
         self._latest: TactileReading | None = None
         self.on_exchange: Callable[[SessionState | None, LearnerState | None], None] | None = None
@@ -157,19 +155,14 @@ class Pipeline:
 
     @property
     def axis_ns(self) -> int:
-        """`t_ns` less `made_ns` of the latest reading: where the time of a replay is counted from,
-        0 of live readings."""
+        """`t_ns` less `made_ns` of the latest reading: the time from which a replay counts, 0 of
+        live readings."""
         return 0 if self._latest is None else self._latest.t_ns - self._latest.made_ns
 
-    @property
-    def on_request(self) -> bool:
-        """Whether a settled grasp is judged only when somebody asks."""
-        return self.grip is not None and self.grip.on_request
-
     def ask(self) -> None:
-        """Judge the grasp at hand once it has settled: the controller waits for the verdict."""
-        if self.grip is not None:
-            self.grip.ask()
+        """Judge the current grasp once it has settled: the controller waits for the verdict."""
+        if self.hand is not None:
+            self.hand.gate.ask()
 
     def sensors_exchanged(
         self, session: SessionState | None = None, learned: LearnerState | None = None
@@ -179,7 +172,7 @@ class Pipeline:
         `session` and `learned` are what was known of them when they were there before. Raises
         `ValueError` for ones that are of another model.
         """
-        self.memory.opinion = NO_OPINION
+        self._forget_opinion()
         self.memory.is_to_learn = False
         if self._session is not None:
             self._session.reset()
@@ -187,13 +180,13 @@ class Pipeline:
                 self._session.restore(session)
         if self.trust is not None:
             self.trust.sensors_exchanged(learned)
-        if self.grip is not None:
-            self.grip.forget()
+        if self.hand is not None:
+            self.hand.forget()
         if self.on_exchange is not None:
             self.on_exchange(session, learned)
 
     def knows(self, grasp: GraspId) -> bool:
-        """Whether an outcome of a grasp would be taken."""
+        """Return True if an outcome of a grasp would be taken."""
         return self.trust is not None and grasp in self.trust.ledger
 
     def outcome(self, grasp: GraspId, *, slipped: bool) -> None:
@@ -202,86 +195,93 @@ class Pipeline:
             self.trust.outcome(grasp, slipped=slipped)
 
     def restart(self) -> None:
-        """What was said of the grasp at hand no longer counts: another model or gate goes on."""
-        memory = self.memory
-        memory.opinion, memory.learnt_grasp, memory.doubt = NO_OPINION, 0, NO_DOUBT
-        memory.is_to_learn = False
-        if self.grip is not None:
-            self.grip.restart()
+        """Discard the current grasp's verdict.
+
+        Call after restoring state under another model or gate.
+        """
+        self._forget_opinion()
+        self.memory.learnt_grasp, self.memory.recent = 0, NO_RECENT_VERDICT
+        self.memory.is_to_learn = False
+        if self.hand is not None:
+            self.hand.restart()
 
     def memories(self) -> dict[str, dict[str, Any]]:
-        """What every part remembers between two readings, all that its next finding depends on.
+        """Return what every part remembers between two readings, by the name of the part.
 
-        By the name of the part, in groups that a judge has wholly or, but for `judge`, not at all.
-        The session is not among it.
+        Its next finding depends on nothing else. A judge has each group wholly or, but for
+        `judge`, not at all. The session is not among it.
         """
         judge = {"judge": {"judge": self.memory, "health": self._health.memory}}
-        return judge if self.grip is None else judge | self.grip.memories()
+        return judge if self.hand is None else judge | self.hand.memories()
 
     def skip(self) -> None:
-        """Readings were left out before the next one: nobody knows what moved meanwhile."""
-        if self.grip is not None:
-            self.grip.interrupt()
+        """Note that readings were left out before the next one: anything may have moved."""
+        if self.hand is not None:
+            self.hand.interrupt()
 
     def observe_joints(self, reading: JointReading) -> None:
         """Take in joint angles."""
-        if self.grip is not None:
-            self.grip.observe_joints(reading)
+        if self.hand is not None:
+            self.hand.observe_joints(reading)
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
         self.learn()
         self._latest = reading
-        memory, grasp, counts = self.memory, None, None
+        memory = self.memory
         memory.readings += 1
-        watched = self._health.watch(reading)
-        felt = self._observe(reading, watched)
-        if felt.counts is not None:
+        checked = self._health.check(reading)
+        moment, counts = self._follow(reading, checked)
+        grasp = None
+        if counts is not None:
             session = None if self._session is None else self._session.now
-            examined = self._plausibility.examine(felt.counts, watched.broken, session)
-            memory.opinion = self._assess(self._network.judge(examined, session), felt.grasp)
+            examined = self._plausibility.examine(counts, checked.broken, session)
             grasp = examined.grasp
-            counts = None if any_of(watched.broken) else felt.counts
-        elif felt.gate is not GateState.JUDGED:
-            memory.opinion = NO_OPINION
-        judgement = self._decide(reading.t_ns, watched.reasons, felt, memory.opinion, counts)
-        self._remember(judgement.decision, felt)
+            memory.opinion, memory.assessment = self._network.judge(examined, session), None
+            if any_of(checked.broken):
+                counts = None
+        elif moment.state is not GateState.JUDGED:
+            self._forget_opinion()
+        assessment = self._assess(moment)
+        judgement = self._decide(
+            reading.t_ns, checked.reasons, moment, memory.opinion, assessment, counts
+        )
+        stable = judgement.decision is Decision.STABLE
+        if self.trust is not None and assessment is not None and (stable or moment.judges):
+            self.trust.note(GraspId(self.boot_id, moment.grasp), assessment, stable=stable)
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
-            self._note(grasp, judgement.grasp)
+            self._keep_to_learn(grasp, moment.grasp)
         return judgement
 
     def watch(self, reading: TactileReading) -> None:
         """Take in a reading that is not to be judged: what repeats it later is not fresh."""
-        self._health.watch(reading)
+        self._health.check(reading)
 
     def silence(self, last_t_ns: int) -> Judgement:
-        """Judgement when no reading came for too long; `last_t_ns` is the last one's time."""
-        if self.grip is None:
-            felt = Felt(self.memory.readings, None, judged=False)
+        """Return the judgement when no reading came for too long since that of `last_t_ns`."""
+        if self.hand is None:
+            moment = Moment(self.memory.readings, judges=False, judged=False)
         else:
-            felt = self.grip.felt(None)._replace(still_ns=None, motion=None, motion_limits=None)
-        return self._decide(last_t_ns, (Reason.STALE,), felt, NO_OPINION)
+            now = self.hand.moment()
+            moment = now._replace(still_ms=None, motion=None, motion_limits=None)
+        grasp = GraspId(self.boot_id, moment.grasp)
+        assessment = None if self.trust is None else self.trust.review(grasp, None)
+        return self._decide(last_t_ns, (Reason.STALE,), moment, NO_OPINION, assessment)
 
     def health(self) -> dict[str, Reason]:
-        """What is not well now: electrodes such as `ff_7`, fingers, joints, model, session."""
+        """Return what is not well: electrodes such as `ff_7`, fingers, joints, model, session."""
         self.learn()
-        broken = self._health.electrodes()
         opinion = self.memory.opinion
-        found = dict.fromkeys(opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
-        for (finger, place), reason in broken.items():
-            found[electrode_name(self._fingers[finger], place)] = reason
-        if self.grip is not None:
-            untared = [finger for finger in self._fingers if finger not in self.grip.tared]
-            found |= dict.fromkeys(untared, Reason.NOT_TARED)
-            if self.grip.joints_lost:
-                found["joints"] = Reason.JOINTS_LATE
-            if self.grip.joints_frozen:
-                found["joints"] = Reason.JOINTS_FROZEN
+        findings = dict.fromkeys(opinion.repaired, Reason.ELECTRODE_IMPLAUSIBLE)
+        for (finger, place), reason in self._health.electrodes().items():
+            findings[electrode_name(self._fingers[finger], place)] = reason
+        if self.hand is not None:
+            findings |= self.hand.health()
         if Reason.MODEL_FAILED in opinion.reasons:
-            found["model"] = Reason.MODEL_FAILED
+            findings["model"] = Reason.MODEL_FAILED
         if self._session is not None and not self._session.calibrated:
-            found["session"] = Reason.NOT_CALIBRATED
-        return found
+            findings["session"] = Reason.NOT_CALIBRATED
+        return findings
 
     def learn(self) -> None:
         """Take the grasp that was judged last into the session, if it is over.
@@ -289,34 +289,46 @@ class Pipeline:
         A grasp must be judged by what came before it, however often: else what is like nothing seen
         before would be seen the next time. It takes as long as judging, so the verdict goes first.
         """
-        memory, grip = self.memory, self.grip
+        memory = self.memory
         if self._session is None or not memory.is_to_learn:
             return
-        if grip is None or grip.grasp != memory.learnt_grasp or grip.state in NOT_HELD:
+        now = None if self.hand is None else self.hand.gate.memory
+        if now is None or now.grasp != memory.learnt_grasp or now.state in NOT_HELD:
             memory.is_to_learn = False
             self._session.observe(memory.to_learn, slip=memory.to_learn_slip)
 
-    def _assess(self, opinion: Opinion, grasp: int) -> Opinion:
-        """The opinion with what it is worth by the outcomes that are known."""
-        if self.trust is None or opinion.p_slip is None:
-            return opinion
+    def _forget_opinion(self) -> None:
+        self.memory.opinion, self.memory.assessment = NO_OPINION, None
+
+    def _follow(
+        self, reading: TactileReading, checked: Checked
+    ) -> tuple[Moment, NDArray[np.uint16] | None]:
+        """Return where in a grasp the hand is, and the counts to judge; None: judge nothing."""
+        if self.hand is not None:
+            in_time = 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns
+            return self.hand.step(reading, checked, in_time=in_time)
+        usable = not checked.reasons
+        moment = Moment(self.memory.readings, judges=usable)
+        return moment, reading.counts if usable else None
+
+    def _assess(self, moment: Moment) -> Assessment | None:
+        """Return what the opinion is worth by the outcomes that are known now."""
+        memory, opinion, trust = self.memory, self.memory.opinion, self.trust
+        if trust is None:
+            return None
+        grasp = GraspId(self.boot_id, moment.grasp)
+        if not moment.judges or opinion.p_slip is None:
+            return trust.review(grasp, memory.assessment)
         try:
-            assessment = self.trust.judge(
-                GraspId(self.boot_id, grasp), opinion.p_slip, opinion.margin, self._network.features
+            memory.assessment = trust.judge(
+                grasp, opinion.p_slip, opinion.margin, self._network.features
             )
         except ValueError:
-            return Opinion(None, (Reason.MODEL_FAILED,), opinion.repaired)
-        return Opinion(opinion.p_slip, (), opinion.repaired, opinion.margin, assessment)
+            memory.opinion = Opinion(None, (Reason.MODEL_FAILED,), opinion.repaired)
+            return trust.review(grasp, None)
+        return memory.assessment
 
-    def _remember(self, decision: Decision, felt: Felt) -> None:
-        """Keep what was said of a grasp until its outcome is told."""
-        assessment, stable = self.memory.opinion.assessment, decision is Decision.STABLE
-        if self.trust is None or assessment is None:
-            return
-        if stable or felt.counts is not None:
-            self.trust.note(GraspId(self.boot_id, felt.grasp), assessment, stable=stable)
-
-    def _note(self, counts: NDArray[np.generic], grasp: int) -> None:
+    def _keep_to_learn(self, counts: NDArray[np.generic], grasp: int) -> None:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""
         if self._session is not None and grasp != self.memory.learnt_grasp:
             memory, p_slip = self.memory, self.memory.opinion.p_slip
@@ -324,76 +336,58 @@ class Pipeline:
             memory.learnt_grasp, memory.is_to_learn = grasp, True
             memory.to_learn, memory.to_learn_slip = counts.astype(np.float64), slip
 
-    def _observe(self, reading: TactileReading, watched: Watched) -> Felt:
-        grip = self.grip
-        if grip is None:
-            return Felt(self.memory.readings, None if watched.reasons else reading.counts)
-        grip.observe(reading, watched)
-        counts, renews = None, grip.renews
-        if not watched.reasons and 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns:
-            counts = grip.counts_to_judge(reading, watched)
-            if counts is not None:
-                grip.judged()
-        return grip.felt(counts, renews=renews)
-
     def _decide(
         self,
         t_ns: int,
-        against: tuple[Reason, ...],
-        felt: Felt,
+        unusable: tuple[Reason, ...],
+        moment: Moment,
         opinion: Opinion,
+        assessment: Assessment | None,
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
-        health = (*against, *opinion.reasons)
+        """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
         calibrated = None if self._session is None else self._session.calibrated
+        objections = (*unusable, *opinion.reasons)
         if self._needs_session and calibrated is False:
-            health = (*health, Reason.NOT_CALIBRATED)
-        assessment = opinion.assessment
-        p_slip = opinion.p_slip if assessment is None else assessment.p_slip
-        case = Case(
-            p_slip=p_slip,
-            health=health,
-            in_contact=felt.in_contact,
-            settled=felt.settled,
-            gate=felt.reasons,
-            # Taken last, so that a slow inference counts too.
-            age_ns=self.clock() - t_ns,
-            against_stable=None
-            if self.trust is None or assessment is None
-            else WITHHELD[self.trust.permission(GraspId(self.boot_id, felt.grasp), assessment)],
+            objections = (*objections, Reason.NOT_CALIBRATED)
+        p_slip, withheld = opinion.p_slip, None
+        if assessment is not None:
+            p_slip, withheld = assessment.p_slip, WITHHELD[assessment.permission]
+        decision, reasons = decide(
+            p_slip,
+            objections,
+            moment,
+            self.clock() - t_ns,  # taken last, so that a slow inference counts too
+            self._limits,
+            withheld=withheld,
+            recent=self._recent(p_slip, objections, withheld, moment),
         )
-        memory, made_ns = self.memory, 0 if self._latest is None else self._latest.made_ns
-        judged = felt.counts is not None and p_slip is not None
-        said = alone(case, self._limits) if judged else Decision.STABLE
-        if said is Decision.STABLE:
-            case = memory.doubt.on(case, felt.grasp, made_ns, self._limits)
-        else:
-            memory.doubt = Doubt(felt.grasp, made_ns, said)
-        decision, reasons = decide(case, self._limits)
-        known, trust, worth = decision is not Decision.UNKNOWN, self.trust, assessment or self.trust
+        supervised = assessment is not None and assessment.supervised
         return Judgement(
             t_ns=t_ns,
-            grasp=felt.grasp,
             decision=decision,
-            p_slip=p_slip if known else None,
             reasons=reasons if len(reasons) < 2 else tuple(dict.fromkeys(reasons)),
-            judged=felt.judged,
-            repaired=opinion.repaired,
+            p_slip=None if decision is Decision.UNKNOWN else p_slip,
+            moment=moment,
+            opinion=opinion,
+            assessment=assessment,
+            supervised=supervised and WATCHED_LIFT.issuperset(reasons),
             session_calibrated=calibrated,
-            gate=felt.gate,
-            contact=felt.touching,
-            changes=felt.changes,
-            still_ms=None if felt.still_ns is None else felt.still_ns / 1e6,
-            early=known and felt.early,
-            motion=felt.motion,
-            motion_limits=felt.motion_limits,
-            p_slip_model=opinion.p_slip if known else None,
-            outcomes=0 if worth is None else worth.outcomes,
-            supervised=(
-                assessment is not None
-                and assessment.supervised
-                and WATCHED_LIFT.issuperset(reasons)
-            ),
-            risk=None if trust is None else trust.report(),
             judged_counts=counts,
         )
+
+    def _recent(
+        self,
+        p_slip: float | None,
+        objections: tuple[Reason, ...],
+        withheld: Reason | None,
+        moment: Moment,
+    ) -> Decision:
+        """Return an earlier decision that still counts against `stable`, and note this one."""
+        memory, made_ns = self.memory, 0 if self._latest is None else self._latest.made_ns
+        if moment.judges and p_slip is not None:
+            said = without_gate(p_slip, objections, withheld, self._limits)
+            if said is not Decision.STABLE:
+                memory.recent = RecentVerdict(moment.grasp, made_ns, said)
+                return Decision.STABLE
+        return memory.recent.of(moment.grasp, made_ns, self._limits)

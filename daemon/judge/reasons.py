@@ -1,11 +1,11 @@
 """What a verdict may be, why it is `unknown`, and where in a grasp the hand is.
 
 A new reason for `unknown` starts here: a member of `Reason`, and what to do about it in `ADVICE`.
-Then the part that notices puts it among the `reasons` of what it finds (`findings`: `Watched` for
-a reading that cannot be used, `Felt` for a hand that is not ready, `Examined` for counts that are
-no grasp, `Opinion` for a network that failed); any of them makes the verdict `unknown`, with no
-change of `decision`. None outranks another: a verdict lists them in the order of the parts, then
-age and confidence. A test asks for the row in the table of deploy/wire/README.md, another for
+Then the part that notices puts it among the `reasons` of what it finds: `Checked` for a reading
+that cannot be used, `Moment` for a hand that is not ready, `Examined` for counts that are no grasp,
+`Opinion` for a network that failed. Any of them makes the verdict `unknown`, with no change of
+`decision`. None outranks another: a verdict lists them in the order of the parts, then age and
+confidence. A test asks for the row in the table of deploy/wire/README.md, another for
 `graspd schema > deploy/wire/messages.schema.json`.
 """
 
@@ -13,6 +13,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
+
+from models.contract import Finger
 
 
 class Decision(StrEnum):
@@ -135,3 +138,33 @@ class GateChange:
     former: GateState
     state: GateState
     cause: GateCause
+
+
+class Moment(NamedTuple):
+    """Where in a grasp the hand is; the defaults are those of a reading that is a grasp itself."""
+
+    grasp: int
+    """Number of the current grasp, from 1; 0 before the first."""
+    state: GateState | None = None
+    judges: bool = True
+    """True if the network is to judge the grasp by this reading."""
+    judged: bool = True
+    """True for a grasp's first judgement or the answer to a question; False for a periodic refresh.
+    Where each reading is a grasp, True for each, sound or not."""
+    in_contact: bool = True
+    """True if all required fingers touch."""
+    settled: bool = True
+    """True if the grasp has settled, was judged, and still keeps still."""
+    reasons: tuple[Reason, ...] = ()
+    """Why `settled` is false."""
+    touching: tuple[Finger, ...] | None = None
+    changes: tuple[GateChange, ...] = ()
+    """Changes of the gate since the moment before, oldest first."""
+    still_ms: float | None = None
+    """Time for which the hand has touched and kept still, ms."""
+    early: bool = False
+    """True if it was judged while something might still slide slowly."""
+    motion: dict[Finger, float | None] | None = None
+    """How each finger moves, in units of its noise; None where that is not known."""
+    motion_limits: dict[Finger, float] | None = None
+    """Largest motion of a finger that is still."""

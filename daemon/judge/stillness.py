@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from operator import le, truediv
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Number, all_of, any_of
+from daemon.judge.health import Number
 from daemon.judge.windows import (
     APART,
     LONG_NS,
@@ -25,9 +24,6 @@ from daemon.judge.windows import (
     STEPS_MIN,
     Noise,
     Tails,
-    centred,
-    fast_limit,
-    slow_limit,
 )
 from drivers.base import ELECTRODES
 
@@ -59,20 +55,19 @@ Times = NDArray[np.float64]
 
 
 def mean_distance(
-    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_]
+    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
 ) -> NDArray[np.float64]:
-    """Of the `usable` electrodes (fingers, 24), counts, shape (..., fingers).
+    """Return the mean distance of each finger's `usable` electrodes, counts, shape (..., fingers).
 
     Counts of shape (..., fingers, 24), whole numbers below 2**16: float32 adds 24 of them exactly.
+    `usable`, shape (fingers, 24); None: all are usable.
     """
-    distance = one - other
-    np.abs(distance, out=distance)
+    distance = np.abs(one - other)
     mean: NDArray[np.float64]
-    if all_of(usable):
-        mean = distance.dot(ONES).astype(np.float64) / ELECTRODES
-        return mean
-    distance *= usable
-    mean = (distance @ ONES) / np.maximum(usable.sum(axis=1), 1)
+    if usable is None:
+        mean = (distance @ ONES) / np.float64(ELECTRODES)
+    else:
+        mean = (distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1)
     return mean
 
 
@@ -81,9 +76,9 @@ class MotionMemory:
     """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""
 
     times_ns: NDArray[np.int64]
-    """Shape (2 * STEPS,), oldest first; as with `steps`, what is remembered is a slice."""
+    """Shape (STEPS,), newest last."""
     steps: NDArray[np.float32]
-    """Shape (2 * STEPS, fingers, 24): it moves to the right, and then goes back to the left."""
+    """Shape (STEPS, fingers, 24), newest last."""
     clean: NDArray[np.float32]
     """The last sweep without spikes."""
     counts: NDArray[np.float32]
@@ -102,8 +97,6 @@ class MotionMemory:
     """Sums of the squared differences of steps 1 to `APART` apart, shape (APART, fingers)."""
     blocks: NDArray[np.float64]
     """Their means, shape (BLOCKS, APART, fingers), written round and round."""
-    first: Number = 0
-    """Where in `steps` the oldest is."""
     number: Number = 0
     """Steps that are remembered."""
     sweeps: Number = 0
@@ -121,9 +114,7 @@ class MotionMemory:
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for what no such memory can be."""
-        end = self.first + self.number
-        pending_max = max(self.number - APART, 0)
-        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
+        if self.number > STEPS or self.pending > max(self.number - APART, 0):
             raise ValueError("more steps than are remembered")
 
 
@@ -147,8 +138,8 @@ class Motion:
         self._noise_blocks = 0
         """Blocks that it is known from."""
         self.memory = MotionMemory(
-            times_ns=np.zeros(2 * STEPS, dtype=np.int64),
-            steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
+            times_ns=np.zeros(STEPS, dtype=np.int64),
+            steps=np.zeros((STEPS, *shape), dtype=np.float32),
             clean=np.zeros(shape, dtype=np.float32),
             counts=np.zeros(shape, dtype=np.float32),
             jumped=np.zeros(shape, dtype=np.uint8),
@@ -191,7 +182,7 @@ class Motion:
         """Forget the motion: what comes next does not continue what came before."""
         memory = self.memory
         memory.number = memory.sweeps = memory.block_steps = memory.total_ns = 0
-        memory.first = memory.pending = 0
+        memory.pending = 0
         memory.last_ns = None
         memory.block.fill(0.0)
         self._say_unknown()
@@ -206,14 +197,14 @@ class Motion:
         self,
         t_ns: int,
         counts: NDArray[np.uint16],
-        usable: NDArray[np.bool_],
+        usable: NDArray[np.bool_] | None,
         *,
         wanted: bool = True,
     ) -> None:
         """Take in the sweep of `t_ns`, shape (fingers, 24), and which electrodes are usable.
 
-        How the fingers move is not worked out, and not known, where it is not `wanted`. Times must
-        not go back; call `reset` where they do, and after a gap.
+        `usable` is None if all are. How the fingers move is not worked out, and not known, where it
+        is not `wanted`. Times must not go back; call `reset` where they do, and after a gap.
         """
         memory, sweep = self.memory, counts.astype(np.float32)
         if memory.last_ns is None:
@@ -222,13 +213,12 @@ class Motion:
             memory.jumped.fill(0)
             memory.lost.fill(LOST_MAX)
             memory.usable_since_ns.fill(t_ns)
-        if not all_of(usable):
+        if usable is not None:
             sweep = np.where(usable, sweep, memory.clean)
             gone = ~usable & (memory.lost >= LOST_MAX)
-            if any_of(gone):
-                end = memory.first + memory.number
-                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[end - 1 - APART]
-                if memory.pending and any_of(was_usable):
+            if gone.any():
+                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[-1 - APART]
+                if memory.pending and was_usable.any():
                     self._fill_block()
                 # Not in this step, and what comes next has nothing to jump from.
                 memory.all_usable_since_ns = t_ns + STEP_NS
@@ -237,7 +227,7 @@ class Motion:
             memory.lost += ~usable & ~gone
         self._clean(sweep)
         if memory.lost.tobytes() != self._nothing:
-            memory.lost[usable] = 0
+            memory.lost[... if usable is None else usable] = 0
         memory.total = memory.total + memory.clean if memory.sweeps else memory.clean
         memory.total_ns += t_ns - memory.last_ns
         memory.sweeps += 1
@@ -281,17 +271,11 @@ class Motion:
 
     def _remember(self, t_ns: int) -> None:
         memory = self.memory
-        if memory.number == STEPS:
-            memory.first += 1
-            memory.number -= 1
-        place = memory.first + memory.number
-        if place == len(memory.steps):
-            memory.steps[: memory.number] = memory.steps[memory.first :]
-            memory.times_ns[: memory.number] = memory.times_ns[memory.first :]
-            memory.first, place = 0, memory.number
-        np.divide(memory.total, memory.sweeps, out=memory.steps[place])
-        memory.times_ns[place] = t_ns
-        memory.number += 1
+        memory.steps[:-1] = memory.steps[1:]
+        memory.times_ns[:-1] = memory.times_ns[1:]
+        np.divide(memory.total, memory.sweeps, out=memory.steps[-1])
+        memory.times_ns[-1] = t_ns
+        memory.number = min(memory.number + 1, STEPS)
 
     def _learn_noise(self) -> None:
         memory = self.memory
@@ -309,13 +293,12 @@ class Motion:
     def _fill_block(self) -> None:
         """Take the pending steps into the block, by the electrodes that are usable until now."""
         memory = self.memory
-        end = memory.first + memory.number
-        begin, memory.pending = end - memory.pending, 0
-        since_ns = memory.times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
+        begin, memory.pending = STEPS - memory.pending, 0
+        since_ns = memory.times_ns[begin - APART : -APART, np.newaxis, np.newaxis]
         usable = memory.usable_since_ns <= since_ns
         numbers = np.maximum(np.count_nonzero(usable, axis=2), 1)
         for apart, sums in enumerate(memory.block, start=1):
-            differences = memory.steps[begin:end] - memory.steps[begin - apart : end - apart]
+            differences = memory.steps[begin:] - memory.steps[begin - apart : -apart]
             means = (np.square(differences) * usable) @ ONES / numbers
             np.add.reduce((sums, *means), axis=0, out=sums)
 
@@ -346,57 +329,56 @@ class Motion:
 
     def _decide(self) -> None:
         memory = self.memory
-        number, end = memory.number, memory.first + memory.number
         self._say_unknown()
         self.looked = True
-        if memory.block_number < BLOCKS_MIN or number <= STEPS_MIN:
+        if memory.block_number < BLOCKS_MIN or memory.number <= STEPS_MIN:
             return
-        times_ns = memory.times_ns[memory.first : end]
+        first = STEPS - memory.number
+        times_ns = memory.times_ns[first:]
         now_ns = times_ns.item(-1)
         age_ns = now_ns - times_ns.item(0)
         if age_ns < SHORT_NS:
             return
         windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
-        short, long = (min(begin, number - STEPS_MIN) for begin in windows.tolist())
+        short, long = (min(begin, len(times_ns) - STEPS_MIN) for begin in windows.tolist())
         noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
-        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
-        self.early = all(map(le, self.fast, self.fast_limits))
+        beside = self._follow_fast(first + short, times_s[short - long :], noise)
+        self.early = _within(self.fast, self.fast_limits)
         if age_ns >= LONG_NS:
-            self._follow_slow(memory.first + long, end, times_s, noise)
-            slow = all(map(le, self.slow, self.slow_limits))
-            self.sure = slow and all(map(le, self.fast, beside))
+            self._follow_slow(first + long, times_s, noise)
+            self.sure = _within(self.slow, self.slow_limits) and _within(self.fast, beside)
 
-    def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
-        """How steps have moved, and its limit where it decides alone; the limit where not."""
-        memory, number, tails = self.memory, end - begin, self._tails
-        times_s = centred(times_s)
-        extent = float(times_s.dot(times_s))
-        times_s /= extent
-        slopes = times_s.astype(np.float32).dot(memory.steps[begin:end].reshape(number, -1))
+    def _follow_fast(self, begin: int, times_s: Times, noise: Noise) -> list[float]:
+        """Find how steps have moved, and the limit where this window decides alone.
+
+        Return the limit where it does not.
+        """
+        memory = self.memory
+        line, by_noise, self.fast_limits, beside = noise.fast(times_s, self._tails)
+        slopes = line.astype(np.float32).dot(memory.steps[begin:].reshape(len(line), -1))
         slopes = np.abs(slopes, out=slopes).reshape(memory.clean.shape)
-        root = math.sqrt(extent)
-        by_noise = [each / root for each in noise.slope[number].tolist()]
-        self.fast = list(map(truediv, self._mean(slopes, begin), by_noise))
-        self.fast_limits = fast_limit(tails.alone, by_noise)
-        return self.fast_limits if tails.fast == tails.alone else fast_limit(tails.fast, by_noise)
+        means = self._mean(slopes, begin)
+        self.fast = [mean / usual for mean, usual in zip(means, by_noise, strict=True)]
+        return beside
 
-    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> None:
-        """How far steps have spread, and the limit of it."""
-        memory, number = self.memory, end - begin
-        steps = memory.steps[begin:end]
+    def _follow_slow(self, begin: int, times_s: Times, noise: Noise) -> None:
+        """Find how far steps have spread, and the limit of it."""
+        steps = self.memory.steps[begin:]
         middle = np.add.reduce(steps, axis=0)
-        middle /= number
+        middle /= len(steps)
         deviations = steps - middle
         squares = np.add.reduce(np.square(deviations, out=deviations), axis=0)
-        by_noise = [each * (number - 1) for each in noise.variance[number].tolist()]
-        self.slow = list(map(math.sqrt, map(truediv, self._mean(squares, begin), by_noise)))
-        times_s = centred(times_s)
-        extent = float(times_s.dot(times_s))
-        extents = [extent / each for each in by_noise]
-        self.slow_limits = slow_limit(self._tails.slow, extents, noise.spread[number].tolist())
+        means = self._mean(squares, begin)
+        by_noise, self.slow_limits = noise.slow(times_s, self._tails)
+        self.slow = [math.sqrt(mean / usual) for mean, usual in zip(means, by_noise, strict=True)]
 
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown
         self.fast_limits = self.slow_limits = self._no_limits
         self.looked = self.early = self.sure = False
+
+
+def _within(moves: list[float], limits: list[float]) -> bool:
+    """Return True if no finger moves more than its limit."""
+    return all(move <= limit for move, limit in zip(moves, limits, strict=True))

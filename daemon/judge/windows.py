@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -41,11 +42,11 @@ its logarithm. With the noise it is what 44 held touches of one sensor showed, i
 FAST_SHARE = 0.1
 """Share of the false alarms that the short window may have where the long one decides."""
 SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))
-"""Of so many values on a line around 0: sum of the products of those so many steps apart, over the
-sum of squares. Noise that is correlated makes a slope the larger."""
+"""`SLOPE_ECHO[n, k-1]`: lag-k autocorrelation of a centred ramp of n samples; scales the slope's
+variance for correlated noise."""
 SPREAD_ECHO = np.zeros((STEPS + 1, APART - 1))
-"""Of so many values: pairs that are so many steps apart, over all pairs. Noise that is correlated
-spreads the less."""
+"""`SPREAD_ECHO[n, k-1]`: share of the pairs of n samples that are k steps apart; correlated noise
+spreads less by that."""
 for _number in range(STEPS_MIN, STEPS + 1):
     for _lag in range(1, APART):
         _line = np.arange(_number) - (_number - 1) / 2.0
@@ -58,8 +59,7 @@ class Noise:
     """What noise alone makes of windows of so many steps: each of shape (steps, fingers)."""
 
     slope: NDArray[np.float64]
-    """Mean absolute slope, counts/s, if the squares of the times around their mean sum to 1 s**2.
-    """
+    """Mean absolute slope, counts/s, where squared times around their mean sum to 1 s**2."""
     variance: NDArray[np.float64]
     """Mean square deviation from the mean, counts**2 ..."""
     spread: NDArray[np.float64]
@@ -67,8 +67,9 @@ class Noise:
 
     @classmethod
     def of(cls, variance: NDArray[np.float64], correlations: NDArray[np.float64]) -> Noise:
-        """By the variance, counts**2, of each finger's electrodes, shape (fingers,), and the
-        correlations of those 1 to `APART` - 1 steps apart, shape (APART - 1, fingers).
+        """Return it by the variance of each finger's electrodes, counts**2, shape (fingers,).
+
+        `correlations`, shape (APART - 1, fingers): those at 1 to `APART` - 1 steps.
         """
         slopes = np.maximum(1.0 + 2.0 * SLOPE_ECHO @ correlations, 0.1)
         spreads = np.maximum(1.0 - SPREAD_ECHO @ correlations, 0.1)
@@ -78,6 +79,36 @@ class Noise:
             variance=variance * spreads,
             spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
         )
+
+    def fast(
+        self, times_s: NDArray[np.float64], tails: Tails
+    ) -> tuple[NDArray[np.float64], list[float], list[float], list[float]]:
+        """Describe the short window of steps at these times.
+
+        Return the weights by which a sum of steps is their slope; each finger's mean absolute slope
+        by noise alone, counts/s; and the limits of slopes over that, where the short window decides
+        alone and where it does not.
+        """
+        line = centred(times_s)
+        extent = float(line.dot(line))
+        root = math.sqrt(extent)
+        by_noise = [each / root for each in self.slope[len(line)].tolist()]
+        alone = beside = fast_limit(tails.alone, by_noise)
+        if tails.fast != tails.alone:
+            beside = fast_limit(tails.fast, by_noise)
+        return line / extent, by_noise, alone, beside
+
+    def slow(self, times_s: NDArray[np.float64], tails: Tails) -> tuple[list[float], list[float]]:
+        """Describe the long window of steps at these times.
+
+        Return each finger's sum of squared deviations by noise alone, counts**2, and the limits of
+        the root of a sum over that.
+        """
+        number, line = len(times_s), centred(times_s)
+        extent = float(line.dot(line))
+        by_noise = [each * (number - 1) for each in self.variance[number].tolist()]
+        extents = [extent / each for each in by_noise]
+        return by_noise, slow_limit(tails.slow, extents, self.spread[number].tolist())
 
 
 class Tails(NamedTuple):
@@ -92,25 +123,25 @@ class Tails(NamedTuple):
 
     @classmethod
     def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
-        """By the share of a holding hand's sweeps that may be called moving, 0..0.5.
+        """Return them by the share of a holding hand's sweeps that may be called moving, 0..0.5.
 
         Raises `ValueError` for another share.
         """
         if not 0.0 < false_alarms < 0.5:
             raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
-        slow, fast = upper_tail(finger), upper_tail(FAST_SHARE * finger)
+        slow, fast = (-NormalDist().inv_cdf(share) for share in (finger, FAST_SHARE * finger))
         return cls(slow, fast, slow if early else fast)
 
 
 def fast_limit(tail: float, by_noise: Sequence[float]) -> list[float]:
-    """Of each finger's mean absolute slope over what noise makes of it, counts/s."""
+    """Return the limit of each finger's mean absolute slope over `by_noise`, both in counts/s."""
     usual, creeps = math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
     return [math.hypot(usual, creeps / each) for each in by_noise]
 
 
 def slow_limit(tail: float, extents: Sequence[float], spreads: Sequence[float]) -> list[float]:
-    """Of each finger's root mean square deviation over that of noise.
+    """Return the limit of each finger's root mean square deviation over that of noise.
 
     `extents` are the sum of the squares of the times around their mean over the sum of the squares
     of the noise, (s/counts)**2, and `spreads` are those of `Noise`.
@@ -128,15 +159,16 @@ class OperatingPoint(NamedTuple):
     """What one window can tell."""
 
     after_ns: int
-    """Its length: so long after a motion has ended it says so."""
+    """Its length: it tells that a motion has ended this much later."""
     counts_per_s: float
-    """A steady motion of so many counts/s, mean of a finger's electrodes, is seen in every other
-    sweep; a faster one in more."""
+    """Steady motion, mean of a finger's electrodes, that is seen in every other sweep; a faster one
+    is seen in more."""
 
 
 def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, OperatingPoint]:
-    """Of the short and of the long window, for a finger of typical noise and so many ns between
-    sweeps.
+    """Return what the short and the long window can tell of a finger of typical noise.
+
+    `period_ns`: time between sweeps.
     """
     sweeps = max(math.ceil(STEP_NS / period_ns), 1)
     step_ns = sweeps * period_ns
@@ -164,20 +196,10 @@ def _extent(number: int, step_ns: int) -> float:
 
 
 def creep(tail: float) -> float:
-    """Speed that a held touch keeps to but for so many standard deviations, counts/s."""
+    """Return the speed of a held touch, counts/s, `tail` standard deviations above the median."""
     return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
 
 
 def centred(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """With a mean of 0."""
+    """Return times with a mean of 0."""
     return np.asarray(times_s - np.add.reduce(times_s) / len(times_s))
-
-
-def upper_tail(share: float) -> float:
-    """How many standard deviations this share, 0..0.5, of a Gaussian lies above.
-
-    Abramowitz and Stegun, 26.2.23; the error is at most 0.00045.
-    """
-    t = math.sqrt(-2.0 * math.log(share))
-    above = 2.515517 + t * (0.802853 + t * 0.010328)
-    return t - above / (1.0 + t * (1.432788 + t * (0.189269 + t * 0.001308)))

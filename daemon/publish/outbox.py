@@ -14,7 +14,7 @@ import onnxruntime
 
 from daemon import __version__
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.judge.reasons import Decision, GateChange, Reason
+from daemon.judge.reasons import Decision, GateChange, Moment, Reason
 from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import (
     DECISION_CODE,
@@ -109,8 +109,10 @@ class Outbox:
         `received_ns` is when the driver handed the reading over, monotonic; `silence_ns` how long
         no message may come before the consumer must take the grasp for unknown.
         """
-        for change in judgement.changes:
-            self._gate_change(judgement, change)
+        moment, worth = judgement.moment, judgement.assessment
+        known = judgement.decision is not Decision.UNKNOWN
+        for change in moment.changes:
+            self._gate_change(judgement.t_ns, moment, change)
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
         message = Verdict(
@@ -118,30 +120,30 @@ class Outbox:
             seq=self._verdict_seq,
             t=self._wall_clock(),
             t_mono_ns=judgement.t_ns,
-            grasp=judgement.grasp,
+            grasp=moment.grasp,
             verdict=judgement.decision,
             verdict_code=DECISION_CODE[judgement.decision],
             p_slip=judgement.p_slip,
-            valid=judgement.decision is not Decision.UNKNOWN,
+            valid=known,
             reasons=list(judgement.reasons),
             age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
             latency_us=latency_us,
-            repaired=list(judgement.repaired),
+            repaired=list(judgement.opinion.repaired),
             session_calibrated=judgement.session_calibrated,
-            judged=judgement.judged,
-            gate=judgement.gate,
-            contact=None if judgement.contact is None else list(judgement.contact),
+            judged=moment.judged,
+            gate=moment.state,
+            contact=None if moment.touching is None else list(moment.touching),
             silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
-            p_slip_model=judgement.p_slip_model,
-            outcomes=judgement.outcomes,
+            p_slip_model=judgement.opinion.p_slip if known else None,
+            outcomes=0 if worth is None else worth.outcomes,
             supervised=judgement.supervised,
-            risk=judgement.risk,
-            early=judgement.early,
-            still_ms=judgement.still_ms,
-            motion=judgement.motion,
-            motion_limits=judgement.motion_limits,
+            risk=None if worth is None else worth.report,
+            early=known and moment.early,
+            still_ms=moment.still_ms,
+            motion=moment.motion,
+            motion_limits=moment.motion_limits,
         )
         payload = encode(message)
         self._send(self._verdict_topic, payload)
@@ -150,10 +152,10 @@ class Outbox:
         self.decisions[judgement.decision] += 1
         if judgement.reasons:
             self.reasons.update(judgement.reasons)
-        if judgement.repaired:
-            self._repaired.update(judgement.repaired)
-        if judgement.judged:
-            self._remember(judgement.grasp)
+        if judgement.opinion.repaired:
+            self._repaired.update(judgement.opinion.repaired)
+        if moment.judged:
+            self._remember(moment.grasp)
         return message, payload
 
     def _remember(self, grasp: int) -> None:
@@ -221,19 +223,19 @@ class Outbox:
         for output in self._outputs:
             output.send(topic, payload)
 
-    def _gate_change(self, judgement: Judgement, change: GateChange) -> None:
+    def _gate_change(self, t_ns: int, moment: Moment, change: GateChange) -> None:
         message = GateMessage(
             boot_id=self._boot_id,
             seq=self._gate_seq,
             t=self._wall_clock(),
-            t_mono_ns=judgement.t_ns,
+            t_mono_ns=t_ns,
             grasp=change.grasp,
             former=change.former,
             state=change.state,
             cause=change.cause,
-            still_ms=judgement.still_ms,
-            motion=judgement.motion,
-            motion_limits=judgement.motion_limits,
+            still_ms=moment.still_ms,
+            motion=moment.motion,
+            motion_limits=moment.motion_limits,
         )
         self._gate_seq += 1
         self._send(self._gate_topic, encode(message))
@@ -254,7 +256,7 @@ class Outbox:
         `readings_hz` is how many came per second since the last one; `drivers` the counters of all
         parts by name. `skipped_readings` and `overloaded` are as in `Status`.
         """
-        session, grip, trust = pipeline.session, pipeline.grip, pipeline.trust
+        session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
         health = pipeline.health()
         if state is State.SILENT:
             health["link"] = Reason.STALE
@@ -271,8 +273,8 @@ class Outbox:
             repaired=dict(self._repaired),
             session_grasps=None if session is None else session.grasps,
             session_calibrated=None if session is None else session.calibrated,
-            gate=None if grip is None else grip.state,
-            tared=None if grip is None else list(grip.tared),
+            gate=None if hand is None else hand.gate.memory.state,
+            tared=None if hand is None else list(hand.tared),
             health=health,
             latency_us=_spread_us(self.latency),
             jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},

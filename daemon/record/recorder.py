@@ -157,7 +157,7 @@ class Recorder(Companion):
     def on_verdict(self, published: Published) -> None:
         """Record the counts that the network judged."""
         judgement = published.judgement
-        if judgement.judged and judgement.judged_counts is not None:
+        if judgement.moment.judged and judgement.judged_counts is not None:
             making = partial(Judged.of, self._header.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 

@@ -84,9 +84,9 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
         return cls(
             boot_id=boot_id,
             t_mono_ns=judgement.t_ns,
-            grasp=judgement.grasp,
+            grasp=judgement.moment.grasp,
             counts=[] if counts is None else counts.tolist(),
-            repaired=list(judgement.repaired),
+            repaired=list(judgement.opinion.repaired),
         )
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from daemon.judge.findings import Examined
-from daemon.judge.network import Network
+from daemon.judge.network import Examined, Network
 from daemon.judge.reasons import Decision
 from daemon.process.text import Colour, coloured
 from daemon.publish.companion import Companion, Published

@@ -14,8 +14,7 @@ from pydantic import (
     model_validator,
 )
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import ContactLimits, GateLimits, JointLimits
+from daemon.judge.decision import ContactLimits, GateLimits, JointLimits, Limits
 from daemon.process.files import read_regular
 from daemon.process.text import printable
 from daemon.scene.drivers import (

@@ -1,6 +1,7 @@
 """What a verdict is worth: the model's opinion, corrected by outcomes, under the risk that is set.
 
-Between judge and message: `judge` a grasp, decide, `note` what was said; tell each `outcome`.
+At each reading: `judge` a grasp that the network judged, or `review` one that it judged before;
+decide; `note` what was said. Tell each `outcome`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Final, Literal
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from daemon.trust.learner import Learner, LearnerState, sigmoid
@@ -23,20 +25,22 @@ MAX_BYTES: Final = 1 << 20
 DIGEST_BYTES: Final = 32
 
 
-class Assessment(msgspec.Struct, frozen=True, eq=False):
-    """What is thought of one grasp, before anything is said."""
+class Assessment(msgspec.Struct, frozen=True):
+    """What is thought of one grasp, before anything is said; the defaults are those of no grasp."""
 
-    p_slip: float
-    """After learning, 0..1; the model's own as long as nothing was learned."""
     outcomes: int
-    """How many `p_slip` rests on."""
-    log_odds: float
-    """Of slip, after learning."""
-    permission: Permission
-    """Whether it may be called `stable`, by the outcomes that were known when it was judged."""
-    supervised: bool
-    """Whether its lift, watched, would teach what is not known: ask for it."""
-    features: bytes
+    """Number of outcomes that `p_slip` rests on."""
+    report: RiskReport
+    """What lifts of `stable` verdicts came to, until now."""
+    p_slip: float | None = None
+    """After learning, 0..1; the model's own until something was learned. None: not judged."""
+    log_odds: float = 0.0
+    """Log-odds of slip, after learning."""
+    permission: Permission = Permission.ALLOWED
+    """Whether it may be called `stable`, by the outcomes that are known."""
+    supervised: bool = False
+    """True if its lift, watched, would teach what is not known: ask for it."""
+    features: bytes = b""
     """What `note` remembers, float64."""
 
 
@@ -85,36 +89,37 @@ class Trust:
             raise ValueError(f"{p_slip} is no probability")
         features = self._judging.features(margin, inputs)
         log_odds = self._judging.log_odds(features)
-        permission = self._decide(grasp, log_odds)
+        permission = self._permission(grasp, log_odds)
         return Assessment(
-            p_slip=sigmoid(log_odds) if self._judging.outcomes else p_slip,
             outcomes=self._judging.outcomes,
+            report=self.report(),
+            p_slip=sigmoid(log_odds) if self._judging.outcomes else p_slip,
             log_odds=log_odds,
             permission=permission,
             supervised=self.risk.supervised(permission, grasp.boot_id, grasp.grasp),
             features=features.astype("<f8").tobytes(),
         )
 
-    def _decide(self, grasp: GraspId, log_odds: float) -> Permission:
+    def review(self, grasp: GraspId, former: Assessment | None) -> Assessment:
+        """Return the assessment of a grasp that was judged before, None for none, as it is now.
+
+        It may be called `stable` only if it might be then. What has been called so, may be again;
+        else outcomes that were told since count too.
+        """
+        report = self.report()
+        if former is None:
+            return Assessment(self._judging.outcomes, report)
+        permission = former.permission
+        if permission is Permission.ALLOWED and not self.ledger.is_stable(grasp):
+            permission = self._permission(grasp, former.log_odds)
+        return replace(former, permission=permission, report=report)
+
+    def _permission(self, grasp: GraspId, log_odds: float) -> Permission:
         permission = self.risk.decide(log_odds)
         has_rule = self._limits.max_slip_when_stable is not None
         if has_rule and permission is Permission.ALLOWED and self.ledger.is_told(grasp):
             return Permission.WITHHELD  # its outcome is known: a second lift would not be counted
         return permission
-
-    @property
-    def outcomes(self) -> int:
-        """How many what is thought of the next grasp rests on."""
-        return self._judging.outcomes
-
-    def permission(self, grasp: GraspId, assessment: Assessment) -> Permission:
-        """Whether a grasp that was judged may be called `stable` now: never more than then.
-
-        What has been called so, may be again; else outcomes that were told since count too.
-        """
-        if assessment.permission is not Permission.ALLOWED or self.ledger.is_stable(grasp):
-            return assessment.permission
-        return self._decide(grasp, assessment.log_odds)
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
         """Remember what was said of a grasp, unless it is of another model.

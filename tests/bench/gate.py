@@ -15,8 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import GateLimits, GripLimits, JointLimits
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision
 from drivers.base import JointReading, TactileReading
@@ -111,7 +110,7 @@ def study(
         if judgement.decision is not Decision.UNKNOWN and moment.phase is Phase.RELEASE:
             release_s = grasps[moment.grasp - 1].truth.release_s
             result.outlived_s = max(result.outlived_s, moment.t_s - release_s)
-        if judgement.judged:
+        if judgement.moment.judged:
             grasps[moment.grasp - 1].judged.append((moment.t_s, judgement))
     return result
 
@@ -123,7 +122,7 @@ class Judge:
         self._model = model
         self._now_ns = 0
         gate = GateLimits(early=early)
-        self._grip = GripLimits(sweeps=sweeps, joints=JointLimits(), gate=gate)
+        self._grip = HandLimits(sweeps=sweeps, joints=JointLimits(), gate=gate)
 
     def row(self, counts: NDArray[np.uint16]) -> tuple[Decision, float | None]:
         """Verdict on a row of a table, which is a grasp of its own."""
@@ -139,10 +138,10 @@ class Judge:
             pipeline.observe_joints(JointReading(self._now_ns, index, names, angles))
             yield moment, pipeline.judge(_tactile(self._now_ns, index, moment.counts))
 
-    def _pipeline(self, grip: GripLimits | None) -> Pipeline:
+    def _pipeline(self, hand: HandLimits | None) -> Pipeline:
         fingers = self._model.contract.fingers
         limits = Limits(max_age_ns=MAX_AGE_NS)
-        return Pipeline(self._model, fingers, limits, lambda: self._now_ns, grip=grip, learns=False)
+        return Pipeline(self._model, fingers, limits, lambda: self._now_ns, hand=hand, learns=False)
 
 
 def _tactile(t_ns: int, seq: int, counts: NDArray[np.uint16]) -> TactileReading:

@@ -96,7 +96,7 @@ class Reference:
         pipeline.session.restore(self._statistics)
         faults = np.zeros(counts.shape, dtype=np.uint8)
         pipeline.judge(TactileReading(time.monotonic_ns(), 0, counts, faults))
-        assessment = pipeline.memory.opinion.assessment
+        assessment = pipeline.memory.assessment
         if assessment is not None:
             self.trust.ledger.note(grasp, assessment.features, stable=stable)
 

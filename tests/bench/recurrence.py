@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.judge.recurrence import PastSweeps
+from daemon.judge.health import PastSweeps
 from daemon.process.text import markdown_table
 from drivers.twins.grasps.grasps import Counts, recorded_counts
 from drivers.twins.grasps.whole_grasps import (

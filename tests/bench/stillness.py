@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.limits import GateLimits
+from daemon.judge.decision import GateLimits
 from daemon.judge.stillness import Motion
 from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES

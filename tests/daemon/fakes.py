@@ -8,8 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import GripLimits
+from daemon.judge.decision import HandLimits, Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.trust.trust import Trust
 from drivers.base import DriverCounters, DriverError, Fact, Reading, TactileReading
@@ -95,7 +94,7 @@ def pipeline(
     clock: Clock,
     fingers: Sequence[str] = FINGERS,
     *,
-    grip: GripLimits | None = None,
+    hand: HandLimits | None = None,
     trust: Trust | None = None,
     **limits: float,
 ) -> Pipeline:
@@ -108,7 +107,7 @@ def pipeline(
             min_confidence=limits.get("min_confidence", 0.0),
         ),
         clock,
-        grip=grip,
+        hand=hand,
         trust=trust,
     )
 

@@ -53,17 +53,6 @@ def test_the_triangle_is_read_row_by_row() -> None:
     assert NoveltyCheck(crossed).never_seen(counts).tolist() == [True, False]
 
 
-@pytest.mark.parametrize("repaired", [0, 5])
-def test_one_reading_is_looked_at_as_many_are(repaired: int) -> None:
-    check = NoveltyCheck(seen(spread=1 / 100, distance_max=2.4))
-    random = np.random.default_rng(repaired)
-    values = 2000.0 + random.normal(0.0, 1.0, (400, 3, 24)) * random.uniform(50, 300, (400, 1, 1))
-    values[::7, 1, 2] = np.nan
-    expected = ~check.never_seen(values, repaired)
-    assert 0.1 < expected.mean() < 0.9
-    assert [check.is_seen(reading, repaired) for reading in values] == expected.tolist()
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

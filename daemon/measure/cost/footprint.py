@@ -42,7 +42,7 @@ ELSEWHERE = (
     ("driver can", ("drivers.can.driver",)),
     ("driver palm", ("drivers.palm.driver",)),
     ("joints", ("daemon.judge.joint_motion", "drivers.joints.driver", "drivers.palm.calibration")),
-    ("gate", ("daemon.judge.grip",)),
+    ("gate", ("daemon.judge.hand",)),
     ("session", ("daemon.judge.calibration",)),
     ("session file", ("daemon.session.keeper",)),
     ("questions", ("daemon.publish.questions",)),
@@ -277,7 +277,7 @@ def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, i
     judgement = pipeline.judge(reading)
     judged_ns = time.thread_time_ns()
     outbox.verdict(judgement, judgement.t_ns, SILENCE_NS)
-    ran = judgement.judged or judgement.judged_counts is not None
+    ran = judgement.moment.judged or judgement.judged_counts is not None
     return judged_ns - begun_ns, time.thread_time_ns() - judged_ns, ran
 
 

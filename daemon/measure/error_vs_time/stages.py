@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.grip import Grip
+from daemon.judge.decision import HELD, HandLimits, Limits, decide
+from daemon.judge.hand import HandTracker
 from daemon.judge.health import Health
-from daemon.judge.limits import GripLimits
+from daemon.judge.network import Plausibility
 from daemon.judge.pipeline import Pipeline
-from daemon.judge.plausibility import Plausibility
 from daemon.publish.outbox import Outbox
 from daemon.publish.sockets import Sockets
 from daemon.scene import Scene, parse
@@ -65,7 +64,7 @@ def _stages(
     fingers = model.contract.fingers
     now = [time.monotonic_ns()]
     limits = Limits(max_age_ns=10**12)
-    health, grip = Health(len(fingers)), Grip(fingers, GripLimits())
+    health, hand = Health(len(fingers)), HandTracker(fingers, HandLimits())
     electrodes = Electrodes(model.contract.seen)
     plausibility = Plausibility(fingers, model.contract.seen, electrodes)
     pipeline = Pipeline(model, fingers, limits, time.monotonic_ns, learns=False)
@@ -74,12 +73,11 @@ def _stages(
         TactileReading(now[0] + i * PERIOD_NS, i, row, np.zeros(row.shape, dtype=np.uint8))
         for i, row in enumerate(counts)
     ]
-    watched = [health.watch(reading) for reading in readings]
+    checked = [health.check(reading) for reading in readings]
     judgement = pipeline.judge(readings[0])
     names = [name for finger in fingers for name in electrode_columns(finger)]
     header = (",".join(names) + "\n").encode()
     lines = [(",".join(map(str, row.ravel())) + "\n").encode() for row in counts]
-    case = Case(0.25, (), in_contact=True, settled=True, gate=(), age_ns=0)
     sound = np.zeros(counts.shape[1:], dtype=np.bool_)
 
     def parse(index: int) -> None:
@@ -88,11 +86,11 @@ def _stages(
 
     return {
         "parse a row of CSV, with its header": parse,
-        "health": lambda index: health.watch(readings[index]),
-        "contact and gate": lambda index: grip.observe(readings[index], watched[index]),
+        "health": lambda index: health.check(readings[index]),
+        "contact and gate": lambda index: hand.step(readings[index], checked[index]),
         "like the training?": lambda index: plausibility.examine(counts[index], sound),
         "image or features": lambda index: model.inputs.build(counts[index], model.input),
         "session (the network)": lambda _: model.run(),
-        "decision": lambda _: decide(case, limits),
+        "decision": lambda _: decide(0.25, (), HELD, 0, limits),
         "message and socket": lambda _: outbox.verdict(judgement, now[0], PERIOD_NS),
     }

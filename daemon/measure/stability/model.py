@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.findings import Examined
-from daemon.judge.network import Network
+from daemon.judge.decision import HELD, Limits, decide
+from daemon.judge.network import Examined, Network
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, Reason
 from daemon.measure.reference.exact import Exact, exact_input, exact_softening, exact_standard
@@ -306,10 +305,7 @@ class ModelStability:
         network = Network(self._model, LIMITS.slip_threshold)
         for reading in counts:
             found = network.judge(Examined((), reading), self._session)
-            case = Case(
-                found.p_slip, found.reasons, in_contact=True, settled=True, gate=(), age_ns=0
-            )
-            decision, reasons = decide(case, LIMITS)
+            decision, reasons = decide(found.p_slip, found.reasons, HELD, 0, LIMITS)
             said.add(decision, found.p_slip, reasons, self._model)
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Watched
-from daemon.judge.grip import Grip
+from daemon.judge.decision import HandLimits, JointLimits
+from daemon.judge.hand import HandTracker
+from daemon.judge.health import Checked
 from daemon.judge.joint_motion import JointMotion
-from daemon.judge.limits import GripLimits, JointLimits
 from daemon.judge.reasons import Reason
 from daemon.measure.stability.steps import StepRow
 from drivers.base import COUNT_MAX, ELECTRODES, JointReading, TactileReading
@@ -39,7 +39,7 @@ def joint_rows() -> Iterator[StepRow]:
         with np.errstate(all="raise"):
             motion.observe(_angle(0, 0.0), 0)
             motion.observe(_angle(step_ns, JUMP_RAD), step_ns)
-            against = motion.against(step_ns)
+            against = motion.objection(step_ns)
         yield StepRow(
             f"joint velocity, 0.5 rad within {step_ns} ns",
             "moving",
@@ -51,7 +51,7 @@ def joint_rows() -> Iterator[StepRow]:
         motion = JointMotion(JointLimits())
         for t_ns in range(0, S, S // 10_000):
             motion.observe(_angle(t_ns, rate * t_ns / S), t_ns)
-        against = motion.against(t_ns)
+        against = motion.objection(t_ns)
         yield StepRow(
             f"joint velocity of {rate:.4f} rad/s at 10 kHz",
             "still" if wanted is None else str(wanted),
@@ -156,19 +156,17 @@ def _coupled_error() -> float:
 
 def _grasp_through_gate(period_ns: int, touching: int) -> tuple[int, list[Reason]]:
     """How often a grasp is judged that is held for so many sweeps, and what spoke against it."""
-    grip = Grip(FINGERS, GripLimits())
+    hand = HandTracker(FINGERS, HandLimits())
     random = np.random.default_rng(0)
-    judged, reasons = 0, dict.fromkeys(grip.reasons)
+    judged, reasons = 0, dict.fromkeys(hand.moment().reasons)
     for number in range(TARE_SWEEPS + touching):
         level = REST_COUNTS if number < TARE_SWEEPS else TOUCH_COUNTS
         reading = _sweep(number, number * period_ns, level, random)
-        watched = Watched((), np.zeros(reading.counts.shape, dtype=np.bool_))
-        grip.observe(reading, watched)
-        if grip.counts_to_judge(reading, watched) is not None:
-            judged += 1
-            grip.judged()
+        checked = Checked((), np.zeros(reading.counts.shape, dtype=np.bool_))
+        moment, _ = hand.step(reading, checked)
+        judged += moment.judges
         if number >= TARE_SWEEPS:
-            reasons |= dict.fromkeys(grip.reasons)
+            reasons |= dict.fromkeys(moment.reasons)
     return judged, list(reasons)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 from torch import nn
 
-from daemon.judge.decision import Case, Limits, decide
+from daemon.judge.decision import HELD, Limits, decide
 from daemon.judge.reasons import Decision
 from daemon.measure.stability.steps import StepRow
 from models.contract import METADATA_KEY, ModelContract, VectorInput
@@ -105,8 +105,7 @@ def _logit_errors(contract: ModelContract) -> tuple[float, int, float]:
 
 def _is_judged(p_slip: float, logit: float) -> bool:
     """Whether the daemon says of a margin what its sign says."""
-    case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
-    decision, _ = decide(case, Limits(max_age_ns=0))
+    decision, _ = decide(p_slip, (), HELD, 0, Limits(max_age_ns=0))
     return decision is (Decision.SLIP if logit >= 0.0 else Decision.STABLE)
 
 

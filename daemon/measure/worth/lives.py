@@ -42,8 +42,9 @@ def live(stream: Stream, limits: RiskLimits, *, every: bool) -> Life:
     for index, (margin, row, slipped) in enumerate(stream.rows()):
         grasp = GraspId(stream.table, index)
         found = trust.judge(grasp, sigmoid(margin), margin, row)
-        p_slip[index], supervised[index] = found.p_slip, found.supervised
-        stable[index] = found.permission is Permission.ALLOWED and found.p_slip < 0.5
+        p_slip[index] = sigmoid(margin) if found.p_slip is None else found.p_slip
+        supervised[index] = found.supervised
+        stable[index] = found.permission is Permission.ALLOWED and p_slip[index] < 0.5
         trust.note(grasp, found, stable=bool(stable[index]))
         if every or stable[index] or found.supervised:
             trust.outcome(grasp, slipped=slipped)

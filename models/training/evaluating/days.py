@@ -79,7 +79,7 @@ class Day:
             expected = now.mean + (values - self.electrodes.centre) / scale
             counts = np.where(found, np.clip(expected, 0.0, COUNT_MAX), counts)
         if session is None:
-            return counts, self._novelty.is_seen(values, number), True
+            return counts, not self._novelty.never_seen(values[np.newaxis], number).any(), True
         if self.electrodes.moved_finger(values):
             return counts, False, False
         square = self._novelty.square(values, number)

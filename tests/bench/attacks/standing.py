@@ -16,7 +16,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from daemon.judge.median import FreshMedian
+from daemon.judge.hand import FreshMedian
 from daemon.publish.messages import Tactile, Verdict, decode_tactile, decode_verdict
 from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts

@@ -12,8 +12,7 @@ from functools import cache
 
 import numpy as np
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import GateLimits, GripLimits, JointLimits
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import JointReading, TactileReading
@@ -96,8 +95,8 @@ class Grasp:
         self._period_ns = round(1e9 / rate_hz)
         self._steps = self._sound_steps(rate_hz, durations)
         clock = Clock(START_NS)
-        grip = GripLimits(on_request=on_request, gate=GATE, joints=JOINTS)
-        pipeline = Pipeline(network(), FINGERS, Limits(MAX_AGE_NS), clock, grip=grip)
+        settling = HandLimits(on_request=on_request, gate=GATE, joints=JOINTS)
+        pipeline = Pipeline(network(), FINGERS, Limits(MAX_AGE_NS), clock, hand=settling)
         # A daemon tells of silence after ten periods, and not before the age limit.
         hand = _Hand(pipeline, clock, max(MAX_AGE_NS, 10 * self._period_ns))
         self._kept = {0: hand.copy()}
@@ -131,7 +130,7 @@ class Grasp:
     def _first(self, state: GateState) -> int:
         if state is GateState.IDLE:  # at the end of it, when all fingers are tared
             return self._first(GateState.CLOSING) - UNDER_FAULT - 1
-        return [None if said is None else said.gate for said in self._sound].index(state)
+        return [None if said is None else said.moment.state for said in self._sound].index(state)
 
     def _judgement_at(self, now_ns: int) -> Judgement:
         said = self._sound[min((now_ns - START_NS) // self._period_ns, len(self._sound) - 1)]

@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact
-from daemon.judge.limits import ContactLimits
-from daemon.judge.median import FreshMedian
+from daemon.judge.decision import ContactLimits
+from daemon.judge.hand import FreshMedian
 from drivers.twins.grasps.grasps import recorded_counts
 from tests.conftest import data_dir
 

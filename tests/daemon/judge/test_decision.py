@@ -14,8 +14,8 @@ import coverage
 import pytest
 
 from daemon.judge import decision
-from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.reasons import Decision, Reason
+from daemon.judge.decision import HELD, Limits, decide
+from daemon.judge.reasons import Decision, Moment, Reason
 from tests.bench.mutants import mutants
 
 LIMIT_NS = 100
@@ -81,23 +81,26 @@ def expected(
     return ("unknown" if against else worth), against
 
 
-def broken_cases(judge: Callable[[Case, Limits], Any]) -> Iterator[Case]:
+def broken_cases(judge: Callable[..., Any]) -> Iterator[tuple[object, ...]]:
     """Those of all combinations that are not judged by the rule, or raise."""
     for case_of, limits in itertools.product(CASES, (LIMITS, ANY_CONFIDENCE)):
         (p_slip, worth), (age_ns, fresh), health, gate, contact, settled, withheld, doubt = case_of
         if doubt is Decision.SLIP and worth.endswith("stable"):
             worth = "unsure slip"  # the more, the likelier it is to hold
         worth = worth.removeprefix("unsure ") if limits is ANY_CONFIDENCE else worth
-        case = Case(p_slip, health, contact, settled, gate, age_ns, withheld, doubt)
+        moment = Moment(1, in_contact=contact, settled=settled, reasons=gate)
+        given: dict[str, Any] = {"withheld": withheld, "recent": doubt}
+        if doubt is Decision.STABLE and withheld is None:
+            given = {}  # the defaults
         well = contact and settled
         decision, against = expected(worth, fresh, health, gate, well, withheld, doubt)
         try:
-            found, reasons = judge(case, limits)
+            found, reasons = judge(p_slip, health, moment, age_ns, limits, **given)
             right = (found, set(reasons), len(reasons)) == (decision, against, len(against))
         except Exception:  # noqa: BLE001 - a mutant may raise anything
             right = False
         if not right:
-            yield case
+            yield case_of
 
 
 def test_every_combination_is_judged_by_the_rule() -> None:
@@ -109,22 +112,20 @@ def test_every_combination_is_judged_by_the_rule() -> None:
 @pytest.mark.parametrize("where", ["health", "gate"])
 def test_any_reason_makes_the_verdict_unknown(reason: Reason, where: str) -> None:
     health, gate = ((reason,), ()) if where == "health" else ((), (reason,))
-    case = Case(0.0, health, in_contact=where == "health", settled=True, gate=gate, age_ns=0)
-    assert decide(case, LIMITS) == (Decision.UNKNOWN, (reason,))
+    moment = Moment(1, in_contact=where == "health", reasons=gate)
+    assert decide(0.0, health, moment, 0, LIMITS) == (Decision.UNKNOWN, (reason,))
 
 
 def test_the_defaults_ask_for_no_confidence() -> None:
     limits = Limits(max_age_ns=LIMIT_NS)
     for p_slip, decided in ((0.499999, Decision.STABLE), (0.5, Decision.SLIP)):
-        case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
-        assert decide(case, limits) == (decided, ())
+        assert decide(p_slip, (), HELD, 0, limits) == (decided, ())
 
 
 @pytest.mark.parametrize(("age_ns", "stale"), [(100_000_000, False), (100_000_001, True)])
 def test_by_default_a_reading_is_stale_after_a_tenth_of_a_second(age_ns: int, stale: bool) -> None:
     """Ten periods at 100 Hz: no message for so long means unknown, too."""
-    case = Case(0.1, (), in_contact=True, settled=True, gate=(), age_ns=age_ns)
-    assert decide(case, Limits())[1] == ((Reason.STALE,) if stale else ())
+    assert decide(0.1, (), HELD, age_ns, Limits())[1] == ((Reason.STALE,) if stale else ())
 
 
 def test_every_small_mistake_in_the_rule_would_be_noticed() -> None:

@@ -186,9 +186,9 @@ def test_the_sound_grasp_is_in_each_state_and_stable_only_when_judged(
 ) -> None:
     hand = grasp(of_a_palm=of_a_palm, on_request=state is GateState.SETTLED)
     said = hand.soundly(state)
-    assert said[0].gate is state
+    assert said[0].moment.state is state
     after = GateState.IDLE if state is GateState.RELEASED else state
-    assert {judgement.gate for judgement in said} == {state, after}
+    assert {judgement.moment.state for judgement in said} == {state, after}
     assert {judgement.decision for judgement in said} == {decision}
     assert {reason for judgement in said for reason in judgement.reasons} == reasons
 

@@ -1,4 +1,4 @@
-"""The gate by scenarios: whole grasps as a grip feels them, and what it makes of them."""
+"""The gate by scenarios: whole grasps as a hand feels them, and what it makes of them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Watched
-from daemon.judge.grip import Grip
-from daemon.judge.limits import GateLimits, GripLimits, JointLimits
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from daemon.judge.hand import HandTracker
+from daemon.judge.health import Checked
 from daemon.judge.reasons import GateChange, GateState, Reason
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger
@@ -27,7 +27,7 @@ PRESSED = np.where(np.arange(24) % 3 == 0, 1.0, 0.2)
 """Share of a touch's depth that each electrode feels: 0.467 in the mean, and the third deepest
 falls by 0.8 of the depth further than the median one."""
 GATE = GateLimits()
-LIMITS = GripLimits(gate=GATE)
+LIMITS = HandLimits(gate=GATE)
 ALLOWED = {
     *((GateState.IDLE, GateState.CLOSING), (GateState.CLOSING, GateState.SETTLED)),
     *((GateState.SETTLED, GateState.JUDGED), (GateState.JUDGED, GateState.RELEASED)),
@@ -69,7 +69,7 @@ class Scenario:
     spoil: Callable[[float, NDArray[np.float64]], None] = lambda t_s, counts: None
     drift: float = 0.0
     """Counts/s."""
-    limits: GripLimits = LIMITS
+    limits: HandLimits = LIMITS
 
 
 @dataclass
@@ -78,7 +78,7 @@ class Played:
 
     changes: list[GateChange]
     judged: list[Counts]
-    grip: Grip
+    hand: HandTracker
     judged_s: list[float] = field(default_factory=list)
     """When anything was judged, also what stood already."""
     stood_s: list[float] = field(default_factory=list)
@@ -119,38 +119,34 @@ def readings(scenario: Scenario) -> list[tuple[float, TactileReading]]:
 
 
 def play(scenario: Scenario) -> Played:
-    """Feed a grip as the pipeline does, and check what must hold after every reading."""
-    played = Played([], [], Grip(FINGERS, scenario.limits))
-    grip, asks = played.grip, list(scenario.asks_s)
+    """Feed a hand as the pipeline does, and check what must hold after every reading."""
+    played = Played([], [], HandTracker(FINGERS, scenario.limits))
+    hand, asks = played.hand, list(scenario.asks_s)
     for t_s, reading in readings(scenario):
         while asks and asks[0] <= t_s:
-            grip.ask()
+            hand.gate.ask()
             asks.pop(0)
         angle = None if scenario.joint is None else scenario.joint(t_s)
         if angle is not None:
-            grip.observe_joints(
+            hand.observe_joints(
                 JointReading(reading.t_ns, 0, ("FFJ3", "THJ1"), np.array([angle, 0.4 + t_s / 1e9]))
             )
         if scenario.missing[0] <= t_s < scenario.missing[1]:
             continue
         lost = scenario.unusable[0] <= t_s < scenario.unusable[1]
-        watched = Watched((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
-        grip.observe(reading, watched)
-        counts, renews = None if lost else grip.counts_to_judge(reading, watched), grip.renews
+        checked = Checked((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
+        moment, counts = hand.step(reading, checked)
+        assert moment.judges is (counts is not None)
+        assert moment.judges or not moment.judged
         if counts is not None:
-            stands = grip.state is GateState.JUDGED
-            assert stands or grip.state is GateState.SETTLED
-            assert stands or not grip.settled, "what is not judged yet has no verdict to confirm"
-            grip.judged()
-            assert grip.settled
-            played.judged += [] if renews else [counts]
+            assert moment.settled
+            played.judged += [counts] if moment.judged else []
             played.judged_s.append(reading.t_ns / 1e9)
-        played.stood_s += [reading.t_ns / 1e9] * (grip.settled and not lost)
-        assert not grip.settled or (grip.state is GateState.JUDGED and grip.in_contact)
-        assert grip.settled == (not grip.reasons)
-        new = grip.take_changes()
-        assert len(new) <= 4
-        played.changes += new
+        played.stood_s += [reading.t_ns / 1e9] * (moment.settled and not lost)
+        assert not moment.settled or (moment.state is GateState.JUDGED and moment.in_contact)
+        assert moment.settled == (not moment.reasons)
+        assert len(moment.changes) <= 4
+        played.changes += moment.changes
     return played
 
 
@@ -166,7 +162,7 @@ SETTLES = (0.41, 0.45)
 no more than noise."""
 REQUEST = replace(LIMITS, on_request=True)
 JOINTS = replace(LIMITS, joints=JointLimits())
-THREE_HUNDRED_MS = GripLimits(gate=replace(GATE, gap_ns=300 * MS))
+THREE_HUNDRED_MS = HandLimits(gate=replace(GATE, gap_ns=300 * MS))
 SUBSET = replace(LIMITS, required=("ff", "th"))
 
 
@@ -460,7 +456,7 @@ def test_gate_follows(scenario: Scenario) -> None:
     played = play(scenario)
     assert played.story == scenario.changes
     assert len(played.judged) == scenario.judged
-    assert played.grip.grasp == scenario.grasp
+    assert played.hand.gate.memory.grasp == scenario.grasp
     if scenario.settled_s is not None:
         earliest, latest = scenario.settled_s
         assert earliest <= played.first_s(GateState.SETTLED) <= latest

@@ -1,4 +1,4 @@
-"""The gate's limits to the nanosecond, its invariants, and what a grip hands over to judge."""
+"""The gate's limits to the nanosecond, its invariants, and what a hand hands over to judge."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.judge.findings import Watched
-from daemon.judge.gate import CHANGES_MAX, Gate
-from daemon.judge.grip import Grip
-from daemon.judge.limits import GateLimits, JointLimits
+from daemon.judge.decision import GateLimits, HandLimits, JointLimits
+from daemon.judge.gate import Gate
+from daemon.judge.hand import HandTracker
+from daemon.judge.health import Checked
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from daemon.judge.stillness import Motion
 from tests.daemon.judge.test_gate import (
@@ -41,25 +41,30 @@ class Steps:
     """Feeds a gate constant counts, so that times and limits can be told to the nanosecond."""
 
     def __init__(self, *, on_request: bool = False, limits: GateLimits = GATE) -> None:
-        self.gate = Gate(np.ones(3, dtype=np.bool_), limits, on_request=on_request)
+        self.gate = Gate(FINGERS, HandLimits(on_request=on_request, gate=limits))
+        self.now = self.gate.moment(NOTHING)
         self.t_ns = START_NS
+        self._changes: list[GateChange] = []
 
     def step(
         self,
         after_ms: float = 10.0,
         counts: float = 3000.0,
         touching: Sequence[bool] = (True, True, True),
-        against: tuple[Reason, ...] = (),
-    ) -> GateState:
+        objections: tuple[Reason, ...] = (),
+    ) -> GateState | None:
         """One reading: all electrodes of FF read `counts`, the others 3000."""
         self.t_ns += round(after_ms * MS)
         median = np.full(SHAPE, 3000, dtype=np.uint16)
         median[0] = round(counts)
-        self.gate.step(self.t_ns, median, median, ALL, np.array(touching), against)
-        if self.gate.wants_judgement:
-            assert self.gate.state is (GateState.JUDGED if self.gate.renews else GateState.SETTLED)
-            self.gate.judged(self.t_ns, median)
-        return self.gate.state
+        self.now = self.gate.step(self.t_ns, median, median, ALL, np.array(touching), objections)
+        assert self.now.judges or not self.now.judged
+        self._changes += self.now.changes
+        return self.now.state
+
+    def take_changes(self) -> list[GateChange]:
+        changes, self._changes = self._changes, []
+        return changes
 
     def rest(self, seconds: float = 1.2) -> None:
         for _ in range(round(seconds * 100)):
@@ -74,10 +79,10 @@ class Steps:
     def grasp(self) -> None:
         """Hold until it is judged."""
         self.hold()
-        assert self.gate.settled
+        assert self.now.settled
 
     def story(self) -> str:
-        return " ".join(f"{change.state}:{change.cause}" for change in self.gate.take_changes())
+        return " ".join(f"{change.state}:{change.cause}" for change in self.take_changes())
 
 
 @pytest.mark.parametrize("period_ms", [1.0, 8.0, 10.0, 16.0, 20.0, 40.0, 80.0])
@@ -89,15 +94,15 @@ def test_a_touch_must_last_as_long_as_the_window(
     steps.rest()
     steps.step(period_ms)
     touched_ns = steps.t_ns
-    while steps.gate.state is GateState.CLOSING:
-        assert steps.gate.reasons == (Reason.SETTLING,)
-        assert steps.gate.still_ns == steps.t_ns - touched_ns < window_ms * MS
+    while steps.now.state is GateState.CLOSING:
+        assert steps.now.reasons == (Reason.SETTLING,)
+        assert steps.now.still_ms == (steps.t_ns - touched_ns) / MS < window_ms
         steps.step(period_ms)
-    assert steps.gate.settled
-    assert steps.gate.early is early
+    assert steps.now.settled
+    assert steps.now.early is early
     late_ns = steps.t_ns - touched_ns - window_ms * MS
     assert 0 <= late_ns < period_ms * MS
-    assert [c.t_ns for c in steps.gate.take_changes()] == [touched_ns, steps.t_ns, steps.t_ns]
+    assert [c.t_ns for c in steps.take_changes()] == [touched_ns, steps.t_ns, steps.t_ns]
 
 
 def test_what_was_judged_early_is_judged_once_more_when_no_slow_slide_is_left() -> None:
@@ -105,9 +110,9 @@ def test_what_was_judged_early_is_judged_once_more_when_no_slow_slide_is_left() 
     steps.rest()
     for _ in range(60):
         steps.step()
-    assert steps.gate.settled
-    assert not steps.gate.early
-    changes = steps.gate.take_changes()
+    assert steps.now.settled
+    assert not steps.now.early
+    changes = steps.take_changes()
     assert [str(change.cause) for change in changes] == ["contact", *["still", "judged"] * 2]
     touched, *_, judged = changes
     assert judged.t_ns - touched.t_ns == 240 * MS
@@ -120,11 +125,11 @@ def test_a_question_is_answered_early_and_once_more() -> None:
     steps.gate.ask()
     for _ in range(60):
         steps.step()
-    assert steps.gate.settled
+    assert steps.now.settled
     assert steps.story().split().count("judged:judged") == 2
     for _ in range(200):
         steps.step()
-        assert steps.gate.settled
+        assert steps.now.settled
     assert not steps.story()
 
 
@@ -135,14 +140,14 @@ def test_stillness_begins_anew_after_every_motion() -> None:
         for _ in range(20):  # 190 ms
             assert steps.step() is GateState.CLOSING
         assert steps.step(counts=3040) is GateState.CLOSING
-        assert steps.gate.still_ns == 0
-        assert steps.gate.reasons == (Reason.MOVING,)
+        assert steps.now.still_ms == 0
+        assert steps.now.reasons == (Reason.MOVING,)
     for _ in range(23):
         assert steps.step() is GateState.CLOSING
-        assert steps.gate.still_ns < 240 * MS
+        assert (steps.now.still_ms or 0.0) < 240
     for _ in range(2):
         steps.step()
-    assert steps.gate.settled
+    assert steps.now.settled
 
 
 def test_a_judged_grasp_that_moves_on_for_two_windows_is_judged_again() -> None:
@@ -152,7 +157,7 @@ def test_a_judged_grasp_that_moves_on_for_two_windows_is_judged_again() -> None:
     told_s = []
     for place in range(100):  # 80 counts/s, to and fro, so that it is never another grasp
         steps.step(counts=3000 + 0.8 * min(place % 60, 60 - place % 60))
-        if not steps.gate.settled:
+        if not steps.now.settled:
             told_s.append(place / 100)
     assert told_s[0] < 0.3
     assert steps.story() == "closing:moved"
@@ -168,7 +173,7 @@ def test_a_finger_moves_faster_than_held_touches_creep(counts_per_s: float, move
     steps.rest()
     for place in range(60):
         steps.step(counts=3000.0 + counts_per_s * place / 100)
-    assert (GateState.JUDGED in [c.state for c in steps.gate.take_changes()]) is not moves
+    assert (GateState.JUDGED in [c.state for c in steps.take_changes()]) is not moves
 
 
 @pytest.mark.parametrize(("counts", "state"), [(40, "judged"), (-40, "judged"), (41, "closing")])
@@ -176,7 +181,7 @@ def test_another_grasp_is_more_than_the_limit_away(counts: int, state: str) -> N
     steps = Steps()
     steps.grasp()
     assert steps.step(counts=3000 + counts) == state
-    assert not steps.gate.settled, "it moves"
+    assert not steps.now.settled, "it moves"
 
 
 @pytest.mark.parametrize(
@@ -189,7 +194,7 @@ def test_a_gap_is_longer_than_its_limit(gap_ms: float, causes: str) -> None:
     steps.story()
     steps.step(gap_ms)
     assert steps.story() == causes
-    assert steps.gate.settled is (not causes)
+    assert steps.now.settled is (not causes)
 
 
 @pytest.mark.parametrize(("after_ms", "state"), [(99.999, "released"), (100, "idle")])
@@ -207,11 +212,11 @@ def test_a_request_expires_after_its_time(after_ms: float, judged: bool) -> None
     steps.rest()
     steps.gate.ask()
     for _ in range(18):
-        steps.step(50, against=(Reason.MOVING,))
+        steps.step(50, objections=(Reason.MOVING,))
     # Its time runs from the first reading after it.
-    steps.step(after_ms - 930, against=(Reason.MOVING,))
+    steps.step(after_ms - 930, objections=(Reason.MOVING,))
     assert steps.step(80) is (GateState.JUDGED if judged else GateState.SETTLED)
-    assert steps.gate.reasons == (() if judged else (Reason.NOT_ASKED,))
+    assert steps.now.reasons == (() if judged else (Reason.NOT_ASKED,))
 
 
 @pytest.mark.parametrize("reason", [Reason.NOT_TARED, Reason.MOVING, Reason.JOINTS_LATE])
@@ -219,17 +224,17 @@ def test_what_others_say_against_it_keeps_a_grasp_from_settling(reason: Reason) 
     steps = Steps()
     steps.rest()
     for _ in range(50):
-        assert steps.step(against=(reason,)) is GateState.CLOSING
-        assert steps.gate.reasons == (reason,)
+        assert steps.step(objections=(reason,)) is GateState.CLOSING
+        assert steps.now.reasons == (reason,)
     for _ in range(9):
         steps.step()
-    assert steps.gate.settled
-    steps.step(against=(reason,))
-    assert steps.gate.state is GateState.JUDGED
-    assert not steps.gate.settled
-    assert steps.gate.reasons == (reason,)
+    assert steps.now.settled
+    steps.step(objections=(reason,))
+    assert steps.now.state is GateState.JUDGED
+    assert not steps.now.settled
+    assert steps.now.reasons == (reason,)
     steps.step()
-    assert steps.gate.settled, "the same grasp, so its verdict stands"
+    assert steps.now.settled, "the same grasp, so its verdict stands"
 
 
 def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> None:
@@ -241,23 +246,15 @@ def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> Non
         median[0, :12] = 4095 * (place % 2)
         steps.t_ns += 10 * MS
         sweep = median.copy()
-        steps.gate.step(steps.t_ns, sweep, sweep, usable, np.ones(3, dtype=np.bool_))
-        assert steps.gate.settled
-
-
-def test_changes_that_nobody_takes_are_bounded() -> None:
-    steps = Steps()
-    for _ in range(1000):
-        steps.step()
-        steps.step(touching=NOTHING)
-    assert len(steps.gate.take_changes()) == CHANGES_MAX == 64
-    assert steps.gate.take_changes() == []
+        now = steps.gate.step(steps.t_ns, sweep, sweep, usable, np.ones(3, dtype=np.bool_))
+        assert now.settled
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
     random = np.random.default_rng(seed)
-    gate = Gate(np.array([True, seed % 2 == 0, True]), GATE, on_request=seed % 3 == 0)
+    required = FINGERS if seed % 2 == 0 else ("ff", "th")
+    gate = Gate(FINGERS, HandLimits(on_request=seed % 3 == 0, required=required, gate=GATE))
     changes: list[GateChange] = []
     touching, median, t_ns = np.zeros(3, dtype=np.bool_), np.full(SHAPE, 3000), START_NS
     for _ in range(4000):
@@ -269,25 +266,26 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
             median = random.integers(2900, 3000, SHAPE)
         if random.random() < 0.05:
             gate.ask()
-        against = (Reason.JOINTS_LATE,) if random.random() < 0.02 else ()
+        objections = (Reason.JOINTS_LATE,) if random.random() < 0.02 else ()
         if random.random() < 0.05:
             gate.skip(t_ns)
+            now = gate.moment(touching.tolist())
         else:
             sweep, usable = median.astype(np.uint16), random.random(SHAPE) < (0.9 + 0.1 * usual)
-            gate.step(t_ns, sweep, sweep, usable, touching, against)
-        if gate.wants_judgement:
-            assert gate.state in (GateState.SETTLED, GateState.JUDGED)
-            assert gate.in_contact
-            if random.random() < 0.8:  # else the model is slow, or the reading is too old
-                gate.judged(t_ns, median.astype(np.uint16))
-        assert not gate.settled or (gate.state is GateState.JUDGED and gate.in_contact)
-        assert gate.settled == (not gate.reasons)
-        new = gate.take_changes()
-        assert len(new) <= 5
-        changes += new
+            now = gate.step(
+                *(t_ns, sweep, sweep, usable, touching, objections),
+                in_time=random.random() < 0.8,
+                fresh=random.random() < 0.9,
+            )
+        assert now.settled or not now.judges
+        assert now.judges or not now.judged
+        assert not now.settled or (now.state is GateState.JUDGED and now.in_contact)
+        assert now.settled == (not now.reasons)
+        assert len(now.changes) <= 5
+        changes += now.changes
     check_chain(changes)
     begun = [change for change in changes if change.cause is GateCause.CONTACT]
-    assert [change.grasp for change in begun] == list(range(1, gate.grasp + 1))
+    assert [change.grasp for change in begun] == list(range(1, gate.memory.grasp + 1))
     assert {change.state for change in changes} == set(GateState), "the walk saw all of it"
 
 
@@ -312,14 +310,11 @@ def test_a_spike_in_the_very_sweep_shows_in_a_single_reading_and_not_in_a_median
 def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> None:
     hasty = replace(GATE, early=True)
     firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, gate=hasty))
-    grip, none = Grip(FINGERS, firm.limits), Watched((), ~ALL)
+    hand, none = HandTracker(FINGERS, firm.limits), Checked((), ~ALL)
     sweeps = [(t_s, reading) for t_s, reading in readings(firm) if not 0.5 < t_s < 0.75]
     after = [reading.counts for t_s, reading in sweeps if t_s >= 0.75]
     for t_s, reading in sweeps:
-        grip.observe(reading, none)
-        counts = grip.counts_to_judge(reading, none)
-        if counts is not None:
-            grip.judged()
+        _, counts = hand.step(reading, none)
         if counts is not None and t_s > 0.5:
             since = round((t_s - 0.75) * 100) + 1
             assert since >= 3
@@ -341,35 +336,33 @@ def test_a_single_reading_is_judged_as_it_came() -> None:
 def test_a_finger_lost_while_settled_is_contact_lost() -> None:
     steps = Steps(on_request=True)
     steps.hold()
-    assert steps.gate.state is GateState.SETTLED
+    assert steps.now.state is GateState.SETTLED
     steps.step(touching=(True, True, False))
-    assert steps.gate.take_changes()[-1].cause is GateCause.CONTACT_LOST
+    assert steps.take_changes()[-1].cause is GateCause.CONTACT_LOST
 
 
 def test_a_grasp_that_slides_slowly_while_settled_must_settle_anew() -> None:
     steps = Steps(on_request=True)
     steps.hold()
-    assert steps.gate.state is GateState.SETTLED
+    assert steps.now.state is GateState.SETTLED
     for sweep in range(100):
         if steps.step(counts=3000 + 0.37 * sweep) is not GateState.SETTLED:
             break
     assert steps.gate.motion.early, "nothing moves fast"
-    assert steps.gate.reasons == (Reason.MOVING,)
-    assert steps.gate.take_changes()[-1].cause is GateCause.MOVED
+    assert steps.now.reasons == (Reason.MOVING,)
+    assert steps.take_changes()[-1].cause is GateCause.MOVED
 
 
 def test_a_finger_that_need_not_touch_need_not_be_tared() -> None:
-    grip, none = Grip(FINGERS, replace(LIMITS, required=FINGERS[:2])), Watched((), ~ALL)
+    hand, none = HandTracker(FINGERS, replace(LIMITS, required=FINGERS[:2])), Checked((), ~ALL)
     for t_s, reading in readings(Scenario("firm", GRASPED, UP)):
         counts = reading.counts.copy()
         counts[2] += round(22.0 * (t_s + 5.0))  # it warms up too fast to be tared, and is no slide
-        grip.observe(msgspec.structs.replace(reading, counts=counts), none)
-        if grip.counts_to_judge(reading, none) is not None:
-            grip.judged()
+        now, _ = hand.step(msgspec.structs.replace(reading, counts=counts), none)
         if t_s > 0.7:
             break
-    assert grip.tared == FINGERS[:2]
-    assert grip.settled
+    assert hand.tared == FINGERS[:2]
+    assert now.settled
 
 
 def test_released_ends_though_time_went_back() -> None:
@@ -378,7 +371,7 @@ def test_released_ends_though_time_went_back() -> None:
     steps.step(touching=NOTHING)
     steps.step(-60_000.0, touching=NOTHING)
     steps.rest(1.0)
-    assert steps.gate.state is GateState.IDLE
+    assert steps.now.state is GateState.IDLE
 
 
 def test_a_request_expires_though_time_went_back() -> None:
@@ -389,19 +382,17 @@ def test_a_request_expires_though_time_went_back() -> None:
     steps.rest(2.0)
     for _ in range(30):
         steps.step()
-    assert steps.gate.state is GateState.SETTLED
+    assert steps.now.state is GateState.SETTLED
 
 
 def test_an_electrode_that_comes_back_as_the_grasp_settles_is_not_judged_by_old_values() -> None:
     firm = Scenario("firm", GRASPED, UP)
     moment_s = settle_s(firm)
-    grip, lost = Grip(FINGERS, LIMITS), ~ALL
+    hand, lost = HandTracker(FINGERS, LIMITS), ~ALL
     lost[0, [0, 3, 6, 9, 12]] = True  # five of the eight that are pressed by 300 counts
     for t_s, reading in readings(firm):
         away = -0.05 <= t_s < moment_s - 1e-3
-        watched = Watched((), lost if away else ~ALL)
-        grip.observe(reading, watched)
-        counts = grip.counts_to_judge(reading, watched)
+        _, counts = hand.step(reading, Checked((), lost if away else ~ALL))
         if counts is not None:
             assert t_s >= moment_s - 1e-3
             assert np.abs(counts.astype(np.int64) - reading.counts).max() < 30
@@ -414,16 +405,19 @@ def test_sensors_that_were_away_for_more_than_a_second_may_be_others(
     missing: tuple[float, float], tared: tuple[str, ...]
 ) -> None:
     away = Scenario("away for 0.9 s, or 1.2", GRASPED, "", missing=missing)
-    assert play(away).grip.tared == tared
+    assert play(away).hand.tared == tared
 
 
 def test_joints_are_lost_when_readings_go_on_without_them() -> None:
     silent = Scenario("no joints", GRASPED, UP, limits=replace(LIMITS, joints=JointLimits()))
-    assert not Grip(FINGERS, silent.limits).joints_lost, "nothing came yet"
-    assert play(silent).grip.joints_lost
-    assert play(replace(silent, joint=lambda t_s: 0.7 if t_s <= 0.0 else None)).grip.joints_lost
-    assert not play(replace(silent, joint=lambda t_s: 0.7)).grip.joints_lost
-    assert not play(replace(silent, limits=LIMITS)).grip.joints_lost, "nobody asks"
+    assert "joints" not in HandTracker(FINGERS, silent.limits).health(), "nothing came yet"
+    assert play(silent).hand.health()["joints"] is Reason.JOINTS_LATE
+    assert (
+        play(replace(silent, joint=lambda t_s: 0.7 if t_s <= 0.0 else None)).hand.health()["joints"]
+        is Reason.JOINTS_LATE
+    )
+    assert "joints" not in play(replace(silent, joint=lambda t_s: 0.7)).hand.health()
+    assert "joints" not in play(replace(silent, limits=LIMITS)).hand.health(), "nobody asks"
 
 
 def test_readings_of_the_same_time_are_no_gap() -> None:
@@ -432,30 +426,28 @@ def test_readings_of_the_same_time_are_no_gap() -> None:
 
 
 def test_after_readings_were_left_out_three_more_count_for_nothing() -> None:
-    firm, none = Scenario("firm", GRASPED, UP), Watched((), ~ALL)
-    grip, since = Grip(FINGERS, LIMITS), 0
+    firm, none = Scenario("firm", GRASPED, UP), Checked((), ~ALL)
+    hand, since = HandTracker(FINGERS, LIMITS), 0
+    now = hand.moment()
     for t_s, reading in readings(firm):
         if abs(t_s - 0.8) < 1e-6:
-            assert grip.settled
-            grip.interrupt()
-        grip.observe(reading, none)
-        if grip.counts_to_judge(reading, none) is not None:
-            grip.judged()
+            assert now.settled
+            hand.interrupt()
+        now, _ = hand.step(reading, none)
         since += t_s > 0.8 - 1e-6
-        if since and grip.settled:
+        if since and now.settled:
             break
     # The third begins the motion anew; 24 readings later the long window is full.
     assert since == 3 + 24
 
 
 def test_motion_is_told_as_soon_as_one_window_knows_it_and_of_the_one_nearer_to_its_limit() -> None:
-    firm, none = Scenario("firm", GRASPED, UP, missing=(0.8, 1.0)), Watched((), ~ALL)
-    grip, known = Grip(FINGERS, LIMITS), {}
+    firm, none = Scenario("firm", GRASPED, UP, missing=(0.8, 1.0)), Checked((), ~ALL)
+    hand, known = HandTracker(FINGERS, LIMITS), {}
     for t_s, reading in readings(firm):
         if 0.8 - 1e-6 <= t_s < 1.0 - 1e-6:
             continue
-        grip.observe(reading, none)
-        felt = grip.felt(None)
+        felt, _ = hand.step(reading, none)
         assert felt.motion is not None
         assert felt.motion_limits is not None
         known[round(t_s, 2)] = felt.motion["ff"], felt.motion_limits["ff"]
@@ -470,14 +462,13 @@ def test_motion_is_told_as_soon_as_one_window_knows_it_and_of_the_one_nearer_to_
 
 
 def test_of_both_windows_the_one_nearer_to_its_limit_is_told() -> None:
-    grip, none = Grip(FINGERS, LIMITS), Watched((), ~ALL)
+    hand, none = HandTracker(FINGERS, LIMITS), Checked((), ~ALL)
     alone, told = Motion(3, LIMITS.gate.false_alarms, early=LIMITS.gate.early), set()
     for _, reading in readings(Scenario("firm", GRASPED, UP)):
-        grip.observe(reading, none)
+        felt, _ = hand.step(reading, none)
         alone.add(reading.t_ns, reading.counts, ALL)
-        felt = grip.felt(None)
         motion, limits = felt.motion or {}, felt.motion_limits or {}
-        if not grip.touching or not alone.known or max(alone.slow) == math.inf:
+        if not felt.touching or not alone.known or max(alone.slow) == math.inf:
             continue
         for place, finger in enumerate(FINGERS):
             fast = alone.fast[place], alone.fast_limits[place]
@@ -490,13 +481,12 @@ def test_of_both_windows_the_one_nearer_to_its_limit_is_told() -> None:
 
 
 def test_nobody_looks_for_motion_while_nothing_touches() -> None:
-    firm, none = Scenario("firm", GRASPED, UP), Watched((), ~ALL)
-    grip, touched, looked = Grip(FINGERS, LIMITS), [], []
+    firm, none = Scenario("firm", GRASPED, UP), Checked((), ~ALL)
+    hand, touched, looked = HandTracker(FINGERS, LIMITS), [], []
     for _, reading in readings(firm):
-        grip.observe(reading, none)
-        felt = grip.felt(None)
+        felt, _ = hand.step(reading, none)
         assert felt.motion is not None
-        touched.append(bool(grip.touching))
+        touched.append(bool(felt.touching))
         looked.append(any(now is not None for now in felt.motion.values()))
     assert looked == touched
     assert {*looked} == {False, True}

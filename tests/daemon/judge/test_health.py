@@ -78,7 +78,7 @@ def test_every_electrode_is_broken_when_the_definition_says_so(seed: int) -> Non
     for place, (counts, flags) in enumerate(
         zip(*spoilt(np.random.default_rng(seed), 300), strict=True)
     ):
-        watched = health.watch(TactileReading(place, place, counts, flags))
+        watched = health.check(TactileReading(place, place, counts, flags))
         broken, repeats = definition.watch(counts, flags)
         assert watched.broken.tolist() == broken, f"seed {seed}, sweep {place}"
         assert (Reason.FROZEN in watched.reasons) == repeats
@@ -95,14 +95,14 @@ def test_a_first_reading_of_low_counts_is_no_jump_from_anywhere() -> None:
     flags = np.zeros(counts.shape, dtype=np.uint8)
     for place in range(3):  # two jumps more would be enough
         counts[1, 4] = 3000 - 500 * place
-        health.watch(TactileReading(place, place, counts.copy(), flags))
+        health.check(TactileReading(place, place, counts.copy(), flags))
     assert Reason.ELECTRODE_JUMPS not in health.electrodes().values()
 
 
 def test_what_is_shared_by_all_sound_readings_cannot_be_written() -> None:
     sweeps, _ = spoilt(np.random.default_rng(0), 2)
     counts = np.clip(sweeps[0], 1, 4094)
-    watched = Health(FINGERS).watch(
+    watched = Health(FINGERS).check(
         TactileReading(0, 0, counts, np.zeros(counts.shape, dtype=np.uint8))
     )
     assert not watched.broken.any()
@@ -120,7 +120,7 @@ def watched(steps: NDArray[np.int64]) -> tuple[Health, list[dict[tuple[int, int]
     for place in range(len(steps) + 1):
         counts = np.full((FINGERS, 24), 2000 + place % 2)
         counts[1] = 2000 + steps[:place].sum(axis=0)
-        health.watch(TactileReading(place, place, counts.astype(np.uint16), flags))
+        health.check(TactileReading(place, place, counts.astype(np.uint16), flags))
         found.append(health.electrodes())
     return health, found
 
@@ -204,7 +204,7 @@ def test_rails_are_broken_and_their_neighbours_are_not(count: int, railed: bool)
     counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
     counts[2, 7] = count
     health = Health(FINGERS)
-    broken = health.watch(TactileReading(0, 0, counts, np.zeros((3, 24), dtype=np.uint8))).broken
+    broken = health.check(TactileReading(0, 0, counts, np.zeros((3, 24), dtype=np.uint8))).broken
     assert broken.sum() == broken[2, 7] == railed
     assert health.electrodes() == ({(2, 7): Reason.SATURATED} if railed else {})
 
@@ -221,7 +221,7 @@ def test_one_finger_that_repeats_itself_is_enough(finger: int, flagged: bool) ->
         if flagged:
             counts[finger, 3] += place
             flags[finger, 3] = 1
-        reasons.append(health.watch(TactileReading(place, place, counts, flags)).reasons)
+        reasons.append(health.check(TactileReading(place, place, counts, flags)).reasons)
     assert reasons == [(), (Reason.FROZEN,)]
 
 
@@ -232,7 +232,7 @@ def test_a_sweep_that_comes_again_was_seen_in_a_reading_that_could_not_be_used(f
         counts = np.full((FINGERS, 24), 2000 + sweep, dtype=np.uint16)
         flags = np.zeros((FINGERS, 24), dtype=np.uint8)
         flags[0, 0] = bits
-        reasons.append(health.watch(TactileReading(place, place, counts, flags)).reasons)
+        reasons.append(health.check(TactileReading(place, place, counts, flags)).reasons)
     assert reasons[1:] == [(), (), (Reason.FROZEN,)]
 
 
@@ -242,7 +242,7 @@ def test_electrodes_of_all_fingers_that_repeat_themselves_are_no_held_finger() -
     for place in range(5):
         counts = np.full((FINGERS, 24), 2000 + place, dtype=np.uint16)
         counts[:, :10] = 2000
-        assert health.watch(TactileReading(place, place, counts, flags)).reasons == ()
+        assert health.check(TactileReading(place, place, counts, flags)).reasons == ()
 
 
 def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
@@ -250,7 +250,7 @@ def test_of_two_faults_of_an_electrode_the_first_is_named() -> None:
     flags[0, 5] = ElectrodeFault.PARITY | ElectrodeFault.NOT_A_COUNT
     flags[1, 6] = ElectrodeFault.ERROR_WORD
     counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
-    found = health.watch(TactileReading(0, 0, counts, flags))
+    found = health.check(TactileReading(0, 0, counts, flags))
     assert (found.reasons, int(found.broken.sum())) == ((), 2)
     assert health.electrodes() == {(0, 5): Reason.NOT_A_COUNT, (1, 6): Reason.ERROR_WORD}
 
@@ -262,6 +262,6 @@ def test_a_fault_that_is_not_of_one_electrode_speaks_against_the_reading(flag: i
     flags[0, 1] = ElectrodeFault.PARITY
     counts = np.full((FINGERS, 24), 2000, dtype=np.uint16)
     named = {16: Reason.HELD, 32: Reason.CUT_OFF}.get(int(flag))
-    found = Health(FINGERS).watch(TactileReading(0, 0, counts, flags))
+    found = Health(FINGERS).check(TactileReading(0, 0, counts, flags))
     assert found.reasons == ((Reason.PARITY, named) if named else (Reason.PARITY,))
     assert np.argwhere(found.broken).tolist() == [[0, 1], [2, 23]]

@@ -30,13 +30,13 @@ def test_a_sound_reading_is_judged(p_slip: float, decision: Decision) -> None:
     assert judgement.decision is decision
     assert judgement.p_slip == p_slip
     assert judgement.reasons == ()
-    assert judgement.grasp == 1
+    assert judgement.moment.grasp == 1
 
 
 def test_each_reading_is_a_grasp_of_its_own() -> None:
     clock = Clock()
     judge = pipeline(FakeModel(), clock)
-    assert [judge.judge(reading(clock(), seed)).grasp for seed in range(3)] == [1, 2, 3]
+    assert [judge.judge(reading(clock(), seed)).moment.grasp for seed in range(3)] == [1, 2, 3]
 
 
 OF_AN_ELECTRODE = (
@@ -72,7 +72,7 @@ def test_a_flagged_electrode_is_repaired_and_named_whatever_it_reads(
     model = FakeModel()
     judgement = pipeline(model, clock).judge(bad)
     assert judgement.decision is Decision.STABLE
-    assert judgement.repaired == ("th_24",)
+    assert judgement.opinion.repaired == ("th_24",)
     # What the network saw is the image with the training's mean: the fake's electrodes are
     # independent of each other, so nothing else is expected of one.
     bad.counts[2, 23] = 2000
@@ -100,7 +100,7 @@ def test_twelve_electrodes_and_eight_of_a_finger_are_repaired_and_no_more(
     judgement = pipeline(model, clock).judge(bad)
     assert judgement.reasons == reasons
     assert model.runs == (0 if reasons else 1)
-    assert len(judgement.repaired) == (0 if reasons else bad.faults.astype(bool).sum())
+    assert len(judgement.opinion.repaired) == (0 if reasons else bad.faults.astype(bool).sum())
 
 
 def test_a_fault_flag_that_nobody_knows_is_still_a_fault() -> None:
@@ -148,7 +148,7 @@ def test_an_electrode_at_a_rail_is_repaired(count: int) -> None:
     bad.counts[0, 6] = count
     judgement = pipeline(FakeModel(), clock).judge(bad)
     assert judgement.decision is Decision.STABLE
-    assert judgement.repaired == ("ff_7",)
+    assert judgement.opinion.repaired == ("ff_7",)
 
 
 @pytest.mark.parametrize("count", [0, 4095])
@@ -174,7 +174,7 @@ def test_an_electrode_that_jumps_while_the_others_keep_still_has_a_loose_contact
         moving = TactileReading(clock(), number, counts, np.zeros((3, 24), dtype=np.uint8))
         judgement = judge.judge(moving)
         assert judgement.decision is Decision.STABLE
-        repaired.append(judgement.repaired)
+        repaired.append(judgement.opinion.repaired)
     assert repaired[:3] == [()] * 3
     assert repaired[5:30] == [("mf_5",)] * 25
     assert repaired[-10:] == [()] * 10
@@ -192,7 +192,7 @@ def test_a_touch_that_moves_many_electrodes_is_no_loose_contact() -> None:
         touch = TactileReading(
             clock(), number, counts.astype(np.uint16), np.zeros((3, 24), dtype=np.uint8)
         )
-        assert judge.judge(touch).repaired == ()
+        assert judge.judge(touch).opinion.repaired == ()
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_an_electrode_that_keeps_its_count_is_repaired_in_time() -> None:
         stuck.counts[2, 7] = 2000 if number < 30 else 2001 + number
         judgement = judge.judge(stuck)
         assert judgement.reasons == ()
-        decisions.append(judgement.repaired)
+        decisions.append(judgement.opinion.repaired)
     # 16 repeats after the first make it frozen, until it moves again.
     assert decisions == [()] * 16 + [("th_8",)] * 14 + [()] * 10
 
@@ -354,7 +354,7 @@ def test_stable_needs_a_fresh_healthy_seen_reading_and_a_probability(
             assert broken.sum() <= 12
             assert (broken.sum(axis=1) <= 8).all()
             names = {f"{FINGERS[finger]}_{column + 1}" for finger, column in np.argwhere(broken)}
-            assert names <= set(judgement.repaired)
+            assert names <= set(judgement.opinion.repaired)
             assert 0 <= age_ns <= 100 * MS
             sound = raw.counts[~broken]
             assert LOW - MARGIN <= sound.min() <= sound.max() <= HIGH + MARGIN

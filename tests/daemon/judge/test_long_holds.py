@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.findings import Watched
-from daemon.judge.grip import Grip
-from daemon.judge.limits import GripLimits
+from daemon.judge.decision import HandLimits
+from daemon.judge.hand import HandTracker
+from daemon.judge.health import Checked
 from daemon.judge.reasons import GateState
 from drivers.base import TactileReading
 from tests.daemon.judge.test_contact import PRESSED, Hand, at_rest, noisy, still
@@ -79,16 +79,16 @@ def test_a_hand_that_was_closed_at_the_start_is_tared_when_it_opens(higher: floa
 
 
 def test_sensors_that_were_away_are_tared_anew() -> None:
-    grip = Grip(("ff", "mf", "th"), GripLimits())
-    usable = Watched((), np.zeros((3, 24), dtype=np.bool_))
+    hand = HandTracker(("ff", "mf", "th"), HandLimits())
+    usable = Checked((), np.zeros((3, 24), dtype=np.bool_))
     other = at_rest() - np.abs(np.random.default_rng(3).normal(0.0, 60.0, (3, 24)))
     states, t_ns = [], 10**12
     for pause_s, mean in ((0.0, at_rest()), (1.5, other)):
         t_ns += round(pause_s * 1e9)
         for counts in noisy(np.broadcast_to(mean, (300, 3, 24))):
             faults = np.zeros(counts.shape, dtype=np.uint8)
-            grip.observe(TactileReading(t_ns, 0, counts, faults), usable)
-            states.append(grip.state)
+            moment, _ = hand.step(TactileReading(t_ns, 0, counts, faults), usable)
+            states.append(moment.state)
             t_ns += 10_000_000
     assert set(states) == {GateState.IDLE}
-    assert grip.tared == ("ff", "mf", "th")
+    assert hand.tared == ("ff", "mf", "th")

@@ -129,7 +129,7 @@ def test_whoever_takes_over_anywhere_judges_the_rest_the_same(
         expected = judged(whole, now, part)
         other = handed_on(other, judge(now, gate, model))
         assert judged(other, now, part) == expected
-        times += sum(each.judged for each, _ in expected)
+        times += sum(each.moment.judged for each, _ in expected)
         frozen += sum(Reason.FROZEN in each.reasons for each, _ in expected)
     assert times > 5
     assert frozen > 100
@@ -160,8 +160,8 @@ def test_another_model_judges_the_grasp_at_hand_anew_and_knows_where_the_hand_re
     found = [each for each, _ in judged(other, now, readings[place : place + 100])]
     assert found[0].decision is Decision.UNKNOWN
     assert Reason.NOT_TARED not in {reason for each in found for reason in each.reasons}
-    assert found[0].grasp == said[-1].grasp
-    assert any(each.judged for each in found if each.grasp == said[-1].grasp)
+    assert found[0].moment.grasp == said[-1].moment.grasp
+    assert any(each.moment.judged for each in found if each.moment.grasp == said[-1].moment.grasp)
 
 
 def test_the_memory_of_another_hand_is_refused(readings: list[Reading]) -> None:
@@ -238,7 +238,7 @@ def test_what_is_no_memory_is_refused(spare: tuple[Pipeline, list[int]], data: b
         ("hand", "motion", "last_ns", 2**63 - 1),
         ("hand", "motion", "total_ns", 2**63 - 1),
         ("hand", "motion", "number", 53),
-        ("hand", "motion", "first", 100),
+        ("hand", "motion", "pending", 48),
     ],
 )
 def test_numbers_that_no_judge_counts_to_are_refused(

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 
 from daemon.judge.calibration import Calibration
-from daemon.judge.findings import Examined
-from daemon.judge.network import Network
-from daemon.judge.plausibility import Plausibility
+from daemon.judge.network import Examined, Network, Plausibility
 from daemon.judge.reasons import Reason
 from models import zoo
 from models.electrodes import Electrodes

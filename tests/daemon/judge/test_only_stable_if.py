@@ -19,7 +19,7 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from daemon.judge.limits import ContactLimits, GateLimits, GripLimits, JointLimits
+from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision
 from drivers.base import ElectrodeFault, JointReading, TactileReading
@@ -118,9 +118,9 @@ class Feel:
 class Hand:
     """A pipeline whose fingers are tared, and what is necessary for a verdict."""
 
-    def __init__(self, gate: GripLimits) -> None:
+    def __init__(self, gate: HandLimits) -> None:
         self.model, self.clock = FakeModel(), Clock()
-        self.pipeline: Pipeline = pipeline(self.model, self.clock, grip=gate)
+        self.pipeline: Pipeline = pipeline(self.model, self.clock, hand=gate)
         still_ms = EARLY_MS if gate.gate.early else STILL_MS
         self.necessity = Necessity(POSES["rest"], FINGERS, gate.required or FINGERS, still_ms)
         self.answer: float | None = None
@@ -158,8 +158,8 @@ class Hand:
         if self.model.runs != runs:
             self.answer, self.answered_ns = answer, reading.t_ns
             if answer is not None and 0.5 <= answer <= 1.0:
-                self.slip = judgement.grasp, reading.t_ns
-        self.judged += judgement.judged
+                self.slip = judgement.moment.grasp, reading.t_ns
+        self.judged += judgement.moment.judged
         unknown = judgement.decision is Decision.UNKNOWN
         assert unknown is bool(judgement.reasons)
         assert unknown is (judgement.p_slip is None)
@@ -170,7 +170,7 @@ class Hand:
             assert judgement.p_slip == p_slip
             assert 0 <= reading.t_ns - self.answered_ns <= STANDS_MS * MS
             grasp, slip_ns = self.slip
-            doubted = grasp == judgement.grasp and reading.t_ns - slip_ns < STEADY_MS * MS
+            doubted = grasp == judgement.moment.grasp and reading.t_ns - slip_ns < STEADY_MS * MS
             assert (judgement.decision is Decision.SLIP) is (p_slip >= 0.5 or doubted)
             assert 0 <= self.clock() - reading.t_ns <= AGE_MAX_MS * MS
             assert not self.necessity.lacks(), self.necessity.lacks()
@@ -225,9 +225,9 @@ def limits(
     sweeps: int = 3,
     required: tuple[Finger, ...] = FINGERS,
     early: bool = False,
-) -> GripLimits:
+) -> HandLimits:
     """Those that `Necessity` knows."""
-    return GripLimits(
+    return HandLimits(
         on_request=on_request,
         sweeps=sweeps,
         required=required,
@@ -246,13 +246,13 @@ def limits(
 
 
 @cache
-def _tared(gate: GripLimits) -> Hand:
+def _tared(gate: HandLimits) -> Hand:
     hand = Hand(gate)
     hand.play(Feel("rest", times=QUIET_READINGS))
     return hand
 
 
-def tared(gate: GripLimits) -> Hand:
+def tared(gate: HandLimits) -> Hand:
     """A hand of its own that has rested for long enough."""
     hand = _tared(gate)
     contract = hand.model.contract  # large, and never changed
@@ -371,13 +371,13 @@ def test_a_verdict_is_given_only_if_all_that_it_needs_holds_in(
 @given(gate=gates, begin=begins, feels=st.lists(feels, min_size=3, max_size=12))
 @settings(max_examples=400)
 def test_a_verdict_is_given_only_if_all_that_it_needs_holds(
-    gate: GripLimits, begin: Sequence[Feel], feels: Sequence[Feel]
+    gate: HandLimits, begin: Sequence[Feel], feels: Sequence[Feel]
 ) -> None:
     for decision in check(gate, (*begin, *feels)):
         event(decision)
 
 
-def check(gate: GripLimits, feels: Sequence[Feel]) -> set[Decision]:
+def check(gate: HandLimits, feels: Sequence[Feel]) -> set[Decision]:
     """Play to a tared hand as much of it as there is time for; the decisions."""
     hand = tared(gate)
     left = STEPS_MAX
@@ -397,13 +397,13 @@ def test_a_hand_that_closes_and_keeps_still_gets_a_verdict() -> None:
     # Two or three sweeps until the median touches, and 240 ms of stillness.
     first = decisions.index(Decision.STABLE)
     assert first in {1 + 24, 2 + 24}
-    assert said[first].still_ms == 240.0
+    assert said[first].moment.still_ms == 240.0
     assert said[first].judged_counts is not None
-    assert not said[first].early
+    assert not said[first].moment.early
     assert set(decisions[first:]) == {Decision.STABLE}
 
 
-class Watched(TactileImager):
+class Checked(TactileImager):
     """Keeps what was judged last."""
 
     def build(self, counts: NDArray[np.generic], out: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -413,16 +413,16 @@ class Watched(TactileImager):
 
 def test_electrodes_that_come_back_are_not_judged_by_an_earlier_grasp() -> None:
     hand = tared(limits())
-    hand.model.inputs = watched = Watched(3)
+    hand.model.inputs = watched = Checked(3)
     assert hand.play(Feel("grasp", times=40))[-1].decision is Decision.STABLE
     lost = (Flaw(0, 0, 8, int(ElectrodeFault.MISSING), 0),)
     hand.play(Feel("rest", times=40, flaws=lost))
     closing = Feel("other", times=40, flaws=lost)
-    number = [said.judged for said in copy.deepcopy(hand).play(closing)].index(True)
+    number = [said.moment.judged for said in copy.deepcopy(hand).play(closing)].index(True)
     hand.play(dataclasses.replace(closing, times=number))
     watched.counts = POSES["other"]
     [said] = hand.play(Feel("other"))
-    assert "ff_1" not in said.repaired
+    assert "ff_1" not in said.opinion.repaired
     assert np.abs(watched.counts - POSES["other"]).max() <= NOISE
 
 

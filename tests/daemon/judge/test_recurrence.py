@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
-from daemon.judge.health import Health
-from daemon.judge.limits import GripLimits
+from daemon.judge.decision import HandLimits, Limits
+from daemon.judge.health import Health, PastSweeps
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.judge.recurrence import PastSweeps
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.palm.packet import ROUND, PalmCounters, PalmPacket
 from drivers.palm.rounds import RoundAssembler
@@ -84,7 +82,7 @@ def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stabl
     """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
     counters, clock = PalmCounters(), Clock(START_NS)
     sweeps = RoundAssembler(FINGERS, counters)
-    pipeline = Pipeline(network(), FINGERS, Limits(), clock, grip=GripLimits())
+    pipeline = Pipeline(network(), FINGERS, Limits(), clock, hand=HandLimits())
     moments = synthetic_grasps(1, rate_hz=PALM_RATE_HZ, durations=HELD, seed=0)
     source = PalmTwin(moment.counts for moment in moments).packets()
     last: deque[PalmPacket] = deque(maxlen=packets)
@@ -188,7 +186,7 @@ def test_an_electrode_that_is_not_read_hides_no_ring(faulty: str) -> None:
         }[faulty]
         faults[:, where] = ElectrodeFault.PARITY
         counts[:, where] = random.integers(0, 4096, (3, len(where)))
-        said.append(health.watch(TactileReading(number, number, counts, faults)).reasons)
+        said.append(health.check(TactileReading(number, number, counts, faults)).reasons)
     assert all(Reason.FROZEN not in reasons for reasons in said[:9])
     assert all(Reason.FROZEN in reasons for reasons in said[9:])
 
@@ -198,11 +196,11 @@ def test_old_sweeps_in_any_order_are_frozen() -> None:
     fresh = random.integers(500, 3500, (SWEEPS, 3, 24)).astype(np.uint16)
     faults = np.zeros((3, 24), dtype=np.uint8)
     for number, counts in enumerate(fresh):
-        assert not health.watch(TactileReading(number, number, counts, faults)).reasons
+        assert not health.check(TactileReading(number, number, counts, faults)).reasons
     for number in range(500):
         counts = fresh[random.integers(SWEEPS)]
         reading = TactileReading(SWEEPS + number, SWEEPS + number, counts, faults)
-        assert Reason.FROZEN in health.watch(reading).reasons
+        assert Reason.FROZEN in health.check(reading).reasons
 
 
 def test_a_finger_that_is_not_read_at_all_does_not_recur() -> None:

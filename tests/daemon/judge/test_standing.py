@@ -71,8 +71,8 @@ def never_twice(sweeps: Iterator[Counts]) -> Iterator[Counts]:
 )
 def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool) -> None:
     model, clock = TactileModel(zoo.find("cnn1")), Clock()
-    grip = limits(on_request=on_request, early=early)
-    judge = Pipeline(model, model.contract.fingers, Limits(), clock, grip=grip)
+    hand = limits(on_request=on_request, early=early)
+    judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=hand)
     direct, faults = Direct(model), np.zeros((3, 24), dtype=np.uint8)
     told: list[Judgement] = []
     asked, ages = False, []
@@ -83,7 +83,7 @@ def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool
         if number % 25 == 0:
             judge.ask()
         told.append(judge.judge(TactileReading(clock(), number, counts, faults)))
-        if told[-1].p_slip is not None and not told[-1].repaired:
+        if told[-1].p_slip is not None and not told[-1].opinion.repaired:
             age = direct.said[::-1].index(told[-1].p_slip)  # to the bit
             assert age * PERIOD_NS <= 100 * MS
             assert not (asked and age), "a question is answered by the newest counts"
@@ -94,16 +94,16 @@ def test_what_is_told_is_what_the_network_says_now(on_request: bool, early: bool
     decisions = [each.decision for each in told if each.decision is not Decision.UNKNOWN]
     turns = sum(a is not b for a, b in itertools.pairwise(decisions))
     assert (decisions[0], decisions[-1], turns) == (Decision.STABLE, Decision.SLIP, 1)
-    assert {each.grasp for each in told} == {0, 1}
+    assert {each.moment.grasp for each in told} == {0, 1}
 
 
 def test_a_grasp_stays_judged_and_is_one() -> None:
     hand = tared(limits())
     said = hand.play(Feel(times=500))
-    first = [each.judged for each in said].index(True)
-    assert sum(each.judged for each in said) == 1
-    assert {each.gate for each in said[first:]} == {GateState.JUDGED}
-    assert not [change for each in said[first + 1 :] for change in each.changes]
+    first = [each.moment.judged for each in said].index(True)
+    assert sum(each.moment.judged for each in said) == 1
+    assert {each.moment.state for each in said[first:]} == {GateState.JUDGED}
+    assert not [change for each in said[first + 1 :] for change in each.moment.changes]
     assert hand.model.runs > 10 * 4.5
 
 
@@ -208,15 +208,15 @@ def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(
     taken: list[NDArray[np.generic]] = []
     monkeypatch.setattr(SessionCalibration, "observe", lambda _, counts, slip: taken.append(counts))
     model, clock = TactileModel(zoo.find("small-session")), Clock()
-    judge = Pipeline(model, model.contract.fingers, Limits(), clock, grip=limits())
+    judge = Pipeline(model, model.contract.fingers, Limits(), clock, hand=limits())
     faults, held, judged = np.zeros((3, 24), dtype=np.uint8), 0, []
     for number, moment in enumerate(synthetic_grasps(1, seed=1)):
         clock.now_ns += 10 * MS
         said = judge.judge(TactileReading(clock(), number, moment.counts, faults))
         judge.learn()
         held += moment.phase is Phase.SETTLE
-        judged += [said.judged_counts] if said.judged else []
-        if said.gate is GateState.JUDGED:
+        judged += [said.judged_counts] if said.moment.judged else []
+        if said.moment.state is GateState.JUDGED:
             assert not taken
     assert held
     assert len(taken) == 1

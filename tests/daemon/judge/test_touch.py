@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.judge.contact import Contact, Rest, Tare, Touch, Window
-from daemon.judge.limits import ContactLimits
+from daemon.judge.decision import ContactLimits
 
 THRESHOLD = 20.0
 S = 1_000_000_000

@@ -34,7 +34,7 @@ def trusting(
 def lift(judge: Pipeline, clock: Clock, seed: int, *, slipped: bool) -> Judgement:
     """Judge a grasp and tell its outcome."""
     judgement = judge.judge(reading(clock(), seed))
-    judge.outcome(GraspId(BOOT, judgement.grasp), slipped=slipped)
+    judge.outcome(GraspId(BOOT, judgement.moment.grasp), slipped=slipped)
     return judgement
 
 
@@ -43,18 +43,20 @@ def test_without_an_outcome_nothing_changes(p_slip: float) -> None:
     clock = Clock()
     plain = pipeline(FakeModel(p_slip), clock).judge(reading(clock()))
     trusted = trusting(FakeModel(p_slip), clock).judge(reading(clock()))
-    assert trusted.p_slip == plain.p_slip == trusted.p_slip_model
-    assert trusted.risk is not None
-    assert (trusted.risk.target, trusted.risk.bound, trusted.supervised) == (None, None, False)
-    assert msgspec.structs.replace(trusted, risk=None) == plain
+    assert trusted.p_slip == plain.p_slip == trusted.opinion.p_slip
+    assert trusted.assessment is not None
+    report = trusted.assessment.report
+    assert (report.target, report.bound, trusted.supervised) == (None, None, False)
+    assert msgspec.structs.replace(trusted, assessment=None) == plain
 
 
 def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.3), clock)
     found = [lift(judge, clock, seed, slipped=True) for seed in range(30)]
-    assert [judgement.outcomes for judgement in found] == list(range(30))
-    assert {judgement.p_slip_model for judgement in found if judgement.p_slip} == {0.3}
+    worth = [judgement.assessment for judgement in found]
+    assert [None if each is None else each.outcomes for each in worth] == list(range(30))
+    assert {judgement.opinion.p_slip for judgement in found if judgement.p_slip} == {0.3}
     assert found[0].p_slip == 0.3
     assert found[-1].decision is Decision.SLIP
     assert found[-1].p_slip is not None
@@ -74,10 +76,10 @@ def test_in_the_warm_up_grasps_are_to_be_lifted_under_supervision() -> None:
     for left, judgement in zip((3, 2, 1), found, strict=False):
         assert judgement.decision is Decision.UNKNOWN
         assert judgement.reasons == (Reason.UNPROVEN,)
-        assert judgement.p_slip is judgement.p_slip_model is None
+        assert judgement.p_slip is None
         assert judgement.supervised
-        assert judgement.risk is not None
-        assert judgement.risk.warm_up_left == left
+        assert judgement.assessment is not None
+        assert judgement.assessment.report.warm_up_left == left
     assert found[3].reasons in ((), (Reason.LOW_CONFIDENCE,))
     assert not found[3].supervised
 
@@ -121,7 +123,9 @@ def test_exchanged_sensors_teach_nothing_of_the_new_ones() -> None:
         lift(judge, clock, seed, slipped=True)
     judge.sensors_exchanged()
     judgement = judge.judge(reading(clock(), 31))
-    assert (judgement.outcomes, judgement.p_slip) == (0, 0.3)
+    assert judgement.p_slip == 0.3
+    assert judgement.assessment is not None
+    assert judgement.assessment.outcomes == 0
 
 
 @pytest.mark.parametrize("p_slip", [math.nan, -0.5, 1.5, RuntimeError()])
@@ -133,7 +137,7 @@ def test_a_network_that_gives_no_probability_is_asked_for_no_more(
     judgement = judge.judge(reading(clock()))
     assert judgement.reasons == (Reason.MODEL_FAILED,)
     assert judge.trust is not None
-    assert not judge.knows(GraspId(BOOT, judgement.grasp))
+    assert not judge.knows(GraspId(BOOT, judgement.moment.grasp))
 
 
 @settings(max_examples=60, deadline=None)
@@ -156,8 +160,8 @@ def test_the_bound_holds_for_what_is_said(
         model.answer = p_slip
         judgement = judge.judge(reading(clock(), seed))
         if judgement.decision is Decision.STABLE:
-            said_stable.add(judgement.grasp)
-        waiting.append((judgement.grasp, slipped))
+            said_stable.add(judgement.moment.grasp)
+        waiting.append((judgement.moment.grasp, slipped))
         while len(waiting) > late:
             grasp, ended = waiting.pop(0)
             judge.outcome(GraspId(BOOT, grasp), slipped=ended)
@@ -180,7 +184,7 @@ def test_a_lift_after_the_outcome_was_told_is_counted_or_not_permitted() -> None
     first = trust.judge(grasp, 0.1, -2.0, NONE)
     trust.note(grasp, first, stable=True)
     trust.outcome(grasp, slipped=False)
-    assert trust.permission(grasp, first) is Permission.ALLOWED, "it was counted"
+    assert trust.review(grasp, first).permission is Permission.ALLOWED, "it was counted"
     assert trust.judge(grasp, 0.1, -2.0, NONE).permission is Permission.WITHHELD
     free = Trust("model", 0)
     free.note(grasp, free.judge(grasp, 0.1, -2.0, NONE), stable=True)
@@ -195,7 +199,7 @@ def test_what_was_permitted_and_not_said_is_asked_again() -> None:
     assert {each.permission for each in early} == {Permission.ALLOWED}
     slips = 0
     for grasp, assessment in zip(grasps, early, strict=True):
-        if trust.permission(grasp, assessment) is Permission.ALLOWED:
+        if trust.review(grasp, assessment).permission is Permission.ALLOWED:
             trust.note(grasp, assessment, stable=True)
             trust.outcome(grasp, slipped=True)
             slips += 1
@@ -208,9 +212,10 @@ def test_without_learning_what_was_learned_before_is_not_used() -> None:
         grasp = GraspId(BOOT, number)
         taught.note(grasp, taught.judge(grasp, 0.4, -0.4, x), stable=False)
         taught.outcome(grasp, slipped=False)
-    assert taught.judge(GraspId(BOOT, 99), 0.4, -0.4, x).p_slip < 0.3
+    assert (taught.judge(GraspId(BOOT, 99), 0.4, -0.4, x).p_slip or 1.0) < 0.3
     plain = Trust("model", 0, learns=False)
     plain.restore(taught.state())
     assessment = plain.judge(GraspId(BOOT, 99), 0.4, -0.4, x)
-    assert (assessment.p_slip, assessment.outcomes, plain.outcomes) == (0.4, 0, 0)
+    assert (assessment.p_slip, assessment.outcomes) == (0.4, 0)
+    assert plain.review(GraspId(BOOT, 99), None).outcomes == 0
     assert plain.state() == taught.state()

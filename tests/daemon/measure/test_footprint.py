@@ -71,7 +71,7 @@ BUSES = {
 names."""
 JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
 HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
-GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "median", "grip", "stillness")}
+GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")}
 STATISTICS = {"daemon.judge.calibration", "models.session_statistics"}
 KEPT = {"daemon.session.file", "daemon.session.keeper"}
 ASK = {"daemon.publish.questions"}

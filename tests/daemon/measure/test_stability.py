@@ -26,9 +26,8 @@ import onnxruntime as ort
 from onnx import helper, numpy_helper
 
 from daemon.commands.report import add_arguments
-from daemon.judge.decision import Case, Limits, decide
-from daemon.judge.findings import Examined
-from daemon.judge.network import Network
+from daemon.judge.decision import HELD, Limits, decide
+from daemon.judge.network import Examined, Network
 from daemon.judge.reasons import Decision
 from daemon.measure.reference.reference import Reference
 from daemon.measure.stability import report as stability
@@ -399,8 +398,7 @@ def test_what_is_not_finite_never_gives_a_verdict(
 
 @pytest.mark.parametrize("p_slip", [np.nan, np.inf, -np.inf, -1e-9, 1.0 + 1e-9, None])
 def test_a_probability_that_is_none_is_unknown(p_slip: float | None) -> None:
-    case = Case(p_slip, (), in_contact=True, settled=True, gate=(), age_ns=0)
-    outcome, reasons = decide(case, Limits(max_age_ns=1))
+    outcome, reasons = decide(p_slip, (), HELD, 0, Limits(max_age_ns=1))
     assert outcome is Decision.UNKNOWN
     assert reasons
 

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daemon.judge.network import Opinion
 from daemon.judge.pipeline import Judgement
-from daemon.judge.reasons import Decision, Reason
+from daemon.judge.reasons import Decision, Moment, Reason
 from daemon.publish.companion import Answer
 from daemon.publish.messages import OutcomeMessage, decode_outcome, schema
 from daemon.publish.outbox import JUDGED_MAX, Outbox
@@ -51,7 +52,8 @@ def judge(outbox: Outbox, grasp: int, *, judged: bool = True) -> None:
     outcome = Decision.SLIP if judged else Decision.UNKNOWN
     reasons = () if judged else (Reason.MOVING,)
     p_slip = 0.9 if judged else None
-    outbox.verdict(Judgement(NOW_NS, grasp, outcome, p_slip, reasons, judged), NOW_NS, 10**8)
+    moment, opinion = Moment(grasp, judged=judged), Opinion(p_slip, ())
+    outbox.verdict(Judgement(NOW_NS, outcome, reasons, p_slip, moment, opinion), NOW_NS, 10**8)
 
 
 def test_an_outcome_of_a_judged_grasp_is_published_as_the_schema_says() -> None:

@@ -190,7 +190,7 @@ def test_where_every_reading_is_a_grasp_it_is_what_is_judged_unless_electrodes_a
     )
     assert well.judged_counts is not None
     assert np.array_equal(well.judged_counts, counts)
-    assert repaired.repaired == ("mf_4",)
+    assert repaired.opinion.repaired == ("mf_4",)
     assert repaired.judged_counts is None
     assert unusable.judged_counts is None
 

@@ -221,9 +221,9 @@ def test_what_a_settled_grasp_was_judged_by_is_recorded_with_its_number(
 ) -> None:
     daemon, readings = Daemon(tmp_path, monkeypatch), sweeps()[:1000]
     judged = {
-        judgement.t_ns: (judgement.grasp, place + 1)
+        judgement.t_ns: (judgement.moment.grasp, place + 1)
         for place, judgement in enumerate(map(daemon.judge, readings))
-        if judgement.judged
+        if judgement.moment.judged
     }
     daemon.recorder.close()
     found = [
@@ -294,8 +294,8 @@ def test_where_readings_were_left_out_the_replay_knows_too(
             daemon.recorder.on_event(LoopEvent.SKIPPED)
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
-    gaps = [each for each in expected for change in each.changes if change.cause is GateCause.GAP]
-    assert len(gaps) > 3
+    changes = [change for each in expected for change in each.moment.changes]
+    assert [change.cause for change in changes].count(GateCause.GAP) > 3
     paths = files(tmp_path)
     assert again(*paths) == expected
     assert len(paths) > 3

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from daemon.judge.limits import ContactLimits, GateLimits, GripLimits
+from daemon.judge.decision import ContactLimits, GateLimits, HandLimits
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
 from daemon.publish.companion import Companion, LoopEvent, Published
@@ -73,7 +73,7 @@ class Bench(Companion):
         clock: Clock,
         cost_ns: Callable[[], int],
         *,
-        grip: GripLimits | None = None,
+        hand: HandLimits | None = None,
     ) -> None:
         self.clock = clock
         self.cost_ns = cost_ns
@@ -88,7 +88,7 @@ class Bench(Companion):
         with StopSignal() as stop:
             loop = Loop(
                 [driver],
-                pipeline(FakeModel(), clock, grip=grip, max_age_ns=SECOND_NS),
+                pipeline(FakeModel(), clock, hand=hand, max_age_ns=SECOND_NS),
                 Outbox("right", FINGERS, "fake", "ab" * 32, [self], clock, lambda: 1.79e9),
                 stop,
                 [self],
@@ -290,7 +290,7 @@ def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
     assert Decision.STABLE in {verdict.verdict for verdict, _ in bench.judged}
 
 
-LIMITS = GripLimits(contact=ContactLimits(), gate=GateLimits())
+LIMITS = HandLimits(contact=ContactLimits(), gate=GateLimits())
 
 
 def grasps(seed: int) -> list[TactileReading]:
@@ -341,7 +341,7 @@ def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
         costs = busy(seed, clock) if live else itertools.repeat(0)
         driver = LiveDriver([msgspec.structs.replace(item) for item in grasps(seed)], clock)
         driver.live = live
-        bench = Bench(driver, clock, costs.__next__, grip=LIMITS)
+        bench = Bench(driver, clock, costs.__next__, hand=LIMITS)
         judged.append({seen.seq: verdict for verdict, seen in bench.judged})
         skipped = bench.statuses[-1].skipped_readings
     without, overloaded = judged
@@ -367,7 +367,7 @@ def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
         return 15 * MS if 200 * PERIOD_NS < clock() - START_NS < 215 * PERIOD_NS else 0
 
     driver = LiveDriver(came, clock)
-    bench = Bench(driver, clock, cost_ns, grip=LIMITS)
+    bench = Bench(driver, clock, cost_ns, hand=LIMITS)
     said = {seen.seq: verdict for verdict, seen in bench.judged}
     assert said[199].verdict is Decision.STABLE
     first_skipped = min(set(range(250)) - set(said))

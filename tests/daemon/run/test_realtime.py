@@ -176,9 +176,9 @@ def test_the_rehearsal_goes_through_a_whole_grasp(model: str) -> None:
     pipeline = rehearse(
         lambda clock: assembly.build_pipeline(wanted, loaded, clock), loaded.contract.seen
     )
-    assert pipeline.grip is not None
-    seen.append(pipeline.grip.state)
-    assert pipeline.grip.grasp == 1
+    assert pipeline.hand is not None
+    seen.append(pipeline.hand.gate.memory.state)
+    assert pipeline.hand.gate.memory.grasp == 1
     assert seen[-1] in (GateState.RELEASED, GateState.IDLE)
     if pipeline.session is not None:
         assert pipeline.session.grasps == 1

@@ -8,8 +8,8 @@ from typing import Literal
 import msgspec
 import pytest
 
+from daemon.judge.health import SWEEPS
 from daemon.judge.reasons import Decision, Reason
-from daemon.judge.recurrence import SWEEPS
 from daemon.publish.companion import Answer, Published
 from daemon.publish.messages import decode_verdict
 from daemon.run.replaying import Comparison, Controller

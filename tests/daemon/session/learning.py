@@ -54,7 +54,8 @@ def judge(part: Trust, grasp: int, boot: str = BOOT) -> None:
     margin = float(draw.normal(0.0, 4.0))
     name = GraspId(boot, grasp)
     found = part.judge(name, sigmoid(margin), margin, inputs)
-    part.note(name, found, stable=found.permission is Permission.ALLOWED and found.p_slip < 0.5)
+    holds = found.p_slip is not None and found.p_slip < 0.5
+    part.note(name, found, stable=holds and found.permission is Permission.ALLOWED)
 
 
 def tell(part: Trust, grasp: int, boot: str = BOOT) -> Told:

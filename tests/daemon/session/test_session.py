@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.decision import Limits
-from daemon.judge.limits import GripLimits
+from daemon.judge.decision import HandLimits, Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
@@ -526,7 +525,7 @@ def test_a_young_session_is_less_sure_and_on_the_same_side(
     model = TactileModel(zoo.find("small-session"))
     young = Pipeline(model, FINGERS, limits, lambda: 0, learns=False)
     for judgement, row in zip(judge(young, rows), rows, strict=True):
-        if judgement.p_slip is None or judgement.repaired:
+        if judgement.p_slip is None or judgement.opinion.repaired:
             continue
         model.inputs.build(row, model.input)
         _, p_slip = model.run()
@@ -586,7 +585,7 @@ def settled_verdicts(pipeline: Pipeline, clock: Clock, seconds: float) -> list[J
 def test_a_scene_that_requires_a_session_judges_nothing_without_one(bts3_dir: Path) -> None:
     model, clock = TactileModel(zoo.find("cnn1-session")), Clock()
     pipeline = Pipeline(
-        model, FINGERS, Limits(10**12), clock, grip=GripLimits(), needs_session=True, learns=False
+        model, FINGERS, Limits(10**12), clock, hand=HandLimits(), needs_session=True, learns=False
     )
     assert pipeline.session is not None
     for row in read_table(bts3_dir / "palm_down.csv").counts[::12]:  # of all objects
@@ -601,13 +600,13 @@ def test_a_scene_that_requires_a_session_judges_nothing_without_one(bts3_dir: Pa
 
 def test_an_exchanged_sensor_ends_the_verdict_that_stands(bts3_dir: Path) -> None:
     model, clock = TactileModel(zoo.find("cnn1")), Clock()
-    pipeline = Pipeline(model, FINGERS, Limits(10**12), clock, grip=GripLimits())
-    assert settled_verdicts(pipeline, clock, 4.0)[-1].gate is GateState.JUDGED
+    pipeline = Pipeline(model, FINGERS, Limits(10**12), clock, hand=HandLimits())
+    assert settled_verdicts(pipeline, clock, 4.0)[-1].moment.state is GateState.JUDGED
     pipeline.sensors_exchanged()
     after = pipeline.judge(reading_of(clock))
     assert after.decision is Decision.UNKNOWN
     assert Reason.NOT_TARED in after.reasons
-    assert after.contact == ()
+    assert after.moment.touching == ()
 
 
 def reading_of(clock: Clock) -> TactileReading:

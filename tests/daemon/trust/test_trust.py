@@ -40,13 +40,15 @@ def judge(part: Trust, grasp: int, margin: float = -6.0, boot: str = BOOT) -> bo
     """Judge and note a grasp; returns whether it was called stable."""
     name = named(grasp, boot)
     assessment = part.judge(name, sigmoid(margin), margin, inputs(grasp))
-    stable = assessment.permission is Permission.ALLOWED and assessment.p_slip < 0.5
+    stable = assessment.permission is Permission.ALLOWED and (assessment.p_slip or 0.0) < 0.5
     part.note(name, assessment, stable=stable)
     return stable
 
 
 def p_slip(part: Trust, grasp: int = 0, margin: float = -1.0) -> float:
-    return part.judge(named(10**6), sigmoid(margin), margin, inputs(grasp)).p_slip
+    found = part.judge(named(10**6), sigmoid(margin), margin, inputs(grasp)).p_slip
+    assert found is not None
+    return found
 
 
 @pytest.mark.parametrize("limits", [RiskLimits(), RULE])
@@ -67,7 +69,7 @@ def test_an_outcome_changes_the_probability_towards_what_happened() -> None:
         judge(part, 0, -1.0)
         assert part.outcome(named(0), slipped=slipped) is Told.TAKEN
         assert part.learner.outcomes == 1
-        moderated = part.judge(named(1), 0.5, -1.0, inputs(0)).p_slip
+        moderated = part.judge(named(1), 0.5, -1.0, inputs(0)).p_slip or 0.0
         assert (moderated > before) or not slipped
     assert part.learner.outcomes == 1
 

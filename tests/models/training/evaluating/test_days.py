@@ -10,7 +10,7 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 
 from daemon.judge.calibration import SessionCalibration
-from daemon.judge.plausibility import Plausibility
+from daemon.judge.network import Plausibility
 from models.contract import SessionInput, Sharpness
 from models.inputs import SessionBuilder
 from models.training.data.protocols import splits

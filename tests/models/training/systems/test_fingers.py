@@ -91,7 +91,7 @@ def test_a_model_of_two_fingers_judges_a_hand_of_two(tmp_path: Path) -> None:
     pipeline = build_pipeline(scene, model, lambda: 10**9)
     counts = grasps.counts[:1, [0, 2]][0]
     judgement = pipeline.judge(TactileReading(10**9, 0, counts, np.zeros((2, 24), dtype=np.uint8)))
-    assert judgement.grasp == 1
+    assert judgement.moment.grasp == 1
 
 
 def test_a_hand_of_fingers_that_were_never_recorded_is_told_so(tmp_path: Path) -> None:

@@ -1,0 +1,248 @@
+"""How the hand holds: fresh values, contact, joints and gate of one hand, reading by reading.
+
+A palm that is asked for two electrodes at a time repeats 2 of 7 values of a stream at 100 Hz; one
+spike in a hundred values is 25 to 150 counts deep. The median of three fresh values takes spikes
+out, and costs one sweep of delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import compress
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from daemon.judge.contact import Contact
+from daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
+from daemon.judge.gate import Gate
+from daemon.judge.health import NO_COUNT, Checked, all_of, any_of
+from daemon.judge.reasons import Moment, Reason
+from drivers.base import ELECTRODES, JointReading, TactileReading
+from models.contract import Finger
+
+if TYPE_CHECKING:
+    from daemon.judge.joint_motion import JointMotion
+
+OUTAGE_NS = 1_000_000_000
+"""After this long without a usable reading the sensors may have been exchanged or powered again."""
+
+
+@dataclass(slots=True, eq=False)
+class MedianMemory:
+    """The values of every electrode; arrays have shape (fingers, 24)."""
+
+    fresh: NDArray[np.uint16]
+    """Shape (3, fingers, 24): the last three fresh values, oldest first."""
+    last: NDArray[np.uint16]
+    """The last value, fresh or not."""
+    held: NDArray[np.bool_]
+    """True where that repeated the one before."""
+    number: NDArray[np.uint8]
+    """Number of fresh values, up to three."""
+    all_full: bool = False
+    """True if it is three of each."""
+
+
+class FreshMedian:
+    """Keeps three fresh values per electrode; constant memory, no clock."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        """`shape` is (fingers, 24)."""
+        self.memory = MedianMemory(
+            fresh=np.zeros((MEDIAN_SWEEPS, *shape), dtype=np.uint16),
+            last=np.full(shape, NO_COUNT, dtype=np.uint16),
+            held=np.zeros(shape, dtype=np.bool_),
+            number=np.zeros(shape, dtype=np.uint8),
+        )
+        self.counts = np.zeros(shape, dtype=np.uint16)
+        """Median of the last three fresh values, shape (fingers, 24); 0 where there is none."""
+
+    def reset(self) -> None:
+        """Forget everything: what comes next does not continue what came before."""
+        memory = self.memory
+        memory.last = np.full_like(memory.last, NO_COUNT)
+        memory.held.fill(False)
+        memory.number.fill(0)
+        memory.all_full = False
+
+    def push(self, counts: NDArray[np.uint16], usable: NDArray[np.bool_] | None) -> None:
+        """Take in one sweep, shape (fingers, 24).
+
+        Electrodes that are not `usable` are forgotten; None: all are usable. A value that repeats
+        the one before is taken for held, so not fresh; the next one counts again. A held value of
+        71.43 Hz data is never held twice, and a quiet electrode repeats itself in one sweep of ten
+        without being held.
+        """
+        memory = self.memory
+        oldest, middle, newest = memory.fresh
+        memory.held = (counts == memory.last) & ~memory.held
+        fresh = ~memory.held
+        if usable is not None:
+            fresh &= usable
+        np.putmask(oldest, fresh, middle)
+        np.putmask(middle, fresh, newest)
+        np.putmask(newest, fresh, counts)
+        if usable is not None or not memory.all_full:
+            self._fill(counts, usable, fresh)
+        memory.last = counts if usable is None else np.where(usable, counts, memory.last)
+        self.counts = np.sort(memory.fresh, axis=0)[1]
+
+    def is_full(self, usable: NDArray[np.bool_] | None) -> bool:
+        """Return True if each `usable` electrode has three fresh values."""
+        memory = self.memory
+        if memory.all_full or usable is None:
+            return memory.all_full
+        return bool((memory.number[usable] == MEDIAN_SWEEPS).all())
+
+    def _fill(
+        self,
+        counts: NDArray[np.uint16],
+        usable: NDArray[np.bool_] | None,
+        fresh: NDArray[np.bool_],
+    ) -> None:
+        """Count the fresh values; until there are three, the first stands for those missing."""
+        memory = self.memory
+        if usable is not None:
+            memory.number[~usable] = 0
+        first = fresh & (memory.number == 0)
+        np.copyto(memory.fresh, counts, where=first)
+        memory.number += fresh & (memory.number < MEDIAN_SWEEPS)
+        memory.all_full = all_of(memory.number == MEDIAN_SWEEPS)
+
+
+@dataclass(slots=True)
+class HandMemory:
+    """What the hand's parts do not remember themselves."""
+
+    last_ns: int | None = None
+    """Time of the last usable reading."""
+    unsettled: Annotated[int, msgspec.Meta(ge=0, le=MEDIAN_SWEEPS)] = 0
+    """Readings to come whose median may be of values from before some that are missing."""
+
+
+class HandTracker:
+    """Follows contact, joints and gate of one hand, and says when a grasp is to be judged."""
+
+    def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
+        """`fingers` are those of the readings, in their order."""
+        required = fingers if limits.required is None else limits.required
+        self._fingers = tuple(fingers)
+        self._required = [place for place, finger in enumerate(fingers) if finger in required]
+        self._limits = limits
+        self._fresh = FreshMedian((len(fingers), ELECTRODES))
+        self._contact = Contact(len(fingers), limits.contact)
+        self._joints: JointMotion | None = None
+        if limits.joints is not None:
+            from daemon.judge.joint_motion import JointMotion  # only where it is needed
+
+            self._joints = JointMotion(limits.joints)
+        self.gate = Gate(fingers, limits)
+        self.memory = HandMemory()
+
+    @property
+    def tared(self) -> tuple[Finger, ...]:
+        """Fingers of which it is known where they rest."""
+        return tuple(compress(self._fingers, self._contact.tared.tolist()))
+
+    def health(self) -> dict[str, Reason]:
+        """Return what is not well: fingers without a tare, and `joints`."""
+        tared, joints, last_ns = self.tared, self._joints, self.memory.last_ns
+        findings: dict[str, Reason] = {
+            finger: Reason.NOT_TARED for finger in self._fingers if finger not in tared
+        }
+        if joints is not None and joints.is_frozen:
+            findings["joints"] = Reason.JOINTS_FROZEN
+        elif joints is not None and last_ns is not None and joints.misses_some(last_ns):
+            findings["joints"] = Reason.JOINTS_LATE
+        return findings
+
+    def forget(self) -> None:
+        """Forget tare and grasp: the sensors are others, or may be."""
+        self._contact.forget()
+        self.gate.motion.forget()
+        self._fresh.reset()
+        self.restart()
+
+    def restart(self) -> None:
+        """Let the current grasp settle again, from the last reading on."""
+        if self.memory.last_ns is not None:
+            self.gate.restart(self.memory.last_ns)
+
+    def interrupt(self) -> None:
+        """Let the current grasp settle again: readings are missing before the next one."""
+        self.memory.unsettled = MEDIAN_SWEEPS
+
+    def memories(self) -> dict[str, dict[str, Any]]:
+        """Return what the hand's parts remember, by part; see `Pipeline.memories`."""
+        hand: dict[str, Any] = {
+            "hand": self.memory,
+            "fresh": self._fresh.memory,
+            "contact": self._contact.memory,
+            "gate": self.gate.memory,
+            "motion": self.gate.motion.memory,
+        }
+        joints = {} if self._joints is None else {"joints": {"joints": self._joints.memory}}
+        return {"hand": hand, **joints}
+
+    def observe_joints(self, reading: JointReading) -> None:
+        """Take in joint angles."""
+        if self._joints is not None:
+            self._joints.observe(reading, reading.made_ns)
+
+    def step(
+        self, reading: TactileReading, checked: Checked, *, in_time: bool = True
+    ) -> tuple[Moment, NDArray[np.uint16] | None]:
+        """Take in a reading of these fingers and what was found in it.
+
+        Return where in a grasp the hand is, and the counts to judge now, shape (fingers, 24). None:
+        judge nothing, for one because the reading is not `in_time`.
+        """
+        t_ns, last_ns = reading.made_ns, self.memory.last_ns
+        if checked.reasons:
+            self.gate.skip(t_ns)
+            return self.moment(), None
+        if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gate.gap_ns:
+            self._fresh.reset()
+            if t_ns - last_ns > OUTAGE_NS:
+                self._contact.forget()
+                self.gate.motion.forget()
+        self.memory.last_ns = t_ns
+        if self.memory.unsettled:
+            self.memory.unsettled -= 1
+            self.gate.restart(t_ns)
+        usable = ~checked.broken if any_of(checked.broken) else None
+        self._fresh.push(reading.counts, usable)
+        median = self._fresh.counts
+        self._contact.observe(t_ns, reading.counts, median, usable)
+        moment = self.gate.step(
+            t_ns,
+            reading.counts,
+            median,
+            usable,
+            self._contact.touching,
+            self._objections(t_ns),
+            in_time=in_time,
+            fresh=self._fresh.is_full(usable),
+        )
+        if not moment.judges:
+            return moment, None
+        return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else reading.counts
+
+    def moment(self) -> Moment:
+        """Return where in a grasp the hand is without a new reading; it is not to be judged."""
+        return self.gate.moment(self._contact.touching.tolist())
+
+    def _objections(self, t_ns: int) -> tuple[Reason, ...]:
+        """Return what tare and joints say against settling."""
+        objections: list[Reason] = []
+        tared = self._contact.tared
+        if not all_of(tared) and not all_of(tared[self._required]):
+            objections.append(Reason.NOT_TARED)
+        joints = None if self._joints is None else self._joints.objection(t_ns)
+        if joints is not None:
+            objections.append(joints)
+        return tuple(objections)
