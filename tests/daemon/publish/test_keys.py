@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import zmq
+from zmq.auth.thread import ThreadAuthenticator
 
 from daemon import scene
 from daemon.publish import door as doors
@@ -23,6 +24,7 @@ from daemon.scene import SceneError
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import graspd
 from tests.daemon.publish.doors import Asked
+from tests.daemon.publish.test_sockets import STATUS
 from tests.ports import free_port
 
 PATIENCE_S = 100.0
@@ -495,3 +497,13 @@ def test_peers_that_cannot_be_disconnected_end_the_daemon(
     monkeypatch.setattr(doors.Door, "close", lambda self: close(self) and False)
     with pytest.raises(doors.PublishError, match="cannot disconnect"):
         door.sockets.check_keys()
+
+
+def test_an_authenticator_that_has_ended_ends_the_daemon(
+    door: Door, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(ThreadAuthenticator, "is_alive", lambda _self: False)
+        with pytest.raises(doors.PublishError, match="authenticator has ended"):
+            door.sockets.on_status(STATUS)
+    door.sockets.on_status(STATUS)
