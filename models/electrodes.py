@@ -9,12 +9,16 @@ closed form from the inverse covariance P: the residual is `(P d)_i / P_ii`, its
 from __future__ import annotations
 
 import math
+from operator import gt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.contract import SeenCounts
 
+ROUNDING = 1e-9
+"""Share of a limit within which `Electrodes.plain_square` leaves it open whether it is kept: some
+thousand times what rounding makes of a residual."""
 IMPLAUSIBLE = 8.0
 """Residual from here on, in its standard deviations. Real grasps are heavier in the tails than a
 Gaussian: 7 to 8 % of the held-out ones have an electrode beyond it. To repair it changes F1 by 0.3
@@ -32,6 +36,8 @@ class Electrodes:
         self._shape = np.shape(seen.centre)
         of_fingers = self._precision.reshape(self._shape * 2).sum(axis=(1, 3))
         self._finger_limits = IMPLAUSIBLE * np.sqrt(np.diag(of_fingers))
+        self._plain_limits = (1.0 - ROUNDING) * self._limits
+        self._plain_finger_limits: list[float] = ((1.0 - ROUNDING) * self._finger_limits).tolist()
         self.centre = self._centre.reshape(self._shape)
         """Mean of each electrode in the training, counts, shape (fingers, 24)."""
         self.spread = np.sqrt(np.diag(np.linalg.inv(self._precision))).reshape(self.centre.shape)
@@ -63,6 +69,21 @@ class Electrodes:
             found[worst] = True
             others.forget(worst)
         return found.reshape(broken.shape)
+
+    def plain_square(self, deviations: NDArray[np.float64]) -> float | None:
+        """Mean square whitened deviation (`NoveltyCheck.square`) of a reading that is plainly well.
+
+        `deviations` from `centre`, shape (fingers, 24). None where `implausible` finds an electrode
+        of them or `moved_finger` says yes, or might.
+        """
+        flat = deviations.reshape(-1)
+        residuals = self._precision.dot(flat)
+        if 0 in (np.abs(residuals) < self._plain_limits).tobytes():
+            return None
+        of_fingers = np.add.reduce(residuals.reshape(self._shape), axis=1).tolist()
+        if any(map(gt, map(abs, of_fingers), self._plain_finger_limits)):
+            return None
+        return float(flat.dot(residuals)) / len(flat)
 
     def moved_finger(self, values: NDArray[np.float64]) -> bool:
         """Whether one number, added to all electrodes of a finger, made `values` what they are.

@@ -76,9 +76,9 @@ class MotionMemory:
     """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""
 
     times_ns: NDArray[np.int64]
-    """Shape (STEPS,), newest last."""
+    """Shape (2 * STEPS,), oldest first; as with `steps`, what is remembered is a slice."""
     steps: NDArray[np.float32]
-    """Shape (STEPS, fingers, 24), newest last."""
+    """Shape (2 * STEPS, fingers, 24): it moves to the right, and then goes back to the left."""
     clean: NDArray[np.float32]
     """The last sweep without spikes."""
     counts: NDArray[np.float32]
@@ -97,6 +97,8 @@ class MotionMemory:
     """Sums of the squared differences of steps 1 to `APART` apart, shape (APART, fingers)."""
     blocks: NDArray[np.float64]
     """Their means, shape (BLOCKS, APART, fingers), written round and round."""
+    first: Number = 0
+    """Where in `steps` the oldest is."""
     number: Number = 0
     """Steps that are remembered."""
     sweeps: Number = 0
@@ -114,7 +116,9 @@ class MotionMemory:
 
     def __post_init__(self) -> None:
         """Raise `ValueError` for what no such memory can be."""
-        if self.number > STEPS or self.pending > max(self.number - APART, 0):
+        end = self.first + self.number
+        pending_max = max(self.number - APART, 0)
+        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
             raise ValueError("more steps than are remembered")
 
 
@@ -138,8 +142,8 @@ class Motion:
         self._noise_blocks = 0
         """Blocks that it is known from."""
         self.memory = MotionMemory(
-            times_ns=np.zeros(STEPS, dtype=np.int64),
-            steps=np.zeros((STEPS, *shape), dtype=np.float32),
+            times_ns=np.zeros(2 * STEPS, dtype=np.int64),
+            steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
             clean=np.zeros(shape, dtype=np.float32),
             counts=np.zeros(shape, dtype=np.float32),
             jumped=np.zeros(shape, dtype=np.uint8),
@@ -182,7 +186,7 @@ class Motion:
         """Forget the motion: what comes next does not continue what came before."""
         memory = self.memory
         memory.number = memory.sweeps = memory.block_steps = memory.total_ns = 0
-        memory.pending = 0
+        memory.first = memory.pending = 0
         memory.last_ns = None
         memory.block.fill(0.0)
         self._say_unknown()
@@ -217,7 +221,8 @@ class Motion:
             sweep = np.where(usable, sweep, memory.clean)
             gone = ~usable & (memory.lost >= LOST_MAX)
             if gone.any():
-                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[-1 - APART]
+                end = memory.first + memory.number
+                was_usable = memory.usable_since_ns[gone] <= memory.times_ns[end - 1 - APART]
                 if memory.pending and was_usable.any():
                     self._fill_block()
                 # Not in this step, and what comes next has nothing to jump from.
@@ -271,11 +276,17 @@ class Motion:
 
     def _remember(self, t_ns: int) -> None:
         memory = self.memory
-        memory.steps[:-1] = memory.steps[1:]
-        memory.times_ns[:-1] = memory.times_ns[1:]
-        np.divide(memory.total, memory.sweeps, out=memory.steps[-1])
-        memory.times_ns[-1] = t_ns
-        memory.number = min(memory.number + 1, STEPS)
+        if memory.number == STEPS:
+            memory.first += 1
+            memory.number -= 1
+        place = memory.first + memory.number
+        if place == len(memory.steps):
+            memory.steps[: memory.number] = memory.steps[memory.first :]
+            memory.times_ns[: memory.number] = memory.times_ns[memory.first :]
+            memory.first, place = 0, memory.number
+        np.divide(memory.total, memory.sweeps, out=memory.steps[place])
+        memory.times_ns[place] = t_ns
+        memory.number += 1
 
     def _learn_noise(self) -> None:
         memory = self.memory
@@ -293,12 +304,13 @@ class Motion:
     def _fill_block(self) -> None:
         """Take the pending steps into the block, by the electrodes that are usable until now."""
         memory = self.memory
-        begin, memory.pending = STEPS - memory.pending, 0
-        since_ns = memory.times_ns[begin - APART : -APART, np.newaxis, np.newaxis]
+        end = memory.first + memory.number
+        begin, memory.pending = end - memory.pending, 0
+        since_ns = memory.times_ns[begin - APART : end - APART, np.newaxis, np.newaxis]
         usable = memory.usable_since_ns <= since_ns
         numbers = np.maximum(np.count_nonzero(usable, axis=2), 1)
         for apart, sums in enumerate(memory.block, start=1):
-            differences = memory.steps[begin:] - memory.steps[begin - apart : -apart]
+            differences = memory.steps[begin:end] - memory.steps[begin - apart : end - apart]
             means = (np.square(differences) * usable) @ ONES / numbers
             np.add.reduce((sums, *means), axis=0, out=sums)
 
@@ -329,42 +341,42 @@ class Motion:
 
     def _decide(self) -> None:
         memory = self.memory
+        number, end = memory.number, memory.first + memory.number
         self._say_unknown()
         self.looked = True
-        if memory.block_number < BLOCKS_MIN or memory.number <= STEPS_MIN:
+        if memory.block_number < BLOCKS_MIN or number <= STEPS_MIN:
             return
-        first = STEPS - memory.number
-        times_ns = memory.times_ns[first:]
+        times_ns = memory.times_ns[memory.first : end]
         now_ns = times_ns.item(-1)
         age_ns = now_ns - times_ns.item(0)
         if age_ns < SHORT_NS:
             return
         windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
-        short, long = (min(begin, len(times_ns) - STEPS_MIN) for begin in windows.tolist())
+        short, long = (min(begin, number - STEPS_MIN) for begin in windows.tolist())
         noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
-        beside = self._follow_fast(first + short, times_s[short - long :], noise)
+        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
         self.early = _within(self.fast, self.fast_limits)
         if age_ns >= LONG_NS:
-            self._follow_slow(first + long, times_s, noise)
+            self._follow_slow(memory.first + long, end, times_s, noise)
             self.sure = _within(self.slow, self.slow_limits) and _within(self.fast, beside)
 
-    def _follow_fast(self, begin: int, times_s: Times, noise: Noise) -> list[float]:
+    def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
         """Find how steps have moved, and the limit where this window decides alone.
 
         Return the limit where it does not.
         """
         memory = self.memory
         line, by_noise, self.fast_limits, beside = noise.fast(times_s, self._tails)
-        slopes = line.astype(np.float32).dot(memory.steps[begin:].reshape(len(line), -1))
+        slopes = line.astype(np.float32).dot(memory.steps[begin:end].reshape(len(line), -1))
         slopes = np.abs(slopes, out=slopes).reshape(memory.clean.shape)
         means = self._mean(slopes, begin)
         self.fast = [mean / usual for mean, usual in zip(means, by_noise, strict=True)]
         return beside
 
-    def _follow_slow(self, begin: int, times_s: Times, noise: Noise) -> None:
+    def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> None:
         """Find how far steps have spread, and the limit of it."""
-        steps = self.memory.steps[begin:]
+        steps = self.memory.steps[begin:end]
         middle = np.add.reduce(steps, axis=0)
         middle /= len(steps)
         deviations = steps - middle

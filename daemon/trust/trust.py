@@ -112,6 +112,8 @@ class Trust:
         permission = former.permission
         if permission is Permission.ALLOWED and not self.ledger.is_stable(grasp):
             permission = self._permission(grasp, former.log_odds)
+        if permission is former.permission and report is former.report:
+            return former
         return replace(former, permission=permission, report=report)
 
     def _permission(self, grasp: GraspId, log_odds: float) -> Permission:

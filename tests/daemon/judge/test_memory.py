@@ -238,7 +238,7 @@ def test_what_is_no_memory_is_refused(spare: tuple[Pipeline, list[int]], data: b
         ("hand", "motion", "last_ns", 2**63 - 1),
         ("hand", "motion", "total_ns", 2**63 - 1),
         ("hand", "motion", "number", 53),
-        ("hand", "motion", "pending", 48),
+        ("hand", "motion", "first", 100),
     ],
 )
 def test_numbers_that_no_judge_counts_to_are_refused(

@@ -251,6 +251,7 @@ def test_memory_is_bounded_however_fast_readings_come() -> None:
     motion, counts = Motion(1, 0.05, early=True), wavering(0.5, 20_000.0, 3.5, 14)
     fed(motion, counts, 20_000.0)
     assert motion.memory.number <= STEPS
+    assert motion.memory.first + motion.memory.number <= len(motion.memory.steps)
     assert replace(motion.memory).number == STEPS, "what is full may be taken over"
 
 
