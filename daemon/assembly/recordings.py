@@ -19,7 +19,7 @@ from daemon.record.mcap import header_of
 from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.topics import Exchanged, Topic
 from daemon.scene import Scene, SceneError, parse
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import GraspId, Report
 from daemon.trust.trust import decode
 from models.runtime import TactileModel
 
@@ -139,4 +139,4 @@ class RecordedRun:
                 grasp = GraspId(event.grasp_boot_id or self.header.boot_id, event.grasp)
                 pipeline.outcome(grasp, slipped=event.outcome == "slip")
                 if event.grasp_boot_id is None:
-                    self._companion.on_outcome(event.grasp, event.outcome, event.object)
+                    self._companion.on_outcome(Report(grasp, event.outcome, event.object))

@@ -34,7 +34,7 @@ from daemon.session.file import (
     others,
     read,
 )
-from daemon.trust.ledger import GraspId, Ledger
+from daemon.trust.lift_book import GraspId, LiftBook
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.base import Annotation, DriverError, JointReading, Reading, TactileReading
 from models.contract import ModelError, SessionInput
@@ -166,12 +166,12 @@ def _learned(kept: KeptSession | None) -> dict[str, Any] | None:
     return {
         "model": state.model,
         "outcomes": state.learner.outcomes,
-        "told": {str(told): number for told, number in state.ledger.told.items()},
+        "told": {str(told): number for told, number in state.lifts.told.items()},
         "max_slip_when_stable": state.risk.max_slip_when_stable,
         "lifts": state.risk.lifts,
         "slips": state.risk.slips,
-        "outstanding": state.ledger.outstanding,
-        "unreported": state.ledger.unreported,
+        "outstanding": state.lifts.outstanding,
+        "unreported": state.lifts.unreported,
         "proven": state.risk.proven,
     }
 
@@ -240,7 +240,7 @@ def _taught(trust: Trust) -> TrustState:
     """
     state = trust.state()
     risk = msgspec.structs.replace(state.risk, lifts=0, slips=0)
-    return msgspec.structs.replace(state, risk=risk, ledger=Ledger().state())
+    return msgspec.structs.replace(state, risk=risk, lifts=LiftBook().state())
 
 
 def _check(wanted: scene.Scene, model: TactileModel, state: SessionState) -> None:

@@ -22,7 +22,7 @@ from daemon.judge.decision import (
 from daemon.judge.health import Checked, Health, Number, any_of
 from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
 from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
 from daemon.trust.trust import Assessment
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger, ModelError, SessionInput
@@ -132,6 +132,8 @@ class Pipeline:
         self._network = Network(model, limits.slip_threshold)
         self.trust = trust
         """What outcomes have taught; None where nothing learns and no risk is set."""
+        self.lifts = LiftBook() if trust is None else trust.lifts
+        """Which grasps were judged, and how their lifts ended."""
         self.boot_id = ""
         """Identifies the start of the daemon in the names of its grasps."""
         self.hand: HandTracker | None = None
@@ -185,14 +187,11 @@ class Pipeline:
         if self.on_exchange is not None:
             self.on_exchange(session, learned)
 
-    def knows(self, grasp: GraspId) -> bool:
-        """Return True if an outcome of a grasp would be taken."""
-        return self.trust is not None and grasp in self.trust.ledger
-
-    def outcome(self, grasp: GraspId, *, slipped: bool) -> None:
-        """Take in how the lift of a grasp has ended; some 0.1 ms."""
+    def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
+        """Take in how the lift of a grasp has ended; takes 0.1 ms."""
         if self.trust is not None:
-            self.trust.outcome(grasp, slipped=slipped)
+            return self.trust.outcome(grasp, slipped=slipped)
+        return self.lifts.tell(grasp, slipped=slipped)[0]
 
     def restart(self) -> None:
         """Discard the current grasp's verdict.
@@ -247,8 +246,8 @@ class Pipeline:
             reading.t_ns, checked.reasons, moment, memory.opinion, assessment, counts
         )
         stable = judgement.decision is Decision.STABLE
-        if self.trust is not None and assessment is not None and (stable or moment.judges):
-            self.trust.note(GraspId(self.boot_id, moment.grasp), assessment, stable=stable)
+        if stable or moment.judges or moment.judged:
+            self._note(GraspId(self.boot_id, moment.grasp), assessment, stable=stable)
         if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
             self._keep_to_learn(grasp, moment.grasp)
         return judgement
@@ -327,6 +326,13 @@ class Pipeline:
             memory.opinion = Opinion(None, (Reason.MODEL_FAILED,), opinion.repaired)
             return trust.review(grasp, None)
         return memory.assessment
+
+    def _note(self, grasp: GraspId, assessment: Assessment | None, *, stable: bool) -> None:
+        """Enter in the book what was said of a grasp."""
+        if self.trust is None or assessment is None:
+            self.lifts.note(grasp, NOT_ASSESSED, stable=stable)
+        else:
+            self.trust.note(grasp, assessment, stable=stable)
 
     def _keep_to_learn(self, counts: NDArray[np.generic], grasp: int) -> None:
         """Keep a grasp for `learn`, once: as judged first, not as it changed since."""

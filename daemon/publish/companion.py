@@ -5,10 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from enum import Enum
-from typing import Any, Concatenate, Literal, NamedTuple, ParamSpec, Protocol, TypeVar
+from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
 
 from daemon.judge.pipeline import Judgement
 from daemon.publish.messages import Status, Verdict
+from daemon.trust.lift_book import GraspId, LiftBook, Report
 from drivers.base import Reading, TactileReading
 
 P = ParamSpec("P")
@@ -16,8 +17,8 @@ R = TypeVar("R")
 
 Answer = Callable[[str | None], None]
 """Takes None for yes, or why not."""
-CONTRADICTS = "contradicts: another outcome of this grasp was told before"
-"""Why an outcome is refused: the first one stays."""
+REPEATED = "repeated"
+"""Answers an outcome that is known and kept already: nothing was written or published again."""
 
 
 def at_once(answer: Answer) -> None:
@@ -45,6 +46,9 @@ class Published(NamedTuple):
     """What the verdict is about; None after silence."""
     is_answer: bool
     """True if this is the verdict that controllers who ask wait for."""
+    grasp: GraspId
+    lifts: LiftBook
+    """Where a peer that asked to lift the grasp claims it."""
 
 
 class Requests(Protocol):
@@ -53,18 +57,12 @@ class Requests(Protocol):
     def ask(self) -> None:
         """Ask for a verdict, by which a controller decides whether to lift."""
 
-    def outcome(
-        self,
-        boot_id: str,
-        grasp: int,
-        outcome: Literal["stable", "slip"],
-        object_name: str | None = None,
-    ) -> str | None:
-        """Tell how the lift of a grasp has ended; return None if it is taken, else why not."""
+    def outcome(self, report: Report, answer: Answer) -> None:
+        """Tell how the lift of a grasp has ended.
 
-    @property
-    def keep(self) -> Callable[[Answer], None]:
-        """Calls its argument once all outcomes until now are on the disk, or cannot be."""
+        `answer` is called with None once the outcome is on the disk, with `REPEATED`, or with the
+        reason why the outcome is refused or not kept.
+        """
 
 
 class Companion:
@@ -94,9 +92,7 @@ class Companion:
     def on_verdict(self, published: Published) -> None:
         """A verdict was published."""
 
-    def on_outcome(
-        self, grasp: int, outcome: Literal["stable", "slip"], object_name: str | None
-    ) -> None:
+    def on_outcome(self, report: Report) -> None:
         """The outcome of a judged grasp was published."""
 
     def on_status(self, status: Status) -> None:

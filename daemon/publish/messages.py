@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal
 import msgspec
 
 from daemon.judge.reasons import Decision, GateCause, GateState, Reason
-from daemon.trust.ledger import Told
+from daemon.trust.lift_book import OutcomeStatus
 from daemon.trust.risk import RiskReport
 from models.contract import Finger
 
@@ -192,7 +192,7 @@ class LearnerHealth(msgspec.Struct, frozen=True, kw_only=True):
     """`[learn] enabled`."""
     outcomes: Count
     """Learned from since the start of the session."""
-    told: dict[Told, Count]
+    told: dict[OutcomeStatus, Count]
     """Outcomes since the start of the session, by what became of them; only what occurred."""
     uncertainty: Probability
     """1: nothing is learned yet; towards 0: what is learned hardly changes any more."""

@@ -28,7 +28,7 @@ from daemon.publish.messages import (
     Verdict,
     encode,
 )
-from daemon.trust.ledger import GRASPS_MAX
+from daemon.trust.lift_book import Report
 from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 
@@ -37,9 +37,6 @@ if TYPE_CHECKING:
     from daemon.trust.trust import Trust
 
 SHA_DIGITS = 12
-JUDGED_MAX = GRASPS_MAX
-"""Grasps of which it is remembered that they were judged. No more than what learns remembers, so
-that no outcome is taken in vain."""
 
 
 class Output(Protocol):
@@ -86,15 +83,14 @@ class Outbox:
         self._outputs = tuple(outputs)
         self._clock = clock
         self._wall_clock = wall_clock
-        self._boot_id = uuid.uuid4().hex if boot_id is None else boot_id
+        self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
+        """Identifies this start of the daemon in all messages."""
         self._verdict_seq = 0
         self._gate_seq = 0
         self._tactile_seq = 0
         self._status_seq = 0
         self._outcome_topic = f"outcome.{hand}".encode()
         self._outcome_seq = 0
-        self._judged: dict[int, None] = {}
-        """Grasps that were judged last, oldest first."""
         self._versions = {
             "graspd": __version__,
             "onnxruntime": onnxruntime.__version__,
@@ -116,7 +112,7 @@ class Outbox:
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
         message = Verdict(
-            boot_id=self._boot_id,
+            boot_id=self.boot_id,
             seq=self._verdict_seq,
             t=self._wall_clock(),
             t_mono_ns=judgement.t_ns,
@@ -154,47 +150,23 @@ class Outbox:
             self.reasons.update(judgement.reasons)
         if judgement.opinion.repaired:
             self._repaired.update(judgement.opinion.repaired)
-        if moment.judged:
-            self._remember(moment.grasp)
         return message, payload
 
-    def _remember(self, grasp: int) -> None:
-        self._judged[grasp] = None
-        if len(self._judged) > JUDGED_MAX:
-            del self._judged[next(iter(self._judged))]
-
-    def outcome(
-        self,
-        boot_id: str,
-        grasp: int,
-        outcome: Literal["stable", "slip"],
-        object_name: str | None = None,
-        *,
-        known: bool = False,
-    ) -> str | None:
-        """Send how the lift of a grasp ended, and what was lifted if that is known.
-
-        None once it is sent; else why it is not: `boot_id` is of another start, or the grasp was
-        not judged, or too long ago. A `known` grasp is sent in any case.
-        """
-        own = boot_id == self._boot_id
-        if not (own or known):
-            return "unknown boot_id: of a start whose grasps are not known any more"
-        if not (known or grasp in self._judged):
-            return "unknown grasp: not judged, or too long ago"
+    def outcome(self, report: Report) -> None:
+        """Send how the lift of a grasp ended, and what was lifted if that is known."""
+        boot_id, grasp = report.grasp
         message = OutcomeMessage(
-            boot_id=self._boot_id,
+            boot_id=self.boot_id,
             seq=self._outcome_seq,
             t=self._wall_clock(),
             t_mono_ns=self._clock(),
             grasp=grasp,
-            outcome=outcome,
-            object=object_name,
-            grasp_boot_id=None if own else boot_id,
+            outcome=report.outcome,
+            object=report.object_name,
+            grasp_boot_id=None if boot_id == self.boot_id else boot_id,
         )
         self._outcome_seq += 1
         self._send(self._outcome_topic, encode(message))
-        return None
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
         """Send one reading, with the newest joint angles, to each output that wants it."""
@@ -207,7 +179,7 @@ class Outbox:
 
     def _encoded(self, reading: TactileReading, joints: JointReading | None) -> bytes:
         message = Tactile(
-            boot_id=self._boot_id,
+            boot_id=self.boot_id,
             seq=self._tactile_seq,
             t=self._wall_clock(),
             t_mono_ns=reading.t_ns,
@@ -225,7 +197,7 @@ class Outbox:
 
     def _gate_change(self, t_ns: int, moment: Moment, change: GateChange) -> None:
         message = GateMessage(
-            boot_id=self._boot_id,
+            boot_id=self.boot_id,
             seq=self._gate_seq,
             t=self._wall_clock(),
             t_mono_ns=t_ns,
@@ -261,7 +233,7 @@ class Outbox:
         if state is State.SILENT:
             health["link"] = Reason.STALE
         message = Status(
-            boot_id=self._boot_id,
+            boot_id=self.boot_id,
             seq=self._status_seq,
             t=self._wall_clock(),
             t_mono_ns=self._clock(),
@@ -294,9 +266,9 @@ class Outbox:
 
 
 def _lifts(trust: Trust) -> Lifts:
-    ledger = trust.ledger
+    book = trust.lifts
     return Lifts(
-        reported=trust.risk.lifts, outstanding=ledger.outstanding, unreported=ledger.unreported
+        reported=trust.risk.lifts, outstanding=book.outstanding, unreported=book.unreported
     )
 
 
@@ -304,7 +276,7 @@ def _learner(trust: Trust) -> LearnerHealth:
     return LearnerHealth(
         enabled=trust.learns,
         outcomes=trust.learner.outcomes,
-        told=dict(trust.ledger.told),
+        told=dict(trust.lifts.told),
         uncertainty=trust.learner.uncertainty,
     )
 

@@ -8,12 +8,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Literal
+from typing import Final
 
-from daemon.publish.companion import CONTRADICTS, Requests
+from daemon.publish.companion import REPEATED, Requests
 from daemon.publish.door import Message
 from daemon.publish.messages import OBJECT_PATTERN
-from daemon.trust.ledger import GRASPS_MAX, GraspId
+from daemon.trust.lift_book import GraspId, Report
 
 JUDGE, LIFT = b"judge", b"lift"
 """Questions. The answer is the same, but only `lift` makes the peer the owner of the grasp."""
@@ -25,7 +25,6 @@ _REPORT = re.compile(
     rb"outcome ([0-9a-f]{32}) ([0-9]{1,15}) (stable|slip)(?: (%b))?" % OBJECT_PATTERN.encode()
 )
 MALFORMED = "malformed: outcome <boot_id> <grasp> <stable|slip> [<object>]"
-NOT_YOURS = "not yours: another peer asks whether it may lift here"
 
 Peer = bytes
 """Routing id of a connection."""
@@ -42,55 +41,6 @@ class _Question:
     lifts: bool
 
 
-@dataclass(slots=True)
-class _Lift:
-    """A grasp that a peer wants to lift, or whose outcome was reported."""
-
-    owner: Peer | None
-    """Name of the first peer that was answered about it; None: no peer asked to lift it."""
-    outcome: str | None = None
-
-
-class LiftBook:
-    """Which peer may report the outcome of which grasp, for the last `GRASPS_MAX` grasps."""
-
-    def __init__(self) -> None:
-        self._lifts: dict[GraspId, _Lift] = {}
-        """Oldest first."""
-
-    def own(self, grasp: GraspId, peer: Peer) -> None:
-        """Make the peer the owner of a grasp that is not in the book yet."""
-        self._entry(grasp, peer)
-
-    def report(self, grasp: GraspId, outcome: str) -> None:
-        """Note an outcome that was taken."""
-        self._entry(grasp, None).outcome = outcome
-
-    def objection(self, grasp: GraspId, peer: Peer, outcome: str) -> str | None:
-        """Return why the peer may not report this outcome; None if it may.
-
-        A grasp with an owner is reported by its owner. A grasp without one is reported by the
-        owners of other grasps, or by all peers if there are no owners.
-        """
-        lift = self._lifts.get(grasp)
-        if lift is None or lift.owner is None:
-            owners = {each.owner for each in self._lifts.values() if each.owner is not None}
-        else:
-            owners = {lift.owner}
-        if owners and peer not in owners:
-            return NOT_YOURS
-        if lift is not None and lift.outcome not in (None, outcome):
-            return CONTRADICTS
-        return None
-
-    def _entry(self, grasp: GraspId, owner: Peer | None) -> _Lift:
-        """Return the entry of a grasp; a new one gets this owner."""
-        lift = self._lifts.setdefault(grasp, _Lift(owner))
-        if len(self._lifts) > GRASPS_MAX:
-            del self._lifts[next(iter(self._lifts))]
-        return lift
-
-
 class Questions:
     """Takes questions and outcomes, and answers them. A peer has one question at a time."""
 
@@ -103,7 +53,6 @@ class Questions:
         self._patience_ns = patience_ns
         self._waiting: dict[Peer, _Question] = {}
         """Oldest first."""
-        self._book = LiftBook()
 
     @property
     def waiting(self) -> int:
@@ -136,50 +85,45 @@ class Questions:
         self._waiting[peer] = question
 
     def _take_outcome(self, envelope: Message, text: bytes, requests: Requests) -> None:
-        refusal = self._refusal(envelope[0], text, requests)
-        answer = partial(self._answer_outcome, envelope)
-        if refusal is None:
-            requests.keep(answer)
-        else:
-            answer(refusal)
-
-    def _refusal(self, peer: Peer, text: bytes, requests: Requests) -> str | None:
-        """Pass an outcome on. Return None, or why it is refused."""
-        report = _REPORT.fullmatch(text)
-        if report is None:
-            return MALFORMED
-        outcome: Literal["stable", "slip"] = "slip" if report[3] == b"slip" else "stable"
-        object_name = None if report[4] is None else report[4].decode()
-        grasp = GraspId(report[1].decode(), int(report[2]))
-        refusal = self._book.objection(grasp, peer[:NAME_BYTES], outcome)
-        if refusal is None:
-            refusal = requests.outcome(*grasp, outcome, object_name)
-        if refusal is None:
-            self._book.report(grasp, outcome)
-        return refusal
+        """Pass on how a lift has ended, or refuse a text that does not say so."""
+        told = _REPORT.fullmatch(text)
+        if told is None:
+            self._answer_outcome(envelope, MALFORMED)
+            return
+        report = Report(
+            grasp=GraspId(told[1].decode(), int(told[2])),
+            outcome="slip" if told[3] == b"slip" else "stable",
+            object_name=None if told[4] is None else told[4].decode(),
+            peer=envelope[0][:NAME_BYTES],
+        )
+        requests.outcome(report, partial(self._answer_outcome, envelope))
 
     def _answer_outcome(self, envelope: Message, refusal: str | None) -> None:
         """Tell the peer whether its outcome was taken. A peer that has gone misses it."""
+        answer: dict[str, object] = {"v": 1, "ok": refusal in (None, REPEATED)}
+        if refusal == REPEATED:
+            answer["repeated"] = True
+        elif refusal is not None:
+            answer["why"] = refusal
         refused = "malformed" if refusal == MALFORMED else "outcomes_refused"
-        self.counters["outcomes" if refusal is None else refused] += 1
-        said = {"v": 1, "ok": True} if refusal is None else {"v": 1, "ok": False, "why": refusal}
-        self._answer(envelope, json.dumps(said, separators=(",", ":")).encode())
+        self.counters["outcomes" if answer["ok"] else refused] += 1
+        self._answer(envelope, json.dumps(answer, separators=(",", ":")).encode())
 
     def _answer(self, envelope: Message, payload: bytes) -> None:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
-    def answer(
-        self, payload: bytes, now_ns: int | None = None, grasp: GraspId | None = None
-    ) -> None:
+    def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:
         """Answer all questions, or with `now_ns` those that can wait no longer.
 
-        `grasp` is the one that the answer is about: it gets its owner here.
+        Return the names of the peers that asked whether they may lift, in the order of asking.
         """
+        lifters = []
         for peer, question in list(self._waiting.items()):
             if now_ns is not None and question.due_ns > now_ns:
-                return
+                break
             del self._waiting[peer]
             self.counters["answered"] += 1
             self._answer(question.envelope, payload)
-            if question.lifts and grasp is not None and grasp.grasp:
-                self._book.own(grasp, peer[:NAME_BYTES])
+            if question.lifts:
+                lifters.append(peer[:NAME_BYTES])
+        return lifters

@@ -14,7 +14,6 @@ from daemon.publish.companion import Companion, Published, Requests
 from daemon.publish.door import Admission, Door, Listener, PublishError
 from daemon.publish.messages import Status
 from daemon.scene import Curve, Scene, SceneError
-from daemon.trust.ledger import GraspId
 
 if TYPE_CHECKING:
     from daemon.process.signals import Stop
@@ -134,10 +133,10 @@ class Sockets(Companion):
         """Answer all questions, or those alone that have waited too long for a better answer."""
         if self.questions is None or not self.questions.waiting:
             return
-        verdict = published.verdict
-        overdue_at_ns = None if published.is_answer else self._clock()
-        grasp = GraspId(verdict.boot_id, verdict.grasp)
-        self.questions.answer(published.payload, overdue_at_ns, grasp)
+        now_ns = None if published.is_answer else self._clock()
+        lifters = self.questions.answer(published.payload, now_ns)
+        for peer in lifters if published.grasp.grasp else ():
+            published.lifts.claim(published.grasp, peer)
 
     def on_status(self, status: Status) -> None:
         """Check that libzmq still serves the sockets, and look at the list of keys.

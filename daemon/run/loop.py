@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final, Literal
+from functools import partial
+from typing import Final
 
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.process.signals import Stop
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import (
-    CONTRADICTS,
+    REPEATED,
     Answer,
     Companion,
     LoopEvent,
@@ -26,7 +27,14 @@ from daemon.publish.deadlines import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.overload import LoadShedder, mark_repeats
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import (
+    NOT_YOURS,
+    REFUSALS,
+    UNKNOWN_START,
+    GraspId,
+    OutcomeStatus,
+    Report,
+)
 from drivers.base import Driver, JointReading, Reading, TactileReading
 
 STATUS_PERIOD_NS: Final = 1_000_000_000
@@ -101,7 +109,7 @@ class Loop:
         self._sleep = timing.sleep
         self._new_selector = timing.selector
         self._max_age_ns = timing.max_age_ns
-        self.keep = keep
+        self._keep = keep
 
         self._companions = companions
         self._before_wait = hooks(companions, Companion.before_wait)
@@ -300,7 +308,10 @@ class Loop:
         self._silence_due_ns = received_ns + silence_ns
         verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
         is_answer = is_answer or verdict.judged or not self._pipeline.on_request
-        published = Published(judgement, verdict, payload, reading, is_answer)
+        grasp = GraspId(self._pipeline.boot_id, verdict.grasp)
+        published = Published(
+            judgement, verdict, payload, reading, is_answer, grasp, self._pipeline.lifts
+        )
         for on_verdict in self._on_verdict:
             on_verdict(published)
         return verdict
@@ -337,27 +348,37 @@ class Loop:
         for on_event in self._on_event:
             on_event(LoopEvent.ASKED)
 
-    def outcome(
-        self,
-        boot_id: str,
-        grasp: int,
-        outcome: Literal["stable", "slip"],
-        object_name: str | None = None,
-    ) -> str | None:
-        """Publish and learn how the lift of a judged grasp has ended; return None, or why not."""
-        judged = GraspId(boot_id, grasp)
-        trust = self._pipeline.trust
-        if trust is not None and trust.ledger.contradicts(judged, slipped=outcome == "slip"):
-            trust.outcome(judged, slipped=outcome == "slip")  # which counts it
-            return CONTRADICTS
-        refused = self._outbox.outcome(
-            *judged, outcome, object_name, known=self._pipeline.knows(judged)
-        )
-        if refused is None:
-            self._pipeline.outcome(judged, slipped=outcome == "slip")
+    def outcome(self, report: Report, answer: Answer) -> None:
+        """Learn and publish how the lift of a judged grasp has ended, and keep it on the disk."""
+        lifts, grasp = self._pipeline.lifts, self._judged_as(report.grasp)
+        if not lifts.may_report(grasp, report.peer):
+            answer(NOT_YOURS)
+            return
+        status = self._pipeline.outcome(grasp, slipped=report.outcome == "slip")
+        if status in REFUSALS:
+            is_earlier = status is OutcomeStatus.UNKNOWN and grasp.boot_id != self._outbox.boot_id
+            answer(UNKNOWN_START if is_earlier else REFUSALS[status])
+            return
+        if status is OutcomeStatus.TAKEN:
+            self._outbox.outcome(report)
             for on_outcome in self._on_outcome:
-                on_outcome(grasp, outcome, object_name)
-        return refused
+                on_outcome(report)
+        elif lifts.is_kept(grasp):
+            answer(REPEATED)
+            return
+        self._keep(partial(self._kept, grasp, answer))
+
+    def _kept(self, grasp: GraspId, answer: Answer, problem: str | None) -> None:
+        """The outcome of a grasp is on the disk, or is not because of a problem."""
+        if problem is None:
+            self._pipeline.lifts.keep(grasp)
+        answer(problem)
+
+    def _judged_as(self, grasp: GraspId) -> GraspId:
+        """Return the name of a grasp in the book: a replay enters its grasps as recorded."""
+        if grasp.boot_id != self._outbox.boot_id:
+            return grasp
+        return GraspId(self._pipeline.boot_id, grasp.grasp)
 
 
 def _count_tactile(readings: Sequence[Reading]) -> int:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import Literal
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.process.text import Colour, coloured, printable
 from daemon.publish.companion import Companion, Published
 from daemon.publish.messages import Verdict
 from daemon.run.summary import Summary
+from daemon.trust.lift_book import Report
 from daemon.trust.trust import Trust
 from drivers.base import Annotation
 
@@ -53,11 +53,9 @@ class Printer(Companion):
             return True
         return False
 
-    def on_outcome(
-        self, grasp: int, outcome: Literal["stable", "slip"], object_name: str | None
-    ) -> None:
+    def on_outcome(self, report: Report) -> None:
         """Count how a lift ended that was judged before."""
-        self.result.outcome(grasp, slipped=outcome == "slip")
+        self.result.outcome(report.grasp.grasp, slipped=report.outcome == "slip")
 
     def summary(self, trust: Trust | None) -> None:
         """Write the summary of everything since the start; `trust` is what outcomes have taught."""

@@ -6,24 +6,22 @@ import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion, Published, Requests
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.run.summary import Summary
+from daemon.trust.lift_book import GraspId, Report
 from models.runtime import TactileModel
 
 
 class _Lift(NamedTuple):
-    boot_id: str
-    grasp: int
-    outcome: Literal["stable", "slip"]
-    object_name: str | None
+    report: Report
     allowed: bool
-    """Whether `stable` was said, or a lift under supervision asked for."""
+    """True if `stable` was said, or a lift under supervision asked for."""
     over: bool
-    """Whether the next reading is another grasp in any case."""
+    """True if the next reading is another grasp in any case."""
 
 
 class Controller(Companion):
@@ -46,17 +44,18 @@ class Controller(Companion):
     def on_verdict(self, published: Published) -> None:
         """Take note of a grasp; the lift of the one before it is over."""
         verdict, reading = published.verdict, published.reading
-        if self._lift is not None and self._lift.grasp != verdict.grasp:
+        if self._lift is not None and self._lift.report.grasp.grasp != verdict.grasp:
             self.tell()
         note = None if reading is None else reading.annotation
         if note is None or note.slipped is None or not verdict.judged:
             return
         again = self._lift is not None and self._lift.allowed
         self._lift = _Lift(
-            boot_id=verdict.boot_id,
-            grasp=verdict.grasp,
-            outcome="slip" if note.slipped else "stable",
-            object_name=_sent(note.object_name),
+            Report(
+                GraspId(verdict.boot_id, verdict.grasp),
+                "slip" if note.slipped else "stable",
+                _sent(note.object_name),
+            ),
             allowed=again or verdict.verdict == "stable" or verdict.supervised,
             over=verdict.gate is None,
         )
@@ -71,7 +70,7 @@ class Controller(Companion):
         lift, self._lift = self._lift, None
         if lift is None or self._requests is None or (self._only_lifted and not lift.allowed):
             return
-        self._requests.outcome(lift.boot_id, lift.grasp, lift.outcome, lift.object_name)
+        self._requests.outcome(lift.report, lambda _problem: None)
 
 
 def _sent(object_name: str | None) -> str | None:

@@ -127,6 +127,7 @@ class Runner:
             if woken:
                 log.warning("the computer has slept: everything starts anew")
             elif following is not None:
+                following.pipeline.lifts.follow(parts.pipeline.lifts)
                 parts, self._former = following, parts
             else:
                 return

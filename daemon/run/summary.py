@@ -237,7 +237,7 @@ class Summary:
     def _compared(self, trust: Trust | None) -> Iterator[tuple[str, Tally]]:
         """What was tried; without learning only where something was learned."""
         for how, tally in self.compared.items():
-            learned = trust is not None and bool(trust.ledger.told)
+            learned = trust is not None and bool(trust.lifts.told)
             if tally.decisions and (learned or how != WITHOUT_LEARNING):
                 yield how, tally
 
@@ -280,7 +280,7 @@ class Summary:
 
 def _learned(trust: Trust | None) -> Iterator[str]:
     """What outcomes have taught, and what became of the risk, for people."""
-    if trust is None or not trust.ledger.told:
+    if trust is None or not trust.lifts.told:
         return
     yield f"learned from {trust.learner.outcomes} outcomes"
     report = trust.report()

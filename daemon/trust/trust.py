@@ -16,7 +16,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from daemon.trust.learner import Learner, LearnerState, sigmoid
-from daemon.trust.ledger import GraspId, Ledger, LedgerState, Told
+from daemon.trust.lift_book import (
+    NOT_ASSESSED,
+    GraspId,
+    LiftBook,
+    LiftBookState,
+    OutcomeStatus,
+)
 from daemon.trust.risk import Permission, Risk, RiskLimits, RiskReport, RiskState
 
 VERSION: Final = 1
@@ -44,18 +50,20 @@ class Assessment(msgspec.Struct, frozen=True):
     """What `note` remembers, float64."""
 
 
-class TrustState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class TrustState(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"lifts": "ledger"}
+):
     """All that is learned; worth nothing with another model or other fingers."""
 
     version: Literal[1]
     model: str
     learner: LearnerState
     risk: RiskState
-    ledger: LedgerState
+    lifts: LiftBookState
 
 
 class Trust:
-    """Learner, risk and ledger of one hand with one model."""
+    """Learner, risk and lift book of one hand with one model."""
 
     def __init__(
         self, model: str, inputs: int, limits: RiskLimits | None = None, *, learns: bool = True
@@ -75,7 +83,7 @@ class Trust:
         self._judging = self.learner if learns else Learner(inputs)
         """What grasps are judged by: without learning, one that is never taught."""
         self.risk = Risk(self._limits)
-        self.ledger = Ledger()
+        self.lifts = LiftBook()
 
     def judge(
         self, grasp: GraspId, p_slip: float, margin: float, inputs: NDArray[np.floating]
@@ -110,7 +118,7 @@ class Trust:
         if former is None:
             return Assessment(self._judging.outcomes, report)
         permission = former.permission
-        if permission is Permission.ALLOWED and not self.ledger.is_stable(grasp):
+        if permission is Permission.ALLOWED and not self.lifts.is_stable(grasp):
             permission = self._permission(grasp, former.log_odds)
         if permission is former.permission and report is former.report:
             return former
@@ -119,32 +127,32 @@ class Trust:
     def _permission(self, grasp: GraspId, log_odds: float) -> Permission:
         permission = self.risk.decide(log_odds)
         has_rule = self._limits.max_slip_when_stable is not None
-        if has_rule and permission is Permission.ALLOWED and self.ledger.is_told(grasp):
+        if has_rule and permission is Permission.ALLOWED and self.lifts.is_told(grasp):
             return Permission.WITHHELD  # its outcome is known: a second lift would not be counted
         return permission
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
-        """Remember what was said of a grasp, unless it is of another model.
+        """Enter what was said of a grasp in the book.
 
+        Nothing is learned from an assessment of another model, or of a grasp that was not judged.
         Raises `ValueError` if that was not allowed.
         """
-        if len(assessment.features) != 8 * (self._inputs + 2):
-            return
+        is_ours = len(assessment.features) == 8 * (self._inputs + 2)
+        features = assessment.features if is_ours else NOT_ASSESSED
         if stable and assessment.permission is not Permission.ALLOWED:
             raise ValueError(f"grasp {grasp.grasp} was called stable: {assessment.permission}")
-        if self.ledger.note(grasp, assessment.features, stable=stable):
+        if self.lifts.note(grasp, features, stable=stable):
             self._report = None
 
-    def outcome(self, grasp: GraspId, *, slipped: bool) -> Told:
-        """Take in how a lift ended; what is not `TAKEN` has changed nothing but a counter."""
-        told, record = self.ledger.tell(grasp, slipped=slipped)
-        if told is Told.TAKEN and record is not None:
-            current = record.features is not None
-            self.risk.take(stable=record.stable, slipped=slipped, proves=current)
-            if record.features is not None and self.learns:
-                self.learner.learn(np.frombuffer(record.features, "<f8"), slipped=slipped)
+    def outcome(self, grasp: GraspId, *, slipped: bool) -> OutcomeStatus:
+        """Take in how a lift ended; only an outcome that is `TAKEN` changes more than a counter."""
+        status, lift = self.lifts.tell(grasp, slipped=slipped)
+        if status is OutcomeStatus.TAKEN and lift is not None:
+            self.risk.take(stable=lift.stable, slipped=slipped, proves=bool(lift.features))
+            if lift.features and self.learns:
+                self.learner.learn(np.frombuffer(lift.features, "<f8"), slipped=slipped)
         self._report = None
-        return told
+        return status
 
     def report(self) -> RiskReport:
         """What lifts of `stable` verdicts came to, until now."""
@@ -154,7 +162,7 @@ class Trust:
                 target=self._limits.max_slip_when_stable,
                 lifts=risk.lifts,
                 slips=risk.slips,
-                outstanding=self.ledger.outstanding,
+                outstanding=self.lifts.outstanding,
                 bound=risk.bound,
                 warm_up_left=risk.warm_up_left,
             )
@@ -167,12 +175,12 @@ class Trust:
         if learned is not None:
             self.learner.restore(learned)
         self.risk.exchanged()
-        self.ledger.exchanged()
+        self.lifts.exchanged()
         self._report = None
 
     def state(self) -> TrustState:
         """What `restore` needs; what comes later does not change it."""
-        parts = self.learner.state(), self.risk.state(), self.ledger.state()
+        parts = self.learner.state(), self.risk.state(), self.lifts.state()
         return TrustState(VERSION, self._model, *parts)
 
     def fits(self, state: TrustState) -> bool:
@@ -183,11 +191,11 @@ class Trust:
         """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
         if not self.fits(state):
             raise ValueError("is of another model")
-        learner, risk, ledger = Learner(self._inputs), Risk(self._limits), Ledger()
+        learner, risk = Learner(self._inputs), Risk(self._limits)
         learner.restore(state.learner)
         risk.restore(state.risk)
-        ledger.restore(state.ledger, self._inputs + 2)
-        self.learner, self.risk, self.ledger = learner, risk, ledger
+        self.lifts.restore(state.lifts, self._inputs + 2)
+        self.learner, self.risk = learner, risk
         if self.learns:
             self._judging = learner
         self._report = None

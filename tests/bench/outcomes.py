@@ -30,7 +30,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.publish.messages import decode_tactile, decode_verdict
 from daemon.session.file import SessionFile, kept_now, load
-from daemon.trust.ledger import GraspId, Told
+from daemon.trust.lift_book import GraspId, OutcomeStatus
 from daemon.trust.trust import Trust, TrustState, decode
 from deploy.clients.python.graspd_client import Client, Outcome, Verdict
 from drivers.base import TactileReading
@@ -98,7 +98,7 @@ class Reference:
         pipeline.judge(TactileReading(time.monotonic_ns(), 0, counts, faults))
         assessment = pipeline.memory.assessment
         if assessment is not None:
-            self.trust.ledger.note(grasp, assessment.features, stable=stable)
+            self.trust.lifts.note(grasp, assessment.features, stable=stable)
 
     def agrees(self, kept: TrustState) -> bool:
         """Whether that is the same, to the bit."""
@@ -191,7 +191,7 @@ class Bench:
             self.found.told_again += 1
         self.found.answers_ms.append((time.monotonic() - began_s) * 1e3)
         self.found.acknowledged += 1
-        if self._reference.trust.outcome(grasp, slipped=slipped) is Told.UNKNOWN:
+        if self._reference.trust.outcome(grasp, slipped=slipped) is OutcomeStatus.UNKNOWN:
             self.found.not_learned += 1
 
     def _look_and_start_again(self, told: tuple[GraspId, bool] | None = None) -> None:

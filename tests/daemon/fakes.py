@@ -10,6 +10,7 @@ import numpy as np
 
 from daemon.judge.decision import HandLimits, Limits
 from daemon.judge.pipeline import Pipeline
+from daemon.trust.lift_book import GraspId, LiftBook
 from daemon.trust.trust import Trust
 from drivers.base import DriverCounters, DriverError, Fact, Reading, TactileReading
 from models.contract import (
@@ -77,6 +78,10 @@ class FakeModel:
         if isinstance(self.answer, Exception):
             raise ModelError("broken") from self.answer
         return 1.0 - self.answer, self.answer
+
+
+NO_LIFT = GraspId("", 0), LiftBook()
+"""Ends a `Published` of no grasp."""
 
 
 class Clock:

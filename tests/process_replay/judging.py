@@ -22,6 +22,7 @@ from daemon.record.header import RecordingHeader
 from daemon.record.recorder import Recorder
 from daemon.run.loop import Loop, Timing
 from daemon.scene import Scene
+from daemon.trust.lift_book import GraspId, Report
 from drivers.base import DriverCounters, Fact, Reading, TactileReading
 from tests.process_replay.streams import FINGERS, PERIOD_NS, Clock
 
@@ -207,8 +208,8 @@ class _World(Companion):
     def _tell(self, requests: Requests, boot_id: str, grasp: int, *, turned: bool = False) -> None:
         slipped = (grasp % 3 == 0) != turned
         object_name = "cup" if grasp % 2 else None
-        why = requests.outcome(boot_id, grasp, "slip" if slipped else "stable", object_name)
-        self.messages.append(("answer", f"{grasp}: {why}"))
+        report = Report(GraspId(boot_id, grasp), "slip" if slipped else "stable", object_name)
+        requests.outcome(report, lambda why: self.messages.append(("answer", f"{grasp}: {why}")))
 
 
 class _Never:

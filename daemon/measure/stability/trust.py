@@ -26,7 +26,7 @@ from daemon.trust.learner import (
     MEAN_SPREADS_MAX,
     Learner,
 )
-from daemon.trust.ledger import GRASPS_MAX, GraspId
+from daemon.trust.lift_book import LIFTS_MAX, GraspId
 from daemon.trust.risk import LOWEST, Permission, Risk, RiskLimits
 from daemon.trust.trust import Trust, decode, encode
 from drivers.base import ELECTRODES
@@ -53,7 +53,7 @@ THETA_ERROR_MAX = 1e-9
 STATE_BYTES_MAX = 2 << 20
 JUDGE_US_MAX, OUTCOME_US_MAX = 30.0, 200.0
 """Bounds of the median of the quietest batch: a computer has other work too."""
-BATCHES, BATCH = 20, GRASPS_MAX
+BATCHES, BATCH = 20, LIFTS_MAX
 
 Outcome = tuple[float, NDArray[np.float64], bool]
 """Margin, inputs, whether it slipped."""
@@ -347,7 +347,7 @@ def _memory() -> StepRow:
     before, _ = tracemalloc.get_traced_memory()
     trust = _trust()
     outcomes = _varied(np.random.default_rng(4))
-    for number, (margin, inputs, _) in zip(range(2 * GRASPS_MAX), outcomes, strict=False):
+    for number, (margin, inputs, _) in zip(range(2 * LIFTS_MAX), outcomes, strict=False):
         grasp = GraspId("report", number)
         trust.note(grasp, trust.judge(grasp, 0.5, margin, inputs), stable=False)
     encoded = encode(trust.state())

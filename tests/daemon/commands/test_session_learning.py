@@ -13,7 +13,7 @@ import pytest
 from daemon import scene as scenes
 from daemon.assembly import assembly
 from daemon.session.file import SessionFile, former_of, kept_now, load
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_TABLE

@@ -16,7 +16,7 @@ from daemon.judge.calibration import SessionCalibration
 from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import GraspId
 from daemon.trust.risk import RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import ElectrodeFault, TactileReading
@@ -170,12 +170,12 @@ def test_under_a_risk_a_grasp_that_is_judged_on_and_on_is_one_lift() -> None:
     said = hand.play(Feel(times=300, answer=0.001))
     assert said[-1].decision is Decision.STABLE
     assert trust.report().outstanding == 1
-    (record,) = trust.ledger.state().records
+    (record,) = trust.lifts.state().records
     first = record.features
     hand.play(Feel(times=300, answer=0.002))
-    assert trust.ledger.state().records[0].features == first, "what it was called stable by"
+    assert trust.lifts.state().records[0].features == first, "what it was called stable by"
     hand.play(Feel(times=50, answer=0.9))
-    assert trust.ledger.is_stable(GraspId(BOOT, 1)), "it may have been lifted on that"
+    assert trust.lifts.is_stable(GraspId(BOOT, 1)), "it may have been lifted on that"
     hand.pipeline.outcome(GraspId(BOOT, 1), slipped=True)
     assert (trust.risk.lifts, trust.risk.slips) == (1, 1)
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import NOT_ASSESSED, GraspId
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import ElectrodeFault
@@ -137,7 +137,9 @@ def test_a_network_that_gives_no_probability_is_asked_for_no_more(
     judgement = judge.judge(reading(clock()))
     assert judgement.reasons == (Reason.MODEL_FAILED,)
     assert judge.trust is not None
-    assert not judge.knows(GraspId(BOOT, judgement.moment.grasp))
+    _, lift = judge.lifts.tell(GraspId(BOOT, judgement.moment.grasp), slipped=True)
+    assert lift is not None
+    assert lift.features == NOT_ASSESSED
 
 
 @settings(max_examples=60, deadline=None)

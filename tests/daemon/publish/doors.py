@@ -10,6 +10,7 @@ import zmq
 
 from daemon.publish.companion import Answer
 from daemon.publish.door import Door, Listener
+from daemon.trust.lift_book import Report
 
 WAIT_MS = 100_000
 
@@ -44,10 +45,10 @@ class Publisher:
 class Asked:
     """Stands for the loop: counts questions, takes outcomes, and keeps them at once."""
 
-    def __init__(self, why: Callable[..., str | None] = lambda *_told: None) -> None:
+    def __init__(self, why: Callable[[Report], str | None] = lambda _report: None) -> None:
         """`why` says why an outcome is refused; None: it is taken."""
         self.times = 0
-        self.outcomes: list[tuple[object, ...]] = []
+        self.outcomes: list[Report] = []
         self.waiting: list[Answer] | None = None
         """Answers that wait until the outcomes are kept; None: they are kept at once."""
         self._why = why
@@ -55,13 +56,11 @@ class Asked:
     def ask(self) -> None:
         self.times += 1
 
-    def outcome(self, *told: object) -> str | None:
-        self.outcomes.append(told)
-        return self._why(*told)
-
-    def keep(self, answer: Answer) -> None:
-        if self.waiting is None:
-            answer(None)
+    def outcome(self, report: Report, answer: Answer) -> None:
+        self.outcomes.append(report)
+        why = self._why(report)
+        if why is not None or self.waiting is None:
+            answer(why)
         else:
             self.waiting.append(answer)
 

@@ -10,7 +10,7 @@ from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import BUCKETS, LatencyHistogram
 from daemon.publish.messages import DECISION_CODE, Verdict
 from daemon.run.summary import WITHOUT_LEARNING, Summary, Tally
-from daemon.trust.ledger import GraspId
+from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust
 
 

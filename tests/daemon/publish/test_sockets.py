@@ -18,9 +18,14 @@ import pytest
 import zmq
 
 from daemon import scene
+from daemon.judge.network import Opinion
+from daemon.judge.pipeline import Judgement
+from daemon.judge.reasons import Decision, Moment
+from daemon.publish.companion import Published
 from daemon.publish.door import PublishError
-from daemon.publish.messages import decode_status
+from daemon.publish.messages import decode_status, decode_verdict
 from daemon.publish.sockets import Sockets, plan
+from daemon.trust.lift_book import GraspId, LiftBook
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
@@ -47,7 +52,8 @@ def wanted(
     return scene.parse(text, folder / "scene.toml")
 
 
-STATUS = decode_status((Path(__file__).parent / "golden" / "status.json").read_bytes())
+GOLDEN = Path(__file__).parent / "golden"
+STATUS = decode_status((GOLDEN / "status.json").read_bytes())
 
 
 def until(done: Callable[[], object]) -> None:
@@ -102,7 +108,8 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
             return bool(requests.times and requests.outcomes)
 
         until(has_come)
-        assert requests.outcomes == [("0" * 32, 7, "slip", None)]
+        (report,) = requests.outcomes
+        assert report[:3] == (GraspId("0" * 32, 7), "slip", None)
         assert asker.recv() == b'{"v":1,"ok":true}'
         assert sockets.questions is not None
         sockets.questions.answer(b"{}")
@@ -110,6 +117,23 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
         counters = sockets.counters
     assert counters["publish"] == {"dropped": 0}
     assert (counters["ask"]["asked"], counters["ask"]["outcomes"]) == (1, 1)
+
+
+@pytest.mark.parametrize("number", [0, 7])
+def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
+    tmp_path: Path, number: int
+) -> None:
+    """Number 0: before the first touch there is no grasp."""
+    lifts, grasp = LiftBook(), GraspId("0" * 32, number)
+    with Sockets(wanted(tmp_path)) as sockets:
+        assert sockets.questions is not None
+        sockets.questions.take([[b"dashboard", b"judge"], [b"controller", b"lift"]], 0, Asked())
+        verdict = decode_verdict((GOLDEN / "verdict_stable.json").read_bytes())
+        judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
+        sockets.on_verdict(Published(judgement, verdict, b"{}", None, True, grasp, lifts))
+        assert sockets.questions.waiting == 0
+    assert lifts.may_report(grasp, b"controller")
+    assert lifts.may_report(grasp, b"dashboard") == (number == 0)
 
 
 def test_the_descriptor_is_ready_when_a_question_has_come(tmp_path: Path, peers: Peers) -> None:

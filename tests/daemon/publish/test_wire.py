@@ -31,7 +31,7 @@ from daemon.publish.messages import (
     encode,
     schema,
 )
-from daemon.trust.ledger import Told
+from daemon.trust.lift_book import OutcomeStatus
 from daemon.trust.risk import RiskReport
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -207,7 +207,10 @@ MESSAGES: dict[str, Verdict | GateMessage | Tactile | OutcomeMessage | Status] =
         overloaded=False,
         lifts=Lifts(reported=41, outstanding=1, unreported=3),
         learner=LearnerHealth(
-            enabled=True, outcomes=57, told={Told.TAKEN: 57, Told.CONTRADICTS: 1}, uncertainty=0.5
+            enabled=True,
+            outcomes=57,
+            told={OutcomeStatus.TAKEN: 57, OutcomeStatus.CONTRADICTS: 1},
+            uncertainty=0.5,
         ),
         model="cnn1",
         model_sha="0123456789ab",

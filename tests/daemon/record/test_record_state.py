@@ -31,6 +31,7 @@ from daemon.record.recorder import Recorder
 from daemon.scene import Record
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
+from tests.daemon.fakes import NO_LIFT
 from tests.daemon.record.recorded import messages
 
 BOOT = "0123456789abcdef" * 2
@@ -163,7 +164,7 @@ class Daemon:
         self._now_ns = reading.t_ns
         self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
-        self.recorder.on_verdict(Published(judgement, NO_VERDICT, b"", reading, is_answer=True))
+        self.recorder.on_verdict(Published(judgement, NO_VERDICT, b"", reading, True, *NO_LIFT))
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from daemon.publish.messages import Lifts, State, Status, Verdict, decode_status
 from daemon.publish.outbox import Outbox
 from daemon.run.loop import Ended, Loop, Timing
 from daemon.session.sensors import SensorWatch
-from daemon.trust.ledger import GraspId, Told
+from daemon.trust.lift_book import NOT_YOURS, UNKNOWN_START, GraspId, OutcomeStatus, Report
 from daemon.trust.trust import Trust
 from drivers.base import DriverError, JointReading, LinkCause, LinkError, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
@@ -447,13 +448,13 @@ class Peer(Companion):
 
     def before_wait(self, requests: Requests) -> None:
         requests.ask()
-        self.refused.append(requests.outcome(self.boot_id, 1, "slip", "mug"))
+        requests.outcome(Report(GraspId(self.boot_id, 1), "slip", "mug"), self.refused.append)
 
     def on_event(self, event: LoopEvent) -> None:
         self.heard.append(event)
 
-    def on_outcome(self, grasp: int, outcome: str, object_name: str | None) -> None:
-        self.heard.append((grasp, outcome, object_name))
+    def on_outcome(self, report: Report) -> None:
+        self.heard.append(report)
 
     def on_verdict(self, published: Published) -> None:
         self.heard.append(published.payload)
@@ -470,23 +471,71 @@ def test_a_companion_asks_and_tells_and_hears_what_comes_of_it(stop: StopSignal)
     bench = Bench(driver, clock, stop, companions=[peer], boot_id=peer.boot_id)
     bench.run()
     first, second = bench.payloads
+    told = Report(GraspId(peer.boot_id, 1), "slip", "mug")
     assert peer.refused == ["unknown grasp: not judged, or too long ago", None]
-    assert peer.heard == [LoopEvent.ASKED, first, LoopEvent.ASKED, (1, "slip", "mug"), second]
+    assert peer.heard == [LoopEvent.ASKED, first, LoopEvent.ASKED, told, second]
     assert [topic for topic, _ in bench.output.sent[:-1]].count(b"outcome.right") == 1
     assert bench.output.statuses()[-1].drivers["peer"] == {"outcomes": 1}
 
 
-def test_an_outcome_is_kept_by_the_keeper_and_answered_at_once_without_one(
+BOOT = "b" * 32
+
+
+def told(
+    bench: Bench, outcome: Literal["stable", "slip"], peer: bytes = b"controller"
+) -> list[str | None]:
+    """What the answers to an outcome of the first grasp are, as they come."""
+    answers: list[str | None] = []
+    bench.loop.outcome(Report(GraspId(BOOT, 1), outcome, None, peer), answers.append)
+    return answers
+
+
+def test_an_outcome_is_answered_when_it_is_kept_and_repeated_only_then(stop: StopSignal) -> None:
+    clock, waiting = Clock(), list[Answer]()
+    driver = FakeDriver([reading(clock())], clock)
+    bench = Bench(driver, clock, stop, boot_id=BOOT, keep=waiting.append)
+    bench.run()
+    first, again = told(bench, "slip"), told(bench, "slip")
+    assert (first, again, len(waiting)) == ([], [], 2)
+    waiting[0]("not kept: full")
+    third = told(bench, "slip")
+    assert (first, third, len(waiting)) == (["not kept: full"], [], 3)
+    waiting[2](None)
+    assert third == [None]
+    assert told(bench, "slip") == ["repeated"]
+    assert len(waiting) == 3
+    assert [topic for topic, _ in bench.output.sent].count(b"outcome.right") == 1
+
+
+def test_without_a_keeper_an_outcome_is_answered_at_once(stop: StopSignal) -> None:
+    clock = Clock()
+    bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, boot_id=BOOT)
+    bench.run()
+    assert told(bench, "slip") == [None]
+    assert told(bench, "slip") == ["repeated"]
+    assert told(bench, "stable") == ["contradicts: another outcome of this grasp was told before"]
+
+
+def test_an_outcome_of_a_peer_that_does_not_own_the_grasp_changes_nothing(
     stop: StopSignal,
 ) -> None:
-    heard: list[str | None] = []
-    waiting: list[Answer] = []
     clock = Clock()
-    for keep in (None, waiting.append):
-        bench = Bench(FakeDriver([], clock), clock, stop, keep=keep)
-        bench.loop.keep(heard.append)
-    assert heard == [None]
-    assert waiting == [heard.append]
+    bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, boot_id=BOOT)
+    bench.run()
+    bench.pipeline.lifts.claim(GraspId(BOOT, 1), b"controller")
+    assert told(bench, "slip", b"dashboard") == [NOT_YOURS]
+    assert not bench.pipeline.lifts.is_told(GraspId(BOOT, 1))
+    assert told(bench, "stable") == [None]
+
+
+def test_a_replay_takes_outcomes_by_its_own_name_of_the_start(stop: StopSignal) -> None:
+    """It enters its grasps in the book by the start that was recorded."""
+    clock = Clock()
+    bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, boot_id=BOOT)
+    bench.pipeline.boot_id = "e" * 32
+    bench.run()
+    assert told(bench, "slip") == [None]
+    assert bench.pipeline.lifts.is_told(GraspId("e" * 32, 1))
 
 
 def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status(stop: StopSignal) -> None:
@@ -504,7 +553,11 @@ def test_an_outcome_teaches_before_the_next_verdict_and_is_in_the_status(stop: S
     status = bench.output.statuses()[-1]
     assert status.lifts == Lifts(reported=1, outstanding=2, unreported=0)
     assert status.learner is not None
-    assert status.learner.told == {Told.TAKEN: 1, Told.REPEATED: 1}
+    assert status.learner.told == {
+        OutcomeStatus.UNKNOWN: 1,
+        OutcomeStatus.TAKEN: 1,
+        OutcomeStatus.REPEATED: 1,
+    }
     assert 0.0 < status.learner.uncertainty < 1.0
 
 
@@ -520,7 +573,8 @@ def test_an_outcome_of_a_grasp_of_an_earlier_start_is_taken_once_it_is_known(
         bench = Bench(driver, clock, stop, companions=[peer], boot_id="b" * 32, trust=trust)
         bench.run()
         taken = trust is known
-        assert [refused is None for refused in peer.refused] == [taken, taken]
+        expected = [None, "repeated"] if taken else [UNKNOWN_START] * 2
+        assert peer.refused == expected
         assert trust.learner.outcomes == int(taken)
 
 
@@ -529,15 +583,17 @@ def test_the_opposite_of_what_an_earlier_start_was_told_is_counted_and_not_publi
 ) -> None:
     clock, earlier, trust = Clock(), GraspId("e" * 32, 1), Trust("fake", 0)
     trust.note(earlier, trust.judge(earlier, 0.1, -2.0, np.empty(0)), stable=True)
-    assert trust.outcome(earlier, slipped=True) is Told.TAKEN
+    assert trust.outcome(earlier, slipped=True) is OutcomeStatus.TAKEN
     bench = Bench(FakeDriver([], clock), clock, stop, boot_id="b" * 32, trust=trust)
-    refused = bench.loop.outcome(*earlier, "stable")
-    assert refused is not None
-    assert refused.startswith("contradicts")
-    assert trust.ledger.told[Told.CONTRADICTS] == 1
+    answers: list[str | None] = []
+    bench.loop.outcome(Report(earlier, "stable"), answers.append)
+    assert answers[0] is not None
+    assert answers[0].startswith("contradicts")
+    assert trust.lifts.told[OutcomeStatus.CONTRADICTS] == 1
     assert not [topic for topic, _ in bench.output.sent if topic.startswith(b"outcome.")]
-    assert bench.loop.outcome(*earlier, "slip") is None
-    assert [topic for topic, _ in bench.output.sent] == [b"outcome.right"]
+    bench.loop.outcome(Report(earlier, "slip"), answers.append)
+    assert answers[1:] == [None]
+    assert bench.output.sent == []
 
 
 class Exchanging(FakeDriver):

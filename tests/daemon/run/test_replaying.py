@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import pytest
@@ -14,8 +13,9 @@ from daemon.publish.companion import Answer, Published
 from daemon.publish.messages import decode_verdict
 from daemon.run.replaying import Comparison, Controller
 from daemon.run.summary import WITHOUT_SESSION, Summary
+from daemon.trust.lift_book import Report
 from drivers.base import Annotation
-from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
+from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
 
 GOLDEN = Path(__file__).parents[1] / "publish" / "golden" / "verdict_stable.json"
 
@@ -29,17 +29,8 @@ class Requests:
     def ask(self) -> None:
         raise AssertionError
 
-    def outcome(
-        self,
-        boot_id: str,
-        grasp: int,
-        outcome: Literal["stable", "slip"],
-        object_name: str | None = None,
-    ) -> str | None:
-        self.told.append((outcome, object_name))
-        return None
-
-    def keep(self, answer: Answer) -> None:
+    def outcome(self, report: Report, answer: Answer) -> None:
+        self.told.append((report.outcome, report.object_name))
         answer(None)
 
 
@@ -56,7 +47,7 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     verdict = decode_verdict(GOLDEN.read_bytes())
     lifted = msgspec.structs.replace(reading(0), annotation=note)
     judgement = pipeline(FakeModel(), Clock()).judge(lifted)
-    controller.on_verdict(Published(judgement, verdict, b"", lifted, is_answer=True))
+    controller.on_verdict(Published(judgement, verdict, b"", lifted, True, *NO_LIFT))
     controller.tell()
     assert requests.told == [("slip", told)]
 
@@ -75,7 +66,7 @@ def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
         last = run.judge(new)
         judged = seq in (0, len(seeds) - 1)
         told = msgspec.structs.replace(verdict, judged=judged, grasp=1 + seq)
-        comparison.on_verdict(Published(last, told, b"", new, is_answer=True))
+        comparison.on_verdict(Published(last, told, b"", new, True, *NO_LIFT))
     tally = result.compared[WITHOUT_SESSION]
     assert tally.decisions.total() == 2
     assert tally.decisions[Decision.UNKNOWN] == tally.reasons[Reason.FROZEN] == (not fresh)

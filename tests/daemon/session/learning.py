@@ -12,7 +12,7 @@ from daemon.publish.companion import Companion, Requests
 from daemon.session.file import KeptSession, SessionFile
 from daemon.session.keeper import SessionKeeper
 from daemon.trust.learner import LearnerState, sigmoid
-from daemon.trust.ledger import GraspId, Told
+from daemon.trust.lift_book import GraspId, OutcomeStatus
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import Driver
@@ -58,7 +58,7 @@ def judge(part: Trust, grasp: int, boot: str = BOOT) -> None:
     part.note(name, found, stable=holds and found.permission is Permission.ALLOWED)
 
 
-def tell(part: Trust, grasp: int, boot: str = BOOT) -> Told:
+def tell(part: Trust, grasp: int, boot: str = BOOT) -> OutcomeStatus:
     """Its outcome, always the same."""
     return part.outcome(GraspId(boot, grasp), slipped=grasp % 3 == 0)
 

@@ -16,7 +16,7 @@ import pytest
 
 from daemon.session.file import SessionFile, kept_now, load
 from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAIT_S, WAITING_MAX, SessionKeeper
-from daemon.trust.ledger import GRASPS_MAX, Told
+from daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
 from daemon.trust.trust import Trust, TrustState, decode
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
@@ -163,11 +163,11 @@ def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
     found: list[str | None] = []
     keeper = keeper_of(part)
     judge(part, 1)
-    assert tell(part, 1) is Told.TAKEN
+    assert tell(part, 1) is OutcomeStatus.TAKEN
     disk.is_full = True
     keeper.keep(found.append)
     go_round(keeper)
-    assert tell(part, 1) is Told.REPEATED
+    assert tell(part, 1) is OutcomeStatus.REPEATED
     keeper.keep(found.append)
     go_round(keeper)
     where = f"{file.path}: cannot keep the session: No space left on device"
@@ -175,7 +175,7 @@ def test_a_full_disk_is_said_and_what_is_told_again_is_kept_later(
     assert caplog.text.count("No space left on device") == 1
     assert load(file.path) is None
     disk.is_full = False
-    assert tell(part, 1) is Told.REPEATED
+    assert tell(part, 1) is OutcomeStatus.REPEATED
     keeper.keep(found.append)
     go_round(keeper)
     assert found[2:] == [None]
@@ -295,8 +295,8 @@ def test_session_and_what_was_learned_are_restored_together(tmp_path: Path) -> N
     with SessionFile(path) as file:
         session_keeper(again, sensors(), file, Clock(), part=other)
     assert (again.state(), other.state()) == (session.state(), part.state())
-    assert tell(other, 20) is Told.TAKEN  # of a grasp of the former start
-    assert tell(other, 3) is Told.REPEATED
+    assert tell(other, 20) is OutcomeStatus.TAKEN  # of a grasp of the former start
+    assert tell(other, 3) is OutcomeStatus.REPEATED
 
 
 def test_with_another_model_the_session_stays_and_learning_begins_anew(
@@ -426,10 +426,10 @@ def test_saving_takes_less_than_two_mebibytes_with_every_outcome_out(
     tracemalloc.start()
     try:
         keeper = keeper_of(part)
-        for grasp in range(GRASPS_MAX):
+        for grasp in range(LIFTS_MAX):
             judge(part, grasp)
         keeper.save()
-        judge(part, GRASPS_MAX)
+        judge(part, LIFTS_MAX)
         keeper.save()
         assert tracemalloc.get_traced_memory()[1] < 2 << 20
     finally:

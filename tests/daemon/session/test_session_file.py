@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from daemon.session.file import SessionFile, SessionFileError, former_of, kept_now, load, read
-from daemon.trust.ledger import GRASPS_MAX
+from daemon.trust.lift_book import LIFTS_MAX
 from daemon.trust.trust import decode
 from models.session_statistics import SessionState
 from tests.daemon.session.learning import (
@@ -219,7 +219,7 @@ def test_a_file_of_the_first_version_is_still_read(tmp_path: Path) -> None:
 
 def test_what_is_learned_fits_into_the_file_with_every_outcome_still_out(tmp_path: Path) -> None:
     part = trust(inputs=5 * 26)
-    for grasp in range(GRASPS_MAX + 1):
+    for grasp in range(LIFTS_MAX + 1):
         judge(part, grasp)
     with SessionFile(tmp_path / "right.json") as file:
         file.save(kept_now(calibration().state(), FINGERS, {}, part.state()))

@@ -1,4 +1,4 @@
-"""Learner, risk and ledger together: outcomes late, twice, contradicting, and across restarts."""
+"""Learner, risk and lift book together: outcomes late, twice, contradicting, after restarts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from daemon.trust.learner import sigmoid
-from daemon.trust.ledger import GRASPS_MAX, GraspId, Told
+from daemon.trust.lift_book import LIFTS_MAX, GraspId, OutcomeStatus
 from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
 
@@ -67,7 +67,7 @@ def test_an_outcome_changes_the_probability_towards_what_happened() -> None:
     for slipped in (True, False):
         part = trust()
         judge(part, 0, -1.0)
-        assert part.outcome(named(0), slipped=slipped) is Told.TAKEN
+        assert part.outcome(named(0), slipped=slipped) is OutcomeStatus.TAKEN
         assert part.learner.outcomes == 1
         moderated = part.judge(named(1), 0.5, -1.0, inputs(0)).p_slip or 0.0
         assert (moderated > before) or not slipped
@@ -77,7 +77,7 @@ def test_an_outcome_changes_the_probability_towards_what_happened() -> None:
 def test_with_learning_off_outcomes_move_the_risk_alone() -> None:
     part = trust(learns=False)
     assert judge(part, 0)
-    assert part.outcome(named(0), slipped=True) is Told.TAKEN
+    assert part.outcome(named(0), slipped=True) is OutcomeStatus.TAKEN
     assert p_slip(part) == sigmoid(-1.0)
     assert (part.risk.lifts, part.risk.slips, part.risk.proven) == (1, 1, 1)
 
@@ -85,16 +85,19 @@ def test_with_learning_off_outcomes_move_the_risk_alone() -> None:
 def test_an_outcome_told_twice_counts_once_and_a_contradiction_is_refused() -> None:
     part = trust()
     judge(part, 0)
-    assert part.outcome(named(0), slipped=False) is Told.TAKEN
+    assert part.outcome(named(0), slipped=False) is OutcomeStatus.TAKEN
     learned, risked = part.learner.state(), part.risk.state()
-    assert part.outcome(named(0), slipped=False) is Told.REPEATED
-    assert part.outcome(named(0), slipped=True) is Told.CONTRADICTS
-    assert part.outcome(named(1), slipped=True) is Told.UNKNOWN
-    assert part.outcome(named(0, "f" * 32), slipped=True) is Told.UNKNOWN
+    assert part.outcome(named(0), slipped=False) is OutcomeStatus.REPEATED
+    assert part.outcome(named(0), slipped=True) is OutcomeStatus.CONTRADICTS
+    assert part.outcome(named(1), slipped=True) is OutcomeStatus.UNKNOWN
+    assert part.outcome(named(0, "f" * 32), slipped=True) is OutcomeStatus.UNKNOWN
     assert (part.learner.state(), part.risk.state()) == (learned, risked)
-    assert part.ledger.told == {
-        Told.TAKEN: 1, Told.REPEATED: 1, Told.CONTRADICTS: 1, Told.UNKNOWN: 2
-    }  # fmt: skip
+    assert part.lifts.told == {
+        OutcomeStatus.TAKEN: 1,
+        OutcomeStatus.REPEATED: 1,
+        OutcomeStatus.CONTRADICTS: 1,
+        OutcomeStatus.UNKNOWN: 2,
+    }
 
 
 def test_late_outcomes_teach_what_was_judged_then() -> None:
@@ -104,7 +107,7 @@ def test_late_outcomes_teach_what_was_judged_then() -> None:
     for grasp in reversed(range(50)):
         judge(now, grasp, 1.0)
         for part in (late, now):
-            assert part.outcome(named(grasp), slipped=grasp % 3 == 0) is Told.TAKEN
+            assert part.outcome(named(grasp), slipped=grasp % 3 == 0) is OutcomeStatus.TAKEN
     assert late.learner.state() == now.learner.state()
 
 
@@ -113,15 +116,15 @@ def test_the_outcome_of_a_forgotten_grasp_is_unknown_and_a_stable_one_counts_as_
 ):
     part = trust()
     first = judge(part, 0)
-    said = [judge(part, grasp, -6.0 if grasp % 2 else 6.0) for grasp in range(1, GRASPS_MAX)]
+    said = [judge(part, grasp, -6.0 if grasp % 2 else 6.0) for grasp in range(1, LIFTS_MAX)]
     assert first
-    assert part.ledger.outstanding == 1 + sum(said) > 50
-    assert part.ledger.unreported == 0
-    judge(part, GRASPS_MAX)
-    judge(part, GRASPS_MAX + 1)
-    assert part.ledger.unreported == 1 + said[0]
-    assert part.outcome(named(0), slipped=True) is Told.UNKNOWN
-    assert part.outcome(named(2), slipped=True) is Told.TAKEN
+    assert part.lifts.outstanding == 1 + sum(said) > 50
+    assert part.lifts.unreported == 0
+    judge(part, LIFTS_MAX)
+    judge(part, LIFTS_MAX + 1)
+    assert part.lifts.unreported == 1 + said[0]
+    assert part.outcome(named(0), slipped=True) is OutcomeStatus.UNKNOWN
+    assert part.outcome(named(2), slipped=True) is OutcomeStatus.TAKEN
     assert part.risk.slips == said[1]
 
 
@@ -138,31 +141,31 @@ def test_what_a_grasp_is_lifted_on_counts_the_first_verdict_or_the_first_stable_
     expected = trust()
     expected.note(named(8), sure, stable=True)
     for each in (part, expected):
-        assert each.outcome(named(8), slipped=True) is Told.TAKEN
+        assert each.outcome(named(8), slipped=True) is OutcomeStatus.TAKEN
         each.note(named(8), again, stable=True)  # too late to be what it was lifted on
-        assert (each.risk.lifts, each.risk.slips, each.ledger.outstanding) == (1, 1, 0)
+        assert (each.risk.lifts, each.risk.slips, each.lifts.outstanding) == (1, 1, 0)
     assert part.learner.state() == expected.learner.state()
 
 
 def test_stable_said_after_the_outcome_is_not_what_was_lifted_on() -> None:
     part = trust()
     assert not judge(part, 7, 2.0)
-    assert part.outcome(named(7), slipped=True) is Told.TAKEN
+    assert part.outcome(named(7), slipped=True) is OutcomeStatus.TAKEN
     kept = encode(part.state())
     judge(part, 7, -9.0)
     assert encode(part.state()) == kept
-    assert part.ledger.outstanding == 0
+    assert part.lifts.outstanding == 0
 
 
 def test_only_stable_grasps_without_an_outcome_count_as_unreported() -> None:
     part = trust()
     assert judge(part, 0)
-    assert part.outcome(named(0), slipped=False) is Told.TAKEN
+    assert part.outcome(named(0), slipped=False) is OutcomeStatus.TAKEN
     assert not judge(part, 1, 6.0)
     assert judge(part, 2)
-    for grasp in range(3, GRASPS_MAX + 3):
+    for grasp in range(3, LIFTS_MAX + 3):
         judge(part, grasp, 6.0)
-    assert part.ledger.unreported == 1
+    assert part.lifts.unreported == 1
 
 
 def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
@@ -187,8 +190,8 @@ def test_after_an_exchange_former_lifts_count_as_slips_but_teach_nothing() -> No
     part.outcome(named(0), slipped=False)
     assert judge(part, 1)
     part.sensors_exchanged()
-    assert part.outcome(named(1), slipped=True) is Told.TAKEN
-    assert part.outcome(named(1), slipped=True) is Told.REPEATED
+    assert part.outcome(named(1), slipped=True) is OutcomeStatus.TAKEN
+    assert part.outcome(named(1), slipped=True) is OutcomeStatus.REPEATED
     assert (part.risk.lifts, part.risk.slips, part.risk.warm_up_left) == (1, 1, 1)
     assert p_slip(part) == sigmoid(-1.0)
     assert part.judge(named(2), 0.3, -1.0, inputs(2)).permission is Permission.UNPROVEN
@@ -222,9 +225,11 @@ def test_no_adversary_breaks_the_bound(
         if what in ("lift", "tell", "again") and which in said:
             # An adversary lets slip exactly what was called stable.
             slipped = said[which] if slips_if_stable and which not in told else label
-            expected = Told.TAKEN
+            expected = OutcomeStatus.TAKEN
             if which in told:
-                expected = Told.REPEATED if told[which] == slipped else Told.CONTRADICTS
+                expected = (
+                    OutcomeStatus.REPEATED if told[which] == slipped else OutcomeStatus.CONTRADICTS
+                )
             assert part.outcome(named(which), slipped=slipped) is expected
             told.setdefault(which, slipped)
         elif what == "exchange":
@@ -235,7 +240,7 @@ def test_no_adversary_breaks_the_bound(
             assert encode(part.state()) == kept
         lifts = [slipped for grasp, slipped in told.items() if said[grasp]]
         assert (part.risk.lifts, part.risk.slips) == (len(lifts), sum(lifts))
-        assert part.ledger.outstanding == sum(said.values()) - len(lifts)
+        assert part.lifts.outstanding == sum(said.values()) - len(lifts)
         assert part.risk.bound is not None
         assert part.risk.slips <= part.risk.bound + 1e-9
 
@@ -257,7 +262,10 @@ def test_under_drift_and_wrong_outcomes_the_share_of_told_slips_is_kept(
         waiting.append((grasp, bool(truth != (random.random() < wrong))))
         if random.random() < 0.7:
             which, slipped = waiting.pop(int(random.integers(len(waiting))))
-            assert part.outcome(named(which), slipped=slipped) in (Told.TAKEN, Told.UNKNOWN)
+            assert part.outcome(named(which), slipped=slipped) in (
+                OutcomeStatus.TAKEN,
+                OutcomeStatus.UNKNOWN,
+            )
         assert part.risk.bound is not None
         assert part.risk.slips <= part.risk.bound + 1e-9
     assert part.risk.lifts > 15
@@ -294,7 +302,7 @@ def test_a_state_is_not_changed_by_what_comes_later() -> None:
 def test_the_largest_state_of_three_fingers_fits() -> None:
     part = Trust("f" * 64, 78, RULE)
     random = np.random.default_rng(0)
-    for grasp in range(2 * GRASPS_MAX):
+    for grasp in range(2 * LIFTS_MAX):
         x = random.normal(size=78).astype(np.float32)
         assessment = part.judge(named(grasp), 0.5, -9.0, x)
         part.note(named(grasp), assessment, stable=False)
@@ -336,12 +344,12 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
     part = full()
     before = encode(part.state())
     state = part.state()
-    records = state.ledger.records
+    records = state.lifts.records
     unlearned = next(record for record in records if record.slipped is None)
     replace = msgspec.structs.replace
 
     def with_records(*chosen: object) -> TrustState:
-        return replace(state, ledger=replace(state.ledger, records=chosen))
+        return replace(state, lifts=replace(state.lifts, records=chosen))
 
     for why, other in (
         ("another model", replace(state, model="other")),
@@ -352,7 +360,7 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
         ("not finite", with_records(replace(unlearned, features=b"\xff" * 8 * (INPUTS + 2)))),
         ("more slips", replace(state, risk=replace(state.risk, slips=1000))),
         # The learner's and the risk's parts are sound, and of other outcomes.
-        ("twice", replace(trust().state(), ledger=with_records(records[0], records[0]).ledger)),
+        ("twice", replace(trust().state(), lifts=with_records(records[0], records[0]).lifts)),
     ):
         with pytest.raises(ValueError, match=why):
             part.restore(other)
@@ -362,12 +370,12 @@ def test_a_state_of_something_else_is_refused_and_changes_nothing() -> None:
 def test_too_many_records_are_no_state() -> None:
     state = full().state()
     many = tuple(
-        msgspec.structs.replace(state.ledger.records[0], id=named(grasp))
-        for grasp in range(GRASPS_MAX + 1)
+        msgspec.structs.replace(state.lifts.records[0], id=named(grasp))
+        for grasp in range(LIFTS_MAX + 1)
     )
-    ledger = msgspec.structs.replace(state.ledger, records=many)
+    lifts = msgspec.structs.replace(state.lifts, records=many)
     with pytest.raises(ValueError, match="nothing that was learned"):
-        decode(encode(msgspec.structs.replace(state, ledger=ledger)))
+        decode(encode(msgspec.structs.replace(state, lifts=lifts)))
 
 
 def test_judging_changes_nothing() -> None:

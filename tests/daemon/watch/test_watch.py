@@ -17,7 +17,7 @@ from msgspec import structs
 
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
-from daemon.trust.ledger import Told
+from daemon.trust.lift_book import OutcomeStatus
 from daemon.trust.risk import RiskReport
 from daemon.watch.evidence import WATCHED
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerMotion, Rest, image
@@ -337,7 +337,7 @@ def test_a_lift_to_be_watched_is_told_apart(
 
 def test_how_learning_goes_is_seen_what_nobody_told_first() -> None:
     lifts = Lifts(reported=41, outstanding=1, unreported=3)
-    told = {Told.TAKEN: 57, Told.CONTRADICTS: 1}
+    told = {OutcomeStatus.TAKEN: 57, OutcomeStatus.CONTRADICTS: 1}
     learner = LearnerHealth(enabled=True, outcomes=57, told=told, uncertainty=0.41)
     seen = after(
         (b"status.right", status(0, lifts=lifts, learner=learner)),

@@ -15,7 +15,7 @@ import pytest
 
 from daemon.judge.reasons import Decision
 from daemon.publish.messages import LearnerHealth, Lifts
-from daemon.trust.ledger import Told
+from daemon.trust.lift_book import OutcomeStatus
 from daemon.watch.feed import Feed
 from daemon.watch.view import View
 from daemon.watch.watching import TICK_S, Watched, snapshots
@@ -327,7 +327,9 @@ def test_all_of_a_hand_is_in_one_window_and_several_are_in_one_page(
     server, over = Server(0, Newest()), threading.Event()
     views = [View(f"ipc:///tmp/{name}") for name in names]
     lifts = Lifts(reported=41, outstanding=1, unreported=3)
-    learner = LearnerHealth(enabled=True, outcomes=5, told={Told.TAKEN: 5}, uncertainty=0.4)
+    learner = LearnerHealth(
+        enabled=True, outcomes=5, told={OutcomeStatus.TAKEN: 5}, uncertainty=0.4
+    )
     whole = json.dumps(json.loads(tactile(0)) | FULL).encode()
     motion = dict.fromkeys(FIVE, 1.2)
     more = {"contact": FIVE, "still_ms": 130.0, "motion": motion}

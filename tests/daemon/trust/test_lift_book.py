@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from daemon.trust.lifts import LIFTS_MAX, NOT_ASSESSED, GraspId, Lifts, OutcomeStatus
+from daemon.trust.lift_book import LIFTS_MAX, NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
 
 BOOT = "0" * 32
 CONTROLLER, DASHBOARD = b"controller", b"dashboard"
@@ -15,14 +15,14 @@ def named(grasp: int) -> GraspId:
 
 
 def test_only_the_owner_reports_a_grasp_that_was_claimed() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.claim(named(1), CONTROLLER)
     assert lifts.may_report(named(1), CONTROLLER)
     assert not lifts.may_report(named(1), DASHBOARD)
 
 
 def test_a_grasp_stays_with_its_first_owner() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.claim(named(1), CONTROLLER)
     lifts.claim(named(1), DASHBOARD)
     assert lifts.may_report(named(1), CONTROLLER)
@@ -30,7 +30,7 @@ def test_a_grasp_stays_with_its_first_owner() -> None:
 
 
 def test_a_grasp_that_nothing_claimed_is_reported_by_those_that_own_others() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     assert lifts.may_report(named(1), DASHBOARD), "there is no owner at all"
     lifts.claim(named(2), CONTROLLER)
     assert lifts.may_report(named(1), CONTROLLER)
@@ -38,7 +38,7 @@ def test_a_grasp_that_nothing_claimed_is_reported_by_those_that_own_others() -> 
 
 
 def test_as_many_owners_are_remembered_as_grasps() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.claim(named(0), DASHBOARD)
     for grasp in range(1, LIFTS_MAX + 1):
         lifts.claim(named(grasp), CONTROLLER)
@@ -48,7 +48,7 @@ def test_as_many_owners_are_remembered_as_grasps() -> None:
 
 @pytest.mark.parametrize("stable", [True, False])
 def test_a_grasp_that_was_not_assessed_is_told_and_teaches_nothing(stable: bool) -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     assert lifts.note(named(1), NOT_ASSESSED, stable=stable)
     assert lifts.outstanding == stable
     status, lift = lifts.tell(named(1), slipped=True)
@@ -59,7 +59,7 @@ def test_a_grasp_that_was_not_assessed_is_told_and_teaches_nothing(stable: bool)
 
 
 def test_a_grasp_is_entered_again_once_it_is_assessed() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.note(named(1), NOT_ASSESSED, stable=False)
     assert lifts.note(named(1), b"features", stable=False)
     assert not lifts.note(named(1), b"others", stable=False), "the first verdict counts"
@@ -70,10 +70,10 @@ def test_a_grasp_is_entered_again_once_it_is_assessed() -> None:
 
 
 def test_only_assessed_grasps_are_kept_for_the_next_start() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.note(named(1), NOT_ASSESSED, stable=True)
     lifts.note(named(2), bytes(8), stable=True)
-    other = Lifts()
+    other = LiftBook()
     other.restore(lifts.state(), 1)
     assert named(1) not in other
     assert named(2) in other
@@ -81,7 +81,7 @@ def test_only_assessed_grasps_are_kept_for_the_next_start() -> None:
 
 
 def test_an_outcome_is_kept_once_the_disk_has_it() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.note(named(1), bytes(8), stable=True)
     assert lifts.is_kept(named(1)), "there is no outcome to keep"
     lifts.tell(named(1), slipped=False)
@@ -91,11 +91,11 @@ def test_an_outcome_is_kept_once_the_disk_has_it() -> None:
 
 
 def test_a_restored_outcome_is_kept_and_its_owner_is_not() -> None:
-    lifts = Lifts()
+    lifts = LiftBook()
     lifts.note(named(1), bytes(8), stable=True)
     lifts.claim(named(1), CONTROLLER)
     lifts.tell(named(1), slipped=False)
-    other = Lifts()
+    other = LiftBook()
     other.restore(lifts.state(), 1)
     assert other.is_told(named(1))
     assert other.is_kept(named(1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from enum import StrEnum
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -13,6 +13,9 @@ from daemon.trust.learner import vector
 
 LIFTS_MAX: Final = 256
 """Grasps in the book: those of an hour and more. Outcomes of older ones are refused."""
+NOT_YOURS: Final = "not yours: another peer asks whether it may lift here"
+UNKNOWN_START: Final = "unknown boot_id: of a start whose grasps are not known any more"
+"""Why an outcome is refused, besides `REFUSALS`."""
 NOT_ASSESSED: Final = b""
 """Stands for the features of a grasp that nothing can be learned from: the model refused it, or
 the scene has no learner and no risk."""
@@ -27,6 +30,17 @@ class GraspId(NamedTuple):
     """Its number since that start."""
 
 
+class Report(NamedTuple):
+    """How a lift ended, as a peer tells it."""
+
+    grasp: GraspId
+    outcome: Literal["stable", "slip"]
+    object_name: str | None = None
+    """What was lifted, if the peer says so."""
+    peer: bytes | None = None
+    """Name of the peer; None: the daemon itself, when it replays a recording."""
+
+
 class OutcomeStatus(StrEnum):
     """What became of an outcome that was told."""
 
@@ -37,6 +51,13 @@ class OutcomeStatus(StrEnum):
     """Known already, and the opposite: refused, the first one counts."""
     UNKNOWN = "unknown"
     """Of a grasp that was not judged or is too long ago: refused."""
+
+
+REFUSALS: Final = {
+    OutcomeStatus.UNKNOWN: "unknown grasp: not judged, or too long ago",
+    OutcomeStatus.CONTRADICTS: "contradicts: another outcome of this grasp was told before",
+}
+"""Why an outcome is refused, for the peer that told it."""
 
 
 class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,7 +73,7 @@ class Lift(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """None until the outcome is told."""
 
 
-class LiftsState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LiftBookState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is kept of the book between two starts of the daemon."""
 
     records: Annotated[tuple[Lift, ...], msgspec.Meta(max_length=LIFTS_MAX)]
@@ -66,7 +87,7 @@ class LiftsState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return sum(each.stable and each.slipped is None for each in self.records)
 
 
-class Lifts:
+class LiftBook:
     """The last `LIFTS_MAX` judged grasps, and who may report how their lifts ended.
 
     A peer that asks for a lift owns the grasp that it was answered about; it alone reports the
@@ -78,8 +99,7 @@ class Lifts:
         self._lifts: dict[GraspId, Lift] = {}
         """Oldest first."""
         self._owners: dict[GraspId, bytes] = {}
-        """Routing id of the peer that asked to lift a grasp; the oldest first, at most `LIFTS_MAX`.
-        """
+        """Name of the peer that asked to lift a grasp; the oldest first, at most `LIFTS_MAX`."""
         self._unkept: set[GraspId] = set()
         """Grasps whose outcome was taken and is not on the disk yet."""
         self.told: Counter[OutcomeStatus] = Counter()
@@ -130,12 +150,14 @@ class Lifts:
         if len(self._owners) > LIFTS_MAX:
             del self._owners[next(iter(self._owners))]
 
-    def may_report(self, grasp: GraspId, peer: bytes) -> bool:
-        """True if this peer may tell the outcome: the owner of the grasp.
+    def may_report(self, grasp: GraspId, peer: bytes | None) -> bool:
+        """True if this peer may tell the outcome: the owner of the grasp, or the daemon itself.
 
         For a grasp without an owner: any peer that owns another one, or any peer at all while
         there is no owner.
         """
+        if peer is None:
+            return True
         owner = self._owners.get(grasp)
         if owner is not None:
             return owner == peer
@@ -158,6 +180,10 @@ class Lifts:
         self.told[status] += 1
         return status, lift
 
+    def follow(self, former: LiftBook) -> None:
+        """Take over the owners of the book before a reload: their connections are the same."""
+        self._owners = dict(former._owners)
+
     def is_kept(self, grasp: GraspId) -> bool:
         """True unless an outcome of the grasp was taken and is not on the disk yet."""
         return grasp not in self._unkept
@@ -170,12 +196,12 @@ class Lifts:
         """Note that a sensor was exchanged: outcomes still to come teach nothing any more."""
         self._lifts = {grasp: replace(lift, features=None) for grasp, lift in self._lifts.items()}
 
-    def state(self) -> LiftsState:
+    def state(self) -> LiftBookState:
         """Return what `restore` needs: the grasps that were assessed."""
         records = tuple(lift for lift in self._lifts.values() if lift.features != NOT_ASSESSED)
-        return LiftsState(records, dict(self.told), self.unreported)
+        return LiftBookState(records, dict(self.told), self.unreported)
 
-    def restore(self, state: LiftsState, width: int) -> None:
+    def restore(self, state: LiftBookState, width: int) -> None:
         """Go on from an earlier state, with features (width,). Raises `ValueError`."""
         lifts = {lift.id: lift for lift in state.records}
         if len(lifts) != len(state.records):
