@@ -166,7 +166,6 @@ class RoundAssembler:
         self._finished = False
         self.packets: list[PalmPacket | None] = [None] * ROUND
         """What has come of this round, by position."""
-        self._t_ns = 0
         self._counts[:] = 0
         self._faults[:] = ElectrodeFault.MISSING
         self._absent = [False] * len(self._slots)
