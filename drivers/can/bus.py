@@ -171,7 +171,7 @@ class CanBus:
             return
         self._drops_seen = 0
         with contextlib.suppress(OSError):
-            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
         self._socket = raw
 
     def _drain_socket(self, raw: socket.socket, frames: list[Stamped]) -> None:

@@ -156,6 +156,10 @@ def test_a_lag_is_counted_and_nothing_is_skipped(tmp_path: Path) -> None:
         # Due at 10, 20 and 30 ms, taken at 35 ms: late are those more than 10 ms behind.
         assert driver.counters.late == 2
         assert driver.due_ns() == 1_000 * MS + 40 * MS
+        for now_ms, late in ((50 * MS, 2), (60 * MS + 1, 3)):
+            clock.now_ns = 1_000 * MS + now_ms
+            driver.read_ready()
+            assert driver.counters.late == late
 
 
 def test_fast_is_never_waiting_and_never_late(tmp_path: Path) -> None:
