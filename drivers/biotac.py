@@ -6,7 +6,7 @@ SynTouch where the manual is silent.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -97,9 +97,13 @@ def decode_words(
     return _COUNTS[words], _FAULTS[words]
 
 
-def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:
+def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
     """Which of the samples are electrodes: shape (n, 2), rows of (sample, electrode 0..23)."""
-    pairs = [(at, channel - E1) for at, channel in enumerate(channels) if E1 <= channel <= E24]
+    pairs = [
+        (at, channel - E1)
+        for at, channel in enumerate(channels)
+        if channel is not None and E1 <= channel <= E24
+    ]
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 

@@ -36,7 +36,7 @@ def loads(text: str) -> dict[str, Any]:
             case "open":
                 depth, dots = depth + 1, 0
             case "close":
-                depth, dots = max(depth - 1, 0), 0
+                depth, dots = depth - 1, 0
             case "dot":
                 dots += 1
             case "end":

@@ -109,8 +109,6 @@ class CanBus:
         self._bus: can.BusABC | None = None
         self._socket: socket.socket | None = None
         self._fileno: int | None = None
-        self._drops_seen = 0
-        self._idle_ns = 0
 
     def open(self) -> None:
         """Take the bus. Raises `LinkError`, or `DriverError` if no later try can succeed."""

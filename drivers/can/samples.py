@@ -174,7 +174,6 @@ class SampleAssembler:
     def _begin(self) -> None:
         self._have = 0
         self._last = -1
-        self._t_ns = 0
         self._finished = False
 
     def _starts(self, place: int) -> bool:

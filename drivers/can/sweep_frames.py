@@ -49,9 +49,8 @@ class FrameAssembler:
     def _begin(self, tick_us: int, t_ns: int) -> None:
         self._tick_us = tick_us
         self._have = 0
-        self._furthest = -1
-        self._begun_ns = t_ns
-        self._t_ns = 0
+        self._furthest = 0
+        self._begun_ns = self._t_ns = t_ns
         self._finished = False
 
     @property

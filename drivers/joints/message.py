@@ -182,7 +182,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _number(value: object) -> float:
     """A finite number, else NaN. Truth values and text are none."""
     if type(value) is int:
-        return float(value) if abs(value) < 1 << 1000 else math.nan
+        return float(value) if abs(value) <= SEQ_MAX else math.nan
     return value if type(value) is float and math.isfinite(value) else math.nan
 
 

@@ -85,8 +85,7 @@ class SweepDecoder:
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None
-        channels = [channel_of(command) for command in hello.commands]
-        columns = electrode_columns([-1 if channel is None else channel for channel in channels])
+        columns = electrode_columns(map(channel_of, hello.commands))
         samples = hello.slots * hello.sensors
         # Where each electrode's word is in a sweep; one that is not sampled gets the word after
         # the last, which nothing drives.

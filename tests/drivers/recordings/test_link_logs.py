@@ -153,6 +153,7 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
 def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
     found = list(SerialLogParser().feed(encode_records(LineEvent.RECEIVED, 5, data)))
     assert b"".join(record.data for record in found) == data
+    assert max(len(record.data) for record in found) == 960
     assert {(record.event, record.t_ns) for record in found} == {(LineEvent.RECEIVED, 5)}
 
 

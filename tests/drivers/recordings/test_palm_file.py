@@ -35,6 +35,16 @@ def test_a_file_of_packets_plays_count_for_count(
     assert np.array_equal([reading.counts for reading in readings], rows(40))
 
 
+def test_the_size_of_a_file_tells_the_length_where_one_packet_cannot(tmp_path: Path) -> None:
+    path = tmp_path / "hand.palm"
+    path.write_bytes(next(iter(PalmTwin(rows(1), can_record=True).packets())).to_bytes())
+    clock = Clock()
+    with PalmFileDriver(path, clock=clock) as driver:
+        driver.read_ready()
+        assert (driver.counters.packets, driver.counters.bad_lengths) == (1, 0)
+        assert driver.exhausted
+
+
 def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
     clock = Clock()
     path = tmp_path / "hand.palm"

@@ -23,7 +23,9 @@ def test_items_are_due_as_recorded_over_the_speed(
     speed: float, steps_ms: list[int], delay_ms: int
 ) -> None:
     clock = Clock()
-    timeline: Timeline[str] = Timeline(speed, clock, delay_ns=delay_ms * MS)
+    timeline: Timeline[str] = (
+        Timeline(speed, clock, delay_ns=delay_ms * MS) if delay_ms else Timeline(speed, clock)
+    )
     timeline.start(items())
     assert timeline.due_ns() == clock.now_ns, "the first one begins the run"
     began_ns = clock.now_ns
