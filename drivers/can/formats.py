@@ -147,7 +147,7 @@ def sample_length(sensors: int, length: int | None) -> int:
 
     Raises `ValueError` if so many words do not fit into it, or it into a classic frame.
     """
-    if not 1 <= sensors <= SENSORS_MAX:
+    if sensors > SENSORS_MAX:
         raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors
     if length is None:

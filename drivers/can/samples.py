@@ -167,8 +167,7 @@ class SampleAssembler:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
             self._seen = place
-        if t_ns - self._at_ns > self._widest_ns:
-            self._widest_ns = t_ns - self._at_ns
+        self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
         self._at_ns = t_ns
 
     def _begin(self) -> None:

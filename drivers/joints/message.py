@@ -123,7 +123,6 @@ class MessageOrder:
         self._last: float | None = None
         self._counted = False
         self._last_old: float | None = None
-        self._old_in_a_row = 0
 
     def admits(self, message: JointMessage) -> bool:
         """Whether a message comes after all admitted before."""
@@ -142,8 +141,9 @@ class MessageOrder:
 
     def _began_anew(self, now: float) -> bool:
         """Old messages are a new start if enough of them rise: one that repeats itself does not."""
-        rises = self._last_old is not None and now > self._last_old
-        self._old_in_a_row = self._old_in_a_row + 1 if rises else 1
+        if self._last_old is None or now <= self._last_old:
+            self._old_in_a_row = 0
+        self._old_in_a_row += 1
         self._last_old = now
         began = self._old_in_a_row > OLD_MESSAGES_MAX
         self._counters.restarts += began

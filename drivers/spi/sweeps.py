@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
-from drivers.biotac import UNPLUGGED_WORDS, channel_of, decode_words, electrode_columns
+from drivers.biotac import channel_of, decode_words, electrode_columns
 from drivers.spi.clock import DeviceClock
 from drivers.spi.messages import Hello, Sweep
 
@@ -92,7 +92,7 @@ class SweepDecoder:
         self._source = np.full((len(sensors), ELECTRODES), samples, dtype=np.intp)
         for row, sensor in enumerate(sensors):
             self._source[row, columns[:, 1]] = columns[:, 0] * hello.sensors + sensor
-        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.intp)
+        self._words = np.zeros(samples + 1, dtype=np.intp)
         self._is_sampled = self._source < samples
         self._sound = bytes(self._source.size)
         """Faults of a reading without any."""
@@ -125,8 +125,7 @@ class SweepDecoder:
             return None
         if not self._is_next(sweep):
             return None
-        if sweep.tick_end - sweep.tick_start > self.longest_ticks:
-            self.longest_ticks = sweep.tick_end - sweep.tick_start
+        self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
         faults, fallbacks = self.clock.faults, self.clock.fallbacks
         t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
         self._counters.clock_faults += self.clock.faults - faults

@@ -269,6 +269,12 @@ def test_error_frames_say_what_happened() -> None:
     assert describe_error(bus_off) == "bus-off"
     assert describe_error(passive) == "controller problem, error counters"
     assert describe_error(CanFrame(0, b"", ERROR)) == "unknown error class"
+    # CAN_ERR_TX_TIMEOUT, _LOSTARB, _CRTL, _PROT, _TRX, _ACK, _BUSOFF, _BUSERROR, _RESTARTED, _CNT
+    words = ["timeout", "arbitration", "controller", "protocol", "transceiver", "acknowledgement"]
+    for bit, cause in enumerate([*words, "bus-off", "bus error", "restarted", "counters"]):
+        told = describe_error(CanFrame(1 << bit, b"", ERROR))
+        assert cause in told
+        assert "," not in told
 
 
 @pytest.mark.parametrize("frame_format", list(CanFormat))

@@ -156,6 +156,20 @@ def test_a_period_is_learned_from_two_ends_in_a_row_only() -> None:
     assert sweeps.period_ns == 24 * SLOT_NS
 
 
+def test_a_period_is_learned_though_a_sample_is_lost_in_every_sweep() -> None:
+    sweeps, _ = assembler()
+    feed(sweeps, concatenated([samples(n)[:5] + samples(n)[6:] for n in range(6)]))
+    assert sweeps.period_ns == 24 * SLOT_NS
+
+
+def test_the_first_sweep_may_end_on_time_after_a_loss() -> None:
+    sweeps, counters = assembler()
+    kept = samples(0)[:2] + samples(0)[21:]
+    (reading,) = feed(sweeps, retimed(kept, [at * 100_000 for at in (0, 1, 21, 22, 23)]))
+    assert_true(reading, 0)
+    assert (counters.late_frames, counters.lost_frames) == (0, 19)
+
+
 @pytest.mark.parametrize("cut_at", [0, 1, 12, 23])
 def test_a_known_loss_ends_the_sweep_at_hand(cut_at: int) -> None:
     """So few are lost that neither order nor time would show where."""

@@ -45,6 +45,21 @@ def test_the_size_of_a_file_tells_the_length_where_one_packet_cannot(tmp_path: P
         assert driver.exhausted
 
 
+@pytest.mark.parametrize(("nonsense", "plays"), [(1, True), (2, False)])
+def test_half_of_the_packets_of_a_file_make_sense(
+    tmp_path: Path, nonsense: int, plays: bool
+) -> None:
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(data + b"\xff" * 220 * nonsense for data in datagrams(3)))
+    driver = PalmFileDriver(path, clock=Clock())
+    if plays:
+        driver.open()
+        driver.close()
+    else:
+        with pytest.raises(RecordingError, match="not a file of palm packets"):
+            driver.open()
+
+
 def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
     clock = Clock()
     path = tmp_path / "hand.palm"
