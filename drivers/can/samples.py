@@ -120,7 +120,7 @@ class SampleAssembler:
         self._count_run(place, t_ns)
         if until_ns is None:
             until_ns = t_ns
-        elif until_ns > t_ns and until_ns - t_ns >= self._lateness_ns():
+        elif until_ns - t_ns >= self._lateness_ns():
             return self._untimed(place, t_ns)
         if not self._synchronised and not self._starts(place):
             self._counters.unsynchronised_frames += 1
@@ -308,7 +308,7 @@ class SampleAssembler:
             if is_even and not self._is_steady:
                 self._is_steady = True
                 self._readings.forget_period()
-            if (is_even or not (self._broken or self._is_steady)) and 0 < gap_ns <= OUTAGE_NS:
+            if is_even or not (self._broken or self._is_steady):
                 self._readings.learn(gap_ns)
         self._broken = False
         self._widest_ns = 0

@@ -162,7 +162,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         {"data_length": 6},
         {"data_length": 9},
         {"format": "sweep_fd", "data_length": 7},
-        {"format": "sweep_fd", "arbitration_id": 0x7FE},
+        {"format": "sweep_fd", "arbitration_id": 0x7FC},
         {"data_bitrate": 5_000_000},
         {"format": "sweep_fd", "data_bitrate": 5_000_000},
     ],
@@ -174,7 +174,12 @@ def test_arguments_out_of_range_are_refused(options: Mapping[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"arbitration_id": 0}, {"arbitration_id": (1 << 29) - 1}, {"fingers": ("th",)}],
+    [
+        {"arbitration_id": 0},
+        {"arbitration_id": (1 << 29) - 1},
+        {"format": "sweep_fd", "arbitration_id": 0x7FB},
+        {"fingers": ("th",)},
+    ],
 )
 def test_arguments_at_the_end_of_their_range_are_taken(options: Mapping[str, Any]) -> None:
     CanBridgeDriver("virtual", "x", **options)

@@ -265,7 +265,10 @@ def test_error_frames_say_what_happened() -> None:
     assert not is_bus_off(CanFrame(0x040, bytes(8)))
     assert is_overflow(overflow)
     assert not is_overflow(passive)
-    assert not is_overflow(CanFrame(0x004, b"", ERROR))
+    assert not is_overflow(CanFrame(0x004, b"\0", ERROR))
+    assert is_overflow(CanFrame(0x004, b"\0\1", ERROR))
+    assert not is_overflow(CanFrame(0x080, b"\0\1", ERROR))
+    assert not is_overflow(CanFrame(0x004, b"\0\1"))
     assert describe_error(bus_off) == "bus-off"
     assert describe_error(passive) == "controller problem, error counters"
     assert describe_error(CanFrame(0, b"", ERROR)) == "unknown error class"
