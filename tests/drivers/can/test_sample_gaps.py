@@ -302,6 +302,14 @@ def test_a_copy_of_a_last_sample_is_none_of_the_sweep_that_has_begun(electrode: 
     assert (len(readings), counters.duplicate_frames) == (8, 1)
 
 
+def test_a_late_sample_that_a_sweep_lacked_is_none_of_the_next_one_whatever_its_time() -> None:
+    sweeps, counters = assembler()
+    late, (first, *_) = samples(8)[23], samples(9)
+    feed(sweeps, concatenated([*(samples(n) for n in range(8)), samples(8)[:23], [first]]))
+    assert sweeps.push(*late[:2], first[2], first[2] + 17 * SLOT_NS) == ()
+    assert counters.late_frames == 1
+
+
 def test_a_late_sample_of_a_lost_sweep_is_none_of_the_next_one() -> None:
     """The sweep before that had this electrode; time alone says that it cannot be of this one."""
     sweeps, counters = assembler()
