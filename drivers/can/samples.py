@@ -77,18 +77,21 @@ class SampleAssembler:
         self._readings = ReadingMaker(counters)
         self._counters = counters
         self._buffer = bytearray(ELECTRODES * self._width)
-        self._synchronised = False
         self._previous_start_ns: int | None = None
         self._previous_end_ns: int | None = None
-        self._previous_had = _ALL
         self._seen = -1
-        self._run = 0
         self._at_ns = 0
         self._widest_ns = 0
         self._broken = False
-        self._is_steady = False
-        """Whether it has been seen to sweep without a pause."""
         self._origin_ns = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._synchronised = False
+        self._is_steady = False
+        """True if the board has been seen to sweep without a pause."""
+        self._previous_had = _ALL
+        self._run = 0
         self._begin()
 
     @property
@@ -155,10 +158,7 @@ class SampleAssembler:
     def interrupt(self) -> None:
         """The link broke: drop the sweep at hand, wait for the beginning of another."""
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
-        self._synchronised = self._is_steady = False
-        self._previous_had = _ALL
-        self._run = 0
-        self._begin()
+        self._forget()
 
     def _count_run(self, place: int, t_ns: int) -> None:
         """Count the samples in a row that came each right after its predecessor in the order, and
