@@ -155,8 +155,8 @@ def test_an_angle_is_impossible_ten_degrees_beyond_the_range_of_its_joint(joint:
     assert set(JOINTS) == set(RANGES_DEG)
     low, high = RANGES_DEG[joint]
     for angle, impossible in (
-        *((low - 10.01, 1), (low - 9.99, 0), (low, 0)),
-        *((high, 0), (high + 9.99, 0), (high + 10.01, 1)),
+        *((low - 10.01, 1), (low - 10, 0), (low, 0)),
+        *((high, 0), (high + 10, 0), (high + 10.01, 1)),
     ):
         angles = np.full(28, np.nan)
         angles[JOINTS.index(joint)] = math.radians(angle)
