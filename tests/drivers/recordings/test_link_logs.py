@@ -245,3 +245,6 @@ def test_a_link_log_plays_at_its_own_pace_times_speed(tmp_path: Path) -> None:
             times_us += [(r.t_ns - began_ns) // 1000 for r in driver.read_ready()]
         assert driver.period_ns == 24 * 200_000
     assert times_us == [(24 * sweep + 23) * 200 for sweep in range(7)]
+    with LinkLogDriver([path], log, clock=clock) as driver:
+        assert len([reading for _ in range(7) for reading in driver.read_ready()]) == 7
+        assert driver.period_ns == 24 * 400_000
