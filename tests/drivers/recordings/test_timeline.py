@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
+import numpy as np
 import pytest
 
-from drivers.base import RecordingError
+from drivers.base import JointReading, RecordingError
 from drivers.recordings.player import Timeline
 from tests.drivers.palm.palm_stream import MS, Clock
 
@@ -52,6 +53,17 @@ def test_without_a_speed_all_is_due_at_once_and_keeps_its_recorded_times() -> No
         *(0, 10 * MS, 30 * MS),
     ]
     assert timeline.exhausted
+
+
+def test_a_reading_is_handed_over_as_old_as_it_was() -> None:
+    clock = Clock()
+    timeline: Timeline[str] = Timeline(None, clock)
+    clock.now_ns += 5 * MS
+    made = JointReading(480 * MS, 3, (), np.zeros(0))
+    given = timeline.hand_over(made, 500 * MS, 100 * MS)
+    assert (given.t_ns, given.recorded_ns) == (clock.now_ns - 20 * MS, 380 * MS)
+    assert timeline.hand_over(made, 500 * MS).recorded_ns == 480 * MS
+    assert timeline.handed_over_ns == clock.now_ns
 
 
 def test_an_error_waits_until_what_is_before_it_was_taken() -> None:
