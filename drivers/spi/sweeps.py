@@ -97,7 +97,6 @@ class SweepDecoder:
         self._sound = bytes(self._source.size)
         """Faults of a reading without any."""
         self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
-        self._all_present = sum(1 << sensor for sensor in set(sensors))
 
     def fits(self, hello: Hello) -> bool:
         """Whether a later HELLO describes the same sampling."""
@@ -155,10 +154,9 @@ class SweepDecoder:
         """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
         self._sweep[...] = sweep.words
         counts, faults = decode_words(self._words[self._source])
-        absent: list[int] = []
-        if sweep.present & self._all_present != self._all_present:
-            present = [sweep.present >> sensor & 1 for sensor in self._sensors]
-            absent = [row for row, is_there in enumerate(present) if not is_there]
+        present = [sweep.present >> sensor & 1 for sensor in self._sensors]
+        absent = [row for row, is_there in enumerate(present) if not is_there]
+        if absent:
             counts[absent] = 0
             faults[absent] = int(ElectrodeFault.MISSING)
         self._count(faults, absent)

@@ -183,7 +183,7 @@ def test_frames_are_counted_over_a_full_second() -> None:
         bridge(where, clock=clock) as driver,
         can.Bus(interface="virtual", channel=where, ignore_config=True) as bus,
     ):
-        for passed_ns, told in ((1_000 * MS - 1, 0.0), (1, 2.0)):
+        for passed_ns, told in ((1_000 * MS - 1, 0.0), (1, 2.0), (1_000 * MS, 1.0)):
             bus.send(message(b"\0", 0x7FF))
             clock.now_ns += passed_ns
             driver.read_ready()

@@ -45,12 +45,16 @@ def test_the_size_of_a_file_tells_the_length_where_one_packet_cannot(tmp_path: P
         assert driver.exhausted
 
 
-@pytest.mark.parametrize(("nonsense", "plays"), [(1, True), (2, False)])
-def test_half_of_the_packets_of_a_file_make_sense(
-    tmp_path: Path, nonsense: int, plays: bool
+@pytest.mark.parametrize(
+    ("good", "nonsense", "plays"),
+    # One packet and 20 bytes may be a packet with a CAN record (12 bytes) and 8 bytes.
+    [(14, 14 * 220, True), (13, 15 * 220, False), (1, 12, True), (1, 20, False)],
+)
+def test_half_of_the_packets_of_a_file_make_sense_and_with_one_length(
+    tmp_path: Path, good: int, nonsense: int, plays: bool
 ) -> None:
     path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(data + b"\xff" * 220 * nonsense for data in datagrams(3)))
+    path.write_bytes(b"".join(datagrams(1)[:good]) + bytes(nonsense))
     driver = PalmFileDriver(path, clock=Clock())
     if plays:
         driver.open()

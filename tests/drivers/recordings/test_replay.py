@@ -105,7 +105,9 @@ def test_a_table_plays_at_its_rate_times_speed(
 def test_a_stream_plays_at_its_own_times_whatever_their_offset(tmp_path: Path) -> None:
     clock = Clock()
     path = write(tmp_path, stream(["100.5", "100.51", "100.51", "100.75"]))
-    assert times_ms(play(ReplayDriver([path], speed=2, clock=clock), clock)) == [0, 5, 5, 125]
+    readings = tactile(play(ReplayDriver([path], speed=2, clock=clock), clock))
+    assert times_ms([*readings]) == [0, 5, 5, 125]
+    assert [reading.recorded_ns for reading in readings] == [0, 10 * MS, 10 * MS, 250 * MS]
 
 
 def test_the_period_of_a_stream_is_the_shortest_step_so_far(tmp_path: Path) -> None:
