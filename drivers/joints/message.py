@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Mapping
@@ -23,8 +24,8 @@ SEQ_JUMP_MAX: Final = 1000
 """A sender that jumps ahead by more has begun anew."""
 OLD_MESSAGES_MAX: Final = 10
 """So many messages with old but rising numbers may be a detour; one more is a sender anew."""
-_NAMES_KEPT = 64
-"""Names, known or not, whose meaning is remembered: 28 joints with and without prefix."""
+_joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
+"""Remembers 64 names, known or not: 28 joints with and without prefix."""
 
 
 @dataclass(slots=True)
@@ -77,8 +78,6 @@ class JointParser:
 
     def __init__(self, counters: JointCounters) -> None:
         self._counters = counters
-        self.joint_by_name: dict[str, str | None] = {}
-        """Names that have come, at most `_NAMES_KEPT`, and the joint that each is, if it is one."""
 
     def parse(self, data: bytes) -> JointMessage | None:
         """The message, or None if it is none, which is counted."""
@@ -92,7 +91,7 @@ class JointParser:
         seq, t_s, values = message
         angles: dict[str, float] = {}
         for name, value in values.items():
-            joint = self._joint(name)
+            joint = _joint_of(name)
             if joint is None:
                 self._counters.unknown_names += 1
                 continue
@@ -102,13 +101,6 @@ class JointParser:
             self._counters.bad_angles += joint in angles
             angles[joint] = math.nan if joint in angles else angle
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
-
-    def _joint(self, name: str) -> str | None:
-        if name not in self.joint_by_name:
-            if len(self.joint_by_name) >= _NAMES_KEPT:
-                return joint_name(name)
-            self.joint_by_name[name] = joint_name(name)
-        return self.joint_by_name[name]
 
 
 class MessageOrder:

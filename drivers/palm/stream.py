@@ -55,7 +55,6 @@ class PalmStream:
         self._rounds = RoundAssembler(fingers, self.counters, heed_finger_bits=heed_finger_bits)
         self._previous = b""
         self._calibration: Calibration | None = None
-        self._uncalibrated = 0
         self._joint_due_ns = 0
         self._joint_seq = 0
         if calibration is not None:
