@@ -6,7 +6,7 @@ SynTouch where the manual is silent.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -70,10 +70,7 @@ def sample_command(channel: int) -> int:
 
 def channel_of(command: int) -> int | None:
     """Channel that a command byte samples, or None if it is no valid sampling command."""
-    channel = (command & 0x7E) >> 1
-    if channel not in CHANNELS or command != sample_command(channel):
-        return None
-    return channel
+    return _CHANNEL_OF_COMMAND.get(command)
 
 
 def encode_word(count: int) -> int:
@@ -100,21 +97,23 @@ def decode_words(
     return _COUNTS[words], _FAULTS[words]
 
 
-def electrode_columns(channels: Sequence[int]) -> NDArray[np.intp]:
+def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
     """Which of the samples are electrodes: shape (n, 2), rows of (sample, electrode 0..23)."""
-    pairs = [(at, channel - E1) for at, channel in enumerate(channels) if E1 <= channel <= E24]
+    pairs = [
+        (at, channel - E1)
+        for at, channel in enumerate(channels)
+        if channel is not None and E1 <= channel <= E24
+    ]
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Count and fault of all 65536 words, so that a sweep is decoded by two look-ups."""
-    count = np.arange(COUNT_MAX + 1)
-    high, low = count >> 5 << 1, (count & 0x1F) << 3
-    parity = np.array([(byte.bit_count() + 1) % 2 for byte in range(256)])
-    words = (high | parity[high]) << 8 | low | parity[low]  # as `encode_word` makes them
     counts = np.zeros(1 << 16, dtype=np.uint16)
     faults = np.full(1 << 16, int(ElectrodeFault.PARITY), dtype=np.uint8)
-    counts[words], faults[words] = count, 0
+    for count in range(COUNT_MAX + 1):
+        word = encode_word(count)
+        counts[word], faults[word] = count, 0
     for told, fault in (
         (list(ERROR_WORDS), ElectrodeFault.ERROR_WORD),
         (list(UNPLUGGED_WORDS), ElectrodeFault.MISSING),
@@ -123,4 +122,5 @@ def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     return counts, faults
 
 
+_CHANNEL_OF_COMMAND: Final = {sample_command(channel): channel for channel in CHANNELS}
 _COUNTS, _FAULTS = _tables()

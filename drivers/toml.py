@@ -34,9 +34,9 @@ def loads(text: str) -> dict[str, Any]:
     for token in _TOKEN.finditer(text):
         match token.lastgroup:
             case "open":
-                depth, dots = depth + 1, 0
+                depth += 1
             case "close":
-                depth, dots = max(depth - 1, 0), 0
+                depth -= 1
             case "dot":
                 dots += 1
             case "end":

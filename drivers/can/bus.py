@@ -113,8 +113,6 @@ class CanBus:
         self._bus: can.BusABC | None = None
         self._socket: socket.socket | None = None
         self._fileno: int | None = None
-        self._drops_seen = 0
-        self._idle_ns = 0
 
     def open(self) -> None:
         """Take the bus. Raises `LinkError`, or `DriverError` if no later try can succeed."""
@@ -175,7 +173,7 @@ class CanBus:
             return
         self._drops_seen = 0
         with contextlib.suppress(OSError):
-            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+            raw.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
         self._socket = raw
 
     def _drain_socket(self, raw: socket.socket, frames: list[Stamped]) -> None:

@@ -76,11 +76,7 @@ class CanBridgeDriver(Opened):
         options = _bus_options(interface, frame_format, bitrate, data_bitrate)
         self._bus = CanBus(interface, channel, options, clock, wall_clock)
         self._clock = clock
-        self._poll_due_ns = 0
         self._resting_until_ns: int | None = None
-        self._window_start_ns = 0
-        self._window_frames = 0
-        self._frames_per_s = 0.0
 
     @property
     def counters(self) -> CanCounters:

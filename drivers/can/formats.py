@@ -22,7 +22,7 @@ from typing import Final
 import msgspec
 
 from drivers.base import ELECTRODES, FINGERS
-from drivers.biotac import CHANNELS, sample_command
+from drivers.biotac import channel_of, sample_command
 from drivers.can.frames import CLASSIC_DATA_MAX, FD_DATA_MAX
 
 SENSORS_MAX: Final = 3
@@ -39,8 +39,6 @@ _SWEEP_STATUS: Final = struct.Struct("<H")
 _STATUS_AT: Final = _SWEEP_HEAD.size + SWEEP_WORDS_BYTES
 _RESERVED_AT: Final = _STATUS_AT + _SWEEP_STATUS.size
 _RESERVED: Final = bytes(FD_DATA_MAX - _RESERVED_AT)
-
-_CHANNEL_OF_COMMAND: Final = {sample_command(channel): channel for channel in CHANNELS}
 
 
 class CanFormat(StrEnum):
@@ -125,7 +123,7 @@ def parse_sample(data: bytes, sensors: int, length: int) -> SynTouchSample | Rej
     """The sample in a frame of `length` bytes of which `1 + 2 * sensors` are used."""
     if len(data) != length:
         return Reject.LENGTH
-    channel = _CHANNEL_OF_COMMAND.get(data[0])
+    channel = channel_of(data[0])
     if channel is None:
         return Reject.COMMAND
     return SynTouchSample(channel, data[1 : 1 + WORD_BYTES * sensors])
@@ -149,7 +147,7 @@ def sample_length(sensors: int, length: int | None) -> int:
 
     Raises `ValueError` if so many words do not fit into it, or it into a classic frame.
     """
-    if not 1 <= sensors <= SENSORS_MAX:
+    if sensors > SENSORS_MAX:
         raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors
     if length is None:

@@ -80,8 +80,6 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
         return None
     if length > longest:
         return None
-    if word <= STANDARD_ID_MAX:
-        return CanFrame(word, data[:length], flags)
     if word & ERR_FLAG:
         return CanFrame(word & EXTENDED_ID_MAX, data[:length], flags | ERROR)
     if word & RTR_FLAG:

@@ -98,10 +98,11 @@ class ReadingMaker:
         self.period_ns: int | None = None
 
     def learn(self, gap_ns: int) -> None:
-        """Take in the time between two sweeps in a row, ns."""
-        self._gaps_ns.append(gap_ns)
+        """Take in the time between two sweeps in a row, ns, unless it is an outage or none."""
+        if 0 < gap_ns <= OUTAGE_NS:
+            self._gaps_ns.append(gap_ns)
         if len(self._gaps_ns) >= PERIODS_NEEDED:
-            self.period_ns = max(round(statistics.median(self._gaps_ns)), 1)
+            self.period_ns = round(statistics.median(self._gaps_ns))
 
     def forget_period(self) -> None:
         """What was learned may be of sweeps of which some were lost."""

@@ -77,18 +77,21 @@ class SampleAssembler:
         self._readings = ReadingMaker(counters)
         self._counters = counters
         self._buffer = bytearray(ELECTRODES * self._width)
-        self._synchronised = False
         self._previous_start_ns: int | None = None
         self._previous_end_ns: int | None = None
-        self._previous_had = _ALL
         self._seen = -1
-        self._run = 0
         self._at_ns = 0
         self._widest_ns = 0
         self._broken = False
-        self._is_steady = False
-        """Whether it has been seen to sweep without a pause."""
         self._origin_ns = 0.0
+        self._forget()
+
+    def _forget(self) -> None:
+        self._synchronised = False
+        self._is_steady = False
+        """True if the board has been seen to sweep without a pause."""
+        self._previous_had = _ALL
+        self._run = 0
         self._begin()
 
     @property
@@ -120,7 +123,7 @@ class SampleAssembler:
         self._count_run(place, t_ns)
         if until_ns is None:
             until_ns = t_ns
-        elif until_ns > t_ns and until_ns - t_ns >= self._lateness_ns():
+        elif until_ns - t_ns >= self._lateness_ns():
             return self._untimed(place, t_ns)
         if not self._synchronised and not self._starts(place):
             self._counters.unsynchronised_frames += 1
@@ -155,10 +158,7 @@ class SampleAssembler:
     def interrupt(self) -> None:
         """The link broke: drop the sweep at hand, wait for the beginning of another."""
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
-        self._synchronised = self._is_steady = False
-        self._previous_had = _ALL
-        self._run = 0
-        self._begin()
+        self._forget()
 
     def _count_run(self, place: int, t_ns: int) -> None:
         """Count the samples in a row that came each right after its predecessor in the order, and
@@ -167,14 +167,12 @@ class SampleAssembler:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
             self._seen = place
-        if t_ns - self._at_ns > self._widest_ns:
-            self._widest_ns = t_ns - self._at_ns
+        self._widest_ns = max(self._widest_ns, t_ns - self._at_ns)
         self._at_ns = t_ns
 
     def _begin(self) -> None:
         self._have = 0
         self._last = -1
-        self._t_ns = 0
         self._finished = False
 
     def _starts(self, place: int) -> bool:
@@ -310,7 +308,7 @@ class SampleAssembler:
             if is_even and not self._is_steady:
                 self._is_steady = True
                 self._readings.forget_period()
-            if (is_even or not (self._broken or self._is_steady)) and 0 < gap_ns <= OUTAGE_NS:
+            if is_even or not (self._broken or self._is_steady):
                 self._readings.learn(gap_ns)
         self._broken = False
         self._widest_ns = 0

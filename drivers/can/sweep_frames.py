@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
-from drivers.can.readings import OUTAGE_NS, CanCounters, ReadingMaker
+from drivers.can.readings import CanCounters, ReadingMaker
 
 SEQUENCE_JUMP_MAX: Final = 1000
 """Sweep counters that jump by more have started anew; 1000 sweeps last ten seconds."""
@@ -23,6 +23,7 @@ PATIENCE_PERIODS: Final = 2
 PATIENCE_NS: Final = 100_000_000
 """The same while the period is not known, ns."""
 _TICKS: Final = 1 << 32
+_HALF: Final = 1 << 31
 
 
 class FrameAssembler:
@@ -49,9 +50,8 @@ class FrameAssembler:
     def _begin(self, tick_us: int, t_ns: int) -> None:
         self._tick_us = tick_us
         self._have = 0
-        self._furthest = -1
-        self._begun_ns = t_ns
-        self._t_ns = 0
+        self._furthest = 0
+        self._begun_ns = self._t_ns = t_ns
         self._finished = False
 
     @property
@@ -118,13 +118,13 @@ class FrameAssembler:
         if self._current is None or t_ns - self._t_ns > self._patience_ns():
             return False
         back = (self._current - sequence) % (1 << 16)
-        return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _TICKS // 2
+        return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _HALF
 
     def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
         """Begin a sweep; count those left out, or a device that started anew."""
         if self._current is not None:
             jump = (sequence - self._current) % (1 << 16)
-            backwards = (tick_us - self._tick_us) % _TICKS >= _TICKS // 2
+            backwards = (tick_us - self._tick_us) % _TICKS >= _HALF
             if jump > SEQUENCE_JUMP_MAX or backwards:
                 self._counters.restarts += 1
                 self._readings.miss(1)
@@ -149,9 +149,7 @@ class FrameAssembler:
         self._synchronised = True
         self._counters.lost_frames += self._fingers - here
         if self._finished_ns is not None and self._current == self._follows:
-            gap_ns = self._t_ns - self._finished_ns
-            if 0 < gap_ns <= OUTAGE_NS:
-                self._readings.learn(gap_ns)
+            self._readings.learn(self._t_ns - self._finished_ns)
         self._finished_ns = self._t_ns
         self._follows = None if self._current is None else (self._current + 1) % (1 << 16)
         return (self._reading(),)

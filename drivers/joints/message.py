@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Mapping
@@ -23,8 +24,8 @@ SEQ_JUMP_MAX: Final = 1000
 """A sender that jumps ahead by more has begun anew."""
 OLD_MESSAGES_MAX: Final = 10
 """So many messages with old but rising numbers may be a detour; one more is a sender anew."""
-_NAMES_KEPT = 64
-"""Names, known or not, whose meaning is remembered: 28 joints with and without prefix."""
+_joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
+"""Remembers 64 names, known or not: 28 joints with and without prefix."""
 
 
 @dataclass(slots=True)
@@ -77,8 +78,6 @@ class JointParser:
 
     def __init__(self, counters: JointCounters) -> None:
         self._counters = counters
-        self.joint_by_name: dict[str, str | None] = {}
-        """Names that have come, at most `_NAMES_KEPT`, and the joint that each is, if it is one."""
 
     def parse(self, data: bytes) -> JointMessage | None:
         """The message, or None if it is none, which is counted."""
@@ -92,7 +91,7 @@ class JointParser:
         seq, t_s, values = message
         angles: dict[str, float] = {}
         for name, value in values.items():
-            joint = self._joint(name)
+            joint = _joint_of(name)
             if joint is None:
                 self._counters.unknown_names += 1
                 continue
@@ -102,13 +101,6 @@ class JointParser:
             self._counters.bad_angles += joint in angles
             angles[joint] = math.nan if joint in angles else angle
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
-
-    def _joint(self, name: str) -> str | None:
-        if name not in self.joint_by_name:
-            if len(self.joint_by_name) >= _NAMES_KEPT:
-                return joint_name(name)
-            self.joint_by_name[name] = joint_name(name)
-        return self.joint_by_name[name]
 
 
 class MessageOrder:
@@ -123,7 +115,6 @@ class MessageOrder:
         self._last: float | None = None
         self._counted = False
         self._last_old: float | None = None
-        self._old_in_a_row = 0
 
     def admits(self, message: JointMessage) -> bool:
         """Whether a message comes after all admitted before."""
@@ -142,8 +133,9 @@ class MessageOrder:
 
     def _began_anew(self, now: float) -> bool:
         """Old messages are a new start if enough of them rise: one that repeats itself does not."""
-        rises = self._last_old is not None and now > self._last_old
-        self._old_in_a_row = self._old_in_a_row + 1 if rises else 1
+        if self._last_old is None or now <= self._last_old:
+            self._old_in_a_row = 0
+        self._old_in_a_row += 1
         self._last_old = now
         began = self._old_in_a_row > OLD_MESSAGES_MAX
         self._counters.restarts += began
@@ -182,7 +174,7 @@ def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _number(value: object) -> float:
     """A finite number, else NaN. Truth values and text are none."""
     if type(value) is int:
-        return float(value) if abs(value) < 1 << 1000 else math.nan
+        return float(value) if abs(value) <= SEQ_MAX else math.nan
     return value if type(value) is float and math.isfinite(value) else math.nan
 
 

@@ -18,7 +18,6 @@ many, zeros where nobody measured, tables that turn back.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -187,19 +186,19 @@ def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
 
 def _curve_problems(points: Sequence[Point]) -> Iterator[str]:
     """`points` are sorted by raw."""
-    rises = set()
+    slopes = []
     for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(points):
         if raw == next_raw:
             yield f"raw {raw} stands twice"
             continue
         slope = (next_degrees - degrees) / (next_raw - raw)
-        rises.add(math.copysign(1, slope) if slope else 0)
+        slopes.append(slope)
         if abs(slope) > SLOPE_MAX_DEG:
             yield (
                 f"{abs(slope):.2f} degrees per count from raw {raw} to {next_raw} "
                 f"is steeper than {SLOPE_MAX_DEG}"
             )
-    if len(rises) > 1 or 0 in rises:
+    if not (all(slope > 0 for slope in slopes) or all(slope < 0 for slope in slopes)):
         yield "is not monotone: degrees must only rise or only fall with raw"
 
 

@@ -96,7 +96,7 @@ class CoupledTable:
 
     def __init__(self, points: Sequence[CoupledPoint]) -> None:
         """Raises `ValueError` if the raw pairs span no triangle."""
-        table = np.array(points, dtype=np.float64).reshape(-1, 4)
+        table = np.array(points, dtype=np.float64)
         triangles = _delaunay(table[:, :2])
         if not len(triangles):
             raise ValueError("the raw pairs do not span a triangle")
@@ -163,20 +163,14 @@ def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
     both pairs of triangles: either is right.
     """
     triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
-    if not len(triples):
-        return triples.reshape(0, 3)
     a, b, c = (points[triples[:, corner]] for corner in range(3))
-    ab, ac = b - a, c - a
-    twice_area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-    broad = np.abs(twice_area) >= 1.0  # in counts squared; corners on one line have 0
-    triples, a, ab, ac = triples[broad], a[broad], ab[broad], ac[broad]
-    twice_area = twice_area[broad]
-    ab_2, ac_2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
-    offset = np.stack(
-        [ac[:, 1] * ab_2 - ab[:, 1] * ac_2, ab[:, 0] * ac_2 - ac[:, 0] * ab_2], axis=1
-    ) / (2.0 * twice_area[:, None])
-    radius_2 = (offset**2).sum(axis=1)
-    distance_2 = ((points[None, :, :] - (a + offset)[:, None, :]) ** 2).sum(axis=2)
-    empty = (distance_2 > radius_2[:, None] * (1.0 - 1e-9)).all(axis=1)
+    edges = np.stack([b - a, c - a], axis=1)
+    broad = np.abs(np.linalg.det(edges)) > 0.5  # twice the area, counts squared; 0 on one line
+    triples, a, edges = triples[broad], a[broad], edges[broad]
+    # The circle's centre is as far from the first corner as from the others.
+    offset = np.linalg.solve(edges, (edges**2).sum(axis=2, keepdims=True) / 2)[:, :, 0]
+    distance = np.linalg.norm(points - (a + offset)[:, None, :], axis=2)
+    radius = np.linalg.norm(offset, axis=1, keepdims=True)
+    empty = (distance > radius * (1.0 - 1e-9)).all(axis=1)
     found: NDArray[np.intp] = triples[empty]
     return found

@@ -37,8 +37,6 @@ COMMAND_MAX = 4
 
 ROUND = 14
 """Packets until each channel of a BioTac has come once."""
-TYPE_FIRST: Final = 0x0001
-TYPE_LAST: Final = 0x001B
 TYPE_METADATA_FIRST: Final = 0xFFF9
 TYPE_METADATA_LAST: Final = 0xFFFF
 """From here to here `tactile` holds no samples but serial numbers, versions and the like."""
@@ -74,14 +72,15 @@ CHANNELS: tuple[tuple[Channel, Channel | None], ...] = tuple(map(_channels, rang
 """By position in the round: the channels of `other_0` and `other_1`. The last has only one."""
 
 
+_POSITIONS: Final = {2 * position + 1: position for position in range(ROUND)}
+
+
 def position_of(tactile_type: int) -> int | None:
     """Position 0..13 in the round that a `tactile_type` stands for, or None if it is no sample.
 
     0x0001 is (PDC, TAC), 0x0003 (TDC, E1), 0x0005 (E2, E3) ... 0x0019 (E22, E23), 0x001B (E24, -).
     """
-    if not TYPE_FIRST <= tactile_type <= TYPE_LAST or tactile_type % 2 == 0:
-        return None
-    return tactile_type // 2
+    return _POSITIONS.get(tactile_type)
 
 
 class Palm(StrEnum):

@@ -128,7 +128,7 @@ class RoundAssembler:
 
     def _place_of(self, position: int, t_ns: int) -> int | None:
         if self._place is not None and self._place_t_ns is not None:
-            return self._place + self._step(position, t_ns - self._place_t_ns)
+            return self._place + _step(self._place, position, t_ns - self._place_t_ns)
         if position != 0:
             return None
         if self._place_t_ns is None:
@@ -138,15 +138,6 @@ class RoundAssembler:
         self._miss(missed)
         self._begin(self._round + missed + 1)
         return self._round * ROUND
-
-    def _step(self, position: int, elapsed_ns: int) -> int:
-        """Places from the furthest to this packet; not above 0 for one that comes late."""
-        place = self._place or 0
-        step = (position - place) % ROUND or ROUND
-        if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
-            return step - ROUND
-        overdue_ns = elapsed_ns - (step + LATE_MAX) * CYCLE_NS
-        return step + max(0, overdue_ns // ROUND_NS + 1) * ROUND
 
     def _move_on(self, to_round: int) -> Sequence[TactileReading]:
         """Close the round at hand, incomplete as it may be, and begin another."""
@@ -166,7 +157,6 @@ class RoundAssembler:
         self._finished = False
         self.packets: list[PalmPacket | None] = [None] * ROUND
         """What has come of this round, by position."""
-        self._t_ns = 0
         self._counts[:] = 0
         self._faults[:] = ElectrodeFault.MISSING
         self._absent = [False] * len(self._slots)
@@ -235,3 +225,12 @@ class RoundAssembler:
             self._counts[row] = 0
             self._faults[row] = ElectrodeFault.MISSING
             self._known[row] = False
+
+
+def _step(place: int, position: int, elapsed_ns: int) -> int:
+    """Places from the furthest to this packet; not above 0 for one that comes late."""
+    step = (position - place) % ROUND or ROUND
+    if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
+        return step - ROUND
+    overdue_ns = elapsed_ns - (step + LATE_MAX) * CYCLE_NS
+    return step + max(0, overdue_ns // ROUND_NS + 1) * ROUND

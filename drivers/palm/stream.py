@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.base import JointReading, Reading
-from drivers.palm.packet import CYCLE_NS, SENSORS, Palm, PalmCounters, PalmPacket, PalmParser
+from drivers.palm.packet import SENSORS, Palm, PalmCounters, PalmPacket, PalmParser
 from drivers.palm.rounds import RoundAssembler
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ class PalmStream:
         self._rounds = RoundAssembler(fingers, self.counters, heed_finger_bits=heed_finger_bits)
         self._previous = b""
         self._calibration: JointCalibration | None = None
-        self._uncalibrated = 0
         self._joint_due_ns = 0
         self._joint_seq = 0
         if calibration is not None:
@@ -63,8 +62,8 @@ class PalmStream:
             from drivers.palm.calibration import load_calibration
 
             self._calibration = load_calibration(calibration)
-            middle = [2000] * SENSORS
-            self._uncalibrated = int(np.isnan(self._calibration.angles_rad(middle)).sum())
+            counts = range(SENSORS)  # any will do
+            self._uncalibrated = int(np.isnan(self._calibration.angles_rad(counts)).sum())
 
     @property
     def cycles_to_go(self) -> int:
@@ -97,7 +96,7 @@ class PalmStream:
         self.palm = None
 
     def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
-        if self._calibration is None or t_ns < self._joint_due_ns - CYCLE_NS // 2:
+        if self._calibration is None or t_ns < self._joint_due_ns:
             return None
         from drivers.palm.hall import JOINTS, impossible_angles
 

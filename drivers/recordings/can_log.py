@@ -67,9 +67,8 @@ def frame_of(line: str) -> tuple[int, CanFrame] | None:
         flags |= REMOTE
     if len(found[4]) == 3:
         return (wall_ns, CanFrame(word, data, flags)) if word <= STANDARD_ID_MAX else None
-    if word & ERR_FLAG:
-        return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags | ERROR)
-    return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags | EXTENDED)
+    flags |= ERROR if word & ERR_FLAG else EXTENDED
+    return wall_ns, CanFrame(word & EXTENDED_ID_MAX, data, flags)
 
 
 class CanLog:

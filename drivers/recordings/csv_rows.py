@@ -79,7 +79,6 @@ class Recording:
     ) -> None:
         self._path = path
         self._strict = strict
-        self._line = 1
         self._ended = True
         texts = self._texts(lines)
         header = next(texts, None)

@@ -41,9 +41,7 @@ class SerialRecord:
 
 
 def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
-    """The records of some bytes. Raises `ValueError` for a time that is none."""
-    if not 0 <= t_ns < 1 << 64:
-        raise ValueError(f"time {t_ns} ns is out of range")
+    """The records of some bytes."""
     head = _TIME.pack(t_ns)
     starts = range(0, max(len(data), 1), PIECE_MAX_BYTES)
     return b"".join(

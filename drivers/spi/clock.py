@@ -183,8 +183,6 @@ class _Drift:
 
     def __init__(self) -> None:
         self._origin: tuple[float, int] | None = None
-        self.slope, self.slack = 0.0, SLACK_MAX
-        """Host ns per device ns, less one, and how wrong that may be."""
         self._restart(0.0, 0.0)
 
     def _restart(self, x: float, y: float) -> None:
@@ -196,6 +194,7 @@ class _Drift:
 
     def _conclude(self) -> None:
         self.slope, self.slack = 0.0, SLACK_MAX
+        """Host ns per device ns, less one, and how wrong that may be."""
         if self._x_variance > 0.0:
             error = math.sqrt(self._noise_variance * DECAY / (2.0 * self._x_variance))
             slope, slack = self._covariance / self._x_variance, SLACK_SIGMAS * error

@@ -101,13 +101,8 @@ class Conversation:
         self._parser, self._sent = frame_parser(), frame_parser()
         self._next_seq = 0
         self._sweeps: SweepDecoder | None = None
-        self._starts = False
         self._pings: dict[int, int] = {}
         """When the PINGs that wait for an answer were sent, by their nonce."""
-        self._pings_sent = 0
-        self._ping_due_ns = self._silent_at_ns = 0
-        self._silence_ns = SILENCE_MIN_NS
-        """How long no sweep may come, ns."""
 
     @property
     def counters(self) -> BridgeCounters:

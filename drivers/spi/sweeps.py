@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
-from drivers.biotac import UNPLUGGED_WORDS, channel_of, decode_words, electrode_columns
+from drivers.biotac import channel_of, decode_words, electrode_columns
 from drivers.spi.clock import DeviceClock
 from drivers.spi.messages import Hello, Sweep
 
@@ -85,20 +85,18 @@ class SweepDecoder:
         self._sensors = tuple(sensors)
         self._counters = counters
         self._bridge_seq: int | None = None
-        channels = [channel_of(command) for command in hello.commands]
-        columns = electrode_columns([-1 if channel is None else channel for channel in channels])
+        columns = electrode_columns(map(channel_of, hello.commands))
         samples = hello.slots * hello.sensors
         # Where each electrode's word is in a sweep; one that is not sampled gets the word after
         # the last, which nothing drives.
         self._source = np.full((len(sensors), ELECTRODES), samples, dtype=np.intp)
         for row, sensor in enumerate(sensors):
             self._source[row, columns[:, 1]] = columns[:, 0] * hello.sensors + sensor
-        self._words = np.full(samples + 1, UNPLUGGED_WORDS[0], dtype=np.intp)
+        self._words = np.zeros(samples + 1, dtype=np.intp)
         self._is_sampled = self._source < samples
         self._sound = bytes(self._source.size)
         """Faults of a reading without any."""
         self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
-        self._all_present = sum(1 << sensor for sensor in set(sensors))
 
     def fits(self, hello: Hello) -> bool:
         """Whether a later HELLO describes the same sampling."""
@@ -126,8 +124,7 @@ class SweepDecoder:
             return None
         if not self._is_next(sweep):
             return None
-        if sweep.tick_end - sweep.tick_start > self.longest_ticks:
-            self.longest_ticks = sweep.tick_end - sweep.tick_start
+        self.longest_ticks = max(self.longest_ticks, sweep.tick_end - sweep.tick_start)
         faults, fallbacks = self.clock.faults, self.clock.fallbacks
         t_ns = self.clock.host_ns(sweep.tick_end, arrival_ns, idle_ns)
         self._counters.clock_faults += self.clock.faults - faults
@@ -157,10 +154,9 @@ class SweepDecoder:
         """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
         self._sweep[...] = sweep.words
         counts, faults = decode_words(self._words[self._source])
-        absent: list[int] = []
-        if sweep.present & self._all_present != self._all_present:
-            present = [sweep.present >> sensor & 1 for sensor in self._sensors]
-            absent = [row for row, is_there in enumerate(present) if not is_there]
+        present = [sweep.present >> sensor & 1 for sensor in self._sensors]
+        absent = [row for row, is_there in enumerate(present) if not is_there]
+        if absent:
             counts[absent] = 0
             faults[absent] = int(ElectrodeFault.MISSING)
         self._count(faults, absent)

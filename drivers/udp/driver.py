@@ -68,11 +68,9 @@ class DatagramDriver(Opened):
         self._link = Link(self.name)
         self._earlier_drops = 0
         self._sender: Sender | None = None
-        self._heard: Sender = ("", 0)
         self.sender: str | None = None
         """Who was heard last, `udp://ADDRESS:PORT`; None before the first good datagram."""
         self._t_ns = 0
-        self._good_t_ns = 0
         self._heard_from: str | None = None
         """What was heard last, from whom."""
 

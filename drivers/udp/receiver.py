@@ -78,8 +78,8 @@ class DatagramReceiver:
         try:
             self._socket.setblocking(False)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-            self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, True)
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, True)
             self._socket.bind((endpoint.address, endpoint.port))
         except OSError as error:
             self._socket.close()

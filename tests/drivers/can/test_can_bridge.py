@@ -162,7 +162,7 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
         {"data_length": 6},
         {"data_length": 9},
         {"format": "sweep_fd", "data_length": 7},
-        {"format": "sweep_fd", "arbitration_id": 0x7FE},
+        {"format": "sweep_fd", "arbitration_id": 0x7FC},
         {"data_bitrate": 5_000_000},
         {"format": "sweep_fd", "data_bitrate": 5_000_000},
     ],
@@ -170,6 +170,19 @@ def test_frames_that_are_not_ours_are_counted_and_harm_nothing() -> None:
 def test_arguments_out_of_range_are_refused(options: Mapping[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"\w"):
         CanBridgeDriver("virtual", "x", **options)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"arbitration_id": 0},
+        {"arbitration_id": (1 << 29) - 1},
+        {"format": "sweep_fd", "arbitration_id": 0x7FB},
+        {"fingers": ("th",)},
+    ],
+)
+def test_arguments_at_the_end_of_their_range_are_taken(options: Mapping[str, Any]) -> None:
+    CanBridgeDriver("virtual", "x", **options)
 
 
 def test_a_bit_rate_that_socketcan_would_ignore_is_refused() -> None:

@@ -265,10 +265,19 @@ def test_error_frames_say_what_happened() -> None:
     assert not is_bus_off(CanFrame(0x040, bytes(8)))
     assert is_overflow(overflow)
     assert not is_overflow(passive)
-    assert not is_overflow(CanFrame(0x004, b"", ERROR))
+    assert not is_overflow(CanFrame(0x004, b"\0", ERROR))
+    assert is_overflow(CanFrame(0x004, b"\0\1", ERROR))
+    assert not is_overflow(CanFrame(0x080, b"\0\1", ERROR))
+    assert not is_overflow(CanFrame(0x004, b"\0\1"))
     assert describe_error(bus_off) == "bus-off"
     assert describe_error(passive) == "controller problem, error counters"
     assert describe_error(CanFrame(0, b"", ERROR)) == "unknown error class"
+    # CAN_ERR_TX_TIMEOUT, _LOSTARB, _CRTL, _PROT, _TRX, _ACK, _BUSOFF, _BUSERROR, _RESTARTED, _CNT
+    words = ["timeout", "arbitration", "controller", "protocol", "transceiver", "acknowledgement"]
+    for bit, cause in enumerate([*words, "bus-off", "bus error", "restarted", "counters"]):
+        told = describe_error(CanFrame(1 << bit, b"", ERROR))
+        assert cause in told
+        assert "," not in told
 
 
 @pytest.mark.parametrize("frame_format", list(CanFormat))

@@ -88,6 +88,7 @@ def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == truth(0)).all()
         assert driver.describe()["link"].text == "waiting"
+        assert str(failure) in driver.describe()["why"].text
         assert driver.fileno() is None
         assert str(failure) in driver.describe()["last error"].text
         assert first.shut_down == 1
@@ -98,7 +99,8 @@ def test_whatever_python_can_raises_is_a_link_fault_that_is_recovered_from(
         (reading,) = tactile(driver.read_ready())
         assert (reading.counts == truth(3)).all()
         assert not reading.faults.any()
-        assert driver.describe()["link"].text == "up"
+        known = driver.describe()
+        assert (known["link"].text, "why" in known) == ("up", False)
         counters = driver.counters
         assert (counters.bus_faults, counters.link_losses, counters.interrupted_sweeps) == (1, 1, 1)
     assert second.shut_down == 1
@@ -168,9 +170,24 @@ def test_frames_per_second_are_told_until_there_are_none() -> None:
                     bus.send(sent)
                 clock.now_ns += 100 * MS
                 driver.read_ready()
-        assert driver.frames_per_s == pytest.approx(240, rel=0.05)
-        clock.now_ns += 10_000 * MS
+            assert driver.describe()["frames"].text == "240 /s"  # 24 in each tenth
+        clock.now_ns += 1_900 * MS
+        assert driver.frames_per_s == 240.0
+        clock.now_ns += 1
         assert driver.frames_per_s == 0.0
+
+
+def test_frames_are_counted_over_a_full_second() -> None:
+    clock, where = Clock(), channel()
+    with (
+        bridge(where, clock=clock) as driver,
+        can.Bus(interface="virtual", channel=where, ignore_config=True) as bus,
+    ):
+        for passed_ns, told in ((1_000 * MS - 1, 0.0), (1, 2.0), (1_000 * MS, 1.0)):
+            bus.send(message(b"\0", 0x7FF))
+            clock.now_ns += passed_ns
+            driver.read_ready()
+            assert driver.frames_per_s == told
 
 
 def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(

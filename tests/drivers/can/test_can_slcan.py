@@ -94,6 +94,8 @@ def test_data_bit_rates_reach_an_slcan_adapter(monkeypatch: pytest.MonkeyPatch) 
     timing = seen["timing"]
     assert isinstance(timing, can.BitTimingFd)
     assert (timing.nom_bitrate, timing.data_bitrate) == (1_000_000, 5_000_000)
+    assert (timing.nom_sample_point, timing.data_sample_point) == (80.0, 81.25)  # 13 of 16
+    assert timing.f_clock == 80_000_000  # CANable 2
     assert seen["sleep_after_open"] == 0.0
 
 

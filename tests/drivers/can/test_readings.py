@@ -19,6 +19,16 @@ def test_a_period_is_the_median_of_the_last_fifteen_and_known_after_five() -> No
     assert known == [None] * 4 + [10] * 11 + [10] * 7 + [20] * 2
 
 
+def test_a_period_is_of_two_seconds_at_most_and_of_no_sweeps_at_one_time() -> None:
+    made = ReadingMaker(CanCounters())
+    for gap_ns in (0, -1, 2_000 * MS + 1) * 5:
+        made.learn(gap_ns)
+    assert made.period_ns is None
+    for _ in range(5):
+        made.learn(2_000 * MS)
+    assert made.period_ns == 2_000 * MS
+
+
 def test_what_was_missed_leaves_a_gap_in_the_numbers() -> None:
     counters = CanCounters()
     made = ReadingMaker(counters)

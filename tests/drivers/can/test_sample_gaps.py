@@ -134,6 +134,42 @@ def test_a_short_stall_breaks_nothing(periods: float) -> None:
     assert counters.faulty_readings == counters.missed_readings == 0
 
 
+@pytest.mark.parametrize(
+    ("place", "after_us", "is_next"),
+    [(5, 1_899, False), (5, 1_900, True), (9, 2_299, False), (9, 2_300, True)],
+)
+def test_before_the_period_is_known_it_is_taken_for_that_of_the_fastest_board(
+    place: int, after_us: int, is_next: bool
+) -> None:
+    """100 us a sample: three quarters of a sweep are 1800 us, after the time to that place."""
+    sweeps, _ = assembler()
+    begun, late = samples(0)[:5], samples(0)[place]
+    readings = feed(sweeps, [*begun, (*late[:2], begun[-1][2] + after_us * 1000)])
+    assert len(readings) == is_next
+
+
+def test_a_period_is_learned_from_two_ends_in_a_row_only() -> None:
+    """Every second sweep has no end, and its lost samples are too few to look like a pause."""
+    sweeps, _ = assembler()
+    stream = [samples(n) if n < 8 or n % 2 else samples(n)[:10] for n in range(50)]
+    feed(sweeps, concatenated(stream))
+    assert sweeps.period_ns == 24 * SLOT_NS
+
+
+def test_a_period_is_learned_though_a_sample_is_lost_in_every_sweep() -> None:
+    sweeps, _ = assembler()
+    feed(sweeps, concatenated([samples(n)[:5] + samples(n)[6:] for n in range(6)]))
+    assert sweeps.period_ns == 24 * SLOT_NS
+
+
+def test_the_first_sweep_may_end_on_time_after_a_loss() -> None:
+    sweeps, counters = assembler()
+    kept = samples(0)[:2] + samples(0)[21:]
+    (reading,) = feed(sweeps, retimed(kept, [at * 100_000 for at in (0, 1, 21, 22, 23)]))
+    assert_true(reading, 0)
+    assert (counters.late_frames, counters.lost_frames) == (0, 19)
+
+
 @pytest.mark.parametrize("cut_at", [0, 1, 12, 23])
 def test_a_known_loss_ends_the_sweep_at_hand(cut_at: int) -> None:
     """So few are lost that neither order nor time would show where."""
@@ -264,6 +300,14 @@ def test_a_copy_of_a_last_sample_is_none_of_the_sweep_that_has_begun(electrode: 
         assert_true(reading, sweep)
         assert not reading.faults.any()
     assert (len(readings), counters.duplicate_frames) == (8, 1)
+
+
+def test_a_late_sample_that_a_sweep_lacked_is_none_of_the_next_one_whatever_its_time() -> None:
+    sweeps, counters = assembler()
+    late, (first, *_) = samples(8)[23], samples(9)
+    feed(sweeps, concatenated([*(samples(n) for n in range(8)), samples(8)[:23], [first]]))
+    assert sweeps.push(*late[:2], first[2], first[2] + 17 * SLOT_NS) == ()
+    assert counters.late_frames == 1
 
 
 def test_a_late_sample_of_a_lost_sweep_is_none_of_the_next_one() -> None:

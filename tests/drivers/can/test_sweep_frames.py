@@ -107,7 +107,20 @@ def test_a_tenth_of_a_second_while_the_period_is_not_known(late_ns: int, restart
     whole(sweeps, 1)
     push(sweeps, 0, 2, 10)
     push(sweeps, 1, 2, 10 + late_ns)
-    assert counters.restarts == restarts
+    assert counters.restarts == counters.missed_readings == restarts
+
+
+@pytest.mark.parametrize(("ahead_us", "restarts"), [((1 << 31) - 1, 0), (1 << 31, 1)])
+def test_a_tick_that_is_half_of_all_ahead_went_back(ahead_us: int, restarts: int) -> None:
+    sweeps, counters = frame_sweeps()
+    whole(sweeps, 5, tick_us=7)
+    whole(sweeps, 6, tick_us=7 + ahead_us)
+    assert counters.restarts == counters.missed_readings == restarts
+    late_us = 7 + ahead_us - ((1 << 31) - 1)
+    push(sweeps, 0, 5, 0, tick_us=late_us)
+    assert counters.late_frames == 1
+    push(sweeps, 0, 4, 0, tick_us=late_us - 1)
+    assert counters.late_frames == 1
 
 
 def test_a_late_frame_is_one_of_the_two_periods_before() -> None:

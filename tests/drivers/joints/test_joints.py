@@ -145,12 +145,11 @@ def test_one_joint_under_two_names_has_no_angle() -> None:
     assert counters.bad_angles == 1
 
 
-def test_names_are_remembered_up_to_a_limit() -> None:
+def test_any_number_of_unknown_names_is_counted() -> None:
     counters = JointCounters()
     parser = JointParser(counters)
     for number in range(500):
         parser.parse(json.dumps({"joints": {f"X{number}": 0.1, "FFJ3": 0.5}}).encode())
-    assert len(parser.joint_by_name) <= 64
     assert counters.unknown_names == 500
 
 

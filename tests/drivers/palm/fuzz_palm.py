@@ -132,7 +132,7 @@ class _Joints:
 
     @property
     def held_bytes(self) -> int:
-        return len(self._parser.joint_by_name)
+        return 0
 
 
 def _are_angles(message: Angles) -> bool:

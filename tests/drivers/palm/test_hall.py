@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import tomllib
@@ -154,8 +155,8 @@ def test_an_angle_is_impossible_ten_degrees_beyond_the_range_of_its_joint(joint:
     assert set(JOINTS) == set(RANGES_DEG)
     low, high = RANGES_DEG[joint]
     for angle, impossible in (
-        *((low - 10.01, 1), (low - 9.99, 0), (low, 0)),
-        *((high, 0), (high + 9.99, 0), (high + 10.01, 1)),
+        *((low - 10.01, 1), (low - 10, 0), (low, 0)),
+        *((high, 0), (high + 10, 0), (high + 10.01, 1)),
     ):
         angles = np.full(28, np.nan)
         angles[JOINTS.index(joint)] = math.radians(angle)
@@ -252,6 +253,14 @@ def test_a_flat_coupled_table_is_a_plane_inside_and_outside() -> None:
         first, second = table.angles_rad(a, b)
         assert math.degrees(first) == pytest.approx(0.01 * a - 0.002 * b + 1)
         assert math.degrees(second) == pytest.approx(0.004 * a + 0.006 * b - 30)
+
+
+def test_a_coupled_table_is_cut_where_its_points_are_near_each_other() -> None:
+    """Of a flat kite: along the short diagonal, whose ends are 10 and 20 degrees."""
+    kite = [(1000, 1000, 0, 0), (3000, 1000, 0, 0), (2000, 1400, 10, 1), (2100, 600, 20, 2)]
+    for order in itertools.permutations(kite):
+        first, second = np.degrees(CoupledTable(order).angles_rad(2050, 1000))
+        assert (first, second) == pytest.approx((15, 1.5))
 
 
 def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:

@@ -69,6 +69,7 @@ def test_fourteen_packets_make_one_reading_of_their_counts() -> None:
     assert [reading.t_ns for reading in played.readings] == [13 * MS, 27 * MS, 41 * MS, 55 * MS,
                                                              69 * MS]  # fmt: skip
     assert played.counters.lost_packets == played.counters.faulty_readings == 0
+    assert played.counters.readings == 5
 
 
 @pytest.mark.parametrize("order", [("th", "ff"), ("mf",), ("ff", "mf", "rf", "lf", "th")])

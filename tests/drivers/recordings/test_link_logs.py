@@ -24,6 +24,7 @@ from drivers.recordings.serial_log import (
 )
 from drivers.spi.framing import FrameParser
 from drivers.spi.line import LineEvent
+from tests.drivers.can.can_words import Clock
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)
 
@@ -153,6 +154,7 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
 def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
     found = list(SerialLogParser().feed(encode_records(LineEvent.RECEIVED, 5, data)))
     assert b"".join(record.data for record in found) == data
+    assert max(len(record.data) for record in found) == 960
     assert {(record.event, record.t_ns) for record in found} == {(LineEvent.RECEIVED, 5)}
 
 
@@ -213,7 +215,7 @@ def test_the_frames_of_a_can_log_are_counted_and_other_lines_passed_over(tmp_pat
             t_ns = 10**18 + (24 * sweep + at) * 400_000
             data = bytes([sample_command(channel)]) + bytes.fromhex("A251 A8C8 94B9")
             lines.append(line_of(CanFrame(0x1A5, data), t_ns, "can0"))
-    path.write_text("".join([*lines, "x" * 300 + "\n", lines[-1]]))
+    path.write_text("".join([*lines, lines[-1].rstrip().ljust(300) + "\n", lines[-1]]))
     records = list(log.records(path))
     assert len(records) == 49
     readings = [reading for record in records for reading in log.feed(*record)]
@@ -224,3 +226,25 @@ def test_the_frames_of_a_can_log_are_counted_and_other_lines_passed_over(tmp_pat
     assert (counters.frames, counters.accepted_frames, counters.duplicate_frames) == (49, 49, 1)
     log.begin()
     assert log.stream.counters.frames == 0
+
+
+def test_a_link_log_plays_at_its_own_pace_times_speed(tmp_path: Path) -> None:
+    path, clock = tmp_path / "can.log", Clock()
+    data = [bytes([sample_command(at)]) + bytes.fromhex("A251 A8C8 94B9") for at in range(17, 41)]
+    times_ns = [10**18 + at * 400_000 for at in range(24 * 7)]
+    lines = [
+        line_of(CanFrame(0x1A5, data[at % 24]), t_ns, "can0") for at, t_ns in enumerate(times_ns)
+    ]
+    path.write_text("".join(lines))
+    log = CanLog(("ff", "mf", "th"), sequence="electrodes")
+    with LinkLogDriver([path], log, speed=2.0, clock=clock) as driver:
+        assert driver.period_ns is None
+        began_ns, times_us = clock.now_ns, []
+        while not driver.exhausted:
+            clock.now_ns = driver.due_ns() or clock.now_ns
+            times_us += [(r.t_ns - began_ns) // 1000 for r in driver.read_ready()]
+        assert driver.period_ns == 24 * 200_000
+    assert times_us == [(24 * sweep + 23) * 200 for sweep in range(7)]
+    with LinkLogDriver([path], log, clock=clock) as driver:
+        assert len([reading for _ in range(7) for reading in driver.read_ready()]) == 7
+        assert driver.period_ns == 24 * 400_000

@@ -35,6 +35,35 @@ def test_a_file_of_packets_plays_count_for_count(
     assert np.array_equal([reading.counts for reading in readings], rows(40))
 
 
+def test_the_size_of_a_file_tells_the_length_where_one_packet_cannot(tmp_path: Path) -> None:
+    path = tmp_path / "hand.palm"
+    path.write_bytes(next(iter(PalmTwin(rows(1), can_record=True).packets())).to_bytes())
+    clock = Clock()
+    with PalmFileDriver(path, clock=clock) as driver:
+        driver.read_ready()
+        assert (driver.counters.packets, driver.counters.bad_lengths) == (1, 0)
+        assert driver.exhausted
+
+
+@pytest.mark.parametrize(
+    ("good", "nonsense", "plays"),
+    # One packet and 20 bytes may be a packet with a CAN record (12 bytes) and 8 bytes.
+    [(14, 14 * 220, True), (13, 15 * 220, False), (1, 12, True), (1, 20, False)],
+)
+def test_half_of_the_packets_of_a_file_make_sense_and_with_one_length(
+    tmp_path: Path, good: int, nonsense: int, plays: bool
+) -> None:
+    path = tmp_path / "hand.palm"
+    path.write_bytes(b"".join(datagrams(1)[:good]) + bytes(nonsense))
+    driver = PalmFileDriver(path, clock=Clock())
+    if plays:
+        driver.open()
+        driver.close()
+    else:
+        with pytest.raises(RecordingError, match="not a file of palm packets"):
+            driver.open()
+
+
 def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
     clock = Clock()
     path = tmp_path / "hand.palm"

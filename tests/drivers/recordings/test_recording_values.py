@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -56,6 +57,12 @@ def test_an_integer_may_be_written_in_several_ways(cell: str, expected: int) -> 
     (row,) = rows_of(table(1, {0: {"th_biotac_24": cell}}), strict=True)
     assert row.counts[2, 23] == expected
     assert not row.faults.any()
+
+
+@pytest.mark.parametrize(("cell", "told"), [("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "...")])
+def test_a_message_shows_forty_characters_of_a_cell(cell: str, told: str) -> None:
+    with pytest.raises(RecordingError, match=rf"column th_biotac_24: '{re.escape(told)}' is not"):
+        rows_of(table(1, {0: {"th_biotac_24": cell}}), strict=True)
 
 
 @pytest.mark.parametrize(("length", "read"), [(32, 5), (33, None)])

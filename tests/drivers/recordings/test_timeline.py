@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
+import numpy as np
 import pytest
 
-from drivers.base import RecordingError
+from drivers.base import JointReading, RecordingError
 from drivers.recordings.player import Timeline
 from tests.drivers.palm.palm_stream import MS, Clock
 
@@ -23,7 +24,9 @@ def test_items_are_due_as_recorded_over_the_speed(
     speed: float, steps_ms: list[int], delay_ms: int
 ) -> None:
     clock = Clock()
-    timeline: Timeline[str] = Timeline(speed, clock, delay_ns=delay_ms * MS)
+    timeline: Timeline[str] = (
+        Timeline(speed, clock, delay_ns=delay_ms * MS) if delay_ms else Timeline(speed, clock)
+    )
     timeline.start(items())
     assert timeline.due_ns() == clock.now_ns, "the first one begins the run"
     began_ns = clock.now_ns
@@ -50,6 +53,17 @@ def test_without_a_speed_all_is_due_at_once_and_keeps_its_recorded_times() -> No
         *(0, 10 * MS, 30 * MS),
     ]
     assert timeline.exhausted
+
+
+def test_a_reading_is_handed_over_as_old_as_it_was() -> None:
+    clock = Clock()
+    timeline: Timeline[str] = Timeline(None, clock)
+    clock.now_ns += 5 * MS
+    made = JointReading(480 * MS, 3, (), np.zeros(0))
+    given = timeline.hand_over(made, 500 * MS, 100 * MS)
+    assert (given.t_ns, given.recorded_ns) == (clock.now_ns - 20 * MS, 380 * MS)
+    assert timeline.hand_over(made, 500 * MS).recorded_ns == 480 * MS
+    assert timeline.handed_over_ns == clock.now_ns
 
 
 def test_an_error_waits_until_what_is_before_it_was_taken() -> None:

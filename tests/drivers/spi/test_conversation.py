@@ -9,7 +9,9 @@ import pytest
 from drivers.base import DeviceFault, Fact, LinkCause
 from drivers.link import LinkState
 from drivers.spi.conversation import Conversation
+from drivers.spi.framing import encode_frame
 from drivers.spi.messages import (
+    DIGEST,
     FIRMWARE,
     BridgeStatus,
     Message,
@@ -249,9 +251,20 @@ def test_the_bridges_own_counters_are_shown_and_an_echo_is_not_taken_for_words()
     conversation = greeted()
     hear(conversation, BridgeStatus(1, 2, 3, 4, 5, (6,)), T0)
     hear(conversation, Ping(7), T0)
+    conversation.not_sent()
     counters = conversation.counters
+    assert counters.host_tx_dropped == 1
     shown = counters.bridge_overruns, counters.bridge_tx_dropped, counters.bridge_rx_errors
     assert (*shown, counters.unknown_frames) == (3, 4, 5, 1)
+
+
+@pytest.mark.parametrize(("kind", "bad"), [(1, 1), (2, 1), (3, 1), (4, 0), (0x80, 0), (0x84, 0)])
+def test_a_frame_makes_no_sense_or_its_type_is_unknown(kind: int, bad: int) -> None:
+    conversation = opened()
+    digest = 0 if kind == 1 else DIGEST
+    assert conversation.receive(encode_frame(kind, b"x", digest), T0, T0) == []
+    counters = conversation.counters
+    assert (counters.frames, counters.bad_frames, counters.unknown_frames) == (1, bad, 1 - bad)
 
 
 @pytest.mark.parametrize(("first", "missed"), [(0, 0), (1, 1), (1000, 1000), (1001, 0)])

@@ -115,6 +115,7 @@ def test_a_frame_of_another_digest_fails_unless_its_type_has_none() -> None:
         ("05 11 22 33 00", "bad_cobs"),  # says four bytes and has three
         ("02 31 00", "bad_crc"),  # no room for a checksum
         ("05 11 22 33 44 00", "bad_crc"),
+        ("01 01 01 01 01 00", "bad_crc"),  # of nothing, the right one
         ("0E 31 32 33 34 35 36 37 38 39 26 39 F4 CA 00", "bad_crc"),
         ("00", "empty"),
     ],
