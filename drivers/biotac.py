@@ -94,7 +94,7 @@ def decode_words(
     A word with a fault has the count 0. Words are the 16 bits as sent, first byte high, soonest
     decoded as `np.intp`.
     """
-    return _COUNTS[words], _FAULTS[words]
+    return COUNT_OF_WORD[words], FAULT_OF_WORD[words]
 
 
 def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
@@ -123,4 +123,5 @@ def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
 
 
 _CHANNEL_OF_COMMAND: Final = {sample_command(channel): channel for channel in CHANNELS}
-_COUNTS, _FAULTS = _tables()
+COUNT_OF_WORD, FAULT_OF_WORD = _tables()
+"""Count, and `ElectrodeFault` bits, of each of the 65536 response words; see `decode_words`."""

@@ -56,7 +56,7 @@ class MeasuredError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the training counts look like; `models.novelty` says what follows for a reading."""
+    """What the training counts look like; `models.electrodes` says what follows for a reading."""
 
     low: tuple[tuple[Count, ...], ...]
     """Smallest count of each electrode, shape (fingers, 24)."""

@@ -15,9 +15,8 @@ from daemon.judge.reasons import Reason
 from daemon.trust.trust import Assessment
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger, ModelError, SeenCounts
-from models.electrodes import ROUNDING, Electrodes
+from models.electrodes import CONTRADICTING_MAX, ROUNDING, Electrodes, NoveltyCheck
 from models.inputs import SessionBuilder
-from models.novelty import CONTRADICTING_MAX, NoveltyCheck
 from models.runtime import TactileModel
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 

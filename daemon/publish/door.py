@@ -268,7 +268,8 @@ class Door:
         try:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:
-            raise PublishError(f"cannot bind {listener.endpoint}: {error.strerror}") from error
+            why = zmq.strerror(error.errno)  # the error's own text names the endpoint once more
+            raise PublishError(f"cannot bind {listener.endpoint}: {why}") from error
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when a question comes.

@@ -1,14 +1,18 @@
-"""Latency statistics in constant memory."""
+"""How late readings and verdicts are, in constant memory."""
 
 from __future__ import annotations
 
 import math
+
+from drivers.base import TactileReading
 
 STEP = 1.02
 """Ratio of neighbouring bucket bounds: a percentile is right to 2 %."""
 FLOOR_US = 0.1
 BUCKETS = math.ceil(math.log(1e8 / FLOOR_US) / math.log(STEP)) + 1
 """Enough to reach 100 s."""
+OUTAGE_PERIODS = 10
+"""A gap of this many periods is an outage, which is told as silence, and no jitter."""
 
 
 class LatencyHistogram:
@@ -39,6 +43,32 @@ class LatencyHistogram:
             if seen >= wanted and number:
                 return min(FLOOR_US * STEP ** (index + 1), self.max_us)
         return 0.0
+
+
+class Deadlines:
+    """Counts since start; costs no memory that grows."""
+
+    def __init__(self) -> None:
+        self.jitter = LatencyHistogram()
+        """How far, us, the time between two readings in a row is from the driver's period."""
+        self.late = 0
+        """Readings that were answered more than a period after their last byte."""
+        self.worst_age_ms = 0.0
+        """Longest time from a reading's last byte to its verdict, ms."""
+        self._last_seq = -1
+        self._last_ns = 0
+
+    def add(self, reading: TactileReading, age_ms: float, period_ns: int | None) -> None:
+        """Count a reading, answered `age_ms` after its last byte, of a driver with this period."""
+        if age_ms > self.worst_age_ms:
+            self.worst_age_ms = age_ms
+        if period_ns is not None:
+            self.late += age_ms * 1e6 > period_ns
+            elapsed_ns = reading.t_ns - self._last_ns
+            in_a_row = reading.seq == self._last_seq + 1 and self._last_seq >= 0
+            if in_a_row and elapsed_ns < OUTAGE_PERIODS * period_ns:
+                self.jitter.add(abs(elapsed_ns - period_ns) / 1e3)
+        self._last_seq, self._last_ns = reading.seq, reading.t_ns
 
 
 _LOG_STEP = math.log(STEP)

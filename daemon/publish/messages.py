@@ -249,14 +249,8 @@ class Status(_Message, frozen=True, kw_only=True):
 
 MESSAGES = (Verdict, GateMessage, Tactile, OutcomeMessage, Status)
 
-_encoder = msgspec.json.Encoder()
-
-
-def encode(message: Verdict | GateMessage | Tactile | OutcomeMessage | Status) -> bytes:
-    """JSON payload of a message."""
-    return _encoder.encode(message)
-
-
+encode = msgspec.json.Encoder().encode
+"""JSON payload of a message."""
 decode_verdict = msgspec.json.Decoder(Verdict).decode
 decode_gate = msgspec.json.Decoder(GateMessage).decode
 decode_tactile = msgspec.json.Decoder(Tactile).decode

@@ -15,7 +15,7 @@ import onnxruntime
 from daemon import __version__
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateChange, Moment, Reason
-from daemon.publish.latency import LatencyHistogram
+from daemon.publish.latency import Deadlines, LatencyHistogram
 from daemon.publish.messages import (
     DECISION_CODE,
     GateMessage,
@@ -33,7 +33,6 @@ from drivers.base import JointReading, TactileReading
 from models.contract import Finger
 
 if TYPE_CHECKING:
-    from daemon.publish.deadlines import Deadlines
     from daemon.trust.trust import Trust
 
 SHA_DIGITS = 12

@@ -34,7 +34,9 @@ the owner of its grasps by them."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Question:
+class Question:
+    """Waits for an answer."""
+
     envelope: Message
     """Routing id, and the delimiter of a REQ socket."""
     due_ns: int
@@ -51,13 +53,8 @@ class Questions:
         that is wanted, and `outcomes_refused`; `dropped` answers."""
         self._send = send
         self._patience_ns = patience_ns
-        self._waiting: dict[Peer, _Question] = {}
-        """Oldest first."""
-
-    @property
-    def waiting(self) -> int:
-        """Number of questions without an answer."""
-        return len(self._waiting)
+        self.waiting: dict[Peer, Question] = {}
+        """Questions without an answer, by the peer's routing id; the oldest first."""
 
     def take(self, messages: Iterable[Message], now_ns: int, requests: Requests) -> None:
         """Take the messages of peers, and pass on to `requests` what they want."""
@@ -68,7 +65,7 @@ class Questions:
                 self._take_outcome([peer, *envelope], text, requests)
             elif well_formed and text in (JUDGE, LIFT):
                 due_ns = now_ns + self._patience_ns
-                self._wait(peer, _Question([peer, *envelope], due_ns, text == LIFT))
+                self._wait(peer, Question([peer, *envelope], due_ns, text == LIFT))
                 asked += 1
             else:
                 self.counters["malformed"] += 1
@@ -76,13 +73,13 @@ class Questions:
             self.counters["asked"] += asked
             requests.ask()
 
-    def _wait(self, peer: Peer, question: _Question) -> None:
-        if self._waiting.pop(peer, None) is not None:
+    def _wait(self, peer: Peer, question: Question) -> None:
+        if self.waiting.pop(peer, None) is not None:
             self.counters["given_up"] += 1
-        elif len(self._waiting) >= WAITING_MAX:
-            del self._waiting[next(iter(self._waiting))]
+        elif len(self.waiting) >= WAITING_MAX:
+            del self.waiting[next(iter(self.waiting))]
             self.counters["given_up"] += 1
-        self._waiting[peer] = question
+        self.waiting[peer] = question
 
     def _take_outcome(self, envelope: Message, text: bytes, requests: Requests) -> None:
         """Pass on how a lift has ended, or refuse a text that does not say so."""
@@ -118,10 +115,10 @@ class Questions:
         Return the names of the peers that asked whether they may lift, in the order of asking.
         """
         lifters = []
-        for peer, question in list(self._waiting.items()):
+        for peer, question in list(self.waiting.items()):
             if now_ns is not None and question.due_ns > now_ns:
                 break
-            del self._waiting[peer]
+            del self.waiting[peer]
             self.counters["answered"] += 1
             self._answer(question.envelope, payload)
             if question.lifts:

@@ -127,7 +127,9 @@ class Sockets(Companion):
     def before_wait(self, requests: Requests) -> None:
         """Pass on what peers ask and report."""
         if self.questions is not None and self._door is not None:
-            self.questions.take(self._door.receive(), self._clock(), requests)
+            messages = self._door.receive()
+            if messages:
+                self.questions.take(messages, self._clock(), requests)
 
     def on_verdict(self, published: Published) -> None:
         """Answer all questions, or those alone that have waited too long for a better answer."""

@@ -23,7 +23,7 @@ from daemon.publish.companion import (
     at_once,
     hooks,
 )
-from daemon.publish.deadlines import Deadlines
+from daemon.publish.latency import Deadlines
 from daemon.publish.messages import State, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.run.overload import LoadShedder, mark_repeats

@@ -197,9 +197,8 @@ class LiftBook:
         self._lifts = {grasp: replace(lift, features=None) for grasp, lift in self._lifts.items()}
 
     def state(self) -> LiftBookState:
-        """Return what `restore` needs: the grasps that were assessed."""
-        records = tuple(lift for lift in self._lifts.values() if lift.features != NOT_ASSESSED)
-        return LiftBookState(records, dict(self.told), self.unreported)
+        """Return what `restore` needs."""
+        return LiftBookState(tuple(self._lifts.values()), dict(self.told), self.unreported)
 
     def restore(self, state: LiftBookState, width: int) -> None:
         """Go on from an earlier state, with features (width,). Raises `ValueError`."""
@@ -207,7 +206,7 @@ class LiftBook:
         if len(lifts) != len(state.records):
             raise ValueError("holds a grasp twice")
         for lift in state.records:
-            if lift.features is not None:
+            if lift.features:
                 vector(lift.features, width)
             if lift.features is not None and lift.slipped is not None:
                 raise ValueError("would learn from a grasp twice")

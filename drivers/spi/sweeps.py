@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
-from drivers.biotac import channel_of, decode_words, electrode_columns
+from drivers.biotac import COUNT_OF_WORD, FAULT_OF_WORD, channel_of, electrode_columns
 from drivers.spi.clock import DeviceClock
 from drivers.spi.messages import Hello, Sweep
 
@@ -153,7 +153,8 @@ class SweepDecoder:
     def _counts_and_faults(self, sweep: Sweep) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Shape (fingers, 24) each; whatever is not sampled or not there is missing."""
         self._sweep[...] = sweep.words
-        counts, faults = decode_words(self._words[self._source])
+        words = self._words[self._source]
+        counts, faults = COUNT_OF_WORD[words], FAULT_OF_WORD[words]
         present = [sweep.present >> sensor & 1 for sensor in self._sensors]
         absent = [row for row, is_there in enumerate(present) if not is_there]
         if absent:

@@ -81,15 +81,18 @@ def test_how_a_lift_ended_is_told_to_all_who_listen(lift_gate: Path, tmp_path: P
         assert subprocess.run([*tell, "stable"], check=False, timeout=200).returncode == 1
         subprocess.run([*tell, "slip"], check=True, timeout=200)
         heard: list[OutcomeMessage] = []
-        while len(heard) < 2:
+        verdicts = 0
+        while verdicts < 20 or not heard:
             assert listener.poll(100_000)
             about, payload = listener.recv_multipart()
+            verdicts += about == b"verdict.right"
             if about == b"outcome.right":
                 heard.append(decode_outcome(payload))
         never = replace(lifted_on, grasp=10**9)
         assert graspd.tell(never, Outcome.SLIPPED, wait_s=10.0).why.startswith("unknown grasp")
-    assert [(told.outcome, told.object) for told in heard] == [("slip", "mug"), ("slip", None)]
-    assert {(told.boot_id, told.grasp) for told in heard} == {(lifted_on.boot_id, lifted_on.grasp)}
+    (told,) = heard  # what is told again is not published again
+    assert (told.outcome, told.object) == ("slip", "mug")
+    assert (told.boot_id, told.grasp) == (lifted_on.boot_id, lifted_on.grasp)
 
 
 def test_a_daemon_that_is_stopped_is_unknown_after_its_silence(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.contract import ModelContract, ModelError, SeenCounts, SessionInput, Sharpness
-from models.novelty import NoveltyCheck
+from models.electrodes import NoveltyCheck
 from tests.daemon.fakes import contract
 
 

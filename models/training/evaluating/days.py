@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from models.electrodes import Electrodes
+from models.electrodes import CONTRADICTING_MAX, Electrodes, NoveltyCheck
 from models.inputs import builder, raw_features
-from models.novelty import CONTRADICTING_MAX, NoveltyCheck
 from models.session_statistics import SessionStatistics, is_odd
 from models.training.arrays import Bools, Floats, Ints, Numbers
 from models.training.data.datasets import COUNT_MAX, Grasps

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from models.contract import SeenCounts
-from models.novelty import NoveltyCheck
+from models.electrodes import NoveltyCheck
 from models.training.arrays import Numbers
 from models.training.data.datasets import COUNT_MAX
 

@@ -116,7 +116,7 @@ def test_an_outcome_is_answered_at_once(asked: Asked) -> None:
     assert asked.tell(TELLER, b"", STABLE) == {"v": 1, "ok": True}
     refused = asked.tell(TELLER, f"outcome {BOOT} 8 slip".encode())
     assert refused == {"v": 1, "ok": False, "why": "no such"}
-    assert asked.questions.waiting == 0
+    assert len(asked.questions.waiting) == 0
     assert asked.questions.counters["outcomes"] == 2
     assert asked.questions.counters["outcomes_refused"] == 1
     assert asked.questions.counters["malformed"] == 0

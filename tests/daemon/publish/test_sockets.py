@@ -131,7 +131,7 @@ def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
         verdict = decode_verdict((GOLDEN / "verdict_stable.json").read_bytes())
         judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
         sockets.on_verdict(Published(judgement, verdict, b"{}", None, True, grasp, lifts))
-        assert sockets.questions.waiting == 0
+        assert len(sockets.questions.waiting) == 0
     assert lifts.may_report(grasp, b"controller")
     assert lifts.may_report(grasp, b"dashboard") == (number == 0)
 

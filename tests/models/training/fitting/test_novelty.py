@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
-from models.novelty import NoveltyCheck
+from models.electrodes import NoveltyCheck
 from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen, seen_counts
 
 
