@@ -77,7 +77,7 @@ class RecordedRun:
     def build_driver(self, wanted: Scene, speed: float | None) -> McapReplayDriver:
         """The driver that plays the files, not yet open; `speed` None is as fast as possible."""
         self._driver = McapReplayDriver(
-            self._paths, wanted.hand.fingers, speed=speed, axis_ns=self.header.known.axis_ns
+            self._paths, wanted.hand.fingers, speed=speed, axis_ns=self.header.axis_ns
         )
         return self._driver
 
@@ -94,7 +94,7 @@ class RecordedRun:
         clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
         pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
         try:
-            recall(pipeline, header.known.judge, same_model=same_model)
+            recall(pipeline, header.judge, same_model=same_model)
         except ValueError:
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
@@ -108,12 +108,12 @@ class RecordedRun:
 
         Another model than the recorded one begins with nothing learned.
         """
-        known = self.header.known
+        header = self.header
         try:
-            if pipeline.session is not None and known.session is not None:
-                pipeline.session.restore(known.session)
-            if pipeline.trust is not None and known.trust:
-                learned = decode(known.trust)
+            if pipeline.session is not None and header.session is not None:
+                pipeline.session.restore(header.session)
+            if pipeline.trust is not None and header.trust:
+                learned = decode(header.trust)
                 if pipeline.trust.fits(learned):
                     pipeline.trust.restore(learned)
         except ValueError as error:
