@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -194,11 +195,12 @@ def again(*paths: Path) -> list[Judgement]:
     """What is judged in a replay, at the times of then."""
     run = RecordedRun(paths)
     wanted = run.scene({}, {}, None)
-    driver = run.build_driver(wanted, None)
-    pipeline = run.pipeline(wanted, assembly.load_model(wanted), learns=True)
+    parts = run.parts(wanted, assembly.load_model(wanted), None)
+    (driver,), pipeline = parts.drivers, parts.pipeline
     run.restore(pipeline)
     found = []
-    with driver:
+    driver.open()
+    with closing(driver):
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)
