@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from daemon import scene
 from daemon.assembly import assembly
+from daemon.assembly.parts import Parts
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion
 from daemon.scene import Scene, SceneError
@@ -35,7 +35,6 @@ class LinkLogs:
         self._paths = tuple(paths)
         self._ending = paths[0].suffix
         self._scene_path = path
-        self._driver: LinkLogDriver[Any] | None = None
 
     def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
         """The scene of the link, with another model or gate mode if given. Raises `SceneError`."""
@@ -53,19 +52,19 @@ class LinkLogs:
             changed(sections, publish, model, mode), self._scene_path or Path("command line")
         )
 
-    def build_driver(self, wanted: Scene, speed: float | None) -> LinkLogDriver[Any]:
-        """The driver of the files, not yet open. Raises `SceneError`."""
+    def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
+        """What plays the files and judges them: readings are as old as they were then.
+
+        Raises `SceneError`.
+        """
         try:
-            self._driver = _driver(wanted, self._paths, speed)
+            driver = _driver(wanted, self._paths, speed)
         except ValueError as error:
             raise SceneError(f"[tactile] {error}") from error
-        return self._driver
-
-    def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
-        """The judge of what the driver plays, which finds readings as old as they were then."""
-        driver = self._driver
-        clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
-        return assembly.build_pipeline(wanted, model, clock, learns=learns)
+        pipeline = assembly.build_pipeline(
+            wanted, model, lambda: driver.handed_over_ns, learns=wanted.session.learn
+        )
+        return Parts(wanted, model, pipeline, [driver])
 
     def restore(self, pipeline: Pipeline) -> None:
         """Nothing: a link log does not know the session."""

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from daemon.assembly import assembly
 from daemon.judge.memory import encode, remember
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
-from daemon.record.header import Known, RecordingHeader
+from daemon.record.header import RecordingHeader
 from daemon.scene import Scene, SceneError
 from daemon.trust.trust import encode as encode_trust
 from models.runtime import TactileModel
@@ -46,13 +49,10 @@ def build_recorder(
     recorder = Recorder(
         retention,
         options,
-        header_of(wanted, model, boot_id),
-        make_link_log=None if tap is None else tap.make_file,
-        take_state=lambda: state_of(pipeline),
+        take_header=partial(header_now, pipeline, header_of(wanted, model, boot_id)),
+        tap=tap,
     )
     pipeline.on_exchange = recorder.exchanged
-    if tap is not None:
-        tap.pass_on(recorder.on_link)
     return recorder
 
 
@@ -83,15 +83,17 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
     )
 
 
-def state_of(pipeline: Pipeline) -> Callable[[], Known]:
-    """Copy the state of judge and session, in some 0.1 ms; calling the result encodes it.
+def header_now(pipeline: Pipeline, header: RecordingHeader) -> Callable[[], RecordingHeader]:
+    """Copy the state of judge and session, in some 0.1 ms; calling the result gives the header with
+    it.
 
     Encoding takes longer, and may be done in another thread.
     """
     judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()
     trust = None if pipeline.trust is None else pipeline.trust.state()
-    return lambda: Known(
+    return lambda: replace(
+        header,
         judge=encode(judge),
         axis_ns=axis_ns,
         session=state,

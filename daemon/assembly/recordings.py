@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Final
 
 from daemon.assembly import assembly
 from daemon.assembly.link_logs import changed
+from daemon.assembly.parts import Parts
 from daemon.judge.memory import recall
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion
@@ -42,7 +42,6 @@ class RecordedRun:
         self.header = headers[0]
         """Of the first file."""
         self._paths = tuple(paths)
-        self._driver: McapReplayDriver | None = None
         self._companion = Companion()
         self._same_grasps = True
         """Whether grasps are told apart as they were then; else outcomes are of none of them."""
@@ -74,46 +73,41 @@ class RecordedRun:
         }
         return parse(changed(sections, publish, model, mode), self._paths[0])
 
-    def build_driver(self, wanted: Scene, speed: float | None) -> McapReplayDriver:
-        """The driver that plays the files, not yet open; `speed` None is as fast as possible."""
-        self._driver = McapReplayDriver(
-            self._paths, wanted.hand.fingers, speed=speed, axis_ns=self.header.known.axis_ns
-        )
-        return self._driver
+    def parts(self, wanted: Scene, model: TactileModel, speed: float | None) -> Parts:
+        """What plays the files and judges them, in the recorded state but for the session.
 
-    def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
-        """The judge of what the driver plays, in the recorded state but for the session.
-
-        It finds readings as old as they were when they were recorded. `learns` says whether its
-        session learns from the grasps.
+        Readings are as old as they were then. `speed` None is as fast as possible.
         """
-        header, driver = self.header, self._driver
+        header = self.header
         same_model = model.sha256 == header.model_sha256
         if not same_model:
             log.warning("%s: was judged by %s, not by this model", self._paths[0], header.model)
-        clock = time.monotonic_ns if driver is None else lambda: driver.handed_over_ns
-        pipeline = assembly.build_pipeline(wanted, model, clock, learns=learns)
+        driver = McapReplayDriver(
+            self._paths, wanted.hand.fingers, speed=speed, axis_ns=header.axis_ns
+        )
+        pipeline = assembly.build_pipeline(
+            wanted, model, lambda: driver.handed_over_ns, learns=wanted.session.learn
+        )
         try:
-            recall(pipeline, header.known.judge, same_model=same_model)
+            recall(pipeline, header.judge, same_model=same_model)
         except ValueError:
             if header.file > 0:
                 log.warning(NOTHING_KNOWN, self._paths[0])
-        if driver is not None:
-            driver.on_event = partial(self._repeat, pipeline)
+        driver.on_event = partial(self._repeat, pipeline)
         pipeline.boot_id = header.boot_id
-        return pipeline
+        return Parts(wanted, model, pipeline, [driver], header.boot_id)
 
     def restore(self, pipeline: Pipeline) -> None:
         """Give `pipeline` the recorded session and what outcomes had taught. Raises `SceneError`.
 
         Another model than the recorded one begins with nothing learned.
         """
-        known = self.header.known
+        header = self.header
         try:
-            if pipeline.session is not None and known.session is not None:
-                pipeline.session.restore(known.session)
-            if pipeline.trust is not None and known.trust:
-                learned = decode(known.trust)
+            if pipeline.session is not None and header.session is not None:
+                pipeline.session.restore(header.session)
+            if pipeline.trust is not None and header.trust:
+                learned = decode(header.trust)
                 if pipeline.trust.fits(learned):
                     pipeline.trust.restore(learned)
         except ValueError as error:

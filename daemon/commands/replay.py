@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from daemon import scene
 from daemon.assembly import assembly
@@ -30,7 +30,7 @@ from daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, Summary
 from daemon.scene import Scene, SceneError
 from daemon.scene.endpoints import check_endpoint, is_private
 from daemon.session.file import SessionFileError, load, statistics_of
-from drivers.base import Driver, DriverError, RecordingError
+from drivers.base import DriverError, RecordingError
 from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_DAY
 from drivers.recordings.csv_rows import columns_of
@@ -38,6 +38,13 @@ from models import zoo
 from models.bts3 import FINGERS, TABLES
 from models.contract import ModelError
 from models.runtime import TactileModel
+
+if TYPE_CHECKING:
+    from daemon.assembly.link_logs import LinkLogs
+    from daemon.assembly.recordings import RecordedRun
+
+    Recorded = LinkLogs | RecordedRun
+    """What graspd has recorded: it says itself how it was judged, as far as it knows."""
 
 MAX_AGE_MS = 1000.0
 """Age limit while replaying, ms: generous, because a recording has no wire to be late on."""
@@ -182,14 +189,8 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         _choose_demo(args)
     recorded = _recorded(args)
     wanted = _scene(args, recorded)
-    model = assembly.load_model(wanted)
-    if recorded is None:
-        wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
-        drivers = assembly.build_drivers(wanted)
-        _need_labels(args, wanted)
-    else:
-        drivers = [recorded.build_driver(wanted, args.speed)]
-    pipeline = _pipeline(args, wanted, model, recorded)
+    parts = _parts(args, wanted, assembly.load_model(wanted), recorded)
+    wanted, model, pipeline = parts.scene, parts.model, parts.pipeline
     prompt = args.speed is not None
     shown: Printer | Demo
     if is_demo and not (args.json or args.verbose) and model.contract.fingers == FINGERS:
@@ -209,7 +210,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
     )
     with ExitStack() as stack:
-        around = Assembly(Parts(wanted, model, pipeline, drivers, pipeline.boot_id or None), stack)
+        around = Assembly(parts, stack)
         sockets = None
         if args.publish is not None:
             waits = args.wait is not None
@@ -219,7 +220,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         if sockets is not None and args.wait is not None:
             _wait(sockets, args.wait, stop)
         companions = [*around.companions, *told]
-        loop = Loop(drivers, pipeline, around.build_outbox(), stop, companions, timing)
+        loop = Loop(parts.drivers, pipeline, around.build_outbox(), stop, companions, timing)
         stack.callback(lambda: shown.summary(pipeline.trust))
         stack.callback(loop.close)
         stack.callback(controller.tell)
@@ -262,29 +263,10 @@ def _comparisons(
         found = assembly.build_pipeline(alone, other, pipeline.clock, learns=False)
         yield Comparison(WITHOUT_SESSION, found, result)
     if pipeline.trust is not None and (args.outcomes or recorded is not None):
-        other, learns = assembly.load_model(wanted), args.session != OFF and wanted.session.learn
+        other, learns = assembly.load_model(wanted), wanted.session.learn
         found = assembly.build_pipeline(alone, other, pipeline.clock, learns=learns)
         _begin(args, found, wanted, recorded)
         yield Comparison(WITHOUT_LEARNING, found, result)
-
-
-class Recorded(Protocol):
-    """What graspd has recorded: it says itself how it was judged, as far as it knows."""
-
-    def scene(self, publish: dict[str, Any], model: dict[str, Any], mode: str | None) -> Scene:
-        """The scene that was recorded, with another model or gate mode if they are given."""
-
-    def build_driver(self, wanted: Scene, speed: float | None) -> Driver:
-        """The driver that plays it."""
-
-    def pipeline(self, wanted: Scene, model: TactileModel, *, learns: bool) -> Pipeline:
-        """The judge of what that driver plays."""
-
-    def restore(self, pipeline: Pipeline) -> None:
-        """Begin with the session that the daemon began with, if that is known."""
-
-    def tell(self, companion: Companion) -> None:
-        """Tell a companion outcomes as they were told then."""
 
 
 def _recorded(args: argparse.Namespace) -> Recorded | None:
@@ -315,22 +297,24 @@ def _recorded(args: argparse.Namespace) -> Recorded | None:
     return RecordedRun(args.recordings)
 
 
-def _pipeline(
+def _parts(
     args: argparse.Namespace, wanted: Scene, model: TactileModel, recorded: Recorded | None
-) -> Pipeline:
-    """The judge; a session model's begins with the kept session if `--session` is a file.
+) -> Parts:
+    """What plays and judges; a session model's begins with the kept session if `--session` is a
+    file.
 
     Raises `SessionFileError` if that is no session of this hand.
     """
-    learns = args.session != OFF and wanted.session.learn
     if recorded is None:
-        pipeline = assembly.build_pipeline(wanted, model, learns=learns)
+        wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
+        _need_labels(args, wanted)
+        parts = Parts.of(wanted, model)
     else:
-        pipeline = recorded.pipeline(wanted, model, learns=learns)
-    if args.session not in (RUNNING, OFF) and pipeline.session is None:
+        parts = recorded.parts(wanted, model, args.speed)
+    if args.session not in (RUNNING, OFF) and parts.pipeline.session is None:
         raise ModelError(f"the model {model.contract.name} keeps no session")
-    _begin(args, pipeline, wanted, recorded)
-    return pipeline
+    _begin(args, parts.pipeline, wanted, recorded)
+    return parts
 
 
 def _begin(
@@ -361,7 +345,10 @@ def _scene(args: argparse.Namespace, recorded: Recorded | None) -> Scene:
     publish = {"endpoint": args.publish}
     model = {} if args.model is None else _model(args.model)
     if recorded is not None:
-        return recorded.scene(publish, model, args.gate)
+        wanted = recorded.scene(publish, model, args.gate)
+        learns = wanted.session.learn and args.session != OFF
+        session = wanted.session.model_copy(update={"learn": learns})
+        return wanted.model_copy(update={"session": session})
     if args.min_confidence is not None:
         model["min_confidence"] = args.min_confidence
     data = {
@@ -376,6 +363,7 @@ def _scene(args: argparse.Namespace, recorded: Recorded | None) -> Scene:
         },
         "model": {"name": assembly.DEFAULT_MODEL} | model if args.model is None else model,
         "gate": {"max_age_ms": MAX_AGE_MS, "mode": args.gate},
+        "session": {"learn": args.session != OFF},
         "publish": publish,
     }
     if args.max_slip_when_stable is not None:

@@ -77,6 +77,10 @@ class RecordingFile:
         self._path = path
         self._stream = os.fdopen(os.open(path, flags, MODE), "wb")
 
+    def append(self, content: bytes) -> None:
+        """Write these bytes, at the latest with the next flush."""
+        self._stream.write(content)
+
     def flush(self) -> int:
         """Put all that was written on the disk; return the file's size, bytes."""
         self._stream.flush()

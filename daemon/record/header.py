@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-import base64
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import msgspec
 
 from drivers.base import FINGERS
 from models.session_statistics import SessionState
 
+_TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
+"""Fields that are texts, or bytes in base64; the others are JSON."""
+_OLDER: Final = {"trust": "", "says_judged": "false"}
+"""What the headers of older recordings lack."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Known:
-    """The state where a file begins: with it the file is judged alike without those before it."""
 
-    judge: bytes = b""
-    """The judge's state, as `daemon.judge.memory.encode` gives it; empty if it is not known."""
-    axis_ns: int = 0
-    """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
-    session: SessionState | None = None
-    """Statistics of the session; None if the model needs none."""
-    trust: bytes = b""
-    """What outcomes have taught, as `daemon.trust.trust.encode` gives it; empty if nothing learns.
+class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
+    """What a file says about the run of the daemon that wrote it.
+
+    With the state where the file begins, it is judged alike without those before it.
     """
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingHeader:
-    """What a file says about the run of the daemon that wrote it."""
 
     fingers: tuple[str, ...]
     """Fingers of a reading, in the order of its rows."""
@@ -48,27 +37,23 @@ class RecordingHeader:
     """Number of the file within its run, from 0; skips one where the disk has failed."""
     wall_minus_monotonic_ns: int = 0
     """To subtract from the file's log times, wall time, for the daemon's monotonic time, ns."""
-    known: Known = Known()
+    judge: bytes = b""
+    """The judge's state, as `daemon.judge.memory.encode` gives it; empty if it is not known."""
+    axis_ns: int = 0
+    """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
+    session: SessionState | None = None
+    """Statistics of the session; None if the model needs none."""
+    trust: bytes = b""
+    """What outcomes have taught, as `daemon.trust.trust.encode` gives it; empty if nothing learns.
+    """
     says_judged: bool = True
     """Whether the file has `judged` messages."""
 
     def texts(self) -> dict[str, str]:
         """The fields as texts, for the metadata record of an MCAP file."""
-        session = self.known.session
         return {
-            "fingers": json.dumps(self.fingers),
-            "joints": json.dumps(self.joints),
-            "boot_id": self.boot_id,
-            "scene": json.dumps(self.scene),
-            "model": self.model,
-            "model_sha256": self.model_sha256,
-            "file": str(self.file),
-            "wall_minus_monotonic_ns": str(self.wall_minus_monotonic_ns),
-            "judge": base64.b64encode(self.known.judge).decode(),
-            "axis_ns": str(self.known.axis_ns),
-            "session": "" if session is None else msgspec.json.encode(session).decode(),
-            "trust": base64.b64encode(self.known.trust).decode(),
-            "says_judged": json.dumps(self.says_judged),
+            name: value if name in _TEXTS else msgspec.json.encode(value).decode()
+            for name, value in msgspec.to_builtins(self).items()
         }
 
     @classmethod
@@ -77,24 +62,12 @@ class RecordingHeader:
 
         Raises `KeyError` for a field that is missing and `ValueError` for a wrong one.
         """
-        fingers = msgspec.json.decode(texts["fingers"], type=tuple[str, ...])
-        session = texts["session"]
-        if not fingers or not set(fingers) <= set(FINGERS):
-            raise ValueError(f"no fingers of a hand: {fingers}")
-        return cls(
-            fingers=fingers,
-            joints=texts["joints"] == "true",
-            boot_id=texts["boot_id"],
-            scene=msgspec.json.decode(texts["scene"], type=dict[str, dict[str, Any]]),
-            model=texts["model"],
-            model_sha256=texts["model_sha256"],
-            file=int(texts["file"]),
-            wall_minus_monotonic_ns=int(texts["wall_minus_monotonic_ns"]),
-            known=Known(
-                judge=base64.b64decode(texts["judge"]),
-                axis_ns=int(texts["axis_ns"]),
-                session=msgspec.json.decode(session, type=SessionState) if session else None,
-                trust=base64.b64decode(texts.get("trust", "")),
-            ),
-            says_judged=texts.get("says_judged") == "true",
-        )
+        texts = {**_OLDER, **texts}
+        fields: dict[str, Any] = {name: texts[name] for name in cls.__struct_fields__}
+        fields["session"] = fields["session"] or "null"  # as older recordings have it
+        for name in fields.keys() - _TEXTS:
+            fields[name] = msgspec.json.decode(fields[name])
+        header = msgspec.convert(fields, cls)
+        if not header.fingers or not set(header.fingers) <= set(FINGERS):
+            raise ValueError(f"no fingers of a hand: {header.fingers}")
+        return header

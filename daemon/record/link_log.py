@@ -3,122 +3,68 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
-from daemon.record.files import RecordingFile
 from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
-from drivers.can.frames import LOST
-
-if TYPE_CHECKING:
-    from drivers.can.frames import CanFrame, Stamped
-    from drivers.spi.line import LineEvent
 
 EARLY_MAX: Final = 1000
 """Entries held while the recorder is not there yet: those of the link's opening."""
 
-Taker = Callable[[object, int], None]
+Sink = Callable[[tuple[object, ...], int], None]
 """Takes an entry and its monotonic time, ns."""
 
 
-class LinkLogFile(RecordingFile, ABC):
-    """Keeps what comes over a link."""
-
-    @abstractmethod
-    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
-        """Write what came over at monotonic `at_ns`; wall time is that plus `offset_ns`."""
-
-
 class Tap:
-    """Passes on what comes over a link; holds it until somebody takes it."""
+    """Passes on what comes over a link; holds it until it is connected."""
 
     def __init__(
-        self, make_file: Callable[[Path], LinkLogFile], clock: Callable[[], int] = time.monotonic_ns
+        self,
+        ending: str,
+        encode: Callable[..., bytes],
+        clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self.make_file = make_file
-        """Makes the file of these entries by its name without ending."""
+        """`ending` is that of the file. `encode` gives the bytes of an entry in the file, by its
+        monotonic time, ns; what makes wall time of that, ns; and the parts of the entry."""
+        self.ending = ending
+        self.encode = encode
         self._clock = clock
-        self._early: deque[tuple[object, int]] = deque(maxlen=EARLY_MAX)
-        self._taker: Taker | None = None
+        self._early: deque[tuple[tuple[object, ...], int]] = deque(maxlen=EARLY_MAX)
+        self._sink: Sink = self._hold
 
-    def pass_on(self, taker: Taker) -> None:
+    def connect(self, sink: Sink) -> None:
         """Hand over what is held, and from now on everything at once."""
         while self._early:
-            taker(*self._early.popleft())
-        self._taker = taker
+            sink(*self._early.popleft())
+        self._sink = sink
 
-    def frames(self, stamped: list[Stamped]) -> None:
-        """CAN frames have come."""
-        self._take(stamped)
+    def take(self, *entry: object) -> None:
+        """Take what a driver tells of its link: CAN frames, or bytes of a serial line."""
+        self._sink(entry, self._clock())
 
-    def bytes(self, event: LineEvent, data: bytes) -> None:
-        """Bytes went over a serial line."""
-        self._take((event, data))
-
-    def _take(self, entry: object) -> None:
-        if self._taker is None:
-            self._early.append((entry, self._clock()))
-        else:
-            self._taker(entry, self._clock())
+    def _hold(self, entry: tuple[object, ...], at_ns: int) -> None:
+        self._early.append((entry, at_ns))
 
 
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:
     """A tap on the link of a driver; None for one that has no link of these kinds."""
     if isinstance(section, CanTactile):
         from drivers.can.driver import CanBridgeDriver
-        from drivers.recordings.can_log import line_of
+        from drivers.recordings.can_log import encode_frames
 
-        channel = section.channel
-        tap = Tap(lambda name: CandumpFile(name, channel, line_of))
+        name = section.channel.replace(" ", "_")
+        tap = Tap(".can.log", lambda _, offset_ns, frames: encode_frames(frames, offset_ns, name))
         if isinstance(driver, CanBridgeDriver):
-            driver.tap(tap.frames)
+            driver.tap(tap.take)
         return tap
     if isinstance(section, SpiTactile):
         from drivers.recordings.serial_log import encode_records
         from drivers.spi.driver import SpiBridgeDriver
 
-        tap = Tap(lambda name: SerialFile(name, encode_records))
+        tap = Tap(".serial", lambda at_ns, _, event, data: encode_records(event, at_ns, data))
         if isinstance(driver, SpiBridgeDriver):
-            driver.tap(tap.bytes)
+            driver.tap(tap.take)
         return tap
     return None
-
-
-class CandumpFile(LinkLogFile):
-    """CAN frames as `candump -L` writes them. What the kernel lost has no line."""
-
-    def __init__(
-        self, name: Path, channel: str, line_of: Callable[[CanFrame, int, str], str]
-    ) -> None:
-        super().__init__(name.with_name(f"{name.name}.can.log"))
-        self._line_of = line_of
-        self._channel = channel.replace(" ", "_")
-
-    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
-        """Take the frames of one drain: each has its own time."""
-        if not isinstance(entry, list):
-            return
-        lines = [
-            self._line_of(frame, max(until_ns + offset_ns, 0), self._channel)
-            for frame, _, until_ns in entry
-            if not frame.flags & LOST
-        ]
-        self._stream.write("".join(lines).encode())
-
-
-class SerialFile(LinkLogFile):
-    """Serial bytes in the frames of `drivers.recordings.serial_log`, with monotonic times."""
-
-    def __init__(self, name: Path, encode: Callable[[LineEvent, int, bytes], bytes]) -> None:
-        super().__init__(name.with_name(f"{name.name}.serial"))
-        self._encode = encode
-
-    def write(self, entry: object, at_ns: int, offset_ns: int) -> None:
-        """Take bytes that came or went at once."""
-        if isinstance(entry, tuple):
-            event, data = entry
-            self._stream.write(self._encode(event, at_ns, data))

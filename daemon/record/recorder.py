@@ -11,18 +11,18 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
 import msgspec
+from msgspec.structs import replace
 
 from daemon.process.worker import Worker
 from daemon.publish.companion import Companion, LoopEvent, Published
 from daemon.record.files import RecordingFile, Retention
 from daemon.record.flat import flat
-from daemon.record.header import Known, RecordingHeader
+from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
 from daemon.record.viewers import ForPeople
@@ -31,7 +31,7 @@ from drivers.base import JointReading, Reading
 
 if TYPE_CHECKING:
     from daemon.publish.messages import Status
-    from daemon.record.link_log import LinkLogFile
+    from daemon.record.link_log import Tap
     from daemon.trust.learner import LearnerState
     from models.session_statistics import SessionState
 
@@ -52,23 +52,16 @@ CLOSE_S: Final = 0.5
 """How long `close` waits for the thread, s."""
 
 
-MakeLinkLog = Callable[[Path], "LinkLogFile"]
-"""Makes a link log by its name without ending."""
-
-MakeKnown = Callable[[], Known]
+MakeHeader = Callable[[], RecordingHeader]
 """Encodes a state that the loop has copied; called in the thread."""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Turn:
-    """Queued between the entries of one file and those of the next."""
-
-    known: MakeKnown
-
+LINK: Final = b""
+"""Topic of entries for the link log."""
+NEXT_FILES: Final = b"next"
+"""Topic of the entry after which new files begin; its content is a `MakeHeader`."""
 
 _Entry = tuple[int, bytes, object]
-"""Monotonic ns; topic; payload, or a function that makes the message. The topic is empty for what
-came over a link, and for a `_Turn`."""
+"""Monotonic ns; topic; payload, or a function that makes the message."""
 
 
 @dataclass(slots=True, eq=False)
@@ -76,11 +69,9 @@ class _Open:
     """Files that are being written, and since when, monotonic ns."""
 
     messages: McapWriter
-    link_log: LinkLogFile | None
+    link_log: RecordingFile | None
     offset_ns: int
     since_ns: int
-    size: int = 0
-    """At the last flush, bytes."""
     unflushed: int = 0
     """Entries that are written to these files, but perhaps not yet on the disk."""
 
@@ -90,38 +81,36 @@ class _Open:
 
 
 class Recorder(Companion):
-    """Records one run of the daemon. `send`, `on_link` and the hooks never block or raise."""
+    """Records one run of the daemon. `send` and the hooks never block or raise."""
 
     def __init__(
         self,
         retention: Retention,
         options: Record,
-        header: RecordingHeader,
         *,
-        take_state: Callable[[], MakeKnown],
-        make_link_log: MakeLinkLog | None = None,
+        take_header: Callable[[], MakeHeader],
+        tap: Tap | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
         """Start the thread, which creates the first file.
 
-        `header` is that of every file, except for `known` and what each file has of its own.
-        `take_state` copies what is known; it is called in the loop, here and where a file is to
-        end: after a status, when no reading is being judged.
+        `take_header` copies what is known, for the header of a file, which lacks only what each
+        file has of its own. It is called in the loop, here and where a file is to end: after a
+        status, when no reading is being judged. `tap` gives what comes over the link.
         """
         self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
         self._rotate_ns = round(options.rotate_minutes * 60e9)
         self._flush_ns = round(options.flush_ms * 1e6)
-        self._header = header
-        self._make_link_log = make_link_log
-        self._take_state = take_state
+        self._take_header = take_header
+        self._tap = tap
         self._clock = clock
         self._wall_clock = wall_clock
         self._queue: deque[_Entry] = deque()
         self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
-        self._asked = False
-        """Whether somebody has asked since the last reading; the next one says so."""
+        self._last_topic = b""
+        """That of the newest entry."""
         self._for_people = ForPeople(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
@@ -130,20 +119,18 @@ class Recorder(Companion):
         self._flush_due_ns = clock() + self._flush_ns
         self._retry_due_ns: int | None = None
         self._awaits_turn = True
-        """True while a `_Turn` is queued, or will be when the loop sees `_wants_turn`."""
+        """True while `NEXT_FILES` is queued, or will be when the loop sees `_wants_turn`."""
         self._wants_turn = False
-        self._queue.append((clock(), b"", _Turn(take_state())))
+        self._queue.append((clock(), NEXT_FILES, take_header()))
         self._stopping = threading.Event()
         self._worker: Worker[None] = Worker("recorder")
         self._worker.submit(self._work)
+        if tap is not None:
+            tap.connect(partial(self._put, LINK))
 
     def send(self, topic: bytes, payload: bytes) -> None:
         """Record a published message."""
-        if self._asked and topic == self._names[Topic.TACTILE]:
-            self._asked = False
-            self._put(topic, partial(_asked, payload))
-        else:
-            self._put(topic, payload)
+        self._put(topic, payload)
 
     def wanted(self, topic: bytes) -> bool:
         """Always: what nobody subscribes to is recorded all the same."""
@@ -158,43 +145,31 @@ class Recorder(Companion):
         """Record the counts that the network judged."""
         judgement = published.judgement
         if judgement.moment.judged and judgement.judged_counts is not None:
-            making = partial(Judged.of, self._header.boot_id, judgement)
+            making = partial(Judged.of, self._retention.boot_id, judgement)
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
-        """Record that readings were skipped; or, with the next reading, that a controller asked."""
-        if event is LoopEvent.ASKED:
-            self._asked = True
-        else:
-            self._tell_asked()
-            self._put(self._names[Topic.SKIPPED], EVENT)
+        """Record an event; a question that follows another one adds nothing."""
+        topic = self._names[Topic(event.value)]
+        if topic != self._last_topic:
+            self._put(topic, EVENT)
 
     def on_status(self, status: Status) -> None:
         """Copy the state if the thread waits for it to go on in new files."""
         if self._wants_turn:
             self._wants_turn = False
-            self._queue.append((self._clock(), b"", _Turn(self._take_state())))
+            self._queue.append((self._clock(), NEXT_FILES, self._take_header()))
 
     def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
         """Record that a sensor is another one than before, and what was known of the new ones."""
-        self._tell_asked()
         self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
-
-    def _tell_asked(self) -> None:
-        """Record a question before what the judge does before the next reading."""
-        if self._asked:
-            self._asked = False
-            self._put(self._names[Topic.ASKED], EVENT)
-
-    def on_link(self, entry: object, at_ns: int) -> None:
-        """Record what came over the link at monotonic `at_ns`, ns, in the link log."""
-        self._put(b"", entry, at_ns)
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
         if len(self._queue) >= QUEUE_MAX:
             self._dropped += 1
         else:
             self._queue.append((self._clock() if at_ns is None else at_ns, topic, content))
+            self._last_topic = topic
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
@@ -231,15 +206,13 @@ class Recorder(Companion):
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
             self._turn()
-        waiting: list[_Entry] = []
-        for entry in entries:
-            if isinstance(entry[2], _Turn):
-                self._write(waiting)
-                waiting = []
-                self._take_turn(entry[2], now_ns)
+        for at_ns, topic, content in entries:
+            if topic == NEXT_FILES:
+                self._take_turn(cast(MakeHeader, content), now_ns)
+            elif self._open is None:
+                self._counted["lost"] += 1
             else:
-                waiting.append(entry)
-        self._write(waiting)
+                self._write(self._open, topic, content, at_ns)
         if self._open is not None and now_ns >= self._flush_due_ns:
             self._flush(self._open, now_ns)
 
@@ -248,27 +221,28 @@ class Recorder(Companion):
         if not self._awaits_turn:
             self._awaits_turn = self._wants_turn = True
 
-    def _take_turn(self, turn: _Turn, now_ns: int) -> None:
+    def _take_turn(self, make_header: MakeHeader, now_ns: int) -> None:
         """Go on in new files, except for the few entries that come after `close`."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
-            self._begin(now_ns, turn.known())
+            self._begin(now_ns, make_header())
 
-    def _begin(self, now_ns: int, known: Known) -> None:
+    def _begin(self, now_ns: int, header: RecordingHeader) -> None:
         """Create the next files, if the disk takes them."""
         offset_ns = self._wall_clock() - now_ns
         try:
             self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
             name = self._retention.name(self._number)
             path = name.with_name(f"{name.name}.mcap")
-            header = replace(
-                self._header, file=self._number, known=known, wall_minus_monotonic_ns=offset_ns
+            messages = McapWriter(
+                path,
+                replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns),
             )
-            messages = McapWriter(path, header)
             link_log = None
             try:
-                link_log = None if self._make_link_log is None else self._make_link_log(name)
+                if self._tap is not None:
+                    link_log = RecordingFile(name.with_name(f"{name.name}{self._tap.ending}"))
             except OSError:
                 messages.remove()
                 raise
@@ -281,19 +255,14 @@ class Recorder(Companion):
         self._counted["files"] += 1
         self._open = _Open(messages, link_log, offset_ns, now_ns)
 
-    def _write(self, entries: list[_Entry]) -> None:
-        """Write entries; count them as lost if there is no file."""
-        files = self._open
-        if files is None:
-            self._counted["lost"] += len(entries)
-            return
-        files.unflushed += len(entries)  # all of them, wherever among them the disk fails
+    def _write(self, files: _Open, topic: bytes, content: object, at_ns: int) -> None:
+        files.unflushed += 1
         try:
-            for at_ns, topic, content in entries:
-                if topic:
-                    self._write_message(files, topic, content, at_ns)
-                elif files.link_log is not None:
-                    files.link_log.write(content, at_ns, files.offset_ns)
+            if topic != LINK:
+                self._write_message(files, topic, content, at_ns)
+            elif files.link_log is not None and self._tap is not None:
+                entry = cast(tuple[object, ...], content)
+                files.link_log.append(self._tap.encode(at_ns, files.offset_ns, *entry))
         except OSError as error:
             self._fail(error)
 
@@ -310,14 +279,14 @@ class Recorder(Companion):
 
     def _flush(self, files: _Open, now_ns: int) -> None:
         try:
-            files.size = sum(file.flush() for file in files.all())
+            size = sum(file.flush() for file in files.all())
         except OSError as error:
             self._fail(error)
             return
         self._counted["recorded"] += files.unflushed
         files.unflushed = 0
         self._flush_due_ns = now_ns + round(self._flush_ns * FLUSH_AFTER)
-        if files.size >= self._rotate_bytes or now_ns - files.since_ns >= self._rotate_ns:
+        if size >= self._rotate_bytes or now_ns - files.since_ns >= self._rotate_ns:
             self._turn()
 
     def _finish(self) -> None:
@@ -347,8 +316,3 @@ class Recorder(Companion):
         say = log.warning if first else log.debug
         where = self._retention.directory
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)
-
-
-def _asked(payload: bytes) -> object:
-    """The content of a reading before which somebody has asked for a judgement."""
-    return {**msgspec.json.decode(payload), "asked": True}

@@ -34,13 +34,6 @@ _ANGLES = msgspec.Meta(
 """So that a viewer offers them by name."""
 
 
-class RecordedTactile(Tactile, frozen=True, kw_only=True):
-    """A reading as it was judged; comes before its verdict."""
-
-    asked: bool = False
-    """Whether somebody has asked for a judgement since the reading before."""
-
-
 class Joints(msgspec.Struct, frozen=True, kw_only=True):
     """A reading of joint angles."""
 
@@ -116,7 +109,7 @@ class Topic(StrEnum):
         return topic
 
     # Written by the outbox:
-    TACTILE = "tactile", RecordedTactile  # read by replay
+    TACTILE = "tactile", Tactile  # read by replay
     VERDICT = "verdict", Verdict  # read by other tools
     GATE = "gate", GateMessage  # read by other tools
     STATUS = "status", Status  # read by other tools
@@ -124,7 +117,7 @@ class Topic(StrEnum):
     # Written by the recorder:
     JOINTS = "joints", Joints  # read by replay
     JUDGED = "judged", Judged  # read by export
-    ASKED = "asked"  # read by replay: as in `RecordedTactile`, where something came between
+    ASKED = "asked"  # read by replay: somebody asked for a judgement
     EXCHANGED = "exchanged", Exchanged  # read by replay
     SKIPPED = "skipped"  # read by replay: readings before the next one were left out
 
@@ -165,21 +158,21 @@ def decode_judged(payload: bytes) -> Judged:
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileReading, bool]:
     """The reading of a `tactile` message, reduced to `fingers`, in their order; and whether
-    somebody asked for a judgement before it.
+    somebody asked for a judgement before it, as older recordings say in it.
 
     Raises `ValueError` or `OverflowError` if the payload is not such a message.
     """
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
     content["faults"] = table(content.get("faults"))
-    message = msgspec.convert(content, RecordedTactile)
+    message = msgspec.convert(content, Tactile)
     names: Sequence[str] = message.fingers
     rows = [names.index(finger) for finger in fingers]
     shape = (len(names), ELECTRODES)
     counts = np.array(message.counts, dtype=np.uint16).reshape(shape)
     faults = np.array(message.faults, dtype=np.uint8).reshape(shape)
     reading = TactileReading(message.t_mono_ns, message.seq, counts[rows], faults[rows])
-    return reading, message.asked
+    return reading, content.get("asked") is True
 
 
 def joint_reading(payload: bytes) -> JointReading:

@@ -21,9 +21,11 @@ from drivers.can.frames import (
     EXTENDED_ID_MAX,
     FD,
     FD_DATA_MAX,
+    LOST,
     REMOTE,
     STANDARD_ID_MAX,
     CanFrame,
+    Stamped,
 )
 from drivers.can.stream import BoardOptions, CanStream
 from drivers.recordings.csv_rows import open_recording
@@ -51,6 +53,16 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
     if frame.flags & FD:
         data = f"#0{data}"
     return f"({seconds}.{rest_ns // NS_PER_US:06}) {channel} {identifier}#{data}\n"
+
+
+def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
+    """Frames as lines; what the kernel lost has none. Wall time is their time plus `offset_ns`."""
+    lines = [
+        line_of(frame, max(until_ns + offset_ns, 0), channel)
+        for frame, _, until_ns in frames
+        if not frame.flags & LOST
+    ]
+    return "".join(lines).encode()
 
 
 def frame_of(line: str) -> tuple[int, CanFrame] | None:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from daemon import scene
 from daemon.assembly import assembly
-from daemon.assembly.recorder import header_of, state_of
+from daemon.assembly.recorder import header_now, header_of
 from daemon.judge.pipeline import Pipeline
 from daemon.publish.companion import Companion, Published, Requests
 from daemon.publish.outbox import Outbox
@@ -101,8 +101,7 @@ def _recorder(folder: Path, clock: Clock, pipeline: Pipeline, header: RecordingH
     return Recorder(
         Retention(folder, "right", BOOT_ID, keep_files=9, keep_bytes=10**9),
         scene.Record(images_hz=0.0),
-        header,
-        take_state=lambda: state_of(pipeline),
+        take_header=lambda: header_now(pipeline, header),
         clock=clock,
         wall_clock=clock,
     )

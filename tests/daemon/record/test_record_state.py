@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import closing
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import cast
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from daemon import scene
 from daemon.assembly import assembly
@@ -25,7 +26,7 @@ from daemon.publish.companion import LoopEvent, Published
 from daemon.publish.messages import Status, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
-from daemon.record.header import Known, RecordingHeader
+from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter, header_of
 from daemon.record.recorder import Recorder
 from daemon.scene import Record
@@ -48,15 +49,20 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.005)
 
 
+HEADER = RecordingHeader(
+    fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
+)
+
+
 class Loop:
     """Counts what it sends, and knows how much that was."""
 
     def __init__(self) -> None:
         self.sent = 0
 
-    def state(self) -> Callable[[], Known]:
-        known = Known(axis_ns=self.sent)
-        return lambda: known
+    def header(self) -> Callable[[], RecordingHeader]:
+        header = replace(HEADER, axis_ns=self.sent)
+        return lambda: header
 
     def send(self, recorder: Recorder, topic: bytes) -> None:
         payload = json.dumps({"number": self.sent}).encode()
@@ -68,11 +74,8 @@ class Loop:
 
 def make(folder: Path, loop: Loop, **options: float) -> Recorder:
     retention = Retention(folder / "record", "right", BOOT, 100, 10**9)
-    header = RecordingHeader(
-        fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
-    )
     wanted = Record(**{"flush_ms": 100.0, **options})  # type: ignore[arg-type]
-    return Recorder(retention, wanted, header, take_state=loop.state)
+    return Recorder(retention, wanted, take_header=loop.header)
 
 
 def files(folder: Path) -> list[Path]:
@@ -92,7 +95,7 @@ def test_a_file_ends_with_a_status_and_the_next_says_what_was_known_then(tmp_pat
     recorder.close()
     number = 7
     for path in files(tmp_path):
-        assert header_of(path).known.axis_ns == number
+        assert header_of(path).axis_ns == number
         found = messages(path)
         assert [content["number"] for _, content in found] == [*range(number, number + len(found))]
         assert found[-1][0] == "status"
@@ -111,7 +114,7 @@ def test_no_file_is_begun_without_a_word_of_the_loop(tmp_path: Path) -> None:
     loop.send(recorder, STATUS)
     wait_until(lambda: recorder.counters["record"]["files"] == 2)
     recorder.close()
-    assert header_of(files(tmp_path)[1]).known.axis_ns == loop.sent
+    assert header_of(files(tmp_path)[1]).axis_ns == loop.sent
 
 
 def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_then(
@@ -131,7 +134,7 @@ def test_after_a_failure_of_the_disk_the_recording_goes_on_with_what_is_known_th
     loop.send(recorder, VERDICT)
     recorder.close()
     (path,) = files(tmp_path)
-    known = header_of(path).known.axis_ns
+    known = header_of(path).axis_ns
     assert [content["number"] for _, content in messages(path)] == [*range(known, loop.sent)]
     assert recorder.counters["record"]["lost"] == known > 0
 
@@ -193,11 +196,12 @@ def again(*paths: Path) -> list[Judgement]:
     """What is judged in a replay, at the times of then."""
     run = RecordedRun(paths)
     wanted = run.scene({}, {}, None)
-    driver = run.build_driver(wanted, None)
-    pipeline = run.pipeline(wanted, assembly.load_model(wanted), learns=True)
+    parts = run.parts(wanted, assembly.load_model(wanted), None)
+    (driver,), pipeline = parts.drivers, parts.pipeline
     run.restore(pipeline)
     found = []
-    with driver:
+    driver.open()
+    with closing(driver):
         while not driver.exhausted:
             for reading in driver.read_ready():
                 assert isinstance(reading, TactileReading)
@@ -308,7 +312,7 @@ def test_where_readings_were_left_out_the_replay_knows_too(
 def rewritten(path: Path, to: Path, judge: bytes, number: int) -> Path:
     """A recording with another header."""
     header = header_of(path)
-    file = McapWriter(to, replace(header, known=replace(header.known, judge=judge), file=number))
+    file = McapWriter(to, replace(header, judge=judge, file=number))
     for kind, content in messages(path):
         if kind not in ("image", "log"):
             file.write(f"{kind}.right".encode(), json.dumps(content).encode(), content["t_mono_ns"])

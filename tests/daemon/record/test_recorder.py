@@ -21,7 +21,7 @@ from daemon import scene
 from daemon.publish.messages import Status
 from daemon.record import recorder as recorder_module
 from daemon.record.files import Retention
-from daemon.record.header import Known, RecordingHeader
+from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.record.topics import schemas
@@ -55,7 +55,7 @@ def make(tmp_path: Path) -> Iterator[Make]:
     def new(where: Retention | None = None, **options: Any) -> Recorder:  # noqa: ANN401
         wanted = Record(**{"flush_ms": 100.0, **options})
         place = where or retention(tmp_path)
-        made.append(Recorder(place, wanted, HEADER, take_state=lambda: Known))
+        made.append(Recorder(place, wanted, take_header=lambda: lambda: HEADER))
         return made[-1]
 
     yield new

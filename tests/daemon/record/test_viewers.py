@@ -16,7 +16,7 @@ from daemon.publish.companion import LoopEvent
 from daemon.publish.messages import Tactile, encode
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
-from daemon.record.header import Known, RecordingHeader
+from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.recorder import Recorder
@@ -276,7 +276,7 @@ def test_a_broken_message_is_not_said(kind: str) -> None:
 def recorder(folder: Path) -> Recorder:
     options = Record(flush_ms=100.0)
     return Recorder(
-        Retention(folder, "right", BOOT, 9, 10**9), options, HEADER, take_state=lambda: Known
+        Retention(folder, "right", BOOT, 9, 10**9), options, take_header=lambda: lambda: HEADER
     )
 
 
@@ -299,7 +299,7 @@ def recorded(folder: Path) -> list[tuple[str, dict[str, Any]]]:
     return [(kind, content) for kind, content in messages(path) if kind != "image"]
 
 
-def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
+def test_questions_in_a_row_are_one_event(tmp_path: Path) -> None:
     writing = recorder(tmp_path)
     for number in range(3):
         if number:
@@ -308,23 +308,22 @@ def test_a_question_is_kept_with_the_reading_after_it(tmp_path: Path) -> None:
         writing.send(b"tactile.right", tactile(number))
     writing.close()
     found = recorded(tmp_path)
-    assert [kind for kind, _ in found] == ["tactile"] * 3
-    assert [content.get("asked", False) for _, content in found] == [False, True, True]
+    assert [kind for kind, _ in found] == ["tactile", "asked", "tactile", "asked", "tactile"]
 
 
 @pytest.mark.parametrize("event", ["skipped", "exchanged"])
-def test_a_question_before_an_event_stays_before_it(tmp_path: Path, event: str) -> None:
+def test_questions_around_an_event_stay_around_it(tmp_path: Path, event: str) -> None:
     writing = recorder(tmp_path)
     writing.on_event(LoopEvent.ASKED)
     if event == "skipped":
         writing.on_event(LoopEvent.SKIPPED)
     else:
         writing.exchanged(None, None)
+    writing.on_event(LoopEvent.ASKED)
     writing.send(b"tactile.right", tactile(0))
     writing.close()
     found = recorded(tmp_path)
-    assert [kind for kind, _ in found] == ["asked", event, "tactile"]
-    assert "asked" not in found[2][1]
+    assert [kind for kind, _ in found] == ["asked", event, "asked", "tactile"]
 
 
 def play(path: Path) -> list[object]:
@@ -364,8 +363,8 @@ def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
     joints = {"v": 1, "seq": 3, "t_mono_ns": 5, "names": ["FFJ3", "THJ4"]}
     old = json.dumps({**joints, "position_rad": [0.25, None]}).encode()
     file.write(b"joints.right", old, 1)
-    file.write(b"asked.right", EVENT, 2)
-    file.write(b"tactile.right", tactile(0, counts), 3)
+    asking = {**json.loads(tactile(0, counts)), "asked": True}
+    file.write(b"tactile.right", json.dumps(asking).encode(), 3)
     file.close()
     angles, asked, played = play(path)
     assert isinstance(angles, JointReading)
