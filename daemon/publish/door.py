@@ -268,7 +268,7 @@ class Door:
         try:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:
-            why = zmq.strerror(error.errno or 0)  # the error's own text names the endpoint once more
+            why = zmq.strerror(error.errno or 0)  # its own text names the endpoint again
             raise PublishError(f"cannot bind {listener.endpoint}: {why}") from error
 
     def fileno(self) -> int:
