@@ -78,7 +78,7 @@ REPORTS = {
         _error_vs_time,
     ),
     "stability": (
-        "daemon.measure.stability.report",
+        "daemon.measure.stability",
         "numerical error of the whole chain on stiff and extreme readings",
         _stability,
     ),
