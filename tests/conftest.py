@@ -34,7 +34,7 @@ BEGUN_FIRST = (
     "emulated/test_timing.py",
     "bench/test_mutants.py",
     "bench/test_fuzz.py",
-    "daemon/measure/test_stability.py",
+    "stability/test_models.py",
     "daemon/measure/test_report.py",
     "daemon/doctor/test_healthy.py",
     "daemon/run/test_realtime.py",
@@ -64,9 +64,19 @@ def data_dir() -> Path | None:
     return next((path for path in candidates if (path / "bts3").is_dir()), None)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Options of `graspd report stability`, which runs `tests/stability`."""
+    parser.addoption("--model", action="append", default=[], help="a model to compare (all)")
+    parser.addoption("--data", type=Path, help="folder of the real grasps")
+    parser.addoption("--outcomes", type=int, default=10_000, help="that the learner is told")
+
+
 @pytest.fixture(scope="session")
-def bts3_dir() -> Path:
+def bts3_dir(request: pytest.FixtureRequest) -> Path:
     """Folder with palm_down.csv, palm_side.csv and palm_45.csv of the real data set."""
+    given: Path | None = request.config.getoption("data")
+    if given is not None:
+        return given
     folder = data_dir()
     if folder is None:
         pytest.skip("no real recordings: get them with `graspd data`, or set $GRASPD_DATA")

@@ -40,7 +40,7 @@ def _error_vs_time(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("runs/error-vs-time"),
         metavar="DIR",
-        help="folder for the page, the table, the picture and the figures",
+        help="folder for the table, the picture and the figures",
     )
     parser.add_argument("--quick", action="store_true", help="few readings: does it run?")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
@@ -78,7 +78,7 @@ REPORTS = {
         _error_vs_time,
     ),
     "stability": (
-        "daemon.measure.stability.report",
+        "daemon.measure.stability",
         "numerical error of the whole chain on stiff and extreme readings",
         _stability,
     ),

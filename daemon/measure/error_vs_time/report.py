@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from daemon.measure.error_vs_time import page, stages
+from daemon.measure.error_vs_time import stages, tables
 from daemon.measure.error_vs_time.picture import DEFAULT
 from daemon.measure.error_vs_time.timing import Step, bandwidth_bytes_per_s, measure
 from daemon.measure.reference.reference import Reference
@@ -87,11 +87,11 @@ def run(args: argparse.Namespace) -> int:
         grasps = read_all(args.data)
         found = report(grasps, [zoo.ZOO, *args.models], quick=args.quick)
         args.out.mkdir(parents=True, exist_ok=True)
-        page.write(found, args.out)
+        tables.write(found, args.out)
     except (DatasetError, ModelError, OSError) as error:
         complain(error)
         return 2
-    sys.stdout.write(json.dumps(found) + "\n" if args.json else page.table(found) + "\n")
+    sys.stdout.write(json.dumps(found) + "\n" if args.json else tables.table(found) + "\n")
     return 0
 
 

@@ -1,10 +1,9 @@
-"""`graspd report error-vs-time`: every model is in it, and the page needs nothing else."""
+"""`graspd report error-vs-time`: every model is in its figures, tables and picture."""
 
 from __future__ import annotations
 
 import itertools
 import json
-import re
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +16,7 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from daemon.measure.error_vs_time import page, picture
+from daemon.measure.error_vs_time import picture, tables
 from daemon.measure.error_vs_time.peers import loop_image
 from daemon.measure.error_vs_time.report import _counts, _errors
 from daemon.measure.error_vs_time.timing import measure
@@ -84,15 +83,6 @@ def test_peers_floor_and_stages_are_there(found: dict[str, Any]) -> None:
     assert found["bandwidth_bytes_per_s"] > 1e8
 
 
-def test_the_page_needs_nothing_from_elsewhere(folder: Path, found: dict[str, Any]) -> None:
-    text = (folder / "error-vs-time.html").read_text()
-    links = re.findall(r"""(?:src|href)\s*=\s*["']([^"'#][^"']*)""", text)
-    assert links == []
-    assert "<script" not in text
-    for row in found["rows"]:
-        assert row["name"].split(",")[0] in text
-
-
 def test_each_point_is_named_in_the_panels_that_it_is_in(
     folder: Path, found: dict[str, Any]
 ) -> None:
@@ -103,11 +93,11 @@ def test_each_point_is_named_in_the_panels_that_it_is_in(
         protocols = set(row["error"]) & {"cv", "objects", "objects-whole", "session"}
         assert drawn.count(f"<!-- {label} -->") == len(protocols) == 3
     assert not any(f"<!-- {row['name']} -->" in drawn for row in found["rows"] if row not in whole)
-    assert all(f"<!-- {asked}" in drawn for asked in page.ASKED)
+    assert all(f"<!-- {asked}" in drawn for asked in tables.ASKED)
 
 
 def test_a_quick_report_says_so_and_on_which_machine(folder: Path, found: dict[str, Any]) -> None:
-    for suffix in ("svg", "md", "html"):
+    for suffix in ("svg", "md"):
         text = (folder / f"error-vs-time.{suffix}").read_text()
         assert "-quick" in text  # an XML comment has no "--"
         assert found["machine"]["processor"].split("(")[0] in text
@@ -196,7 +186,7 @@ def row(
 
 def test_the_advice_names_the_fastest_within_the_interval_of_cnn1() -> None:
     rows = [row("cnn1", 0.94, 800.0), row("good", 0.935, 100.0), row("bad", 0.92, 10.0)]
-    texts = list(page.advice(rows))
+    texts = list(tables.advice(rows))
     assert texts[0] == "For objects that are known, no other day: `cnn1`, F1 94.0 %."
     assert "`good`, 8.0 times as fast as `cnn1`" in texts[-1]
 
@@ -211,7 +201,7 @@ HANDS = [
 
 
 def test_advice_for_a_hand_is_of_models_of_its_own_fingers() -> None:
-    texts = list(page.advice(HANDS))
+    texts = list(tables.advice(HANDS))
     assert texts[0].endswith("`cnn1`, F1 94.0 %.")
     assert "For ff and th alone, known objects: `slow-ff-th`, F1 96.0 %." in texts
     assert "For ff alone, known objects: `quick-ff`, F1 93.0 %." in texts

@@ -1,8 +1,7 @@
-"""The report as figures, tables, and one page that needs nothing else."""
+"""The report as figures, Markdown tables and a picture."""
 
 from __future__ import annotations
 
-import html
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,26 +22,14 @@ PROTOCOL = "cv"
 SUMMARY_MAX = 7
 """Rows of the short table beside the picture."""
 SUMMARY_ALWAYS = (DEFAULT, "cnn1", "cnn1-session", "published: loops, Keras predict")
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 90rem; margin: 2rem auto; padding: 0 1rem;
-  color: #222; background: #fff }
-table { border-collapse: collapse; width: 100%; font-size: 13px }
-th, td { padding: .25rem .5rem; text-align: right; white-space: nowrap;
-  border-bottom: 1px solid #ddd }
-th:first-child, td:first-child { text-align: left }
-th { border-bottom: 2px solid #888 }
-svg { max-width: 100%; height: auto }
-"""
 
 
 def write(found: Found, folder: Path) -> None:
-    """Write `error-vs-time.json`, `.md`, `.svg` and `.html`. Raises `OSError`."""
+    """Write `error-vs-time.json`, `.md` and `.svg`. Raises `OSError`."""
     base = folder / "error-vs-time"
-    picture = draw(found)
     base.with_suffix(".json").write_text(json.dumps(found, indent=1) + "\n")
     base.with_suffix(".md").write_text(table(found) + "\n")
-    base.with_suffix(".svg").write_text(picture)
-    base.with_suffix(".html").write_text(_page(found, picture))
+    base.with_suffix(".svg").write_text(draw(found))
 
 
 def _by_fingers(rows: Sequence[Row]) -> list[list[Row]]:
@@ -82,9 +69,6 @@ COLUMNS = (
     "start, ms",
     "memory, MiB",
 )
-
-
-STAGE_COLUMNS = ("stage", "p50, us", "p99, us")
 
 
 def _summary(rows: Sequence[Row]) -> list[list[str]]:
@@ -156,14 +140,11 @@ def _sorted(rows: Sequence[Row]) -> list[Row]:
 def _stages(found: Found) -> Iterator[str]:
     yield f"Stages of a reading with `{found['stages']['model']}`, hot:"
     yield ""
-    yield from markdown_table(STAGE_COLUMNS, _stage_cells(found))
-
-
-def _stage_cells(found: Found) -> list[list[str]]:
-    return [
-        [name, f"{took['p50']:.0f}", f"{took['p99']:.0f}"]
+    cells = [
+        (name, f"{took['p50']:.0f}", f"{took['p99']:.0f}")
         for name, took in found["stages"]["us"].items()
     ]
+    yield from markdown_table(("stage", "p50, us", "p99, us"), cells)
 
 
 def advice(rows: Sequence[Row]) -> Iterator[str]:
@@ -208,35 +189,4 @@ def _made(found: Found) -> str:
         f"{machine}; {found['readings']['hot']} readings hot, {found['readings']['paced']} paced"
         f"{' (--quick: rough)' if found['quick'] else ''}, "
         f"memory {found['bandwidth_bytes_per_s'] / 1e9:.1f} GB/s; `graspd report error-vs-time`"
-    )
-
-
-def _page(found: Found, picture: str) -> str:
-    cells = [_cells(row) for row in _sorted(found["rows"])]
-    stages = _stage_cells(found)
-    items = "".join(f"<li>{_marked(text)}</li>" for text in advice(found["rows"]))
-    return (
-        "<!doctype html><html lang=en><meta charset=utf-8><title>graspd: error against run time"
-        f"</title><style>{STYLE}</style><h1>Error against run time</h1><ul>{items}</ul>"
-        f"{picture[picture.index('<svg') :]}"
-        f"{_html_table(SUMMARY_COLUMNS, _summary(found['rows']))}"
-        f"<h2>All of them</h2>{_html_table(COLUMNS, cells)}"
-        f"<h2>Stages of a reading</h2>{_html_table(STAGE_COLUMNS, stages)}"
-        f"<p>{_marked(_made(found))}</p></html>\n"
-    )
-
-
-def _html_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
-    body = "".join(
-        "<tr>" + "".join(f"<td>{_marked(cell)}</td>" for cell in row) + "</tr>" for row in rows
-    )
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def _marked(text: str) -> str:
-    """Escaped, with what stands between back ticks as code."""
-    parts = html.escape(text).split("`")
-    return "".join(
-        f"<code>{part}</code>" if index % 2 else part for index, part in enumerate(parts)
     )

@@ -1,0 +1,143 @@
+"""Joint velocity, calibration tables and the gate under extreme times and slopes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from fractions import Fraction
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.judge.decision import HandLimits, JointLimits
+from daemon.judge.hand import HandTracker
+from daemon.judge.health import Checked
+from daemon.judge.joint_motion import JointMotion
+from daemon.judge.reasons import Reason
+from drivers.base import JointReading, TactileReading
+from drivers.palm.calibration import parse_calibration
+from drivers.palm.hall import CoupledTable, Table
+from models.contract import Finger
+
+Note = Callable[..., None]
+FINGERS: tuple[Finger, ...] = ("ff", "mf", "th")
+ELECTRODES, COUNT_MAX = 24, 4095
+S, MS = 1_000_000_000, 1_000_000
+ANGLE_ERROR_MAX_RAD = 1e-9
+"""Largest error of a table; one count of a Hall sensor is 6e-4 rad."""
+REST_COUNTS, TOUCH_COUNTS, NOISE_COUNTS = 2600, 2200, 3.5
+"""Untouched and touched electrodes, and the noise measured on untouched sensors."""
+TARE_SWEEPS = 150
+
+
+def angle(t_ns: int, angle_rad: float) -> JointReading:
+    return JointReading(t_ns, 0, ("FFJ3",), np.array([angle_rad]))
+
+
+@pytest.mark.parametrize("step_ns", [0, 1, 1_000, MS])
+def test_a_jump_is_motion_however_small_the_time_difference(note: Note, step_ns: int) -> None:
+    motion = JointMotion(JointLimits())
+    with np.errstate(all="raise"):
+        motion.observe(angle(0, 0.0), 0)
+        motion.observe(angle(step_ns, 0.5), step_ns)
+        found = motion.objection(step_ns)
+    step = f"joint velocity, 0.5 rad within {step_ns} ns"
+    note(step=step, expected="moving", found=str(found))
+    assert found is Reason.MOVING
+
+
+@pytest.mark.parametrize(("share", "wanted"), [(0.999, None), (1.001, Reason.MOVING)])
+def test_the_speed_limit_is_exact_at_10_khz(
+    note: Note, share: float, wanted: Reason | None
+) -> None:
+    motion, rate, now_ns = JointMotion(JointLimits()), share * JointLimits().rad_per_s, 0
+    for now_ns in range(0, S, S // 10_000):
+        motion.observe(angle(now_ns, rate * now_ns / S), now_ns)
+    found = motion.objection(now_ns)
+    step = f"joint velocity of {rate:.4f} rad/s at 10 kHz"
+    note(step=step, expected=str(wanted or "still"), found=str(found or "still"))
+    assert found is wanted
+
+
+def test_the_steepest_table_is_exact(note: Note) -> None:
+    # As steep as a file may be, and a segment so short that its ends nearly cancel.
+    points = [(1000.0, 0.0), (1000.0 + 2.0**-20, 0.5 * 2.0**-20), (1100.0, 45.0), (3000.0, 80.0)]
+    rows = [list(point) for point in points]
+    parse_calibration({"version": 1, "joints": {"FFJ3": rows}}, Path("calibration"))
+    table = Table(points)
+    segments = list(itertools.pairwise((Fraction(x), Fraction(y)) for x, y in points))
+
+    def degrees(raw: Fraction) -> Fraction:
+        (x, y), (next_x, next_y) = next((s for s in segments if raw < s[1][0]), segments[-1])
+        return y + (raw - x) * (next_y - y) / (next_x - x)
+
+    raws = [*map(float, range(COUNT_MAX + 1)), *(raw for raw, _ in points)]
+    error = max(
+        abs(table.angle_rad(raw) - float(degrees(Fraction(raw))) * pi / 180) for raw in raws
+    )
+    note(
+        step="calibration, steepest segment, 1e-6 counts wide",
+        expected=f"angle to {ANGLE_ERROR_MAX_RAD:.0e} rad",
+        found=f"{error:.1e} rad",
+    )
+    assert error <= ANGLE_ERROR_MAX_RAD
+
+
+def test_a_coupled_table_is_exact_in_a_thin_triangle(note: Note) -> None:
+    corners = [(100.0, 100.0), (4000.0, 4000.0), (2050.0, 2054.0)]
+    degrees = [(0.0, -30.0), (80.0, 30.0), (40.0, 1.0)]
+    table = CoupledTable([(*raws, *angles) for raws, angles in zip(corners, degrees, strict=True)])
+    error = 0.0
+    for weights in ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 2), (1, 2, 5), (3, 4, 1)):
+        shares = [Fraction(weight, sum(weights)) for weight in weights]
+        raw_1, raw_2, *wanted = (
+            float(sum(share * Fraction(row[axis]) for share, row in zip(shares, rows, strict=True)))
+            for rows in (corners, degrees)
+            for axis in (0, 1)
+        )
+        for found, exact in zip(table.angles_rad(raw_1, raw_2), wanted, strict=True):
+            error = max(error, abs(found - exact * pi / 180))
+    note(
+        step="calibration, coupled joints, a triangle 2 counts high",
+        expected=f"angle to {ANGLE_ERROR_MAX_RAD:.0e} rad",
+        found=f"{error:.1e} rad",
+    )
+    assert error <= ANGLE_ERROR_MAX_RAD
+
+
+def test_a_grasp_at_10_khz_is_judged_once(note: Note) -> None:
+    judged, _ = grasp_through_gate(S // 10_000, 5_000)
+    note(step="gate, readings at 10 kHz", expected="judged once", found=f"judged {judged} times")
+    assert judged == 1
+
+
+def test_a_grasp_at_a_tenth_of_a_hertz_is_never_judged(note: Note) -> None:
+    # Between such readings anything may happen.
+    judged, reasons = grasp_through_gate(10 * S, 60)
+    note(
+        step="gate, readings at 0.1 Hz",
+        expected="never judged, for a reason",
+        found=f"judged {judged} times; {', '.join(reasons)}",
+    )
+    assert judged == 0
+    assert reasons
+
+
+def grasp_through_gate(period_ns: int, touching: int) -> tuple[int, list[Reason]]:
+    """How often a grasp of `touching` sweeps is judged, and the objections to it."""
+    hand, random = HandTracker(FINGERS, HandLimits()), np.random.default_rng(0)
+    judged, reasons = 0, dict.fromkeys(hand.moment().reasons)
+    for number in range(TARE_SWEEPS + touching):
+        mean = np.full((len(FINGERS), ELECTRODES), float(REST_COUNTS))
+        if number >= TARE_SWEEPS:
+            mean[:, : ELECTRODES // 3] = TOUCH_COUNTS
+        counts = np.rint(random.normal(mean, NOISE_COUNTS)).astype(np.uint16)
+        faults = np.zeros(counts.shape, dtype=np.uint8)
+        reading = TactileReading(number * period_ns, number, counts, faults)
+        moment, _ = hand.step(reading, Checked((), np.zeros(counts.shape, dtype=np.bool_)))
+        judged += moment.judges
+        if number >= TARE_SWEEPS:
+            reasons |= dict.fromkeys(moment.reasons)
+    return judged, list(reasons)

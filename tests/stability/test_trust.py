@@ -1,0 +1,276 @@
+"""What outcomes teach and what a risk allows, under streams made up for the worst.
+
+The learner is compared with itself in extended precision, the rule's threshold with fractions.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from itertools import islice
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from daemon.trust.learner import Learner
+from daemon.trust.lift_book import LIFTS_MAX, GraspId
+from daemon.trust.risk import LOWEST, Permission, Risk, RiskLimits
+from daemon.trust.trust import Trust, encode
+
+Note = Callable[..., None]
+Random = np.random.Generator
+Outcome = tuple[float, NDArray[np.float64], bool]
+"""Margin, inputs, whether it slipped."""
+INPUTS = 78
+"""A session's features of the whole hand: the largest learner there is."""
+CLIP, INPUT_MAX = 3.0, 1000.0
+"""Limits of a session's features, and of what the learner takes."""
+MEAN_SPREADS_MAX, DRIFT = 50.0, 2e-3
+PRIOR = np.array([0.3, 0.5, *[0.3] * INPUTS]) ** 2
+"""Variances of the weights: of the margin, the bias and the features."""
+CHECKS = 100
+"""How often the covariance is looked at during the longest stream."""
+COMPARED = 500
+"""Outcomes that are compared with extended precision. At the clip, with labels at random, rounding
+grows with each outcome: 4e-9 to 4e-6 in twelve draws, and after 1500 outcomes float64 and long
+double differ altogether. The bounds above hold all the same."""
+ERROR_MAX = 1e-6
+"""Largest error of log-odds, over their magnitude if that is above 1."""
+EIGENVALUE_MIN = 0.99 * DRIFT * 0.3**2
+"""What the learner's docstring derives, with room for rounding."""
+LIFTS = 20_000
+THETA_ERROR_MAX = 1e-9
+"""Log-odds. A lift rounds by 1e-15."""
+STATE_BYTES_MAX = 2 << 20
+BATCHES, BATCH = 20, LIFTS_MAX
+
+
+def varied(random: Random) -> Iterator[Outcome]:
+    while True:
+        inputs = random.normal(0.0, 1.0, INPUTS).clip(-CLIP, CLIP)
+        yield float(random.normal(0.0, 2.0)), inputs, bool(inputs[0] + random.normal() > 0.0)
+
+
+def constant(random: Random) -> Iterator[Outcome]:
+    while True:
+        yield 1.0, np.full(INPUTS, 0.5), bool(random.random() < 0.5)
+
+
+def at(limit: float, margin: float) -> Callable[[Random], Iterator[Outcome]]:
+    def stream(random: Random) -> Iterator[Outcome]:
+        while True:
+            said = float(random.choice((-margin, margin)))
+            yield said, random.choice((-limit, limit), INPUTS), bool(random.random() < 0.5)
+
+    return stream
+
+
+def contradicting(random: Random) -> Iterator[Outcome]:
+    inputs = random.uniform(-CLIP, CLIP, INPUTS)
+    while True:
+        yield 5.0, inputs, True
+        yield 5.0, inputs, False
+
+
+def against_the_margin(random: Random) -> Iterator[Outcome]:
+    while True:
+        yield -30.0, CLIP * np.eye(INPUTS)[random.integers(INPUTS)], True
+
+
+STREAMS: dict[str, Callable[[Random], Iterator[Outcome]]] = {
+    "varied": varied,
+    "constant features": constant,
+    "features at the clip": at(CLIP, 1e9),
+    "features at the largest that is taken": at(INPUT_MAX, 1e300),
+    "contradicting labels": contradicting,
+    "labels against the surest margin": against_the_margin,
+}
+
+
+@pytest.mark.timeout(900)  # a million outcomes take a minute, on a busy machine more
+def test_the_learner_stays_bounded_and_positive_definite(
+    note: Note, request: pytest.FixtureRequest
+) -> None:
+    outcomes: int = request.config.getoption("outcomes")
+    random, learner = np.random.default_rng(0), Learner(INPUTS)
+    start = np.array([1.0, *[0.0] * (INPUTS + 1)])
+    streams = [stream(random) for stream in STREAMS.values()]
+    eigenvalues, variances, spreads, symmetric = [], [], [], True
+    for check in range(CHECKS):
+        for margin, inputs, slipped in islice(streams[check % len(streams)], outcomes // CHECKS):
+            learner.learn(learner.features(margin, inputs), slipped=slipped)
+        state = learner.state()
+        covariance = np.frombuffer(state.covariance, "<f8").reshape(len(PRIOR), -1)
+        symmetric &= bool((covariance == covariance.T).all())
+        eigenvalues.append(float(np.linalg.eigvalsh(covariance)[0]))
+        variances.append(float((covariance.diagonal() / PRIOR).max()))
+        far = np.abs(np.frombuffer(state.mean, "<f8") - start) / np.sqrt(PRIOR)
+        spreads.append(float(far.max()))
+    note(
+        step=f"learner, {outcomes:.0e} outcomes, all of these in turns",
+        expected=f"symmetric, eigenvalues from {EIGENVALUE_MIN:.1e} on, variances within the "
+        f"prior's, weights within {MEAN_SPREADS_MAX:g} spreads",
+        found=f"{'symmetric' if symmetric else 'not symmetric'}, from {min(eigenvalues):.2e} on, "
+        f"{max(variances):.6f} of the prior's, {max(spreads):.1f} spreads",
+    )
+    assert symmetric
+    assert min(eigenvalues) >= EIGENVALUE_MIN
+    assert max(variances) <= 1 + 1e-12
+    assert max(spreads) <= MEAN_SPREADS_MAX
+    Learner(INPUTS).restore(learner.state())  # raises for a state that no outcomes lead to
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_log_odds_are_those_of_long_double(note: Note, name: str) -> None:
+    learner, exact, worst = Learner(INPUTS), ExactLearner(), 0.0
+    for margin, inputs, slipped in islice(STREAMS[name](np.random.default_rng(1)), COMPARED):
+        features = learner.features(margin, inputs)
+        wanted = exact.log_odds(features)
+        error = abs(float(learner.log_odds(features) - wanted)) / max(1.0, abs(float(wanted)))
+        worst = max(worst, error if math.isfinite(error) else math.inf)
+        learner.learn(features, slipped=slipped)
+        exact.learn(features, slipped=slipped)
+    note(
+        step=f"learner, {COMPARED} outcomes, {name}",
+        expected=f"log-odds of long double to {ERROR_MAX:.0e}",
+        found=f"{worst:.1e}",
+    )
+    assert worst <= ERROR_MAX
+
+
+class ExactLearner:
+    """The learner's equations in extended precision, written plainly."""
+
+    def __init__(self) -> None:
+        self.prior = PRIOR.astype(np.longdouble)
+        self.start = np.zeros(len(self.prior), np.longdouble)
+        self.start[0] = 1
+        self.mean = self.start.copy()
+        self.covariance = np.diag(self.prior)
+
+    def log_odds(self, features: NDArray[np.float64]) -> np.longdouble:
+        f = features.astype(np.longdouble)
+        moderated = np.longdouble(math.pi) / 8 * (f @ self.covariance @ f)
+        return np.longdouble((f @ self.mean) / np.sqrt(1 + moderated))
+
+    def learn(self, features: NDArray[np.float64], *, slipped: bool) -> None:
+        f = features.astype(np.longdouble)
+        seen = self.covariance @ f
+        with np.errstate(over="ignore"):  # to infinity, which gives 0 as it should
+            p = 1 / (1 + np.exp(-(f @ self.mean)))
+        w = p * (1 - p)
+        gain = seen / (1 + w * (f @ seen))
+        reach = np.longdouble(MEAN_SPREADS_MAX) * np.sqrt(self.prior)
+        mean = self.mean + gain * (slipped - p)
+        self.mean = np.clip(mean, self.start - reach, self.start + reach)
+        widened = self.covariance - w * np.outer(gain, seen) + np.diag(DRIFT * self.prior)
+        scale = np.sqrt(np.minimum(1, self.prior / np.diag(widened)))
+        self.covariance = widened * np.outer(scale, scale)
+
+
+@pytest.mark.parametrize("alpha", [0.001, 0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5])
+def test_no_adversary_slips_beyond_the_bound(note: Note, alpha: float) -> None:
+    worst = max(
+        beyond_the_bound(alpha, late, slips_from)
+        for late in (1, 20)
+        for slips_from in (LOWEST, LOWEST + 1.0, -1.0)
+    )
+    note(
+        step=f"risk of {alpha:g} against adversaries, {LIFTS} grasps each",
+        expected="slips within the bound at every moment",
+        found=f"nearest {worst:+.2f} slips",
+    )
+    assert worst <= ERROR_MAX
+
+
+def beyond_the_bound(alpha: float, late: int, slips_from: float) -> float:
+    """Return the most slips beyond the bound, by an adversary that knows the rule and theta.
+
+    It lifts the surest grasps, which hold until theta is at `slips_from` and slip from then on.
+    Outcomes come `late` at a time.
+    """
+    rule, worst, waiting = Risk(RiskLimits(alpha)), -math.inf, list[bool]()
+    for _ in range(LIFTS):
+        if rule.decide(LOWEST) is Permission.ALLOWED:
+            waiting.append(rule.theta >= slips_from)
+        elif not waiting:
+            break  # silent for ever
+        if len(waiting) == late or rule.theta < LOWEST:
+            for slipped in waiting:
+                rule.take(stable=True, slipped=slipped, proves=True)
+                worst = max(worst, rule.slips - (rule.bound or 0.0))
+            waiting = []
+    return worst
+
+
+def test_the_threshold_is_that_of_fractions(note: Note) -> None:
+    random, worst = np.random.default_rng(0), 0.0
+    for alpha in (0.001, 0.05, 0.5):
+        rule = Risk(RiskLimits(alpha))
+        theta = Fraction(rule.theta)
+        for unlucky in (random.random(LIFTS) < 1.2 * alpha).tolist():
+            slipped = unlucky and rule.theta >= LOWEST  # else nothing would be lifted
+            rule.take(stable=True, slipped=slipped, proves=True)
+            theta = min(theta + Fraction(alpha) - slipped, Fraction(0))
+            worst = max(worst, abs(float(Fraction(rule.theta) - theta)))
+    note(
+        step=f"risk, threshold after {LIFTS} lifts",
+        expected=f"of fractions to {THETA_ERROR_MAX:.0e}",
+        found=f"{worst:.1e}",
+    )
+    assert worst <= THETA_ERROR_MAX
+
+
+def trust() -> Trust:
+    return Trust("report", INPUTS, RiskLimits(0.05, warm_up=50, explore=0.05))
+
+
+def judge(part: Trust, number: int, margin: float, inputs: NDArray[np.float64]) -> None:
+    grasp = GraspId("report", number)
+    found = part.judge(grasp, 0.5, margin, inputs)
+    part.note(grasp, found, stable=found.permission is Permission.ALLOWED)
+
+
+def test_what_a_grasp_and_an_outcome_cost(note: Note) -> None:
+    # Times are information: how long a computer takes says nothing about what is right.
+    part, outcomes = trust(), varied(np.random.default_rng(3))
+    medians = []
+    for batch in range(BATCHES):
+        took = []
+        for number, (margin, inputs, slipped) in zip(range(BATCH), outcomes, strict=False):
+            began = time.perf_counter_ns()
+            judge(part, BATCH * batch + number, margin, inputs)
+            said = time.perf_counter_ns()
+            part.outcome(GraspId("report", BATCH * batch + number), slipped=slipped)
+            took.append((said - began, time.perf_counter_ns() - said))
+        medians.append(np.median(took, axis=0) / 1e3)
+    judge_us, outcome_us = np.min(medians, axis=0)
+    note(
+        step="learner and risk, time of a grasp judged and noted, and of an outcome",
+        expected=f"p50 of the quietest {BATCH}, for information",
+        found=f"{judge_us:.1f} us, {outcome_us:.1f} us",
+    )
+
+
+def test_all_outcomes_out_fit_into_memory(note: Note) -> None:
+    outcomes, tracing = varied(np.random.default_rng(4)), tracemalloc.is_tracing()
+    tracemalloc.start()
+    before, _ = tracemalloc.get_traced_memory()
+    part = trust()
+    for number, (margin, inputs, _) in zip(range(2 * LIFTS_MAX), outcomes, strict=False):
+        judge(part, number, margin, inputs)
+    encoded = encode(part.state())
+    _, peak = tracemalloc.get_traced_memory()
+    if not tracing:
+        tracemalloc.stop()
+    held = peak - before
+    note(
+        step="learner and risk, memory with all outcomes out, while it is kept",
+        expected=f"within {STATE_BYTES_MAX >> 20} MiB",
+        found=f"{held / (1 << 20):.2f} MiB, {len(encoded) / 1024:.0f} KiB of them written",
+    )
+    assert held <= STATE_BYTES_MAX
