@@ -147,7 +147,7 @@ class HandTracker:
     @property
     def tared(self) -> tuple[Finger, ...]:
         """Fingers of which it is known where they rest."""
-        return tuple(compress(self._fingers, self._contact.tared.tolist()))
+        return tuple(compress(self._fingers, self._contact.memory.tared.tolist()))
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: fingers without a tare, and `joints`."""
@@ -224,7 +224,7 @@ class HandTracker:
             reading.counts,
             median,
             usable,
-            self._contact.touching,
+            self._contact.memory.touching,
             self._objections(t_ns),
             in_time=in_time,
             fresh=self._fresh.is_full(usable),
@@ -235,12 +235,12 @@ class HandTracker:
 
     def moment(self) -> Moment:
         """Return where in a grasp the hand is without a new reading; it is not to be judged."""
-        return self.gate.moment(self._contact.touching.tolist())
+        return self.gate.moment(self._contact.memory.touching.tolist())
 
     def _objections(self, t_ns: int) -> tuple[Reason, ...]:
         """Return what tare and joints say against settling."""
         objections: list[Reason] = []
-        tared = self._contact.tared
+        tared = self._contact.memory.tared
         if not all_of(tared) and not all_of(tared[self._required]):
             objections.append(Reason.NOT_TARED)
         joints = None if self._joints is None else self._joints.objection(t_ns)
