@@ -39,8 +39,8 @@ APART_NS = 50_000_000
 """A finger touches again this long after it let go at the earliest: while it opens, its electrodes
 rise one sweep after the other, which looks like another touch."""
 LONG_HOLD_NS = 60_000_000_000
-"""After a longer hold a finger is tared again: by then 0.2 counts/s between its electrodes (measured
-on three sensors) make more than half of a touch."""
+"""After a longer hold a finger is tared again: 0.2 counts/s between its electrodes (measured on
+three sensors) have made more than half of a touch."""
 ALONE_NS = 30_000_000_000
 """A finger that touches for longer without all the others does not grasp: it is tared again."""
 SUSPECT = 0.5

@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +78,8 @@ class Gate:
         """`fingers` are those of the readings, in their order."""
         required = fingers if limits.required is None else limits.required
         self._fingers = tuple(fingers)
-        self._required = [place for place, finger in enumerate(fingers) if finger in required]
+        self.required = frozenset(fingers).intersection(required)
+        """Fingers that must touch."""
         self._limits = limits.gate
         self._on_request = limits.on_request
         self.motion = Motion(len(fingers), self._limits.false_alarms, early=self._limits.early)
@@ -109,7 +109,7 @@ class Gate:
         counts: NDArray[np.uint16],
         median: NDArray[np.uint16],
         usable: NDArray[np.bool_] | None,
-        touching: NDArray[np.bool_],
+        touching: tuple[Finger, ...],
         objections: tuple[Reason, ...] = (),
         *,
         in_time: bool = True,
@@ -126,15 +126,14 @@ class Gate:
         self.skip(t_ns)
         memory.last_ns = t_ns
         self._follow_question(t_ns)
-        touches = touching.tolist()
-        in_contact = all(touches[finger] for finger in self._required)
-        self.motion.add(t_ns, counts, usable, wanted=in_contact or any(touches))
+        in_contact = self.required.issubset(touching)
+        self.motion.add(t_ns, counts, usable, wanted=in_contact or bool(touching))
         if in_contact and not memory.in_contact:
             memory.touched_ns = t_ns
         memory.in_contact = in_contact
         reasons = self._disturbances(objections)
         self._follow_stillness(t_ns, bool(reasons))
-        self._follow_contact(t_ns, any(touches))
+        self._follow_contact(t_ns, bool(touching))
         if memory.state is GateState.JUDGED:
             reasons += self._follow_judged(t_ns, median.astype(np.float32), usable)
         elif memory.state is GateState.SETTLED and (reasons or not self._is_still):
@@ -142,16 +141,13 @@ class Gate:
             self._enter(GateState.CLOSING, t_ns, cause)
         memory.objections = (*reasons, *self._settle(t_ns, bool(reasons)))
         if in_time and self._wants_judgement(fresh=fresh):
-            return self._judge(t_ns, median, touches)
-        return self.moment(touches)
+            return self._judge(t_ns, median, touching)
+        return self.moment(touching)
 
     def moment(
-        self, touches: Sequence[bool], *, judges: bool = False, judged: bool = False
+        self, touching: tuple[Finger, ...], *, judges: bool = False, judged: bool = False
     ) -> Moment:
-        """Return where in a grasp the hand is, and forget the changes that led there.
-
-        `touches` says of each finger whether it touches; see `Moment` for the others.
-        """
+        """Return where in a grasp the hand is, and forget the changes that led there."""
         memory = self.memory
         is_judged, reasons = memory.state is GateState.JUDGED, memory.objections
         if not (reasons or is_judged):
@@ -166,7 +162,7 @@ class Gate:
             in_contact=memory.in_contact,
             settled=is_judged and not reasons,
             reasons=reasons,
-            touching=tuple(compress(self._fingers, touches)),
+            touching=touching,
             changes=tuple(changes),
             still_ms=self._still_ns / 1e6,
             early=is_judged and memory.early,
@@ -218,7 +214,7 @@ class Gate:
             return age_ns > STANDS_NS or (fresh and (memory.asked or age_ns >= REFRESH_NS))
         return fresh and memory.state is GateState.SETTLED and self._is_asked
 
-    def _judge(self, t_ns: int, median: NDArray[np.uint16], touches: Sequence[bool]) -> Moment:
+    def _judge(self, t_ns: int, median: NDArray[np.uint16], touching: tuple[Finger, ...]) -> Moment:
         """Enter `judged`, or stay there.
 
         A grasp is the same while it is near to where it settled. Where it was judged last does not
@@ -233,7 +229,7 @@ class Gate:
             memory.early = self._still_ns < LONG_NS
             memory.moved_since_ns = None
             self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
-        return self.moment(touches, judges=True, judged=not refreshes)
+        return self.moment(touching, judges=True, judged=not refreshes)
 
     def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
         """Per finger: motion in the window closer to its limit, and that limit."""

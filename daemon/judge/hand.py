@@ -130,9 +130,7 @@ class HandTracker:
 
     def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
         """`fingers` are those of the readings, in their order."""
-        required = fingers if limits.required is None else limits.required
         self._fingers = tuple(fingers)
-        self._required = [place for place, finger in enumerate(fingers) if finger in required]
         self._limits = limits
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
         self._contact = Contact(len(fingers), limits.contact)
@@ -146,8 +144,8 @@ class HandTracker:
 
     @property
     def tared(self) -> tuple[Finger, ...]:
-        """Fingers of which it is known where they rest."""
-        return tuple(compress(self._fingers, self._contact.memory.tared.tolist()))
+        """Fingers whose baseline is known."""
+        return self._named(self._contact.memory.tared)
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: fingers without a tare, and `joints`."""
@@ -224,7 +222,7 @@ class HandTracker:
             reading.counts,
             median,
             usable,
-            self._contact.memory.touching,
+            self._named(self._contact.memory.touching),
             self._objections(t_ns),
             in_time=in_time,
             fresh=self._fresh.is_full(usable),
@@ -235,15 +233,17 @@ class HandTracker:
 
     def moment(self) -> Moment:
         """Return where in a grasp the hand is without a new reading; it is not to be judged."""
-        return self.gate.moment(self._contact.memory.touching.tolist())
+        return self.gate.moment(self._named(self._contact.memory.touching))
 
     def _objections(self, t_ns: int) -> tuple[Reason, ...]:
         """Return what tare and joints say against settling."""
         objections: list[Reason] = []
-        tared = self._contact.memory.tared
-        if not all_of(tared) and not all_of(tared[self._required]):
+        if not self.gate.required.issubset(self.tared):
             objections.append(Reason.NOT_TARED)
         joints = None if self._joints is None else self._joints.objection(t_ns)
         if joints is not None:
             objections.append(joints)
         return tuple(objections)
+
+    def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
+        return tuple(compress(self._fingers, which.tolist()))

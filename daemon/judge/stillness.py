@@ -1,8 +1,8 @@
 """Whether the fingers keep still: how each moves, in units of its own noise.
 
 Fast motion is the slope of a line through the last moments of every electrode; slow slides, which
-stop and turn, show in how far the electrodes spread over a longer time. What is remembered is so
-many steps of time however fast sweeps come, so memory is constant.
+stop and turn, show in how far the electrodes spread over a longer time. Steps of time are
+remembered, not sweeps, so memory is constant.
 """
 
 from __future__ import annotations
@@ -28,25 +28,24 @@ from daemon.judge.windows import (
 from drivers.base import ELECTRODES
 
 SPIKE_COUNTS = 20.0
-"""A value that jumps further than this is believed when the next one does too. Spikes last for one
-sweep: of a sensor by 25 counts or more, of a flipped bit by any; noise does so in one value of
-three thousand."""
+"""A value that jumps further is believed once the next one does too. Spikes last for one sweep:
+those of a sensor are 25 counts or more; noise jumps so far in one value of three thousand."""
 SPIKE_SWEEPS_MAX = 3
-"""Where values come more slowly than sweeps and are held, a spike is in two or three of them; what
-stays is none, however constant."""
+"""Sweeps that a spike lasts where values come more slowly than sweeps and are held."""
 SPIKES_MAX = 4
-"""Where more electrodes of a finger jump at once, the finger moves: by chance not in a year."""
+"""More electrodes of a finger that jump in one sweep are motion: noise does that less than once a
+year."""
 BLOCK_STEPS, BLOCKS = 24, 16
-"""Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
-what it is while a hand closes or opens, ..."""
+"""Noise is the lower quartile of 16 blocks of 24 steps (about 4 s at 100 Hz), so that a hand that
+closes or opens does not change it."""
 QUARTILE = 0.95
-"""Which is so much of the mean, of noise that is correlated as measured or is not."""
+"""Lower quartile of the blocks' variances over their mean; the same for white noise."""
 BLOCKS_MIN = 4
-"""... and is not known before there are so many of them."""
+"""Blocks from which on noise is known."""
 SIGMA_COUNTS = (0.5, 10.0)
 """An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
 LOST_MAX = 3
-"""An electrode that is not usable for so many sweeps in a row is taken to read what it read."""
+"""Sweeps in a row for which an electrode that is not usable is taken to read what it read."""
 SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
@@ -84,11 +83,11 @@ class MotionMemory:
     counts: NDArray[np.float32]
     """The last sweep as it came."""
     jumped: NDArray[np.uint8]
-    """For how many sweeps it has jumped and was not believed."""
+    """Number of sweeps for which it has jumped and was not believed."""
     lost: NDArray[np.uint8]
-    """For how many sweeps it has not been usable, up to `LOST_MAX` and one."""
+    """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
     usable_since_ns: NDArray[np.int64]
-    """Since when an electrode has been usable, but for so many sweeps now and then."""
+    """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
     all_usable_since_ns: Number
     """Since when all have."""
     total: NDArray[np.float32]
@@ -163,20 +162,17 @@ class Motion:
         self.fast_limits = self.slow_limits = self._no_limits
         """What it may be at most for a finger that is still, in the same units."""
         self.looked = False
-        """Whether that was worked out for the last step; else nobody wanted to know."""
+        """True if that was worked out for the last step; else it was not wanted."""
+        self.known = False
+        """True if it is known of all fingers how they moved in the short window."""
         self.early = False
-        """Whether fast motion is excluded."""
+        """True if fast motion is excluded."""
         self.sure = False
-        """Whether slow slides are excluded as well, as far as they can be told from noise."""
-
-    @property
-    def known(self) -> bool:
-        """Whether it is known of all fingers how they moved in the short window."""
-        return max(self.fast) < math.inf
+        """True if slow slides that noise does not hide are excluded as well."""
 
     @property
     def slides(self) -> bool:
-        """Whether it is known that a finger moves slowly, or has moved within the long window."""
+        """True if a finger is known to move slowly, or to have moved within the long window."""
         return any(
             limit < moves < math.inf
             for moves, limit in zip(self.slow, self.slow_limits, strict=True)
@@ -356,6 +352,7 @@ class Motion:
         noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
         beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
+        self.known = max(self.fast) < math.inf
         self.early = _within(self.fast, self.fast_limits)
         if age_ns >= LONG_NS:
             self._follow_slow(memory.first + long, end, times_s, noise)
@@ -388,9 +385,9 @@ class Motion:
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown
         self.fast_limits = self.slow_limits = self._no_limits
-        self.looked = self.early = self.sure = False
+        self.looked = self.known = self.early = self.sure = False
 
 
 def _within(moves: list[float], limits: list[float]) -> bool:
     """Return True if no finger moves more than its limit."""
-    return all(move <= limit for move, limit in zip(moves, limits, strict=True))
+    return False not in [move <= limit for move, limit in zip(moves, limits, strict=True)]
