@@ -225,9 +225,10 @@ class Pipeline:
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
-        self.learn()
-        self._latest = reading
         memory = self.memory
+        if memory.is_to_learn:
+            self.learn()
+        self._latest = reading
         memory.readings += 1
         checked = self._health.check(reading)
         moment, counts = self._follow(reading, checked)
@@ -278,7 +279,7 @@ class Pipeline:
             findings |= self.hand.health()
         if Reason.MODEL_FAILED in opinion.reasons:
             findings["model"] = Reason.MODEL_FAILED
-        if self._session is not None and not self._session.calibrated:
+        if self._session is not None and not self._session.now.calibrated:
             findings["session"] = Reason.NOT_CALIBRATED
         return findings
 
@@ -352,7 +353,7 @@ class Pipeline:
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
-        calibrated = None if self._session is None else self._session.calibrated
+        calibrated = None if self._session is None else self._session.now.calibrated
         objections = (*unusable, *opinion.reasons)
         if self._needs_session and calibrated is False:
             objections = (*objections, Reason.NOT_CALIBRATED)

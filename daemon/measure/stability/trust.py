@@ -140,7 +140,7 @@ def _endurance(outcomes: int) -> StepRow:
     for check in range(CHECKS):
         stream = streams[check % len(streams)]
         for _, (margin, inputs, slipped) in zip(range(every), stream, strict=False):
-            learner.learn(learner.features(margin, inputs), slipped=slipped)
+            learner.learn(learner.judge(margin, inputs)[1], slipped=slipped)
             told += 1
         state = learner.state()
         covariance = np.frombuffer(state.covariance, "<f8").reshape(len(prior), -1)
@@ -166,9 +166,9 @@ def _learner_error(stream: Stream) -> float:
     worst = 0.0
     outcomes = stream(np.random.default_rng(1))
     for _, (margin, inputs, slipped) in zip(range(COMPARED), outcomes, strict=False):
-        features = learner.features(margin, inputs)
+        found, features = learner.judge(margin, inputs)
         wanted = exact.log_odds(features)
-        error = abs(float(learner.log_odds(features) - wanted)) / max(1.0, abs(float(wanted)))
+        error = abs(float(found - wanted)) / max(1.0, abs(float(wanted)))
         worst = max(worst, error if math.isfinite(error) else math.inf)
         learner.learn(features, slipped=slipped)
         exact.learn(features, slipped=slipped)
