@@ -1,8 +1,8 @@
 """Tare and contact: where each electrode rests, how much it wavers, and which finger touches.
 
-A touch presses the skin towards the electrodes under it and lowers their counts (BioTac SP manual,
-section 5). So a finger touches when several electrodes fall below where they rest, and further than
-the finger as a whole: what moves all electrodes alike is the supply or the temperature.
+A touch lowers the counts of the electrodes under it (BioTac SP manual, section 5). It is a fall of
+several electrodes below where they rest, and below the finger as a whole: supply and temperature
+move all electrodes alike.
 """
 
 from __future__ import annotations

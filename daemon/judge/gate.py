@@ -49,8 +49,7 @@ class GateMemory:
     touched_ns: int = 0
     """Time at which all required fingers touched; means nothing unless `in_contact`."""
     still_since_ns: int | None = None
-    """Time since which touch and stillness have lasted, as well as that can be told. None:
-    something moves."""
+    """Time since which touch and stillness have lasted. None: something moves."""
     moved_since_ns: int | None = None
     """Time since which a judged grasp has moved. None: it does not move."""
     early: bool = False
@@ -90,10 +89,7 @@ class Gate:
         self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
-        """Judge the grasp that settles within `request_ns` of the next reading.
-
-        A grasp that was judged is judged again.
-        """
+        """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
         self.memory.asked = True
         self.memory.asked_until_ns = None
 
@@ -190,10 +186,7 @@ class Gate:
 
     @property
     def _still_ns(self) -> int:
-        """Time for which the hand has touched and kept still, ns; 0 if something moves.
-
-        Less than the long window while something may slide slowly.
-        """
+        """Time of touch and stillness, ns; less than the long window if something may slide."""
         memory = self.memory
         if memory.still_since_ns is None or memory.last_ns is None:
             return 0
@@ -215,16 +208,13 @@ class Gate:
         return fresh and memory.state is GateState.SETTLED and self._is_asked
 
     def _judge(self, t_ns: int, median: NDArray[np.uint16], touching: tuple[Finger, ...]) -> Moment:
-        """Enter `judged`, or stay there.
-
-        A grasp is the same while it is near to where it settled. Where it was judged last does not
-        matter: a grasp that creeps would never be another.
-        """
+        """Enter `judged`, or stay there."""
         memory = self.memory
         refreshes = memory.state is GateState.JUDGED and not (memory.asked and self._on_request)
         memory.judged_ns = t_ns
         memory.asked = False
         if memory.state is not GateState.JUDGED:
+            # Kept when it is judged again: else a grasp that creeps would never be another.
             memory.reference = median.astype(np.float32)
             memory.early = self._still_ns < LONG_NS
             memory.moved_since_ns = None

@@ -1,8 +1,7 @@
 """How the hand holds: fresh values, contact, joints and gate of one hand, reading by reading.
 
-A palm that is asked for two electrodes at a time repeats 2 of 7 values of a stream at 100 Hz; one
-spike in a hundred values is 25 to 150 counts deep. The median of three fresh values takes spikes
-out, and costs one sweep of delay.
+One value in a hundred is a spike, 25 to 150 counts deep, and a palm repeats 2 of 7 values at 100
+Hz. The median of three fresh values takes spikes out, and costs one sweep of delay.
 """
 
 from __future__ import annotations
@@ -73,9 +72,8 @@ class FreshMedian:
         """Take in one sweep, shape (fingers, 24).
 
         Electrodes that are not `usable` are forgotten; None: all are usable. A value that repeats
-        the one before is taken for held, so not fresh; the next one counts again. A held value of
-        71.43 Hz data is never held twice, and a quiet electrode repeats itself in one sweep of ten
-        without being held.
+        the one before is taken for held, so not fresh; the next one counts again, for no value of
+        71.43 Hz data is held twice.
         """
         memory = self.memory
         oldest, middle, newest = memory.fresh
@@ -197,8 +195,7 @@ class HandTracker:
     ) -> tuple[Moment, NDArray[np.uint16] | None]:
         """Take in a reading of these fingers and what was found in it.
 
-        Return where in a grasp the hand is, and the counts to judge now, shape (fingers, 24). None:
-        judge nothing, for one because the reading is not `in_time`.
+        Return where in a grasp the hand is, and the counts to judge, shape (fingers, 24), or None.
         """
         t_ns, last_ns = reading.made_ns, self.memory.last_ns
         if checked.reasons:

@@ -1,8 +1,7 @@
 """Whether the fingers keep still: how each moves, in units of its own noise.
 
-Fast motion is the slope of a line through the last moments of every electrode; slow slides, which
-stop and turn, show in how far the electrodes spread over a longer time. Steps of time are
-remembered, not sweeps, so memory is constant.
+Fast motion shows in the slopes of the electrodes, slow slides, which stop and turn, in how far they
+spread over a longer time. Steps of time are remembered, not sweeps, so memory is constant.
 """
 
 from __future__ import annotations
@@ -56,18 +55,14 @@ Times = NDArray[np.float64]
 def mean_distance(
     one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
 ) -> NDArray[np.float64]:
-    """Return the mean distance of each finger's `usable` electrodes, counts, shape (..., fingers).
+    """Return the mean distance of each finger's `usable` electrodes, counts, shape (fingers,).
 
-    Counts of shape (..., fingers, 24), whole numbers below 2**16: float32 adds 24 of them exactly.
-    `usable`, shape (fingers, 24); None: all are usable.
+    Counts, shape (fingers, 24), are whole numbers below 2**16: float32 adds 24 of them exactly.
     """
     distance = np.abs(one - other)
-    mean: NDArray[np.float64]
     if usable is None:
-        mean = (distance @ ONES) / np.float64(ELECTRODES)
-    else:
-        mean = (distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1)
-    return mean
+        return np.asarray((distance @ ONES) / np.float64(ELECTRODES))
+    return np.asarray((distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1))
 
 
 @dataclass(slots=True, eq=False)
@@ -124,22 +119,20 @@ class MotionMemory:
 class Motion:
     """How each finger moves, in units of its own noise; constant memory, no clock.
 
-    Over the short window it is the mean of the electrodes' absolute fitted slopes, over the long
-    one the root mean square of their deviations from their means, each over what noise alone makes
-    of it. Noise is known from the differences of sweeps, which slow motion hardly changes.
+    Over the short window it is the mean of the electrodes' absolute slopes, over the long one the
+    root mean square of their deviations from their means, each over what noise alone makes of it.
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
         """`false_alarms`: share of a holding hand's sweeps that may be called moving, 0..0.5.
 
-        With `early` the short window may have as large a share itself, as it decides alone until
-        the long one is full. Raises `ValueError` for another share.
+        With `early` the short window may have as large a share itself. Raises `ValueError` for
+        another share.
         """
         shape = (fingers, ELECTRODES)
         self._tails = Tails.of(fingers, false_alarms, early=early)
         self._noise: Noise | None = None
-        self._noise_blocks = 0
-        """Blocks that it is known from."""
+        """Worked out when it is needed, once for each new block."""
         self.memory = MotionMemory(
             times_ns=np.zeros(2 * STEPS, dtype=np.int64),
             steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
@@ -294,6 +287,7 @@ class Motion:
             self._fill_block()
             memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
             memory.block_number += 1
+            self._noise = None
             memory.block_steps = 0
             memory.block.fill(0.0)
 
@@ -324,16 +318,13 @@ class Motion:
         ]
 
     def _known_noise(self) -> Noise:
-        memory = self.memory
-        if self._noise is None or self._noise_blocks != memory.block_number:
-            number = min(memory.block_number, BLOCKS)
-            squares = np.sort(memory.blocks[:number], axis=0)[number // 4]
-            low, high = SIGMA_COUNTS
-            correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
-            correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
-            variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
-            self._noise, self._noise_blocks = Noise.of(variance, correlations), memory.block_number
-        return self._noise
+        number = min(self.memory.block_number, BLOCKS)
+        squares = np.sort(self.memory.blocks[:number], axis=0)[number // 4]
+        low, high = SIGMA_COUNTS
+        correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
+        correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
+        variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
+        return Noise.of(variance, correlations)
 
     def _decide(self) -> None:
         memory = self.memory
@@ -349,20 +340,18 @@ class Motion:
             return
         windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
         short, long = (min(begin, number - STEPS_MIN) for begin in windows.tolist())
-        noise = self._known_noise()
+        if self._noise is None:
+            self._noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
-        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
+        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], self._noise)
         self.known = max(self.fast) < math.inf
         self.early = _within(self.fast, self.fast_limits)
         if age_ns >= LONG_NS:
-            self._follow_slow(memory.first + long, end, times_s, noise)
+            self._follow_slow(memory.first + long, end, times_s, self._noise)
             self.sure = _within(self.slow, self.slow_limits) and _within(self.fast, beside)
 
     def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
-        """Find how steps have moved, and the limit where this window decides alone.
-
-        Return the limit where it does not.
-        """
+        """Find how steps have moved; return the limit where this window does not decide alone."""
         memory = self.memory
         line, by_noise, self.fast_limits, beside = noise.fast(times_s, self._tails)
         slopes = line.astype(np.float32).dot(memory.steps[begin:end].reshape(len(line), -1))

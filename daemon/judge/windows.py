@@ -119,10 +119,7 @@ class Tails(NamedTuple):
 
     @classmethod
     def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
-        """Return them by the share of a holding hand's sweeps that may be called moving, 0..0.5.
-
-        Raises `ValueError` for another share.
-        """
+        """Return them by `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
         if not 0.0 < false_alarms < 0.5:
             raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
