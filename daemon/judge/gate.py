@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from daemon.judge.decision import HandLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
-from daemon.judge.stillness import Motion, mean_distance
+from daemon.judge.stillness import ONES, Motion
 from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
 from models.contract import Finger
@@ -287,7 +287,7 @@ class Gate:
         if not memory.in_contact:
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
             return ()
-        distance = mean_distance(counts, memory.reference, usable)
+        distance = _mean_distance(counts, memory.reference, usable)
         if max(distance.tolist()) > self._limits.change_counts:
             self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
             return ()
@@ -317,3 +317,16 @@ class Gate:
         memory.state = state
         if state not in (GateState.SETTLED, GateState.JUDGED):
             memory.early, memory.moved_since_ns = False, None
+
+
+def _mean_distance(
+    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
+) -> NDArray[np.float64]:
+    """Return the mean distance of each finger's `usable` electrodes, counts, shape (fingers,).
+
+    Counts, shape (fingers, 24), are whole numbers below 2**16: float32 adds 24 of them exactly.
+    """
+    distance = np.abs(one - other)
+    if usable is None:
+        return np.asarray((distance @ ONES) / np.float64(ELECTRODES))
+    return np.asarray((distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1))

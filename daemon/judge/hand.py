@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from daemon.judge.contact import Contact
 from daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from daemon.judge.gate import Gate
-from daemon.judge.health import NO_COUNT, Checked, all_of, any_of
+from daemon.judge.health import NO_COUNT, Checked, all_of
 from daemon.judge.reasons import Moment, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger
@@ -210,7 +210,7 @@ class HandTracker:
         if self.memory.unsettled:
             self.memory.unsettled -= 1
             self.gate.restart(t_ns)
-        usable = ~checked.broken if any_of(checked.broken) else None
+        usable = None if checked.is_whole else ~checked.broken
         self._fresh.push(reading.counts, usable)
         median = self._fresh.counts
         self._contact.observe(t_ns, reading.counts, median, usable)

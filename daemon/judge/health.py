@@ -75,6 +75,8 @@ class Checked:
     """Against using it at all."""
     broken: NDArray[np.bool_]
     """Shape (fingers, 24): electrodes that mean nothing in it."""
+    is_whole: bool = False
+    """True if none is broken; a sound reading is known by this without a look at all."""
 
 
 @dataclass(slots=True, eq=False)
@@ -168,7 +170,7 @@ class Health:
         self._no_faults = self.memory.faults.tobytes()
         nothing = np.zeros(shape, dtype=np.bool_)
         nothing.flags.writeable = False  # one for all sound readings
-        self._sound = Checked((), nothing)
+        self._sound = Checked((), nothing, is_whole=True)
         # Constants of full shape, and buffers: numpy takes half the time.
         self._one, self._jump, *limits = (
             np.full(shape, number, dtype=np.uint16) for number in (1, JUMP_COUNTS, *LIMITS)

@@ -81,10 +81,11 @@ class Plausibility:
         Shapes are (fingers, 24). `session` says how today's sensors differ from the training's.
         """
         values = counts.astype(np.float64)
-        if _is_flat(values, broken):
+        is_whole = not any_of(broken)
+        if _is_flat(values, None if is_whole else broken):
             return Examined((Reason.FLAT,), counts)
         if session is not None:
-            if not any_of(broken) and self._is_plain(values, session):
+            if is_whole and self._is_plain(values, session):
                 return Examined((), counts, (), counts)
             values = session.to_training(values)
         grasp, values = self._repair(counts, values, broken, session)
@@ -186,10 +187,10 @@ def electrode_name(finger: Finger, place: int) -> str:
     return f"{finger}_{place + 1}"
 
 
-def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_]) -> bool:
+def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> bool:
     """Return True if the sound electrodes of a finger read about the same; `values` are counts."""
     numbers = [ELECTRODES] * len(values)
-    if any_of(broken):
+    if broken is not None:
         values = np.where(broken, 0.0, values)
         numbers = (~broken).sum(axis=1).tolist()
     sums = values.dot(ONES).tolist()

@@ -19,7 +19,7 @@ from daemon.judge.decision import (
     RecentVerdict,
     decide,
 )
-from daemon.judge.health import Checked, Health, Number, any_of
+from daemon.judge.health import Checked, Health, Number
 from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
 from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
@@ -233,7 +233,7 @@ class Pipeline:
             examined = self._plausibility.examine(counts, checked.broken, session)
             grasp = examined.grasp
             memory.opinion, memory.assessment = self._network.judge(examined, session), None
-            if any_of(checked.broken):
+            if not checked.is_whole:
                 counts = None
         elif moment.state is not GateState.JUDGED:
             self._forget_opinion()

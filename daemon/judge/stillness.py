@@ -52,19 +52,6 @@ ONES = np.ones(ELECTRODES, dtype=np.float32)
 Times = NDArray[np.float64]
 
 
-def mean_distance(
-    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
-) -> NDArray[np.float64]:
-    """Return the mean distance of each finger's `usable` electrodes, counts, shape (fingers,).
-
-    Counts, shape (fingers, 24), are whole numbers below 2**16: float32 adds 24 of them exactly.
-    """
-    distance = np.abs(one - other)
-    if usable is None:
-        return np.asarray((distance @ ONES) / np.float64(ELECTRODES))
-    return np.asarray((distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1))
-
-
 @dataclass(slots=True, eq=False)
 class MotionMemory:
     """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""

@@ -38,7 +38,7 @@ def frozen(stream: Stream, outcomes: Sequence[int]) -> Iterator[NDArray[np.bool_
     rows = list(stream.rows())
     for index, (margin, row, slipped) in enumerate(rows):
         if index in outcomes:
-            yield np.array([learner.judge(*rest)[0] > 0.0 for *rest, _ in rows[REST:]])
+            yield np.array([learner.judge(m, x)[0] > 0.0 for m, x, _ in rows[REST:]])
         learner.learn(learner.judge(margin, row)[1], slipped=bool(slipped))
 
 
