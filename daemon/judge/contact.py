@@ -1,8 +1,8 @@
 """Tare and contact: where each electrode rests, how much it wavers, and which finger touches.
 
-A touch presses the skin towards the electrodes under it and lowers their counts (BioTac SP manual,
-section 5). So a finger touches when several electrodes fall below where they rest, and further than
-the finger as a whole: what moves all electrodes alike is the supply or the temperature.
+A touch lowers the counts of the electrodes under it (BioTac SP manual, section 5). It is a fall of
+several electrodes below where they rest, and below the finger as a whole: supply and temperature
+move all electrodes alike.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from drivers.base import COUNT_MAX, ELECTRODES
 WINDOW = 100
 """Untouched sweeps that a baseline is the median of: one second at 100 Hz."""
 TARE_EVERY = 25
-"""A full window is looked at again after so many more sweeps."""
+"""Sweeps after which a full window is looked at again."""
 FALLEN = 3
 """The third deepest fall counts: spikes are of one electrode, rarely of two, at a time."""
 SOUND_MIN = 12
-"""Usable electrodes, of 24, below which nobody knows whether a finger touches."""
+"""Usable electrodes, of 24, below which it is not known whether a finger touches."""
 LET_GO = 0.6
 """A finger that touched has let go when it falls by less than this share of a touch ..."""
 RELEASED = 0.25
@@ -36,13 +36,13 @@ RELEASED_LONG = 0.5
 DEPTH_FADES_COUNTS_PER_S = 5.0
 """How fast the depth of a hold follows a lighter touch."""
 APART_NS = 50_000_000
-"""No finger touches again so soon after it let go: while it opens, its electrodes rise one sweep
-after the other, and for a moment look as if it pressed again."""
+"""A finger touches again this long after it let go at the earliest: while it opens, its electrodes
+rise one sweep after the other, which looks like another touch."""
 LONG_HOLD_NS = 60_000_000_000
-"""Who has held for longer than this is tared anew afterwards: by then 0.2 counts/s between the
-electrodes of a finger (measured on three sensors) make more than half of a touch."""
+"""After a longer hold a finger is tared again: 0.2 counts/s between its electrodes (measured on
+three sensors) have made more than half of a touch."""
 ALONE_NS = 30_000_000_000
-"""A finger that touches for so long without all the others does not grasp: it is tared anew."""
+"""A finger that touches for longer without all the others does not grasp: it is tared again."""
 SUSPECT = 0.5
 """A fall above this share of what a touch takes may be the beginning of one: not for the tare."""
 SIGMA_MIN_COUNTS = 1.5
@@ -81,10 +81,14 @@ class Touch:
     alone_since_ns: int | None = None
     """Since when it touches without all the others."""
     held_long: bool = False
-    """Whether it has just let go after a long hold."""
+    """True if it has just let go after a long hold."""
+    untouched: Number = 0
+    """Sweeps since something touched."""
+    tared_ns: int | None = None
+    """Time of the last tare."""
 
     def end(self) -> None:
-        """Where the finger rests is not known."""
+        """Note that it is not known where the finger rests."""
         self.touching = False
         self.fall = self.depth = self.lowest = 0.0
         self.since_ns = self.alone_since_ns = None
@@ -92,10 +96,13 @@ class Touch:
     def follow(self, t_ns: int, elapsed_s: float, deep: float, relative: float) -> None:
         """Take in the fall of the third deepest electrode, below its baseline and relative."""
         touched = self.touching
-        self.fall = relative if touched else min(deep, relative)
+        is_long = self.since_ns is not None and t_ns - self.since_ns > LONG_HOLD_NS
         if touched:
-            self.touching = self.fall >= self._hold_ends_at(t_ns)
+            self.fall = relative
+            share = RELEASED_LONG if is_long else RELEASED
+            self.touching = self.fall >= max(LET_GO * self.threshold, share * self.depth)
         else:
+            self.fall = min(deep, relative)
             apart = self.let_go_ns is None or not 0 <= t_ns - self.let_go_ns < APART_NS
             self.touching = apart and self.fall >= self.threshold + self.lowest
         self.held_long = False
@@ -106,53 +113,23 @@ class Touch:
             return
         if touched:
             self.let_go_ns = t_ns
-            self.held_long = self._is_long(t_ns)
+            self.held_long = is_long
             self.lowest = self.fall
-        self.since_ns = None
+        self.since_ns = self.alone_since_ns = None
         self.depth = 0.0
         self.lowest = min(self.lowest, max(self.fall, 0.0))
 
-    def must_be_tared_anew(self, t_ns: int, middle: float, *, accompanied: bool) -> bool:
-        """Whether what is known of where the finger rests is to be trusted no longer.
+    def has_lost_rest(self, t_ns: int, middle: float) -> bool:
+        """Return True if the baseline is no longer to be trusted; while not all fingers touch.
 
-        `middle` is the fall of its median electrode, `accompanied` whether all fingers touch.
+        `middle` is the fall of the finger's median electrode.
         """
         if not self.touching:
-            self.alone_since_ns = None
             # One that rests higher as a whole was tared while it touched, or has drifted far.
             return self.held_long or middle < -self.threshold
-        if accompanied:
-            self.alone_since_ns = None
-        elif self.alone_since_ns is None:
+        if self.alone_since_ns is None:
             self.alone_since_ns = t_ns
-        return self.alone_since_ns is not None and t_ns - self.alone_since_ns > ALONE_NS
-
-    def _hold_ends_at(self, t_ns: int) -> float:
-        """Fall from which on a finger that touches still does."""
-        share = RELEASED_LONG if self._is_long(t_ns) else RELEASED
-        return max(LET_GO * self.threshold, share * self.depth)
-
-    def _is_long(self, t_ns: int) -> bool:
-        return self.since_ns is not None and t_ns - self.since_ns > LONG_HOLD_NS
-
-
-@dataclass(slots=True)
-class Tare:
-    """When to look at how one finger rests."""
-
-    number: Number = 0
-    """Sweeps since something touched: the latest of the window, and those before it."""
-    settled_ns: int | None = None
-    """When a baseline was last taken from them."""
-
-    def clear(self) -> None:
-        """Something touches: begin again afterwards."""
-        self.number = 0
-
-    def add(self) -> bool:
-        """Count a sweep; True when it is time to look at the window."""
-        self.number += 1
-        return self.number >= WINDOW and self.number % TARE_EVERY == 0
+        return t_ns - self.alone_since_ns > ALONE_NS
 
 
 class Rest(NamedTuple):
@@ -160,9 +137,9 @@ class Rest(NamedTuple):
 
     baseline: Floats
     sigma: float
-    """Of its median electrode."""
+    """Standard deviation of its median electrode, counts."""
     known: NDArray[np.bool_]
-    """Of which electrodes that is known."""
+    """True for electrodes whose baseline is known."""
 
 
 @dataclass(slots=True, eq=False)
@@ -176,7 +153,7 @@ class Window:
 
     @classmethod
     def of(cls, fingers: int) -> Window:
-        """An empty one."""
+        """Return an empty one."""
         shape = (WINDOW, fingers, ELECTRODES)
         return cls(np.zeros(shape, dtype=np.uint16), np.zeros(shape, dtype=np.bool_))
 
@@ -188,7 +165,7 @@ class Window:
         self.number += 1
 
     def rests(self, fingers: Sequence[int]) -> Iterator[Rest | None]:
-        """How each of these fingers rests; None of one that has moved. Only of a full window."""
+        """Yield how each of these fingers rests, None for one that moved. The window is full."""
         oldest = self.number % WINDOW
         window = np.concatenate((self.counts[oldest:], self.counts[:oldest]))
         baseline = _median(window)
@@ -204,8 +181,8 @@ class Window:
             if np.count_nonzero(sound[finger]) < SOUND_MIN:
                 yield None
                 continue
-            sigma = max(_middle(sigmas[finger, known]), SIGMA_MIN_COUNTS)
-            trend = abs(_middle(halves[finger, known]))
+            sigma = max(_median(sigmas[finger, known]).item(), SIGMA_MIN_COUNTS)
+            trend = abs(_median(halves[finger, known]).item())
             moved = sigma > SIGMA_MAX_COUNTS or trend > TREND_MAX_COUNTS
             yield None if moved else Rest(baseline[finger], sigma, sound[finger])
 
@@ -215,16 +192,15 @@ class ContactMemory:
     """What is known of the fingers' rest and touch; arrays of shape (fingers, 24) or (fingers,)."""
 
     window: Window
-    tares: list[Tare]
     touches: list[Touch]
     baseline: NDArray[np.float64]
     """Where each electrode rests, counts; 0 without a tare."""
     known: NDArray[np.bool_]
-    """Of which electrodes that is known."""
+    """True for electrodes whose baseline is known."""
     touching: NDArray[np.bool_]
     """Which fingers touch."""
     tared: NDArray[np.bool_]
-    """Whether each finger has a baseline. Without one, nobody knows whether it touches."""
+    """True for fingers that have a baseline. Without one it is not known whether they touch."""
     last_ns: int | None = None
     """Time of the last sweep."""
     rest: NDArray[np.float64] = field(init=False)
@@ -234,14 +210,12 @@ class ContactMemory:
 
     def __post_init__(self) -> None:
         """Work out what follows from the other fields."""
+        self.follow_known()
+
+    def follow_known(self) -> None:
+        """Bring `rest` and `numbers` up to date with `baseline` and `known`."""
         self.rest = np.where(self.known, self.baseline, np.inf)
         self.numbers = np.count_nonzero(self.known, axis=1).tolist()
-
-    def know(self, finger: int, known: NDArray[np.bool_]) -> None:
-        """From now on the baselines of these electrodes of a finger, shape (24,), are known."""
-        self.known[finger] = known
-        self.rest[finger] = np.where(known, self.baseline[finger], np.inf)
-        self.numbers[finger] = int(np.count_nonzero(known))
 
 
 class Contact:
@@ -253,7 +227,6 @@ class Contact:
         self._limits = limits
         self.memory = ContactMemory(
             window=Window.of(fingers),
-            tares=[Tare() for _ in range(fingers)],
             touches=[Touch(limits.counts) for _ in range(fingers)],
             baseline=np.zeros(shape),
             known=np.zeros(shape, dtype=np.bool_),
@@ -261,19 +234,9 @@ class Contact:
             tared=np.zeros(fingers, dtype=np.bool_),
         )
 
-    @property
-    def touching(self) -> NDArray[np.bool_]:
-        """Which fingers touch, shape (fingers,)."""
-        return self.memory.touching
-
-    @property
-    def tared(self) -> NDArray[np.bool_]:
-        """Whether it is known where each finger rests, shape (fingers,)."""
-        return self.memory.tared
-
     def forget(self) -> None:
         """Forget every tare: the sensors may be others, or have been off."""
-        for finger in range(len(self.memory.tares)):
+        for finger in range(len(self.memory.touches)):
             self._forget(finger)
 
     def observe(
@@ -293,27 +256,30 @@ class Contact:
         memory.last_ns = t_ns
         memory.window.add(counts, usable)
         middles = [0.0] * len(numbers)
-        tared, touches = memory.tared.tolist(), memory.touches
-        for finger, touch in enumerate(touches):
+        all_touch = True
+        for finger, touch in enumerate(memory.touches):
             number = numbers[finger]
-            if tared[finger] and number >= SOUND_MIN:
+            if memory.tared[finger] and number >= SOUND_MIN:
                 deep = falls.item(finger, number - FALLEN)
                 middles[finger] = falls.item(finger, number // 2)
                 touch.follow(t_ns, elapsed_s, deep, deep - middles[finger])
             else:
-                # With too few electrodes nobody knows any more, until it is tared again.
+                # With too few electrodes it is not known any more, until it is tared again.
                 memory.tared[finger] = False
                 touch.end()
-        all_touch = all(touch.touching for touch in touches)
-        due = []
-        for finger, touch in enumerate(touches):
-            anew = touch.must_be_tared_anew(t_ns, middles[finger], accompanied=all_touch)
             memory.touching[finger] = touch.touching
-            if anew and memory.tared[finger]:
+            all_touch &= touch.touching
+        for finger, touch in enumerate(memory.touches):
+            if all_touch:
+                touch.alone_since_ns = None
+            elif memory.tared[finger] and touch.has_lost_rest(t_ns, middles[finger]):
                 self._forget(finger)
+        due = []
+        for finger, touch in enumerate(memory.touches):
+            touch.untouched += 1
             if memory.tared[finger] and touch.fall >= SUSPECT * touch.threshold:
-                memory.tares[finger].clear()  # it may be the beginning of a touch
-            elif memory.tares[finger].add():
+                touch.untouched = 0  # it may be the beginning of a touch
+            elif touch.untouched >= WINDOW and touch.untouched % TARE_EVERY == 0:
                 due.append(finger)
         if due:
             for finger, rest in zip(due, memory.window.rests(due), strict=True):
@@ -323,7 +289,7 @@ class Contact:
     def _falls(
         self, median: NDArray[np.uint16], usable: NDArray[np.bool_] | None
     ) -> tuple[NDArray[np.float64], list[int]]:
-        """Falls of each finger's electrodes, ascending, and how many of them count, the first."""
+        """Return each finger's falls, ascending, and the number of those, the first, that count."""
         falls, numbers = median.astype(np.float64), self.memory.numbers
         np.subtract(self.memory.rest, falls, out=falls)
         if usable is not None:
@@ -334,37 +300,31 @@ class Contact:
 
     def _forget(self, finger: int) -> None:
         memory = self.memory
-        memory.tared[finger] = memory.touching[finger] = False
-        memory.know(finger, np.zeros(ELECTRODES, dtype=np.bool_))
+        memory.tared[finger] = memory.touching[finger] = memory.known[finger] = False
+        memory.follow_known()
         memory.touches[finger] = Touch(memory.touches[finger].threshold)
-        memory.tares[finger] = Tare()
 
     def _settle(self, finger: int, rest: Rest, t_ns: int) -> None:
         """Take over how a finger rests."""
         memory = self.memory
-        tare, step = memory.tares[finger], rest.baseline - memory.baseline[finger]
-        elapsed_s = 0.0 if tare.settled_ns is None else max(t_ns - tare.settled_ns, 0) / 1e9
-        tare.settled_ns = t_ns
+        touch, step = memory.touches[finger], rest.baseline - memory.baseline[finger]
+        elapsed_s = 0.0 if touch.tared_ns is None else max(t_ns - touch.tared_ns, 0) / 1e9
+        touch.tared_ns = t_ns
         if memory.tared[finger]:
             limited = np.maximum(step, -DOWN_COUNTS_PER_S * elapsed_s)
             np.minimum(limited, UP_COUNTS_PER_S * elapsed_s, out=limited)
             # An electrode that was not known before is taken as it is.
             step = np.where(memory.known[finger], limited, step)
         memory.baseline[finger] += step
-        memory.know(finger, rest.known)
+        memory.known[finger] = rest.known
+        memory.follow_known()
         limits = self._limits
-        memory.touches[finger].threshold = max(limits.counts, limits.sigmas * rest.sigma)
+        touch.threshold = max(limits.counts, limits.sigmas * rest.sigma)
         memory.tared[finger] = True
 
 
-def _median(values: NDArray[np.integer]) -> Floats:
-    """Along the first axis. Sorting so few whole numbers takes a fifth of `np.median`'s time."""
+def _median(values: NDArray[np.number]) -> Floats:
+    """Return it along the first axis. Sorting takes a fifth of the time of `np.median` here."""
     ordered = np.sort(values, axis=0)
     low, high = ordered[(len(values) - 1) // 2], ordered[len(values) // 2]
     return np.asarray(low / 2.0 + high / 2.0)
-
-
-def _middle(values: Floats) -> float:
-    """Their median, shape (values,)."""
-    ordered = sorted(values.tolist())
-    return float(ordered[(len(ordered) - 1) // 2] / 2.0 + ordered[len(ordered) // 2] / 2.0)

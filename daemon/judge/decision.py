@@ -126,14 +126,7 @@ class RecentVerdict(msgspec.Struct, frozen=True, gc=False):
 NO_RECENT_VERDICT = RecentVerdict(0, 0, Decision.STABLE)
 """Grasps are numbered from 1."""
 HELD: Final = Moment(0)
-"""A hand that holds still."""
-
-
-def without_gate(
-    p_slip: float | None, objections: tuple[Reason, ...], withheld: Reason | None, limits: Limits
-) -> Decision:
-    """Return what a judgement says of a grasp by itself, whatever the hand does since."""
-    return decide(p_slip, objections, HELD, 0, limits, withheld=withheld)[0]
+"""A hand that holds still: what a judgement says of a grasp by itself, whatever follows."""
 
 
 def decide(

@@ -18,14 +18,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import HandLimits
 from daemon.judge.reasons import GateCause, GateChange, GateState, Moment, Reason
-from daemon.judge.stillness import Motion, mean_distance
+from daemon.judge.stillness import ONES, Motion
 from daemon.judge.windows import LONG_NS, SHORT_NS
 from drivers.base import ELECTRODES
 from models.contract import Finger
@@ -50,8 +49,7 @@ class GateMemory:
     touched_ns: int = 0
     """Time at which all required fingers touched; means nothing unless `in_contact`."""
     still_since_ns: int | None = None
-    """Time since which touch and stillness have lasted, as well as that can be told. None:
-    something moves."""
+    """Time since which touch and stillness have lasted. None: something moves."""
     moved_since_ns: int | None = None
     """Time since which a judged grasp has moved. None: it does not move."""
     early: bool = False
@@ -79,7 +77,8 @@ class Gate:
         """`fingers` are those of the readings, in their order."""
         required = fingers if limits.required is None else limits.required
         self._fingers = tuple(fingers)
-        self._required = [place for place, finger in enumerate(fingers) if finger in required]
+        self.required = frozenset(fingers).intersection(required)
+        """Fingers that must touch."""
         self._limits = limits.gate
         self._on_request = limits.on_request
         self.motion = Motion(len(fingers), self._limits.false_alarms, early=self._limits.early)
@@ -90,10 +89,7 @@ class Gate:
         self._not_looked = unknown, dict.fromkeys(fingers, 1.0)
 
     def ask(self) -> None:
-        """Judge the grasp that settles within `request_ns` of the next reading.
-
-        A grasp that was judged is judged again.
-        """
+        """Judge, maybe again, the grasp that settles within `request_ns` of the next reading."""
         self.memory.asked = True
         self.memory.asked_until_ns = None
 
@@ -109,7 +105,7 @@ class Gate:
         counts: NDArray[np.uint16],
         median: NDArray[np.uint16],
         usable: NDArray[np.bool_] | None,
-        touching: NDArray[np.bool_],
+        touching: tuple[Finger, ...],
         objections: tuple[Reason, ...] = (),
         *,
         in_time: bool = True,
@@ -126,15 +122,14 @@ class Gate:
         self.skip(t_ns)
         memory.last_ns = t_ns
         self._follow_question(t_ns)
-        touches = touching.tolist()
-        in_contact = all(touches[finger] for finger in self._required)
-        self.motion.add(t_ns, counts, usable, wanted=in_contact or any(touches))
+        in_contact = self.required.issubset(touching)
+        self.motion.add(t_ns, counts, usable, wanted=in_contact or bool(touching))
         if in_contact and not memory.in_contact:
             memory.touched_ns = t_ns
         memory.in_contact = in_contact
         reasons = self._disturbances(objections)
         self._follow_stillness(t_ns, bool(reasons))
-        self._follow_contact(t_ns, any(touches))
+        self._follow_contact(t_ns, bool(touching))
         if memory.state is GateState.JUDGED:
             reasons += self._follow_judged(t_ns, median.astype(np.float32), usable)
         elif memory.state is GateState.SETTLED and (reasons or not self._is_still):
@@ -142,16 +137,13 @@ class Gate:
             self._enter(GateState.CLOSING, t_ns, cause)
         memory.objections = (*reasons, *self._settle(t_ns, bool(reasons)))
         if in_time and self._wants_judgement(fresh=fresh):
-            return self._judge(t_ns, median, touches)
-        return self.moment(touches)
+            return self._judge(t_ns, median, touching)
+        return self.moment(touching)
 
     def moment(
-        self, touches: Sequence[bool], *, judges: bool = False, judged: bool = False
+        self, touching: tuple[Finger, ...], *, judges: bool = False, judged: bool = False
     ) -> Moment:
-        """Return where in a grasp the hand is, and forget the changes that led there.
-
-        `touches` says of each finger whether it touches; see `Moment` for the others.
-        """
+        """Return where in a grasp the hand is, and forget the changes that led there."""
         memory = self.memory
         is_judged, reasons = memory.state is GateState.JUDGED, memory.objections
         if not (reasons or is_judged):
@@ -166,7 +158,7 @@ class Gate:
             in_contact=memory.in_contact,
             settled=is_judged and not reasons,
             reasons=reasons,
-            touching=tuple(compress(self._fingers, touches)),
+            touching=touching,
             changes=tuple(changes),
             still_ms=self._still_ns / 1e6,
             early=is_judged and memory.early,
@@ -194,10 +186,7 @@ class Gate:
 
     @property
     def _still_ns(self) -> int:
-        """Time for which the hand has touched and kept still, ns; 0 if something moves.
-
-        Less than the long window while something may slide slowly.
-        """
+        """Time of touch and stillness, ns; less than the long window if something may slide."""
         memory = self.memory
         if memory.still_since_ns is None or memory.last_ns is None:
             return 0
@@ -218,22 +207,19 @@ class Gate:
             return age_ns > STANDS_NS or (fresh and (memory.asked or age_ns >= REFRESH_NS))
         return fresh and memory.state is GateState.SETTLED and self._is_asked
 
-    def _judge(self, t_ns: int, median: NDArray[np.uint16], touches: Sequence[bool]) -> Moment:
-        """Enter `judged`, or stay there.
-
-        A grasp is the same while it is near to where it settled. Where it was judged last does not
-        matter: a grasp that creeps would never be another.
-        """
+    def _judge(self, t_ns: int, median: NDArray[np.uint16], touching: tuple[Finger, ...]) -> Moment:
+        """Enter `judged`, or stay there."""
         memory = self.memory
         refreshes = memory.state is GateState.JUDGED and not (memory.asked and self._on_request)
         memory.judged_ns = t_ns
         memory.asked = False
         if memory.state is not GateState.JUDGED:
+            # Kept when it is judged again: else a grasp that creeps would never be another.
             memory.reference = median.astype(np.float32)
             memory.early = self._still_ns < LONG_NS
             memory.moved_since_ns = None
             self._enter(GateState.JUDGED, t_ns, GateCause.JUDGED)
-        return self.moment(touches, judges=True, judged=not refreshes)
+        return self.moment(touching, judges=True, judged=not refreshes)
 
     def _nearest_to_limit(self) -> tuple[dict[Finger, float | None], dict[Finger, float]]:
         """Per finger: motion in the window closer to its limit, and that limit."""
@@ -301,7 +287,7 @@ class Gate:
         if not memory.in_contact:
             self._enter(GateState.CLOSING, t_ns, GateCause.CONTACT_LOST)
             return ()
-        distance = mean_distance(counts, memory.reference, usable)
+        distance = _mean_distance(counts, memory.reference, usable)
         if max(distance.tolist()) > self._limits.change_counts:
             self._enter(GateState.CLOSING, t_ns, GateCause.CHANGED)
             return ()
@@ -331,3 +317,16 @@ class Gate:
         memory.state = state
         if state not in (GateState.SETTLED, GateState.JUDGED):
             memory.early, memory.moved_since_ns = False, None
+
+
+def _mean_distance(
+    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
+) -> NDArray[np.float64]:
+    """Return the mean distance of each finger's `usable` electrodes, counts, shape (fingers,).
+
+    Counts, shape (fingers, 24), are whole numbers below 2**16: float32 adds 24 of them exactly.
+    """
+    distance = np.abs(one - other)
+    if usable is None:
+        return np.asarray((distance @ ONES) / np.float64(ELECTRODES))
+    return np.asarray((distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1))

@@ -1,8 +1,7 @@
 """How the hand holds: fresh values, contact, joints and gate of one hand, reading by reading.
 
-A palm that is asked for two electrodes at a time repeats 2 of 7 values of a stream at 100 Hz; one
-spike in a hundred values is 25 to 150 counts deep. The median of three fresh values takes spikes
-out, and costs one sweep of delay.
+One value in a hundred is a spike, 25 to 150 counts deep, and a palm repeats 2 of 7 values at 100
+Hz. The median of three fresh values takes spikes out, and costs one sweep of delay.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from daemon.judge.contact import Contact
 from daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from daemon.judge.gate import Gate
-from daemon.judge.health import NO_COUNT, Checked, all_of, any_of
+from daemon.judge.health import NO_COUNT, Checked, all_of
 from daemon.judge.reasons import Moment, Reason
 from drivers.base import ELECTRODES, JointReading, TactileReading
 from models.contract import Finger
@@ -73,9 +72,8 @@ class FreshMedian:
         """Take in one sweep, shape (fingers, 24).
 
         Electrodes that are not `usable` are forgotten; None: all are usable. A value that repeats
-        the one before is taken for held, so not fresh; the next one counts again. A held value of
-        71.43 Hz data is never held twice, and a quiet electrode repeats itself in one sweep of ten
-        without being held.
+        the one before is taken for held, so not fresh; the next one counts again, for no value of
+        71.43 Hz data is held twice.
         """
         memory = self.memory
         oldest, middle, newest = memory.fresh
@@ -130,9 +128,7 @@ class HandTracker:
 
     def __init__(self, fingers: Sequence[Finger], limits: HandLimits) -> None:
         """`fingers` are those of the readings, in their order."""
-        required = fingers if limits.required is None else limits.required
         self._fingers = tuple(fingers)
-        self._required = [place for place, finger in enumerate(fingers) if finger in required]
         self._limits = limits
         self._fresh = FreshMedian((len(fingers), ELECTRODES))
         self._contact = Contact(len(fingers), limits.contact)
@@ -146,8 +142,8 @@ class HandTracker:
 
     @property
     def tared(self) -> tuple[Finger, ...]:
-        """Fingers of which it is known where they rest."""
-        return tuple(compress(self._fingers, self._contact.tared.tolist()))
+        """Fingers whose baseline is known."""
+        return self._named(self._contact.memory.tared)
 
     def health(self) -> dict[str, Reason]:
         """Return what is not well: fingers without a tare, and `joints`."""
@@ -199,8 +195,7 @@ class HandTracker:
     ) -> tuple[Moment, NDArray[np.uint16] | None]:
         """Take in a reading of these fingers and what was found in it.
 
-        Return where in a grasp the hand is, and the counts to judge now, shape (fingers, 24). None:
-        judge nothing, for one because the reading is not `in_time`.
+        Return where in a grasp the hand is, and the counts to judge, shape (fingers, 24), or None.
         """
         t_ns, last_ns = reading.made_ns, self.memory.last_ns
         if checked.reasons:
@@ -215,7 +210,7 @@ class HandTracker:
         if self.memory.unsettled:
             self.memory.unsettled -= 1
             self.gate.restart(t_ns)
-        usable = ~checked.broken if any_of(checked.broken) else None
+        usable = None if checked.is_whole else ~checked.broken
         self._fresh.push(reading.counts, usable)
         median = self._fresh.counts
         self._contact.observe(t_ns, reading.counts, median, usable)
@@ -224,7 +219,7 @@ class HandTracker:
             reading.counts,
             median,
             usable,
-            self._contact.touching,
+            self._named(self._contact.memory.touching),
             self._objections(t_ns),
             in_time=in_time,
             fresh=self._fresh.is_full(usable),
@@ -235,15 +230,17 @@ class HandTracker:
 
     def moment(self) -> Moment:
         """Return where in a grasp the hand is without a new reading; it is not to be judged."""
-        return self.gate.moment(self._contact.touching.tolist())
+        return self.gate.moment(self._named(self._contact.memory.touching))
 
     def _objections(self, t_ns: int) -> tuple[Reason, ...]:
         """Return what tare and joints say against settling."""
         objections: list[Reason] = []
-        tared = self._contact.tared
-        if not all_of(tared) and not all_of(tared[self._required]):
+        if not self.gate.required.issubset(self.tared):
             objections.append(Reason.NOT_TARED)
         joints = None if self._joints is None else self._joints.objection(t_ns)
         if joints is not None:
             objections.append(joints)
         return tuple(objections)
+
+    def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
+        return tuple(compress(self._fingers, which.tolist()))

@@ -1,8 +1,4 @@
-"""Check whether a reading can be used, and which of its electrodes are broken.
-
-A finger whose sweep was read before is frozen: a sender that repeats old sweeps gives them new
-numbers.
-"""
+"""Check whether a reading can be used, and which of its electrodes are broken."""
 
 from __future__ import annotations
 
@@ -56,8 +52,8 @@ STILL = 20
 JUMPS_MAX = 2.0
 """An electrode that jumps more than twice within about ten readings has a loose contact."""
 JUMPS_FADE = 0.9
-JUMPS_FORGOTTEN, JUMPS_LOOKED_AT = 1e-9, 16
-"""Of a jump, after 200 readings: as good as none. Every so many readings it is seen."""
+JUMPS_FORGOTTEN = 1e-9
+"""What is left of a jump after 200 readings; less counts as none."""
 LIMITS = COUNT_MAX - 2, 2 * JUMP_COUNTS, 0
 """Above them are a count less 1 that is at a rail, a step and `JUMP_COUNTS` that is far, and a step
 that is one at all. Modulo 2**16, so that what is below zero is large."""
@@ -79,6 +75,8 @@ class Checked:
     """Against using it at all."""
     broken: NDArray[np.bool_]
     """Shape (fingers, 24): electrodes that mean nothing in it."""
+    is_whole: bool = False
+    """True if none is broken; a sound reading is known by this without a look at all."""
 
 
 @dataclass(slots=True, eq=False)
@@ -172,7 +170,7 @@ class Health:
         self._no_faults = self.memory.faults.tobytes()
         nothing = np.zeros(shape, dtype=np.bool_)
         nothing.flags.writeable = False  # one for all sound readings
-        self._sound = Checked((), nothing)
+        self._sound = Checked((), nothing, is_whole=True)
         # Constants of full shape, and buffers: numpy takes half the time.
         self._one, self._jump, *limits = (
             np.full(shape, number, dtype=np.uint16) for number in (1, JUMP_COUNTS, *LIMITS)
@@ -185,40 +183,28 @@ class Health:
         counts = reading.counts
         if counts.shape != self._shape:
             return Checked((Reason.MODEL_MISMATCH,), np.ones(self._shape, dtype=np.bool_))
-        self.memory.faults = reading.faults
+        memory = self.memory
+        memory.faults = reading.faults
+        railed, differs = self._compare(counts)
+        sound, faults = None, 0
         # Nearly all readings are sound, and that is seen with a few cheap operations.
         if reading.faults.tobytes() != self._no_faults:
-            return self._check_flagged(counts, reading.faults)
-        railed, differs = self._compare(counts)
-        repeats = self.memory.sweeps.recurs(counts)
-        if differs.tobytes().count(0) >= ELECTRODES:
-            repeats |= not differs.any(axis=1).all()
+            # Flagged counts were not read: they neither repeat anything nor hide that others do.
+            sound = reading.faults == 0
+            faults = int(np.bitwise_or.reduce(reading.faults, axis=None))
+            memory.changed[~sound] = memory.number
+            railed &= sound
+            differs &= sound
         broken = railed | self._worn_out()
-        if not repeats and not any_of(broken):
-            return self._sound
-        return self._found(0, railed, broken, repeats=repeats)
-
-    def _check_flagged(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> Checked:
-        """Do the same for a reading in which the driver has flagged electrodes.
-
-        Flagged counts were not read: they neither repeat anything nor hide that others do.
-        """
-        sound = flags == 0
-        railed, differs = self._compare(counts)
-        self.memory.changed[~sound] = self.memory.number
-        railed &= sound
-        broken = ~sound | railed | self._worn_out()
-        repeats = self.memory.sweeps.recurs(counts, sound)
-        faults = int(np.bitwise_or.reduce(flags, axis=None))
+        if sound is not None:
+            broken |= ~sound
+        repeats = memory.sweeps.recurs(counts, sound)
         if faults & ~REPAIRABLE:  # flagged counts mean nothing: no further findings on them
             return Checked(_fault_reasons(faults), broken)
-        repeats |= bool((sound.any(axis=1) & ~(differs & sound).any(axis=1)).any())
-        return self._found(faults, railed, broken, repeats=repeats)
-
-    def _found(
-        self, faults: int, railed: NDArray[np.bool_], broken: NDArray[np.bool_], *, repeats: bool
-    ) -> Checked:
-        """Decide what these findings come to."""
+        if differs.tobytes().count(0) >= ELECTRODES:
+            # A sweep that was flagged as a whole is not among those that can recur.
+            read = np.True_ if sound is None else sound.any(axis=1)
+            repeats |= bool((read & ~differs.any(axis=1)).any())
         if repeats:
             also = (Reason.SATURATED,) if too_many(railed) else ()
             return Checked((Reason.FROZEN, *also), broken)
@@ -227,7 +213,7 @@ class Health:
             if railed.any():
                 reasons.append(Reason.SATURATED)
             return Checked((*reasons, Reason.ELECTRODES_BROKEN), broken)
-        return Checked((), broken)
+        return Checked((), broken) if any_of(broken) else self._sound
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
         """Return what is wrong with which electrode, (finger, 0..23), by the last reading."""
@@ -244,10 +230,7 @@ class Health:
         return findings
 
     def _compare(self, counts: NDArray[np.uint16]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Take in how the counts have changed.
-
-        Return which are at a rail and which differ from before, each of shape (fingers, 24).
-        """
+        """Take in counts; return which are at a rail, and which differ from those before."""
         memory, previous = self.memory, self.memory.previous
         memory.number += 1
         above = self._above
@@ -258,10 +241,9 @@ class Health:
         np.putmask(memory.changed, differs, memory.number)
         if memory.has_jumped:
             memory.jumps *= JUMPS_FADE
-            if memory.number % JUMPS_LOOKED_AT == 0:
-                remembered = memory.jumps >= JUMPS_FORGOTTEN
-                memory.jumps *= remembered
-                memory.has_jumped = any_of(remembered)
+            remembered = memory.jumps >= JUMPS_FORGOTTEN
+            memory.jumps *= remembered
+            memory.has_jumped = any_of(remembered)
         if any_of(far):
             near = counts - previous + STILL_COUNTS <= 2 * STILL_COUNTS
             if np.count_nonzero(near) >= STILL:  # some finger may keep still

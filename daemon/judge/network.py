@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from daemon.judge.health import all_of, any_of, too_many
 from daemon.judge.reasons import Reason
-from daemon.trust.trust import Assessment
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger, ModelError, SeenCounts
 from models.electrodes import CONTRADICTING_MAX, ROUNDING, Electrodes, NoveltyCheck
@@ -56,8 +55,6 @@ class Opinion(msgspec.Struct, frozen=True, gc=False):
     repaired: tuple[str, ...] = ()
     margin: float = 0.0
     """The network's log-odds of slip, before softening; 0 where it was not asked."""
-    assessment: Assessment | None = None
-    """What `p_slip` was worth when it was judged. None: nothing learns and no risk is set."""
 
 
 NO_OPINION = Opinion(None, ())
@@ -83,10 +80,11 @@ class Plausibility:
         Shapes are (fingers, 24). `session` says how today's sensors differ from the training's.
         """
         values = counts.astype(np.float64)
-        if _is_flat(values, broken):
+        is_whole = not any_of(broken)
+        if _is_flat(values, None if is_whole else broken):
             return Examined((Reason.FLAT,), counts)
         if session is not None:
-            if not any_of(broken) and self._is_plain(values, session):
+            if is_whole and self._is_plain(values, session):
                 return Examined((), counts, (), counts)
             values = session.to_training(values)
         grasp, values = self._repair(counts, values, broken, session)
@@ -153,50 +151,34 @@ class Network:
         """`slip_threshold` is the probability, 0..1, that softening must not cross."""
         self._model = model
         self._threshold = slip_threshold
+        self.features = model.input if isinstance(model.inputs, SessionBuilder) else NO_FEATURES
+        """What the network was asked about last, shape (inputs,), standardised by the session.
+        Empty for models without a session: what they take is not of unit size."""
 
     def judge(self, examined: Examined, session: Calibration | None = None) -> Opinion:
         """Return the probability of slip of examined counts, or why there is none.
 
         `session` is what is known of it, for a model that needs one.
         """
+        model, repaired = self._model, examined.repaired
         if examined.reasons:
-            return Opinion(None, examined.reasons, examined.repaired)
-        answer = self._ask(examined.counts, session)
-        if isinstance(answer, Reason):
-            return Opinion(None, (answer,), examined.repaired)
-        p_slip, margin = answer
-        return Opinion(p_slip, (), examined.repaired, margin)
-
-    @property
-    def features(self) -> NDArray[np.float32]:
-        """What the network was asked about last, shape (inputs,), standardised by the session.
-
-        Empty for models without a session: what they take is not of unit size.
-        """
-        model = self._model
-        return model.input if isinstance(model.inputs, SessionBuilder) else NO_FEATURES
-
-    def _ask(
-        self, counts: NDArray[np.generic], session: Calibration | None
-    ) -> tuple[float, float] | Reason:
-        """Return probability of slip and margin, or why there are none."""
-        model = self._model
+            return Opinion(None, examined.reasons, repaired)
         if session is not None and isinstance(model.inputs, SessionBuilder):
             model.inputs.use(session.features_mean, session.features_spread)
-        spread = model.inputs.build(counts, model.input)
+        spread = model.inputs.build(examined.counts, model.input)
         if not all_of(spread >= SPREAD_FLOOR_COUNTS):  # also for NaN
-            return Reason.FLAT
+            return Opinion(None, (Reason.FLAT,), repaired)
         try:
             p_stable, p_slip = model.run()
         except ModelError:
-            return Reason.MODEL_FAILED
+            return Opinion(None, (Reason.MODEL_FAILED,), repaired)
         sound = 0.0 <= p_slip <= 1.0 and 0.0 <= p_stable <= 1.0  # false for NaN
         if not (sound and abs(p_stable + p_slip - 1.0) < 1e-3):
-            return Reason.MODEL_FAILED
+            return Opinion(None, (Reason.MODEL_FAILED,), repaired)
         margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
         if session is not None and session.temperature != 1.0:
             p_slip = _softened(margin, session.temperature, self._threshold)
-        return p_slip, margin
+        return Opinion(p_slip, (), repaired, margin)
 
 
 def electrode_name(finger: Finger, place: int) -> str:
@@ -204,19 +186,19 @@ def electrode_name(finger: Finger, place: int) -> str:
     return f"{finger}_{place + 1}"
 
 
-def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_]) -> bool:
+def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> bool:
     """Return True if the sound electrodes of a finger read about the same; `values` are counts."""
     numbers = [ELECTRODES] * len(values)
-    if any_of(broken):
+    if broken is not None:
         values = np.where(broken, 0.0, values)
         numbers = (~broken).sum(axis=1).tolist()
     sums = values.dot(ONES).tolist()
     squares = np.square(values).dot(ONES).tolist()
-    # Sums of whole numbers are exact, so nothing is lost when they cancel.
-    return any(
-        number * square - total * total < (number * FLAT_SPREAD_COUNTS) ** 2
-        for number, total, square in zip(numbers, sums, squares, strict=True)
-    )
+    for number, total, square in zip(numbers, sums, squares, strict=True):
+        # Sums of whole numbers are exact, so nothing is lost when they cancel.
+        if number * square - total * total < (number * FLAT_SPREAD_COUNTS) ** 2:
+            return True
+    return False
 
 
 def _softened(margin: float, temperature: float, threshold: float) -> float:

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.decision import (
+    HELD,
     NO_RECENT_VERDICT,
     WITHHELD,
     HandLimits,
     Limits,
     RecentVerdict,
     decide,
-    without_gate,
 )
-from daemon.judge.health import Checked, Health, Number, any_of
+from daemon.judge.health import Checked, Health, Number
 from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
 from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
@@ -157,8 +157,7 @@ class Pipeline:
 
     @property
     def axis_ns(self) -> int:
-        """`t_ns` less `made_ns` of the latest reading: the time from which a replay counts, 0 of
-        live readings."""
+        """Time from which a replay counts: `t_ns` less `made_ns`, 0 of live readings."""
         return 0 if self._latest is None else self._latest.t_ns - self._latest.made_ns
 
     def ask(self) -> None:
@@ -194,10 +193,7 @@ class Pipeline:
         return self.lifts.tell(grasp, slipped=slipped)[0]
 
     def restart(self) -> None:
-        """Discard the current grasp's verdict.
-
-        Call after restoring state under another model or gate.
-        """
+        """Discard the current grasp's verdict: its state is of another model or gate."""
         self._forget_opinion()
         self.memory.learnt_grasp, self.memory.recent = 0, NO_RECENT_VERDICT
         self.memory.is_to_learn = False
@@ -205,10 +201,9 @@ class Pipeline:
             self.hand.restart()
 
     def memories(self) -> dict[str, dict[str, Any]]:
-        """Return what every part remembers between two readings, by the name of the part.
+        """Return what every part remembers between two readings, but not the session.
 
-        Its next finding depends on nothing else. A judge has each group wholly or, but for
-        `judge`, not at all. The session is not among it.
+        A judge has each group of parts wholly or, except for `judge`, not at all.
         """
         judge = {"judge": {"judge": self.memory, "health": self._health.memory}}
         return judge if self.hand is None else judge | self.hand.memories()
@@ -225,9 +220,10 @@ class Pipeline:
 
     def judge(self, reading: TactileReading) -> Judgement:
         """Judge one reading, as what it is of its grasp. Never raises on bad data."""
-        self.learn()
-        self._latest = reading
         memory = self.memory
+        if memory.is_to_learn:
+            self.learn()
+        self._latest = reading
         memory.readings += 1
         checked = self._health.check(reading)
         moment, counts = self._follow(reading, checked)
@@ -237,7 +233,7 @@ class Pipeline:
             examined = self._plausibility.examine(counts, checked.broken, session)
             grasp = examined.grasp
             memory.opinion, memory.assessment = self._network.judge(examined, session), None
-            if any_of(checked.broken):
+            if not checked.is_whole:
                 counts = None
         elif moment.state is not GateState.JUDGED:
             self._forget_opinion()
@@ -278,15 +274,15 @@ class Pipeline:
             findings |= self.hand.health()
         if Reason.MODEL_FAILED in opinion.reasons:
             findings["model"] = Reason.MODEL_FAILED
-        if self._session is not None and not self._session.calibrated:
+        if self._session is not None and not self._session.now.calibrated:
             findings["session"] = Reason.NOT_CALIBRATED
         return findings
 
     def learn(self) -> None:
         """Take the grasp that was judged last into the session, if it is over.
 
-        A grasp must be judged by what came before it, however often: else what is like nothing seen
-        before would be seen the next time. It takes as long as judging, so the verdict goes first.
+        A grasp is judged only by what came before it: else what is like nothing seen before would
+        be seen the next time. It takes as long as judging, so the verdict goes first.
         """
         memory = self.memory
         if self._session is None or not memory.is_to_learn:
@@ -352,7 +348,7 @@ class Pipeline:
         counts: NDArray[np.uint16] | None = None,
     ) -> Judgement:
         """Return the judgement of a reading that is `unusable` for these reasons, or for none."""
-        calibrated = None if self._session is None else self._session.calibrated
+        calibrated = None if self._session is None else self._session.now.calibrated
         objections = (*unusable, *opinion.reasons)
         if self._needs_session and calibrated is False:
             objections = (*objections, Reason.NOT_CALIBRATED)
@@ -392,7 +388,7 @@ class Pipeline:
         """Return an earlier decision that still counts against `stable`, and note this one."""
         memory, made_ns = self.memory, 0 if self._latest is None else self._latest.made_ns
         if moment.judges and p_slip is not None:
-            said = without_gate(p_slip, objections, withheld, self._limits)
+            said, _ = decide(p_slip, objections, HELD, 0, self._limits, withheld=withheld)
             if said is not Decision.STABLE:
                 memory.recent = RecentVerdict(moment.grasp, made_ns, said)
                 return Decision.STABLE

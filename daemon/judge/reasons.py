@@ -1,11 +1,9 @@
 """What a verdict may be, why it is `unknown`, and where in a grasp the hand is.
 
 A new reason for `unknown` starts here: a member of `Reason`, and what to do about it in `ADVICE`.
-Then the part that notices puts it among the `reasons` of what it finds: `Checked` for a reading
-that cannot be used, `Moment` for a hand that is not ready, `Examined` for counts that are no grasp,
-`Opinion` for a network that failed. Any of them makes the verdict `unknown`, with no change of
-`decision`. None outranks another: a verdict lists them in the order of the parts, then age and
-confidence. A test asks for the row in the table of deploy/wire/README.md, another for
+Then the part that notices it adds it to the `reasons` of its result: `Checked`, `Moment`,
+`Examined` or `Opinion`. Any of them makes the verdict `unknown`. A verdict lists them in the order
+of the parts. Tests ask for the row in the table of deploy/wire/README.md and for
 `graspd schema > deploy/wire/messages.schema.json`.
 """
 

@@ -1,8 +1,7 @@
 """Whether the fingers keep still: how each moves, in units of its own noise.
 
-Fast motion is the slope of a line through the last moments of every electrode; slow slides, which
-stop and turn, show in how far the electrodes spread over a longer time. What is remembered is so
-many steps of time however fast sweeps come, so memory is constant.
+Fast motion shows in the slopes of the electrodes, slow slides, which stop and turn, in how far they
+spread over a longer time. Steps of time are remembered, not sweeps, so memory is constant.
 """
 
 from __future__ import annotations
@@ -28,47 +27,29 @@ from daemon.judge.windows import (
 from drivers.base import ELECTRODES
 
 SPIKE_COUNTS = 20.0
-"""A value that jumps further than this is believed when the next one does too. Spikes last for one
-sweep: of a sensor by 25 counts or more, of a flipped bit by any; noise does so in one value of
-three thousand."""
+"""A value that jumps further is believed once the next one does too. Spikes last for one sweep:
+those of a sensor are 25 counts or more; noise jumps so far in one value of three thousand."""
 SPIKE_SWEEPS_MAX = 3
-"""Where values come more slowly than sweeps and are held, a spike is in two or three of them; what
-stays is none, however constant."""
+"""Sweeps that a spike lasts where values come more slowly than sweeps and are held."""
 SPIKES_MAX = 4
-"""Where more electrodes of a finger jump at once, the finger moves: by chance not in a year."""
+"""More electrodes of a finger that jump in one sweep are motion: noise does that less than once a
+year."""
 BLOCK_STEPS, BLOCKS = 24, 16
-"""Noise is the lower quartile of so many blocks of so many steps (about 4 s at 100 Hz): it stays
-what it is while a hand closes or opens, ..."""
+"""Noise is the lower quartile of 16 blocks of 24 steps (about 4 s at 100 Hz), so that a hand that
+closes or opens does not change it."""
 QUARTILE = 0.95
-"""Which is so much of the mean, of noise that is correlated as measured or is not."""
+"""Lower quartile of the blocks' variances over their mean; the same for white noise."""
 BLOCKS_MIN = 4
-"""... and is not known before there are so many of them."""
+"""Blocks from which on noise is known."""
 SIGMA_COUNTS = (0.5, 10.0)
 """An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
 LOST_MAX = 3
-"""An electrode that is not usable for so many sweeps in a row is taken to read what it read."""
+"""Sweeps in a row for which an electrode that is not usable is taken to read what it read."""
 SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
 
 Times = NDArray[np.float64]
-
-
-def mean_distance(
-    one: NDArray[np.float32], other: NDArray[np.float32], usable: NDArray[np.bool_] | None
-) -> NDArray[np.float64]:
-    """Return the mean distance of each finger's `usable` electrodes, counts, shape (..., fingers).
-
-    Counts of shape (..., fingers, 24), whole numbers below 2**16: float32 adds 24 of them exactly.
-    `usable`, shape (fingers, 24); None: all are usable.
-    """
-    distance = np.abs(one - other)
-    mean: NDArray[np.float64]
-    if usable is None:
-        mean = (distance @ ONES) / np.float64(ELECTRODES)
-    else:
-        mean = (distance * usable) @ ONES / np.maximum(usable.sum(axis=1), 1)
-    return mean
 
 
 @dataclass(slots=True, eq=False)
@@ -84,11 +65,11 @@ class MotionMemory:
     counts: NDArray[np.float32]
     """The last sweep as it came."""
     jumped: NDArray[np.uint8]
-    """For how many sweeps it has jumped and was not believed."""
+    """Number of sweeps for which it has jumped and was not believed."""
     lost: NDArray[np.uint8]
-    """For how many sweeps it has not been usable, up to `LOST_MAX` and one."""
+    """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
     usable_since_ns: NDArray[np.int64]
-    """Since when an electrode has been usable, but for so many sweeps now and then."""
+    """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
     all_usable_since_ns: Number
     """Since when all have."""
     total: NDArray[np.float32]
@@ -125,22 +106,20 @@ class MotionMemory:
 class Motion:
     """How each finger moves, in units of its own noise; constant memory, no clock.
 
-    Over the short window it is the mean of the electrodes' absolute fitted slopes, over the long
-    one the root mean square of their deviations from their means, each over what noise alone makes
-    of it. Noise is known from the differences of sweeps, which slow motion hardly changes.
+    Over the short window it is the mean of the electrodes' absolute slopes, over the long one the
+    root mean square of their deviations from their means, each over what noise alone makes of it.
     """
 
     def __init__(self, fingers: int, false_alarms: float, *, early: bool = False) -> None:
         """`false_alarms`: share of a holding hand's sweeps that may be called moving, 0..0.5.
 
-        With `early` the short window may have as large a share itself, as it decides alone until
-        the long one is full. Raises `ValueError` for another share.
+        With `early` the short window may have as large a share itself. Raises `ValueError` for
+        another share.
         """
         shape = (fingers, ELECTRODES)
         self._tails = Tails.of(fingers, false_alarms, early=early)
         self._noise: Noise | None = None
-        self._noise_blocks = 0
-        """Blocks that it is known from."""
+        """Worked out when it is needed, once for each new block."""
         self.memory = MotionMemory(
             times_ns=np.zeros(2 * STEPS, dtype=np.int64),
             steps=np.zeros((2 * STEPS, *shape), dtype=np.float32),
@@ -163,20 +142,17 @@ class Motion:
         self.fast_limits = self.slow_limits = self._no_limits
         """What it may be at most for a finger that is still, in the same units."""
         self.looked = False
-        """Whether that was worked out for the last step; else nobody wanted to know."""
+        """True if that was worked out for the last step; else it was not wanted."""
+        self.known = False
+        """True if it is known of all fingers how they moved in the short window."""
         self.early = False
-        """Whether fast motion is excluded."""
+        """True if fast motion is excluded."""
         self.sure = False
-        """Whether slow slides are excluded as well, as far as they can be told from noise."""
-
-    @property
-    def known(self) -> bool:
-        """Whether it is known of all fingers how they moved in the short window."""
-        return max(self.fast) < math.inf
+        """True if slow slides that noise does not hide are excluded as well."""
 
     @property
     def slides(self) -> bool:
-        """Whether it is known that a finger moves slowly, or has moved within the long window."""
+        """True if a finger is known to move slowly, or to have moved within the long window."""
         return any(
             limit < moves < math.inf
             for moves, limit in zip(self.slow, self.slow_limits, strict=True)
@@ -298,6 +274,7 @@ class Motion:
             self._fill_block()
             memory.blocks[memory.block_number % BLOCKS] = memory.block / BLOCK_STEPS
             memory.block_number += 1
+            self._noise = None
             memory.block_steps = 0
             memory.block.fill(0.0)
 
@@ -328,16 +305,13 @@ class Motion:
         ]
 
     def _known_noise(self) -> Noise:
-        memory = self.memory
-        if self._noise is None or self._noise_blocks != memory.block_number:
-            number = min(memory.block_number, BLOCKS)
-            squares = np.sort(memory.blocks[:number], axis=0)[number // 4]
-            low, high = SIGMA_COUNTS
-            correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
-            correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
-            variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
-            self._noise, self._noise_blocks = Noise.of(variance, correlations), memory.block_number
-        return self._noise
+        number = min(self.memory.block_number, BLOCKS)
+        squares = np.sort(self.memory.blocks[:number], axis=0)[number // 4]
+        low, high = SIGMA_COUNTS
+        correlations = 1.0 - squares[:-1] / np.maximum(squares[-1], 2.0 * low**2)
+        correlations = np.minimum(np.maximum(correlations, 0.0), 1.0)
+        variance = np.minimum(np.maximum(squares[-1] / 2.0 / QUARTILE, low**2), high**2)
+        return Noise.of(variance, correlations)
 
     def _decide(self) -> None:
         memory = self.memory
@@ -353,19 +327,18 @@ class Motion:
             return
         windows = times_ns.searchsorted((now_ns - SHORT_NS, now_ns - LONG_NS), side="right")
         short, long = (min(begin, number - STEPS_MIN) for begin in windows.tolist())
-        noise = self._known_noise()
+        if self._noise is None:
+            self._noise = self._known_noise()
         times_s = (times_ns[long:] - now_ns) / 1e9
-        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], noise)
+        beside = self._follow_fast(memory.first + short, end, times_s[short - long :], self._noise)
+        self.known = max(self.fast) < math.inf
         self.early = _within(self.fast, self.fast_limits)
         if age_ns >= LONG_NS:
-            self._follow_slow(memory.first + long, end, times_s, noise)
+            self._follow_slow(memory.first + long, end, times_s, self._noise)
             self.sure = _within(self.slow, self.slow_limits) and _within(self.fast, beside)
 
     def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
-        """Find how steps have moved, and the limit where this window decides alone.
-
-        Return the limit where it does not.
-        """
+        """Find how steps have moved; return the limit where this window does not decide alone."""
         memory = self.memory
         line, by_noise, self.fast_limits, beside = noise.fast(times_s, self._tails)
         slopes = line.astype(np.float32).dot(memory.steps[begin:end].reshape(len(line), -1))
@@ -388,9 +361,9 @@ class Motion:
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown
         self.fast_limits = self.slow_limits = self._no_limits
-        self.looked = self.early = self.sure = False
+        self.looked = self.known = self.early = self.sure = False
 
 
 def _within(moves: list[float], limits: list[float]) -> bool:
     """Return True if no finger moves more than its limit."""
-    return all(move <= limit for move, limit in zip(moves, limits, strict=True))
+    return False not in [move <= limit for move, limit in zip(moves, limits, strict=True)]

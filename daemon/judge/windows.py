@@ -19,7 +19,7 @@ from drivers.base import ELECTRODES
 STEP_NS = 5_000_000
 """Of sweeps that come faster than this, the mean is remembered."""
 STEP_SWEEPS_MAX = 10
-"""Of more sweeps within a step nobody knows how the last ones move: they came late, and at once."""
+"""More sweeps within a step came late, and at once: how the last ones move is not known."""
 SHORT_NS, LONG_NS = 100_000_000, 240_000_000
 STEPS = LONG_NS // STEP_NS + 2
 """Steps remembered: the long window, and one at each end of it."""
@@ -28,9 +28,6 @@ STEPS_MIN = 3
 APART = 3
 """Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
 sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
-TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
-"""Standard deviation of a held touch's electrode, and its correlation at one and two sweeps; by the
-differences of sweeps, which the correlation makes less, it is 3.5 counts (2.9 to 4.2)."""
 MEAN_ABS = math.sqrt(2.0 / math.pi)
 """Mean absolute value of a Gaussian of standard deviation 1."""
 SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
@@ -56,7 +53,7 @@ for _number in range(STEPS_MIN, STEPS + 1):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """What noise alone makes of windows of so many steps: each of shape (steps, fingers)."""
+    """What noise alone makes of windows of a number of steps; shape (steps, fingers)."""
 
     slope: NDArray[np.float64]
     """Mean absolute slope, counts/s, where squared times around their mean sum to 1 s**2."""
@@ -107,8 +104,7 @@ class Noise:
         number, line = len(times_s), centred(times_s)
         extent = float(line.dot(line))
         by_noise = [each * (number - 1) for each in self.variance[number].tolist()]
-        extents = [extent / each for each in by_noise]
-        return by_noise, slow_limit(tails.slow, extents, self.spread[number].tolist())
+        return by_noise, slow_limit(tails.slow, extent, by_noise, self.spread[number].tolist())
 
 
 class Tails(NamedTuple):
@@ -123,10 +119,7 @@ class Tails(NamedTuple):
 
     @classmethod
     def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
-        """Return them by the share of a holding hand's sweeps that may be called moving, 0..0.5.
-
-        Raises `ValueError` for another share.
-        """
+        """Return them by `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
         if not 0.0 < false_alarms < 0.5:
             raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
         finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
@@ -140,59 +133,21 @@ def fast_limit(tail: float, by_noise: Sequence[float]) -> list[float]:
     return [math.hypot(usual, creeps / each) for each in by_noise]
 
 
-def slow_limit(tail: float, extents: Sequence[float], spreads: Sequence[float]) -> list[float]:
+def slow_limit(
+    tail: float, extent: float, by_noise: Sequence[float], spreads: Sequence[float]
+) -> list[float]:
     """Return the limit of each finger's root mean square deviation over that of noise.
 
-    `extents` are the sum of the squares of the times around their mean over the sum of the squares
-    of the noise, (s/counts)**2, and `spreads` are those of `Noise`.
+    `extent` is the sum of the squares of the times around their mean, s**2, `by_noise` that of the
+    noise, counts**2, and `spreads` are those of `Noise`.
     """
-    middle, tails, limits = creep(0.0) ** 2, creep(tail) ** 2, []
-    for extent, spread in zip(extents, spreads, strict=True):
-        usual, most = middle * extent, tails * extent
+    middle, tails, limits = CREEP_COUNTS_PER_S**2, creep(tail) ** 2, []
+    for noise, spread in zip(by_noise, spreads, strict=True):
+        usual, most = middle * (extent / noise), tails * (extent / noise)
         # Noise and creep know nothing of each other: their deviations add up as squares do.
         above = math.hypot(tail * spread * (1.0 + usual), most - usual)
         limits.append(math.sqrt(1.0 + usual + above))
     return limits
-
-
-class OperatingPoint(NamedTuple):
-    """What one window can tell."""
-
-    after_ns: int
-    """Its length: it tells that a motion has ended this much later."""
-    counts_per_s: float
-    """Steady motion, mean of a finger's electrodes, that is seen in every other sweep; a faster one
-    is seen in more."""
-
-
-def operating_points(tails: Tails, period_ns: int) -> tuple[OperatingPoint, OperatingPoint]:
-    """Return what the short and the long window can tell of a finger of typical noise.
-
-    `period_ns`: time between sweeps.
-    """
-    sweeps = max(math.ceil(STEP_NS / period_ns), 1)
-    step_ns = sweeps * period_ns
-    short, long = (
-        max(math.ceil(window_ns / step_ns), STEPS_MIN) for window_ns in (SHORT_NS, LONG_NS)
-    )
-    variance, correlations = np.full(1, TYPICAL_COUNTS**2 / sweeps), np.array(TYPICAL_CORRELATIONS)
-    noise = Noise.of(variance, correlations[:, np.newaxis])
-    # The squares of noise and motion add up: how much motion brings the sum to the limit?
-    by_noise = noise.slope[short].item() / math.sqrt(_extent(short, step_ns))
-    (limit,) = fast_limit(tails.alone, [by_noise])
-    fast = by_noise * math.sqrt(limit**2 - 1.0)
-    extent = _extent(long, step_ns) / (noise.variance[long].item() * (long - 1))
-    (limit,) = slow_limit(tails.slow, [extent], noise.spread[long].tolist())
-    slow = MEAN_ABS * math.sqrt((limit**2 - 1.0) / extent)
-    return (
-        OperatingPoint(max(SHORT_NS, short * step_ns), fast),
-        OperatingPoint(max(LONG_NS, long * step_ns), slow),
-    )
-
-
-def _extent(number: int, step_ns: int) -> float:
-    times_s = centred(np.arange(number) * step_ns / 1e9)
-    return float(times_s @ times_s)
 
 
 def creep(tail: float) -> float:

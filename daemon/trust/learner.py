@@ -79,34 +79,29 @@ class Learner:
         ratio = self._covariance.diagonal() / self._prior_variance
         return min(float(ratio.mean()), 1.0)
 
-    def features(self, margin: float, inputs: NDArray[np.floating]) -> Vector:
-        """What is judged by, and to be kept until the outcome is known.
+    def judge(self, margin: float, inputs: NDArray[np.floating]) -> tuple[float, Vector]:
+        """Return log-odds of slip, nearer to 0 the less is known of such grasps, and features.
 
         `margin` is the model's log-odds of slip, before a young session softens them; `inputs`
-        (inputs,) what the model was given, as standardised features of a session. Raises
-        `ValueError` for another shape, and for what is not finite or too large.
+        (inputs,) what the model was given, as standardised features of a session. `learn` takes the
+        features once the outcome is known. Raises `ValueError` for another shape, and for what is
+        not finite or too large.
         """
         if inputs.shape != (self._width - 2,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
         within = (np.abs(inputs) <= INPUT_MAX).tobytes()  # false for NaN
         if 0 in within or not math.isfinite(margin):
             raise ValueError("margin or inputs are not finite, or too large")
-        values = np.empty(self._width)
-        values[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE
-        values[1] = 1.0
-        values[2:] = inputs
-        return values
-
-    def log_odds(self, features: Vector) -> float:
-        """Log-odds of slip for what `features` gave; nearer to 0 the less is known of such grasps.
-
-        MacKay's moderated output.
-        """
+        features = np.empty(self._width)
+        features[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE
+        features[1] = 1.0
+        features[2:] = inputs
         # The prior's covariance is diagonal: the same in a third of the time.
         prior = self._prior_variance if self._is_prior else None
         seen = self._covariance @ features if prior is None else prior * features
         variance = float(features @ seen)
-        return float(features @ self._mean) / math.sqrt(1.0 + math.pi / 8.0 * variance)
+        moderation = math.sqrt(1.0 + math.pi / 8.0 * variance)  # MacKay's moderated output
+        return float(features @ self._mean) / moderation, features
 
     def learn(self, features: Vector, *, slipped: bool) -> None:
         """Take in how the lift of a grasp with these features ended."""

@@ -95,8 +95,7 @@ class Trust:
         """
         if not 0.0 <= p_slip <= 1.0:  # also true for NaN
             raise ValueError(f"{p_slip} is no probability")
-        features = self._judging.features(margin, inputs)
-        log_odds = self._judging.log_odds(features)
+        log_odds, features = self._judging.judge(margin, inputs)
         permission = self._permission(grasp, log_odds)
         return Assessment(
             outcomes=self._judging.outcomes,

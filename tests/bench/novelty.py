@@ -77,8 +77,8 @@ def stable(trained: Trained, before: Counts, stream: Counts, *, told: bool = Fal
     learner = Learner(len(day.inputs))
     for index, reading in enumerate(np.concatenate((before, stream))):
         margin, refused = day.judge(reading)
-        features = learner.features(margin, day.inputs)
-        said.append(not refused and learner.log_odds(features) <= 0.0)
+        log_odds, features = learner.judge(margin, day.inputs)
+        said.append(not refused and log_odds <= 0.0)
         if told and said[-1] and index < len(before):
             learner.learn(features, slipped=True)
     return np.array(said[len(before) :])

@@ -35,11 +35,11 @@ WINDOW = 50
 def frozen(stream: Stream, outcomes: Sequence[int]) -> Iterator[NDArray[np.bool_]]:
     """Verdicts slip on the grasps from `REST` on, after so many outcomes and no more."""
     learner = Learner(stream.features.shape[1])
-    features = [learner.features(margin, row) for margin, row, _ in stream.rows()]
-    for index, (one, slipped) in enumerate(zip(features, stream.slipped, strict=True)):
+    rows = list(stream.rows())
+    for index, (margin, row, slipped) in enumerate(rows):
         if index in outcomes:
-            yield np.array([learner.log_odds(rest) > 0.0 for rest in features[REST:]])
-        learner.learn(one, slipped=bool(slipped))
+            yield np.array([learner.judge(m, x)[0] > 0.0 for m, x, _ in rows[REST:]])
+        learner.learn(learner.judge(margin, row)[1], slipped=bool(slipped))
 
 
 def f1_and_slips(said: NDArray[np.bool_], slipped: NDArray[np.bool_]) -> tuple[float, float]:

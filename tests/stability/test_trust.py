@@ -102,7 +102,7 @@ def test_the_learner_stays_bounded_and_positive_definite(
     eigenvalues, variances, spreads, symmetric = [], [], [], True
     for check in range(CHECKS):
         for margin, inputs, slipped in islice(streams[check % len(streams)], outcomes // CHECKS):
-            learner.learn(learner.features(margin, inputs), slipped=slipped)
+            learner.learn(learner.judge(margin, inputs)[1], slipped=slipped)
         state = learner.state()
         covariance = np.frombuffer(state.covariance, "<f8").reshape(len(PRIOR), -1)
         symmetric &= bool((covariance == covariance.T).all())
@@ -128,9 +128,9 @@ def test_the_learner_stays_bounded_and_positive_definite(
 def test_log_odds_are_those_of_long_double(note: Note, name: str) -> None:
     learner, exact, worst = Learner(INPUTS), ExactLearner(), 0.0
     for margin, inputs, slipped in islice(STREAMS[name](np.random.default_rng(1)), COMPARED):
-        features = learner.features(margin, inputs)
+        log_odds, features = learner.judge(margin, inputs)
         wanted = exact.log_odds(features)
-        error = abs(float(learner.log_odds(features) - wanted)) / max(1.0, abs(float(wanted)))
+        error = abs(float(log_odds - wanted)) / max(1.0, abs(float(wanted)))
         worst = max(worst, error if math.isfinite(error) else math.inf)
         learner.learn(features, slipped=slipped)
         exact.learn(features, slipped=slipped)

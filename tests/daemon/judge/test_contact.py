@@ -48,7 +48,7 @@ class Hand:
         touching = np.zeros((len(sweeps), 3), dtype=np.bool_)
         for place, counts in enumerate(sweeps):
             self.feel(counts, usable)
-            touching[place] = self.contact.touching
+            touching[place] = self.contact.memory.touching
         return touching
 
 
@@ -97,13 +97,13 @@ def test_nothing_touches_in_a_real_untouched_recording_five_times_in_a_row(
     hand = Hand()
     played = np.tile(untouched[::direction], (5, 1, 1))
     assert not hand.play(played[:100]).any()
-    assert hand.contact.tared.all(), "one second is enough for a tare"
+    assert hand.contact.memory.tared.all(), "one second is enough for a tare"
     falls = []
     for counts in played[100:]:
         hand.feel(counts)
         falls.append([touch.fall for touch in hand.contact.memory.touches])
-        assert not hand.contact.touching.any()
-        assert hand.contact.tared.all()
+        assert not hand.contact.memory.touching.any()
+        assert hand.contact.memory.tared.all()
     assert np.max(falls) < 11.0, "the third deepest fall leaves half of the threshold free"
 
 
@@ -197,7 +197,7 @@ def test_a_sag_of_all_electrodes_is_no_touch(untouched: Counts, seconds: float) 
     sagged = untouched - np.rint(fall).astype(np.int64)[:, None, None]
     hand = Hand()
     assert not hand.play(as_sampled(untouched, sagged)).any()
-    assert hand.contact.tared.all()
+    assert hand.contact.memory.tared.all()
 
 
 @pytest.mark.parametrize("edges", [[300, 301, 500, 700], [300, 500, 700, 701]])
@@ -250,7 +250,7 @@ def ten_minutes() -> TenMinutes:
     for second in range(600):
         mean = ten_minutes_mean(second + np.arange(100) / 100, held=True)
         touching.append(hand.play(noisy(mean, second)))
-        tared.append(hand.contact.tared.copy())
+        tared.append(hand.contact.memory.tared.copy())
     baseline = hand.contact.memory.baseline.copy()
     after = hand.play(noisy(ten_minutes_mean(600 + np.arange(300) / 100, held=False), 600))
     return TenMinutes(
@@ -328,10 +328,10 @@ def test_a_finger_that_moves_is_not_tared_until_it_rests(motion: str) -> None:
     moved = MOTIONS[motion](t_s)[:, None, None]
     for counts in noisy(at_rest() + moved):
         hand.feel(counts)
-        assert not hand.contact.tared.any()
-        assert not hand.contact.touching.any()
+        assert not hand.contact.memory.tared.any()
+        assert not hand.contact.memory.touching.any()
     hand.play(noisy(np.broadcast_to(at_rest() + moved[-1], (150, 3, 24)), 1))
-    assert hand.contact.tared.all()
+    assert hand.contact.memory.tared.all()
 
 
 def test_a_hand_that_never_opened_touches_nothing_until_it_opens() -> None:
@@ -349,7 +349,7 @@ def test_a_dead_electrode_makes_no_touch_and_hinders_none() -> None:
     assert not hand.play(rest[:166]).any()
     usable[FF, 0] = False  # found dead after 16 repetitions
     assert not hand.play(rest[166:], usable).any()
-    assert hand.contact.tared.all()
+    assert hand.contact.memory.tared.all()
     assert hand.play(touch, usable)[5:].all()
 
 
@@ -364,7 +364,7 @@ def test_railed_electrodes_make_no_touch_and_hinder_none(rail: int, before_tare:
     touch[:, ~usable] = rail
     assert not hand.play(rest[:start]).any()
     assert not hand.play(rest[start:], usable).any()
-    assert hand.contact.tared.all()
+    assert hand.contact.memory.tared.all()
     assert hand.play(touch, usable)[5:].all()
 
 
@@ -388,7 +388,7 @@ def test_fewer_than_twelve_usable_electrodes_never_touch(usable_electrodes: int)
     assert touching[5:, [MF, TH]].all()
     never_more = Hand()
     never_more.play(still(1.5), usable)
-    assert never_more.contact.tared.tolist() == [enough, True, True]
+    assert never_more.contact.memory.tared.tolist() == [enough, True, True]
     assert never_more.play(touched(0.5, 500.0), usable)[:, FF].any() == enough
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 
 import msgspec
 import numpy as np
@@ -16,6 +16,7 @@ from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
 from daemon.judge.reasons import GateCause, GateChange, GateState, Reason
 from daemon.judge.stillness import Motion
+from models.contract import Finger
 from tests.daemon.judge.test_gate import (
     ALL,
     FINGERS,
@@ -33,7 +34,7 @@ from tests.daemon.judge.test_gate import (
     spike,
 )
 
-NOTHING = (False, False, False)
+NOTHING: tuple[Finger, ...] = ()
 """No finger touches."""
 
 
@@ -50,14 +51,14 @@ class Steps:
         self,
         after_ms: float = 10.0,
         counts: float = 3000.0,
-        touching: Sequence[bool] = (True, True, True),
+        touching: tuple[Finger, ...] = FINGERS,
         objections: tuple[Reason, ...] = (),
     ) -> GateState | None:
         """One reading: all electrodes of FF read `counts`, the others 3000."""
         self.t_ns += round(after_ms * MS)
         median = np.full(SHAPE, 3000, dtype=np.uint16)
         median[0] = round(counts)
-        self.now = self.gate.step(self.t_ns, median, median, ALL, np.array(touching), objections)
+        self.now = self.gate.step(self.t_ns, median, median, ALL, touching, objections)
         assert self.now.judges or not self.now.judged
         self._changes += self.now.changes
         return self.now.state
@@ -246,7 +247,7 @@ def test_electrodes_that_are_not_usable_neither_move_nor_change_a_grasp() -> Non
         median[0, :12] = 4095 * (place % 2)
         steps.t_ns += 10 * MS
         sweep = median.copy()
-        now = steps.gate.step(steps.t_ns, sweep, sweep, usable, np.ones(3, dtype=np.bool_))
+        now = steps.gate.step(steps.t_ns, sweep, sweep, usable, FINGERS)
         assert now.settled
 
 
@@ -256,12 +257,13 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
     required = FINGERS if seed % 2 == 0 else ("ff", "th")
     gate = Gate(FINGERS, HandLimits(on_request=seed % 3 == 0, required=required, gate=GATE))
     changes: list[GateChange] = []
-    touching, median, t_ns = np.zeros(3, dtype=np.bool_), np.full(SHAPE, 3000), START_NS
+    touching, median, t_ns = NOTHING, np.full(SHAPE, 3000), START_NS
     for _ in range(4000):
         usual = random.random() < 0.97
         t_ns += 10 * MS if usual else round(MS * random.choice([0, 1, 90, 101, 5000, -20]))
         if random.random() < 0.02:
-            touching = random.random(3) < random.choice([0.1, 0.9])
+            touches = random.random(3) < random.choice([0.1, 0.9])
+            touching = tuple(compress(FINGERS, touches))
         if random.random() < 0.01:
             median = random.integers(2900, 3000, SHAPE)
         if random.random() < 0.05:
@@ -269,7 +271,7 @@ def test_whatever_comes_the_gate_goes_along_its_arrows(seed: int) -> None:
         objections = (Reason.JOINTS_LATE,) if random.random() < 0.02 else ()
         if random.random() < 0.05:
             gate.skip(t_ns)
-            now = gate.moment(touching.tolist())
+            now = gate.moment(touching)
         else:
             sweep, usable = median.astype(np.uint16), random.random(SHAPE) < (0.9 + 0.1 * usual)
             now = gate.step(
@@ -337,7 +339,7 @@ def test_a_finger_lost_while_settled_is_contact_lost() -> None:
     steps = Steps(on_request=True)
     steps.hold()
     assert steps.now.state is GateState.SETTLED
-    steps.step(touching=(True, True, False))
+    steps.step(touching=FINGERS[:2])
     assert steps.take_changes()[-1].cause is GateCause.CONTACT_LOST
 
 

@@ -38,7 +38,7 @@ def test_a_hand_that_opens_after_a_long_hold_touches_nothing(seconds: int, drift
     assert hand.play(noisy(held(seconds, drift)))[10:].all()
     open_hand = hand.play(noisy(opened(4.0, seconds, drift), 1))
     assert not open_hand[10:].any()
-    assert hand.contact.tared.all()
+    assert hand.contact.memory.tared.all()
     assert hand.play(noisy(held(2, 0.0) + (drift + SLOPES) * seconds, 2))[10:].all()
 
 
@@ -73,8 +73,8 @@ def test_a_hand_that_was_closed_at_the_start_is_tared_when_it_opens(higher: floa
     closed = at_rest() - 300.0 * PRESSED + bulge * (1.0 + 300.0 / 60.0)
     hand.play(noisy(np.broadcast_to(closed, (200, 3, 24))))
     hand.play(still(4.0, 1))
-    assert hand.contact.tared.all()
-    assert not hand.contact.touching.any()
+    assert hand.contact.memory.tared.all()
+    assert not hand.contact.memory.touching.any()
     assert hand.play(noisy(held(2, 0.0), 2))[10:].all()
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from daemon.judge.contact import Contact, Rest, Tare, Touch, Window
+from daemon.judge.contact import Contact, Rest, Touch, Window
 from daemon.judge.decision import ContactLimits
 
 THRESHOLD = 20.0
@@ -118,20 +118,18 @@ def test_a_finger_that_touches_alone_for_half_a_minute_is_tared_anew(
     after_ns: int, anew: bool
 ) -> None:
     touch = held(100.0)
-    assert not touch.must_be_tared_anew(S, 0.0, accompanied=False)
-    assert touch.must_be_tared_anew(S + after_ns, 0.0, accompanied=False) == anew
-    assert not touch.must_be_tared_anew(90 * S, 0.0, accompanied=True)
-    assert not touch.must_be_tared_anew(99 * S, 0.0, accompanied=False), "counted from here on"
+    assert not touch.has_lost_rest(S, 0.0)
+    assert touch.has_lost_rest(S + after_ns, 0.0) == anew
 
 
 @pytest.mark.parametrize(("middle", "anew"), [(-20.0, False), (-20.01, True), (99.0, False)])
 def test_a_finger_that_rests_a_touch_higher_is_tared_anew(middle: float, anew: bool) -> None:
-    assert Touch(THRESHOLD).must_be_tared_anew(S, middle, accompanied=False) == anew
+    assert Touch(THRESHOLD).has_lost_rest(S, middle) == anew
 
 
 def test_a_finger_whose_rest_is_not_known_has_no_fall() -> None:
     touch = held(100.0)
-    touch.must_be_tared_anew(S, 0.0, accompanied=False)
+    touch.has_lost_rest(S, 0.0)
     touch.end()
     found = (touch.touching, touch.fall, touch.depth, touch.lowest)
     assert found == (False, 0.0, 0.0, 0.0)
@@ -165,12 +163,31 @@ def rest_of(sweeps: Sweeps, usable: int = 24) -> Rest | None:
 
 
 def test_a_window_is_looked_at_after_a_hundred_sweeps_and_every_25_more() -> None:
-    tare = Tare()
-    looks = [tare.add() for _ in range(160)]
-    assert [place + 1 for place, look in enumerate(looks) if look] == [100, 125, 150]
-    tare.clear()
-    looks = [tare.add() for _ in range(100)]
-    assert looks == [False] * 99 + [True]
+    contact = Contact(1, ContactLimits())
+    rest = np.full((1, 24), 3000, dtype=np.uint16)
+    looks = []
+    for place in range(1, 320):
+        counts = rest.copy()
+        counts[0, :6] -= np.uint16(100 if place == 160 else 0)
+        contact.observe(place * 10 * MS, counts, counts, ALL)
+        if contact.memory.touches[0].tared_ns == place * 10 * MS:
+            looks.append(place)
+    assert looks == [100, 125, 150, 260, 285, 310], "a hundred sweeps after what looked as a touch"
+
+
+def test_a_finger_that_touches_with_all_others_at_times_is_not_alone() -> None:
+    contact = Contact(2, ContactLimits())
+    rest = np.full((2, 24), 3000, dtype=np.uint16)
+    for place in range(100):
+        contact.observe(place * 10 * MS, rest, rest, None)
+    one, both = rest.copy(), rest.copy()
+    one[0, :6] -= np.uint16(200)
+    both[:, :6] -= np.uint16(200)
+    for at_s, counts in ((1, one), (20, both), (21, one), (50, one)):
+        contact.observe(at_s * S, counts, counts, None)
+        assert contact.memory.tared.tolist() == [True, True]
+    contact.observe(51 * S + 1, one, one, None)
+    assert contact.memory.tared.tolist() == [False, True], "half a minute since it was left alone"
 
 
 def test_the_baseline_is_the_median_of_the_last_hundred_sweeps_only() -> None:
@@ -247,9 +264,9 @@ def test_a_touch_takes_five_sigmas_or_twenty_counts(
 ) -> None:
     contact = Contact(1, limits)
     for place, counts in enumerate(wavering(step)):
-        assert not contact.tared.any()
+        assert not contact.memory.tared.any()
         contact.observe(place * 10 * MS, counts[None], counts[None], ALL)
-    assert contact.tared.all()
+    assert contact.memory.tared.all()
     assert contact.memory.touches[0].threshold == pytest.approx(threshold)
 
 
@@ -281,5 +298,5 @@ def test_the_third_deepest_electrode_makes_the_touch() -> None:
         pressed = rest.copy()
         pressed[0, :fallen] -= np.arange(50, 50 + fallen, dtype=np.uint16)
         contact.observe(S, pressed, pressed, ALL)
-        assert contact.touching.tolist() == [touches]
+        assert contact.memory.touching.tolist() == [touches]
     assert contact.memory.touches[0].fall == 50.0

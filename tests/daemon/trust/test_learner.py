@@ -33,7 +33,7 @@ def lifts(number: int, inputs: int, seed: int = 0, strength: float = 0.6) -> Ite
 
 def learn(learner: Learner, stream: Iterator[Outcome]) -> None:
     for margin, x, slipped in stream:
-        learner.learn(learner.features(margin, x), slipped=slipped)
+        learner.learn(learner.judge(margin, x)[1], slipped=slipped)
 
 
 def covariance(learner: Learner) -> NDArray[np.float64]:
@@ -43,7 +43,7 @@ def covariance(learner: Learner) -> NDArray[np.float64]:
 
 def test_before_an_outcome_the_margin_speaks_moderated_by_what_the_prior_leaves_open() -> None:
     learner = Learner(2)
-    found = learner.log_odds(learner.features(-3.0, np.array([1.0, -2.0])))
+    found = learner.judge(-3.0, np.array([1.0, -2.0]))[0]
     variance = 2.0**2 * 0.3**2 + 0.5**2 + 0.3**2 * (1.0 + 4.0)
     assert found == pytest.approx(-2.0 / math.sqrt(1.0 + math.pi * variance / 8.0), rel=1e-14)
 
@@ -52,7 +52,7 @@ def test_a_margin_beyond_thirty_says_no_more_than_thirty() -> None:
     learner, x = Learner(2), np.zeros(2)
     for margin in (30.5, 1e9):
         for sign in (1.0, -1.0):
-            found = learner.features(sign * margin, x)
+            _, found = learner.judge(sign * margin, x)
             np.testing.assert_array_equal(found, [sign * 20.0, 1.0, 0.0, 0.0])
 
 
@@ -61,8 +61,8 @@ def test_it_is_the_information_filter_in_long_double(inputs: int) -> None:
     learner, reference = Learner(inputs), Reference(inputs)
     for margin, x, slipped in lifts(60, inputs or 1):
         x = x[:inputs]
-        mine, theirs = learner.features(margin, x), reference.features(margin, x.tolist())
-        assert learner.log_odds(mine) == pytest.approx(float(reference.log_odds(theirs)), abs=1e-12)
+        (found, mine), theirs = learner.judge(margin, x), reference.features(margin, x.tolist())
+        assert found == pytest.approx(float(reference.log_odds(theirs)), abs=1e-12)
         learner.learn(mine, slipped=slipped)
         reference.learn(theirs, slipped)
     expected = np.array(reference.covariance, dtype=np.float64)
@@ -78,9 +78,9 @@ def test_float64_is_long_double_after_2000_outcomes_of_three_fingers() -> None:
     worst = 0.0
     for margin, x, slipped in lifts(2000, THREE_FINGERS):
         f = np.concatenate(([margin / 1.5, 1.0], x)).astype(np.longdouble)
-        features = learner.features(margin, x)
+        found, features = learner.judge(margin, x)
         expected = f @ mean / np.sqrt(1 + np.longdouble(math.pi) / 8 * (f @ spread @ f))
-        worst = max(worst, abs(learner.log_odds(features) - float(expected)))
+        worst = max(worst, abs(found - float(expected)))
         learner.learn(features, slipped=slipped)
         p = 1 / (1 + np.exp(-(f @ mean)))
         w, seen = p * (1 - p), spread @ f
@@ -118,17 +118,17 @@ def test_moderated_log_odds_are_those_of_the_mean_probability() -> None:
     mean, spread = np.frombuffer(learner.state().mean), covariance(learner)
     nodes, shares = np.polynomial.hermite_e.hermegauss(60)
     for margin, x, _ in lifts(50, ONE_FINGER, seed=1):
-        f = learner.features(margin, x)
+        log_odds, f = learner.judge(margin, x)
         at = float(f @ mean) + math.sqrt(float(f @ spread @ f)) * nodes
         expected = float(shares @ (1.0 / (1.0 + np.exp(-at))) / shares.sum())
-        assert sigmoid(learner.log_odds(f)) == pytest.approx(expected, abs=0.02)
+        assert sigmoid(log_odds) == pytest.approx(expected, abs=0.02)
 
 
 def test_it_learns_what_the_margin_does_not_know_and_follows_when_that_changes() -> None:
     learner = Learner(ONE_FINGER)
 
     def right(stream: list[Outcome]) -> float:
-        says = [learner.log_odds(learner.features(m, x)) > 0.0 for m, x, _ in stream]
+        says = [learner.judge(m, x)[0] > 0.0 for m, x, _ in stream]
         return sum(a == y for a, (*_, y) in zip(says, stream, strict=True)) / len(stream)
 
     stream = list(lifts(1300, ONE_FINGER, strength=3.0))
@@ -194,7 +194,7 @@ def test_whatever_it_is_told_it_stays_bounded_and_positive_definite(
     prior = np.array([0.3**2, 0.5**2] + [0.3**2] * ONE_FINGER)
     start = np.array([1.0, *([0.0] * (ONE_FINGER + 1))])
     for index, (margin, x, slipped) in enumerate(kind(np.random.default_rng(0), number), 1):
-        learner.learn(learner.features(margin, x), slipped=slipped)
+        learner.learn(learner.judge(margin, x)[1], slipped=slipped)
         if index % (number // 50) == 0:
             matrix, weights = covariance(learner), np.frombuffer(learner.state().mean)
             np.testing.assert_array_equal(matrix, matrix.T)
@@ -222,7 +222,7 @@ def test_what_is_not_finite_or_of_another_shape_is_refused(
     margin: float, inputs: NDArray[np.float64]
 ) -> None:
     with pytest.raises(ValueError, match=r"not finite|of shape"):
-        Learner(3).features(margin, inputs)
+        Learner(3).judge(margin, inputs)
 
 
 def test_a_weight_stops_at_fifty_times_its_priors_deviation_whatever_is_told() -> None:
@@ -230,15 +230,15 @@ def test_a_weight_stops_at_fifty_times_its_priors_deviation_whatever_is_told() -
     for index in range(2000):
         sign = -1.0 if index % 2 else 1.0
         # In turns so far on one side that the learner is sure, and wrong.
-        features = learner.features(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
-        learner.learn(features, slipped=learner.log_odds(features) < 0.0)
+        found, features = learner.judge(30.0 * sign, np.array([-1000.0 * sign, 3.0]))
+        learner.learn(features, slipped=found < 0.0)
     weights = np.frombuffer(learner.state().mean)
     limits = 50.0 * np.array([0.3, 0.5, 0.3, 0.3])
     assert (np.abs(weights - [1.0, 0.0, 0.0, 0.0]) <= limits).all()
-    features = learner.features(0.0, np.array([1000.0, 0.0]))
-    learner.learn(features, slipped=learner.log_odds(features) < 0.0)
+    found, features = learner.judge(0.0, np.array([1000.0, 0.0]))
+    learner.learn(features, slipped=found < 0.0)
     assert np.abs(np.frombuffer(learner.state().mean)[2]) == pytest.approx(15.0)
-    assert np.isfinite(learner.log_odds(features))
+    assert np.isfinite(learner.judge(0.0, np.array([1000.0, 0.0]))[0])
     Learner(2).restore(learner.state())
 
 
