@@ -94,15 +94,14 @@ def main(arguments: list[str]) -> int:
     import gc
     import importlib
 
-    from daemon.process.start import prepare
+    from daemon.process import set_up_libraries
 
-    prepare()
+    set_up_libraries()
     for name, modules in CORE:
         for module in modules:
             importlib.import_module(module)
         meter.take(name)
     gc.freeze()
-    gc.enable()
     import json
     from contextlib import ExitStack
     from pathlib import Path

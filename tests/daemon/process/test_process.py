@@ -65,21 +65,15 @@ def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) ->
     assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
 
 
-COLLECTIONS = """
+FROZEN = """
 import atexit, gc
-before = sum(each["collections"] for each in gc.get_stats())
-def tell():
-    done = sum(each["collections"] for each in gc.get_stats()) - before
-    print(done, gc.isenabled(), gc.get_freeze_count() > 10_000)
-atexit.register(tell)
+atexit.register(lambda: print(gc.isenabled(), gc.get_freeze_count() > 10_000))
 """
 
 
-def test_loading_collects_no_garbage_and_what_is_loaded_is_never_looked_through() -> None:
-    result = python(COLLECTIONS, "check", DEMO_SCENE)
-    done, enabled, frozen = result.stdout.splitlines()[-1].split()
-    assert (enabled, frozen) == ("True", "True")
-    assert int(done) < 60  # it takes some 110 while loading alone
+def test_garbage_collection_never_looks_through_the_modules() -> None:
+    result = python(FROZEN, "check", DEMO_SCENE)
+    assert result.stdout.splitlines()[-1] == "True True"
 
 
 @pytest.mark.parametrize(
@@ -90,10 +84,9 @@ def test_loading_collects_no_garbage_and_what_is_loaded_is_never_looked_through(
     ],
     ids=["any program", "graspd"],
 )
-def test_plugins_that_others_have_installed_are_not_let_in(
+def test_graspd_loads_no_plugins_of_pydantic(
     program: tuple[str, ...], is_loaded: bool, tmp_path: Path
 ) -> None:
-    """Nor looked for, among all that is installed."""
     info = tmp_path / "stranger-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
