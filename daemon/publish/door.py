@@ -9,6 +9,7 @@ pass until the loop has read them.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import threading
@@ -64,6 +65,9 @@ ZAP_DOMAIN: Final = "graspd"
 
 class PublishError(Exception):
     """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
+
+    taken: str | None = None
+    """Endpoint that another program holds, if that is the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +273,10 @@ class Door:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:
             why = zmq.strerror(error.errno or 0)  # its own text names the endpoint again
-            raise PublishError(f"cannot bind {listener.endpoint}: {why}") from error
+            refusal = PublishError(f"cannot bind {listener.endpoint}: {why}")
+            if error.errno == errno.EADDRINUSE:
+                refusal.taken = listener.endpoint
+            raise refusal from error
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when a question comes.
