@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
-from daemon.scene import GateMode, Scene, SceneError
+from daemon.scene import Scene, SceneError
 from daemon.scene.drivers import (
     CanTactile,
     PalmJoints,
@@ -22,6 +22,7 @@ from daemon.scene.drivers import (
     SpiTactile,
     StreamJoints,
 )
+from daemon.scene.scene import GateMode
 from daemon.trust.risk import RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import Driver, DriverError, LinkError

@@ -13,7 +13,7 @@ WAKEUPS_MAX = 4096
 """Bytes that a look takes out of the pipe: more signals than ever come between two."""
 
 
-class Stop(Protocol):
+class StopRequest(Protocol):
     """What the loop looks at to know when to end."""
 
     @property

@@ -27,7 +27,7 @@ from daemon.publish.socket_file import OccupiedError, SocketFile
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-    from daemon.process.signals import Stop
+    from daemon.process.signals import StopRequest
 
 log = logging.getLogger("graspd")
 
@@ -317,7 +317,7 @@ class Door:
         if self._echo.recv_multipart()[1] == self._unheard:
             self._unheard = b""
 
-    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+    def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
         """Wait until a peer has connected to hear messages.
 
         False if there is none within `timeout_s` seconds, or when `stop` becomes readable.

@@ -10,13 +10,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.companion import Companion, PublishedVerdict, Requests
 from daemon.publish.door import Admission, Door, Listener, PublishError
 from daemon.publish.messages import Status
-from daemon.scene import Curve, Scene, SceneError
+from daemon.scene import Scene, SceneError
+from daemon.scene.scene import Curve
 
 if TYPE_CHECKING:
-    from daemon.process.signals import Stop
+    from daemon.process.signals import StopRequest
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
@@ -131,7 +132,7 @@ class Sockets(Companion):
             if messages:
                 self.questions.take(messages, self._clock(), requests)
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Answer all questions, or those alone that have waited too long for a better answer."""
         if self.questions is None or not self.questions.waiting:
             return
@@ -157,7 +158,7 @@ class Sockets(Companion):
             counters["ask"] = dict(self.questions.counters)
         return counters
 
-    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+    def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
         """Wait until a peer has connected to hear messages; see `Door`."""
         return self._door is not None and self._door.wait_for_subscriber(timeout_s, stop)
 

@@ -7,7 +7,7 @@ import sys
 from daemon.judge.network import Examined, Network
 from daemon.judge.reasons import Decision
 from daemon.process.text import Colour, coloured
-from daemon.publish.companion import Companion, Published
+from daemon.publish.companion import Companion, PublishedVerdict
 from daemon.run.summary import Tally
 from daemon.trust.trust import Trust
 from models.runtime import TactileModel
@@ -43,7 +43,7 @@ class Demo(Companion):
             coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", Colour.BOLD),
         )
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Count a grasp."""
         verdict, reading = published.verdict, published.reading
         note = None if reading is None else reading.annotation

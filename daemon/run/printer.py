@@ -8,9 +8,9 @@ import time
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.process.text import Colour, coloured, printable
-from daemon.publish.companion import Companion, Published
+from daemon.publish.companion import Companion, PublishedVerdict
 from daemon.publish.messages import Verdict
-from daemon.run.summary import Summary
+from daemon.run.summary import RunSummary
 from daemon.trust.lift_book import Report
 from daemon.trust.trust import Trust
 from drivers.base import Annotation
@@ -30,11 +30,11 @@ class Printer(Companion):
         """
         self._prompt = prompt
         self._as_json = as_json
-        self.result = Summary()
+        self.result = RunSummary()
         self._start_s = time.monotonic()
         self._gate: GateState | None = None
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Write one verdict, and how the lift of its grasp ended if the recording says so."""
         verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None

@@ -13,7 +13,7 @@ from typing import Self
 
 from daemon.publish.companion import Companion
 from daemon.publish.messages import Status
-from daemon.scene import Realtime
+from daemon.scene.scene import Realtime
 
 log = logging.getLogger("graspd")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.companion import Companion, PublishedVerdict, Requests
 from daemon.publish.messages import OBJECT_PATTERN
-from daemon.run.summary import Summary
+from daemon.run.summary import RunSummary
 from daemon.trust.lift_book import GraspId, Report
 from models.runtime import TactileModel
 
@@ -41,7 +41,7 @@ class Controller(Companion):
         """Remember whom to tell."""
         self._requests = requests
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Take note of a grasp; the lift of the one before it is over."""
         verdict, reading = published.verdict, published.reading
         if self._lift is not None and self._lift.report.grasp.grasp != verdict.grasp:
@@ -81,15 +81,15 @@ def _sent(object_name: str | None) -> str | None:
 class Comparison(Companion):
     """Judges every judged grasp once more in another way, for the summary alone."""
 
-    def __init__(self, how: str, pipeline: Pipeline, result: Summary) -> None:
-        """`how` is a key of `Summary.compared`; to `pipeline` each reading is a grasp, and it has
+    def __init__(self, how: str, pipeline: Pipeline, result: RunSummary) -> None:
+        """`how` is a key of `RunSummary.compared`. To `pipeline` each reading is a grasp; it has
         the clock of the pipeline that made the verdicts."""
         self._how = how
         self._pipeline = pipeline
         self._result = result
         self._grasp: int | None = None
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Count what the first verdict on a grasp would have been."""
         verdict, reading = published.verdict, published.reading
         if reading is None:

@@ -15,7 +15,7 @@ from daemon.assembly.parts import Assembly, Parts
 from daemon.process.signals import StopSignal
 from daemon.publish.door import PublishError
 from daemon.publish.sockets import Sockets, plan
-from daemon.run.loop import Ended, Loop, Timing
+from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.run.reload import Reload
 from drivers.base import DriverError
 from models.contract import ModelError
@@ -172,7 +172,7 @@ class Runner:
                 around.build_outbox(),
                 self._reload,
                 [companion for companion in companions if companion is not None],
-                Timing(wanted.max_age_ns),
+                LoopTiming(wanted.max_age_ns),
                 around.keep,
             )
             stack.callback(loop.close)

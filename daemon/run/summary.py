@@ -147,7 +147,7 @@ def _fractions(parts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
     return {name: part / whole for name, (part, whole) in parts.items() if whole}
 
 
-class Summary:
+class RunSummary:
     """Collects verdicts in constant memory.
 
     Behind a gate a grasp counts once, by its first judgement; else each reading does.

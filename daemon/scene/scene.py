@@ -84,7 +84,7 @@ class Model(Section):
         return self
 
 
-class Session(Section):
+class SessionSection(Section):
     """`[session]`: where a session model keeps what it knows of today's sensors."""
 
     keep: bool | None = None
@@ -98,7 +98,7 @@ class Session(Section):
     """`/var/lib/graspd/<hand>.session.json` unless given."""
 
 
-class Risk(Section):
+class RiskSection(Section):
     """`[risk]`: how many lifts of `stable` verdicts may slip. Without it, none are counted on.
 
     `stable` is said only as far as the outcomes that were told allow it.
@@ -125,7 +125,7 @@ GateMode = Literal["settled", "every", "request"]
 Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0), Unit("ms")]
 
 
-class Gate(Section):
+class GateSection(Section):
     """`[gate]`: when a grasp is judged, and when it is refused."""
 
     mode: GateMode | None = None
@@ -264,10 +264,10 @@ class Scene(Section):
     joints: Joints | None = None
     """Where joint angles come from; the keys depend on `driver`. Without it none are used."""
     model: Model = Model()
-    session: Session = Session()
+    session: SessionSection = SessionSection()
     learn: Learn = Learn()
-    risk: Risk | None = None
-    gate: Gate = Gate()
+    risk: RiskSection | None = None
+    gate: GateSection = GateSection()
     publish: Publish = Publish()
     ask: Ask | None = None
     curve: Curve | None = None

@@ -153,8 +153,8 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
 
 def _apart(wanted: Scene, folder: Path) -> Scene:
     """The scene with its sockets and its session in `folder`, playing recordings at once."""
-    from daemon.scene import Ask
     from daemon.scene.drivers import ReplayTactile
+    from daemon.scene.scene import Ask
 
     ask, tactile = wanted.ask, wanted.tactile
     if wanted.ask_endpoint is not None:
@@ -216,12 +216,12 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     outbox = around.build_outbox()
     meter.take("sockets")
     from daemon.process.signals import StopSignal
-    from daemon.run.loop import Loop, Timing
+    from daemon.run.loop import Loop, LoopTiming
     from daemon.run.reload import Reload
 
     stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
     stack.callback(stop.close)
-    timing = Timing(parts.scene.max_age_ns)
+    timing = LoopTiming(parts.scene.max_age_ns)
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")
     return outbox

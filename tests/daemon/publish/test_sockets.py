@@ -21,7 +21,7 @@ from daemon import scene
 from daemon.judge.network import Opinion
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Moment
-from daemon.publish.companion import Published
+from daemon.publish.companion import PublishedVerdict
 from daemon.publish.door import PublishError
 from daemon.publish.messages import decode_status, decode_verdict
 from daemon.publish.sockets import Sockets, plan
@@ -130,7 +130,7 @@ def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
         sockets.questions.take([[b"dashboard", b"judge"], [b"controller", b"lift"]], 0, Asked())
         verdict = decode_verdict((GOLDEN / "verdict_stable.json").read_bytes())
         judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
-        sockets.on_verdict(Published(judgement, verdict, b"{}", None, True, grasp, lifts))
+        sockets.on_verdict(PublishedVerdict(judgement, verdict, b"{}", None, True, grasp, lifts))
         assert len(sockets.questions.waiting) == 0
     assert lifts.may_report(grasp, b"controller")
     assert lifts.may_report(grasp, b"dashboard") == (number == 0)

@@ -19,14 +19,14 @@ from daemon.publish.companion import (
     Answer,
     Companion,
     LoopEvent,
-    Published,
+    PublishedVerdict,
     Requests,
     at_once,
     hooks,
 )
 from daemon.publish.messages import Lifts, State, Status, Verdict, decode_status, decode_tactile
 from daemon.publish.outbox import Outbox
-from daemon.run.loop import Ended, Loop, Timing
+from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.session.sensors import SensorWatch
 from daemon.trust.lift_book import NOT_YOURS, UNKNOWN_START, GraspId, OutcomeStatus, Report
 from daemon.trust.trust import Trust
@@ -96,7 +96,7 @@ class Bench(Companion):
             ),
             stop,
             [self, *companions],
-            Timing(100 * MS, clock, Sleep() if sleep is None else sleep),
+            LoopTiming(100 * MS, clock, Sleep() if sleep is None else sleep),
             keep or at_once,
         )
 
@@ -104,7 +104,7 @@ class Bench(Companion):
         with closing(self.loop):
             return self.loop.run()
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         self.verdicts.append(published.verdict)
         self.payloads.append(published.payload)
 
@@ -456,7 +456,7 @@ class Peer(Companion):
     def on_outcome(self, report: Report) -> None:
         self.heard.append(report)
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         self.heard.append(published.payload)
 
     @property

@@ -16,10 +16,10 @@ import pytest
 from daemon.judge.decision import ContactLimits, GateLimits, HandLimits
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion, LoopEvent, Published
+from daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
 from daemon.publish.messages import Status, Verdict, decode_status
 from daemon.publish.outbox import Outbox
-from daemon.run.loop import DRAINS_MAX, Loop, Timing
+from daemon.run.loop import DRAINS_MAX, Loop, LoopTiming
 from daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
@@ -92,7 +92,9 @@ class Bench(Companion):
                 Outbox("right", FINGERS, "fake", "ab" * 32, [self], clock, lambda: 1.79e9),
                 stop,
                 [self],
-                Timing(SECOND_NS, clock, rest=self._rest, selector=lambda: ClockSelector(clock)),
+                LoopTiming(
+                    SECOND_NS, clock, rest=self._rest, selector=lambda: ClockSelector(clock)
+                ),
             )
             with closing(loop):
                 loop.run()
@@ -101,7 +103,7 @@ class Bench(Companion):
         self.rests_s.append(seconds)
         self.clock.now_ns += round(seconds * 1e9)
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         self.clock.now_ns += self.cost_ns()
         if published.reading is not None:
             self.judged.append((published.verdict, published.reading))
@@ -435,7 +437,7 @@ def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> N
             Outbox("right", FINGERS, "fake", "ab" * 32, []),
             stop,
             [],
-            Timing(60 * SECOND_NS, rest=rest, selector=BusySelector),
+            LoopTiming(60 * SECOND_NS, rest=rest, selector=BusySelector),
         )
         with closing(loop):
             loop.run()

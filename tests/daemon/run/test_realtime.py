@@ -26,7 +26,7 @@ from daemon.publish.messages import State, Status, Verdict, decode_status, decod
 from daemon.run.realtime import RealtimeMode
 from daemon.run.rehearsal import rehearse
 from daemon.run.runner import rehearse_grasp
-from daemon.scene import Realtime
+from daemon.scene.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.twins.grasps.grasps import Counts, recorded_counts
@@ -36,7 +36,7 @@ from tests.threads import at_work
 WORLD = """
 import ctypes, os, resource, sys
 from daemon.run.realtime import RealtimeMode
-from daemon.scene import Realtime
+from daemon.scene.scene import Realtime
 """
 NOBODY = 65534
 STATUS = Path(__file__).parents[1] / "publish" / "golden" / "status.json"
