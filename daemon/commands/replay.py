@@ -20,7 +20,7 @@ from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.process.text import complain
 from daemon.publish.companion import Companion
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets
 from daemon.run.demo import PUBLISHED, Demo
 from daemon.run.loop import Loop, LoopTiming

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from daemon.process.signals import StopSignal
 from daemon.process.text import complain
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.run.runner import Runner
 from daemon.scene import SceneError
 from drivers.base import DriverError, LinkCause, LinkError, RecordingError

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from daemon.publish.companion import Companion, PublishedVerdict, Requests
-from daemon.publish.door import Admission, Door, Listener, PublishError
+from daemon.publish.door import Admission, Door
+from daemon.publish.listener import Listener, PublishError
 from daemon.publish.messages import Status
 from daemon.scene import Scene, SceneError
 from daemon.scene.scene import Curve
@@ -69,9 +70,9 @@ class Sockets(Companion):
     def _listen(self, wanted: Scene) -> None:
         publish = wanted.publish
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
-        self._publish = Listener.of(wanted.endpoint, mode, publish.group)
+        self._publish = Listener(wanted.endpoint, mode, publish.group)
         if wanted.ask_endpoint is not None:
-            self._ask = Listener.of(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            self._ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
             from daemon.publish.questions import Questions  # only where peers may ask
 
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))

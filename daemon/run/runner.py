@@ -13,7 +13,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.process.signals import StopSignal
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets, plan
 from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.run.reload import Reload

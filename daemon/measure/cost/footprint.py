@@ -107,7 +107,7 @@ def main(arguments: list[str]) -> int:
     from pathlib import Path
 
     from daemon.process.text import complain
-    from daemon.publish.door import PublishError
+    from daemon.publish.listener import PublishError
     from daemon.scene import SceneError
     from drivers.base import DriverError
     from models.contract import ModelError

@@ -15,7 +15,8 @@ import pytest
 import zmq
 
 from daemon.process.signals import StopSignal
-from daemon.publish.door import QUESTIONS_MAX, Door, Listener, Message, PublishError
+from daemon.publish.door import QUESTIONS_MAX, Door, Message
+from daemon.publish.listener import Listener, PublishError
 from tests.daemon.publish.doors import WAIT_MS, Peers, Publisher, first_message
 from tests.ports import free_port
 from tests.threads import at_work
@@ -33,7 +34,7 @@ def peers() -> Iterator[Peers]:
 @pytest.fixture
 def asked(tmp_path: Path) -> Iterator[tuple[Door, str]]:
     """A door with a socket for questions, and its endpoint."""
-    listeners = [Listener.of(f"ipc://{tmp_path}/{name}") for name in ("v", "ask")]
+    listeners = [Listener(f"ipc://{tmp_path}/{name}") for name in ("v", "ask")]
     door = Door(listeners[0], listeners[1])
     yield door, listeners[1].endpoint
     assert door.close()
@@ -174,7 +175,7 @@ def test_a_door_on_a_path_that_is_taken_is_refused(tmp_path: Path) -> None:
 def test_the_socket_file_keeps_its_mode_and_survives_opening_again(
     tmp_path: Path, peers: Peers
 ) -> None:
-    listener = Listener.of(f"ipc://{tmp_path}/v", 0o640)
+    listener = Listener(f"ipc://{tmp_path}/v", 0o640)
     for _ in range(2):
         door = Door(listener)
         subscriber = peers.subscribe(listener.endpoint)

@@ -19,6 +19,7 @@ from zmq.auth.thread import ThreadAuthenticator
 from daemon import scene
 from daemon.publish import door as doors
 from daemon.publish.keys import KeysError, load_clients, load_own, load_pair, make
+from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets
 from daemon.scene import SceneError
 from drivers.recordings.csv_player import DEMO_TABLE
@@ -495,7 +496,7 @@ def test_peers_that_cannot_be_disconnected_end_the_daemon(
     (door.clients / "friend.key").unlink()
     close = doors.Door.close
     monkeypatch.setattr(doors.Door, "close", lambda self: close(self) and False)
-    with pytest.raises(doors.PublishError, match="cannot disconnect"):
+    with pytest.raises(PublishError, match="cannot disconnect"):
         door.sockets.check_keys()
 
 
@@ -504,6 +505,6 @@ def test_an_authenticator_that_has_ended_ends_the_daemon(
 ) -> None:
     with monkeypatch.context() as patched:
         patched.setattr(ThreadAuthenticator, "is_alive", lambda _self: False)
-        with pytest.raises(doors.PublishError, match="authenticator has ended"):
+        with pytest.raises(PublishError, match="authenticator has ended"):
             door.sockets.on_status(STATUS)
     door.sockets.on_status(STATUS)

@@ -22,7 +22,7 @@ from daemon.judge.network import Opinion
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Moment
 from daemon.publish.companion import PublishedVerdict
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.publish.messages import decode_status, decode_verdict
 from daemon.publish.sockets import Sockets, plan
 from daemon.trust.lift_book import GraspId, LiftBook
