@@ -192,13 +192,12 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     wanted = _scene(args, recorded)
     parts = _parts(args, wanted, assembly.load_model(wanted), recorded)
     wanted, model, pipeline = parts.scene, parts.model, parts.pipeline
-    prompt = args.speed is not None
     shown: Printer | Demo
     if is_demo and not (args.json or args.verbose) and model.contract.fingers == FINGERS:
-        shown = Demo(TactileModel(zoo.find(PUBLISHED)), prompt=prompt)
+        shown = Demo(TactileModel(zoo.find(PUBLISHED)))
         told: list[Companion] = [shown]
     else:
-        shown = Printer(as_json=args.json, prompt=prompt)
+        shown = Printer(as_json=args.json)
         shown.result.trained_on = [] if recorded else trained_on(args.recordings, model)
         told = [shown, *_comparisons(args, wanted, pipeline, recorded, shown.result)]
     controller = Controller(only_lifted=args.only_lifted)

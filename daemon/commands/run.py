@@ -102,4 +102,4 @@ def _manager(stack: ExitStack) -> Systemd | None:
 def _printer() -> Printer:
     from daemon.run.printer import Printer
 
-    return Printer(as_json=False, prompt=True)
+    return Printer(as_json=False)
