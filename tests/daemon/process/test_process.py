@@ -46,7 +46,7 @@ sys.meta_path.insert(0, Finder)
 
 @pytest.mark.parametrize(
     "module",
-    ["daemon.cli", "daemon.commands.replay", "pydantic", "numpy", "onnxruntime", "msgspec"],
+    ["daemon.cli", "pydantic", "onnxruntime"],
 )
 def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
     result = python(AT_IMPORT.format(module=module), "replay")
@@ -156,10 +156,8 @@ def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
     assert limits == taken
 
 
-@pytest.mark.parametrize("package", ["torch", "rich"])
+@pytest.mark.parametrize("package", ["rich"])
 def test_a_missing_extra_is_asked_for_from_the_source_and_from_no_index(package: str) -> None:
-    if package == "torch":  # which is looked for after it
-        pytest.importorskip("sklearn", reason="the train extra is not installed")
     code = (
         "import sys, importlib.abc\n"
         "class Absent(importlib.abc.MetaPathFinder):\n"
@@ -192,14 +190,11 @@ def redirected(redirection: str, *arguments: object, **environment: str) -> tupl
 WRITERS = [
     ["replay"],
     ["replay", "--json"],
-    ["replay", "--speed", "100"],
     ["check", DEMO_SCENE],
-    ["check", DEMO_SCENE, "--json"],
     ["run", "--print", DEMO_SCENE],
     ["doctor", DEMO_SCENE, "--listen", "0.1"],
     ["schema"],
     ["models"],
-    ["models", "--json"],
     ["--help"],
     ["--version"],
 ]
