@@ -15,6 +15,7 @@ import pytest
 from daemon.process.text import printable, progress
 from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.processes import GRASPD, TIMEOUT_S, graspd, start, wait_for
+from tests.kit.scenes import demo_scene
 
 ROOT = Path(__file__).parents[3]
 DEMO_SCENE = ROOT / "deploy" / "scenes" / "demo.toml"
@@ -54,11 +55,7 @@ def test_ctrl_c_while_loading_is_130_without_a_word(module: str) -> None:
 
 
 def test_ctrl_c_before_the_drivers_are_there_stops_the_daemon(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-    )
+    scene = demo_scene(tmp_path, "loop = true")
     result = python(AT_IMPORT.format(module="drivers.recordings.faults"), "run", scene)
     assert result.returncode == 0, result.stderr
     assert "Traceback" not in result.stderr
@@ -144,13 +141,9 @@ def test_signals_one_after_the_other_leave_nothing(tmp_path: Path) -> None:
 def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
     tmp_path: Path, allowed: str, taken: tuple[int, int]
 ) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-    )
+    scene = demo_scene(tmp_path, "loop = true")
     with start("run", scene, before=("prlimit", f"--nofile={allowed}")) as process:
-        wait_for(tmp_path / "graspd")
+        wait_for(tmp_path / "v")
         limits = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
         process.terminate()
     assert limits == taken
@@ -209,11 +202,7 @@ def test_an_output_that_cannot_be_written_is_one_line(
     tmp_path: Path, arguments: list[object], redirection: str, why: str
 ) -> None:
     if DEMO_SCENE in arguments:
-        scene = tmp_path / "scene.toml"
-        scene.write_text(
-            f'[tactile]\ndriver = "replay"\nrecordings = ["{DEMO_TABLE}"]\n'
-            f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-        )
+        scene = demo_scene(tmp_path)
         arguments = [scene if word == DEMO_SCENE else word for word in arguments]
     code, _, errors = redirected(redirection, *arguments)
     told = [line for line in errors.splitlines() if not line.startswith("graspd: INFO: ")]
@@ -222,11 +211,7 @@ def test_an_output_that_cannot_be_written_is_one_line(
 
 
 def test_a_daemon_needs_no_output(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f'[tactile]\ndriver = "replay"\npace = "fast"\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\n'
-    )
+    scene = demo_scene(tmp_path, 'pace = "fast"')
     assert redirected(">&- 2>&-", "run", scene) == (0, "", "")
     assert redirected("<&- >&- 2>&-", "run", scene) == (0, "", "")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 from collections.abc import Sequence
 from contextlib import closing
 from typing import Literal
@@ -153,22 +152,6 @@ def test_a_driver_that_gives_up_ends_the_loop_and_no_round(error: DriverError) -
         bench.run()
     assert bench.statuses[-1].state is State.STOPPING
     assert watchdog.fed == 2
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_an_idle_loop(number: signal.Signals) -> None:
-    before = signal.getsignal(number)
-    with StopSignal() as stop:
-        clock = Clock()
-        driver = FakeDriver([], clock)
-        driver.ends = False
-        bench = LoopBench(driver, clock, stop=stop)
-        timer = threading.Timer(0.05, os.kill, (os.getpid(), number))
-        timer.start()
-        bench.run()
-        timer.join()
-        assert stop.received is number
-    assert signal.getsignal(number) is before
 
 
 def test_what_had_come_before_the_signal_is_still_judged() -> None:
