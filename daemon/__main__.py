@@ -13,7 +13,7 @@ INTERRUPTED = 130
 
 
 def main() -> int:
-    """Run the command line; 130 without a word if SIGINT comes where no command waits for it."""
+    """Run the command line; return 130 if SIGINT comes where no command waits for it."""
     heeded = signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
     try:
         if heeded:
@@ -29,26 +29,25 @@ def main() -> int:
 
 
 def _run(heeded: bool) -> int:
-    from daemon.process.start import prepare
+    from daemon.process import set_up_libraries
 
-    prepare()
+    set_up_libraries()
     from daemon.cli import parse
 
     command = parse()
-    gc.freeze()
-    gc.enable()
+    gc.freeze()  # a search through all modules would stop the loop for 30 ms
     if heeded:
         signal.signal(signal.SIGINT, _interrupt_once)
     return command()
 
 
 def _leave_at_once(_number: int, _frame: FrameType | None) -> None:
-    """While modules load, some of which turn the exception into another. Nothing is open yet."""
+    """End the process. Modules that load may turn an exception into another; none is open yet."""
     os._exit(INTERRUPTED)
 
 
 def _interrupt_once(_number: int, _frame: FrameType | None) -> None:
-    """Let the command clean up. Asked again, the process goes quietly, with 130 for a shell too."""
+    """Let the command clean up. The next SIGINT ends the process."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     raise KeyboardInterrupt
 

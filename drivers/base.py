@@ -286,19 +286,20 @@ class DriverError(Exception):
 class LinkError(DriverError):
     """The device does not answer or went away: try again later."""
 
-    def __init__(self, cause: LinkCause, text: str) -> None:
-        """`cause` is for programs, `text` for people."""
+    def __init__(self, cause: LinkCause, text: str, endpoint: str | None = None) -> None:
+        """`cause` and `endpoint`, if the link has one, are for programs, `text` for people."""
         super().__init__(text)
         self.cause = cause
+        self.endpoint = endpoint
 
     @classmethod
-    def from_errno(cls, error: BaseException, text: str) -> LinkError:
+    def from_errno(cls, error: BaseException, text: str, endpoint: str | None = None) -> LinkError:
         """Take the cause from the `errno` of `error`, or of the errors that led to it."""
         reason: BaseException | None = error
         while reason is not None:
             cause = _CAUSES.get(getattr(reason, "errno", None))
             if cause is not None:
-                return cls(cause, text)
+                return cls(cause, text, endpoint)
             reason = reason.__cause__ or reason.__context__
         return cls(LinkCause.UNKNOWN, text)
 

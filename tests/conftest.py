@@ -37,7 +37,6 @@ BEGUN_FIRST = (
     "stability/test_models.py",
     "daemon/measure/test_report.py",
     "daemon/doctor/test_healthy.py",
-    "daemon/run/test_realtime.py",
     "daemon/judge/test_only_stable_if.py",
     "daemon/judge/test_grasps_to_the_lift.py",
     "daemon/commands/test_replay_command.py",

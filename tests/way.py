@@ -26,7 +26,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.publish.sockets import Sockets
-from daemon.run.loop import Loop, Timing
+from daemon.run.loop import Loop, LoopTiming
 from tests.conftest import ROOT
 from tests.daemon.processes import start, wait_for
 
@@ -116,7 +116,7 @@ def walk() -> Walk:
         around.open_drivers()
         recorded = Walk(time.monotonic() + SECONDS_MAX)
         stack.callback(os.close, recorded.event)
-        timing = Timing(wanted.max_age_ns)
+        timing = LoopTiming(wanted.max_age_ns)
         outbox = around.build_outbox()
         loop = Loop(parts.drivers, parts.pipeline, outbox, recorded, around.companions, timing)
         context = stack.enter_context(zmq.Context())

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from daemon.judge.decision import ContactLimits, GateLimits, HandLimits, JointLimits, Limits
 from daemon.judge.pipeline import Pipeline
 from daemon.process.extras import needs
-from daemon.scene import GateMode, Scene, SceneError
+from daemon.scene import Scene, SceneError
 from daemon.scene.drivers import (
     CanTactile,
     PalmJoints,
@@ -22,6 +22,7 @@ from daemon.scene.drivers import (
     SpiTactile,
     StreamJoints,
 )
+from daemon.scene.scene import GateMode
 from daemon.trust.risk import RiskLimits
 from daemon.trust.trust import Trust
 from drivers.base import Driver, DriverError, LinkError
@@ -43,10 +44,9 @@ Clock = Callable[[], int]
 
 
 def model_path(scene: Scene) -> Path:
-    """File of the scene's model.
+    """Return the file of the scene's model, in its form for the hand's fingers if there is one.
 
-    `model.name` is any name of the zoo or of an added model; where the zoo has that model in a
-    form for the hand's fingers alone, it is that form. Raises `ModelError` if there is none.
+    Raises `ModelError`.
     """
     if scene.model.path is not None:
         return scene.model.path
@@ -55,7 +55,7 @@ def model_path(scene: Scene) -> Path:
 
 
 def load_model(scene: Scene) -> TactileModel:
-    """The scene's model, warm. Raises `ModelError`."""
+    """Load the scene's model, and run it once. Raises `ModelError`."""
     return trial.load(model_path(scene))
 
 
@@ -66,7 +66,7 @@ def build_pipeline(
     *,
     learns: bool = True,
 ) -> Pipeline:
-    """The judge of this scene, whose session `learns` from the grasps or stays what it is.
+    """Build the judge of this scene, whose session `learns` from its grasps or does not change.
 
     Raises `ModelError` if the model does not fit the hand, `SceneError` or `RecordingError` if
     recordings do not say whether they are grasps or streams.
@@ -90,7 +90,7 @@ def build_pipeline(
 
 
 def _trust(scene: Scene, model: TactileModel) -> Trust | None:
-    """What learns from outcomes and keeps the risk; None if the scene wants neither."""
+    """Build what learns from outcomes and keeps the risk; None if the scene wants neither."""
     risk, given = scene.risk, model.contract.input
     if risk is None and not scene.learn.enabled:
         return None
@@ -100,7 +100,7 @@ def _trust(scene: Scene, model: TactileModel) -> Trust | None:
 
 
 def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
-    """Raise `ModelError` saying what to write, if the model is not for the hand's fingers."""
+    """Raise `ModelError` with what to write if the model is not for the hand's fingers."""
     wanted, hand = model.contract.fingers, scene.hand.fingers
     if hand == wanted:
         return
@@ -117,7 +117,7 @@ def _refuse_other_fingers(scene: Scene, model: TactileModel) -> None:
 
 
 def _and_sensors(scene: Scene) -> str:
-    """How sensors keep their places where the order of the hand's fingers is that of the wires."""
+    """Advise `tactile.sensors` if the sensors are wired in the order of the hand's fingers."""
     match scene.tactile:
         case SpiTactile(sensors=None) | CanTactile(sensors=None, format="syntouch"):
             return f" and tactile.sensors = {json.dumps(scene.hand.fingers)}, as they are wired"
@@ -126,7 +126,8 @@ def _and_sensors(scene: Scene) -> str:
 
 
 def gate_mode(scene: Scene) -> GateMode:
-    """When the scene has grasps judged. Raises `SceneError` or `RecordingError`."""
+    """Return the gate's mode, by the recordings unless given. Raises `SceneError` or
+    `RecordingError`."""
     if scene.gate.mode is not None:
         return scene.gate.mode
     if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):
@@ -138,7 +139,7 @@ def gate_mode(scene: Scene) -> GateMode:
 
 
 def hand_limits(scene: Scene) -> HandLimits | None:
-    """What must hold before a grasp is judged; None with mode `every`: each reading is one."""
+    """Return the limits of the gate; None with mode `every`, where each reading is a grasp."""
     mode, gate = gate_mode(scene), scene.gate
     if mode == "every":
         if gate.sweeps == 3:
@@ -167,11 +168,11 @@ def _columns(scene: Scene, options: ReplayTactile) -> list[Columns]:
 
 
 def is_mcap(options: ReplayTactile) -> bool:
-    """Whether graspd itself recorded what is replayed. Raises `SceneError` if only some of it."""
-    found = {path.suffix == MCAP for path in options.recordings}
-    if len(found) > 1:
+    """Return True for recordings of graspd. Raises `SceneError` if some are CSV files."""
+    kinds = {path.suffix == MCAP for path in options.recordings}
+    if len(kinds) > 1:
         raise SceneError("tactile.recordings: both CSV and MCAP files")
-    return True in found
+    return True in kinds
 
 
 def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
@@ -183,7 +184,7 @@ def _has_joints(scene: Scene, options: ReplayTactile) -> bool:
 
 
 def joint_limits(scene: Scene) -> JointLimits | None:
-    """None if the scene has no joints, not even in its recordings."""
+    """Return the limits of the joints; None without joints, in the recordings too."""
     tactile = scene.tactile
     recorded = isinstance(tactile, ReplayTactile) and _has_joints(scene, tactile)
     if scene.joints is None and not recorded:
@@ -194,7 +195,7 @@ def joint_limits(scene: Scene) -> JointLimits | None:
 
 
 def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver]:
-    """The drivers of this scene, not yet open, the tactile one first.
+    """Make the drivers of this scene, not yet open, the tactile one first.
 
     Raises `SceneError` naming the section where values do not fit the driver or each other.
     """
@@ -210,11 +211,7 @@ def build_drivers(scene: Scene, clock: Clock = time.monotonic_ns) -> list[Driver
 
 
 def open_driver(driver: Driver) -> None:
-    """Open a driver.
-
-    Raises `LinkError` where a later try may succeed, and `SceneError` where none can: a recording
-    or calibration with mistakes, a device of a kind that there is not.
-    """
+    """Open a driver. Raises `LinkError` if a later try may succeed, `SceneError` if none can."""
     try:
         driver.open()
     except LinkError:

@@ -1,4 +1,4 @@
-"""How the parts of a scene go together: once, for running, for replaying and for what they cost."""
+"""Puts the parts of a scene together, to run it, to replay and to measure its cost."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ log = logging.getLogger("graspd")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parts:
-    """What reads and judges in a scene, nothing of it open yet."""
+    """Drivers and judge of a scene, not open yet."""
 
     scene: Scene
     model: TactileModel
@@ -36,11 +36,11 @@ class Parts:
     drivers: list[Driver]
     """The tactile one first."""
     boot_id: str | None = None
-    """Of the start that judged what is played; None for grasps of this start."""
+    """Start of the daemon that judged the recording; None for grasps of this start."""
 
     @classmethod
     def of(cls, scene: Scene, model: TactileModel) -> Parts:
-        """Those of a scene and its model. Raises `SceneError`, `ModelError` or `RecordingError`."""
+        """Make the parts. Raises `SceneError`, `ModelError` or `RecordingError`."""
         pipeline = assembly.build_pipeline(scene, model, learns=scene.session.learn)
         return cls(scene, model, pipeline, assembly.build_drivers(scene))
 
@@ -65,15 +65,12 @@ class Assembly:
         self._tap: Tap | None = None
 
     def add_sockets(self, sockets: Sockets) -> None:
-        """Send messages to `sockets`, which whoever opened them closes."""
+        """Send messages to `sockets`. The caller closes them."""
         self._outputs.append(sockets)
         self.companions.append(sockets)
 
     def open_drivers(self) -> None:
-        """Open the drivers, keeping all that comes over the link if the scene wants that recorded.
-
-        Raises `LinkError` where a later try may succeed, and `SceneError` where none can.
-        """
+        """Open the drivers, with a tap on a link that is recorded. Raises as `open_driver`."""
         record, drivers = self._parts.scene.record, self._parts.drivers
         if record is not None and record.raw:
             from daemon.record.link_log import tap_of
@@ -84,10 +81,9 @@ class Assembly:
             assembly.open_driver(driver)
 
     def keep_session(self) -> bool:
-        """Have the judge forget sensors that were exchanged. Restore and keep the session and what
-        outcomes teach, if model and scene want that and there is a place for it.
+        """Watch for exchanged sensors; restore and keep session and outcomes if the scene wants it.
 
-        The file is saved for the last time when the stack closes. False if there is none.
+        The file is saved for the last time when the stack closes. Return False without a file.
         """
         scene, pipeline = self._parts.scene, self._parts.pipeline
         file = self._session_file()
@@ -112,7 +108,7 @@ class Assembly:
         return True
 
     def _session_file(self) -> SessionFile | None:
-        """The file of the session, taken; None if none is to be kept or it cannot be."""
+        """Take the file of the session; return None if none is kept or it cannot be had."""
         scene, pipeline = self._parts.scene, self._parts.pipeline
         if (pipeline.session is None and pipeline.trust is None) or not scene.keeps_session:
             return None
@@ -125,10 +121,7 @@ class Assembly:
             return None
 
     def record(self) -> None:
-        """Record, if the scene wants that; the session is by now what it is at the start.
-
-        Raises `SceneError` without the packages that recording needs.
-        """
+        """Record if the scene wants it; call this after `keep_session`. Raises `SceneError`."""
         parts = self._parts
         if parts.scene.record is None:
             return
@@ -143,7 +136,7 @@ class Assembly:
             self.companions.append(recorder)
 
     def build_outbox(self) -> Outbox:
-        """What sends the messages of this run to sockets and recorder, as far as there are."""
+        """Make what sends the messages of this run to sockets and recorder."""
         hand, model = self._parts.scene.hand, self._parts.model
         return Outbox(
             hand.name,

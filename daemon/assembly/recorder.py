@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 def build_recorder(
     wanted: Scene, model: TactileModel, pipeline: Pipeline, boot_id: str, tap: Tap | None = None
 ) -> Recorder | None:
-    """The recorder of a scene, started; None if the scene does not record.
+    """Start the recorder of a scene; return None if the scene does not record.
 
-    Call it when `pipeline` has the session that it starts with. `tap` gives what comes over the
-    link, if that is recorded. Raises `SceneError` without the package `mcap`.
+    `pipeline` has the session that it starts with by now. `tap` is on the link, if that is
+    recorded. Raises `SceneError` without the package `mcap`.
     """
     directory = wanted.record_directory
     if wanted.record is None or directory is None:
@@ -57,7 +57,7 @@ def build_recorder(
 
 
 def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHeader:
-    """The header of the run's files: fingers, scene and model, not yet what is known."""
+    """Make the header of the run's files, without the state of judge and session."""
     network = wanted.model.model_dump(mode="json", exclude_none=True)
     if wanted.model.path is not None:
         network["path"] = str(wanted.model.path.absolute())
@@ -84,10 +84,9 @@ def header_of(wanted: Scene, model: TactileModel, boot_id: str) -> RecordingHead
 
 
 def header_now(pipeline: Pipeline, header: RecordingHeader) -> Callable[[], RecordingHeader]:
-    """Copy the state of judge and session, in some 0.1 ms; calling the result gives the header with
-    it.
+    """Copy the state of judge and session, in 0.1 ms; return what makes the header with it.
 
-    Encoding takes longer, and may be done in another thread.
+    Another thread may call that: encoding takes longer.
     """
     judge, session, axis_ns = remember(pipeline), pipeline.session, pipeline.axis_ns
     state = None if session is None else session.state()

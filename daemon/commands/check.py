@@ -16,6 +16,7 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.process.text import Colour, coloured, complain, printable, progress
 from daemon.scene import drivers as scene_drivers
+from daemon.scene.scene import Realtime, Record, RiskSection
 from drivers.base import DriverError
 from drivers.udp.receiver import SCHEME, Endpoint
 from models.contract import Finger, ModelError, SessionInput
@@ -219,13 +220,13 @@ def _what_is_in(
     return parts
 
 
-def _record(wanted: scene.Record) -> str:
+def _record(wanted: Record) -> str:
     where = wanted.directory or "/var/lib/graspd/record"
     raw = ", and what came over the link" if wanted.raw else ""
     return f"in {where}, at most {wanted.keep_mb:g} MB, flushed every {wanted.flush_ms:g} ms{raw}"
 
 
-def _realtime(wanted: scene.Realtime) -> str:
+def _realtime(wanted: Realtime) -> str:
     priority = "" if wanted.priority is None else f"SCHED_FIFO {wanted.priority}, "
     cpus = "all processors" if wanted.cpus is None else f"processors {wanted.cpus}"
     memory = ", memory locked" if wanted.lock_memory else ""
@@ -272,7 +273,7 @@ def _rejects(wanted: scene.Scene) -> str:
     return f", unknown below a confidence of {confidence:.2f}" if confidence > COIN else ""
 
 
-def _risk(wanted: scene.Risk) -> str:
+def _risk(wanted: RiskSection) -> str:
     return (
         f"{100 * wanted.max_slip_when_stable:g} % of the lifts of `stable` verdicts may slip; "
         f"the first {wanted.warm_up} lifts supervised, then {100 * wanted.explore:g} % of those "

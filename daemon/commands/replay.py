@@ -20,15 +20,16 @@ from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.process.text import complain
 from daemon.publish.companion import Companion
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets
 from daemon.run.demo import PUBLISHED, Demo
-from daemon.run.loop import Loop, Timing
+from daemon.run.loop import Loop, LoopTiming
 from daemon.run.printer import Printer
 from daemon.run.replaying import Comparison, Controller, trained_on
-from daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, Summary
+from daemon.run.summary import WITHOUT_LEARNING, WITHOUT_SESSION, RunSummary
 from daemon.scene import Scene, SceneError
 from daemon.scene.endpoints import check_endpoint, is_private
+from daemon.scene.scene import Hand
 from daemon.session.file import SessionFileError, load, statistics_of
 from drivers.base import DriverError, RecordingError
 from drivers.recordings.csv_columns import SLIPPED
@@ -191,13 +192,12 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
     wanted = _scene(args, recorded)
     parts = _parts(args, wanted, assembly.load_model(wanted), recorded)
     wanted, model, pipeline = parts.scene, parts.model, parts.pipeline
-    prompt = args.speed is not None
     shown: Printer | Demo
     if is_demo and not (args.json or args.verbose) and model.contract.fingers == FINGERS:
-        shown = Demo(TactileModel(zoo.find(PUBLISHED)), prompt=prompt)
+        shown = Demo(TactileModel(zoo.find(PUBLISHED)))
         told: list[Companion] = [shown]
     else:
-        shown = Printer(as_json=args.json, prompt=prompt)
+        shown = Printer(as_json=args.json)
         shown.result.trained_on = [] if recorded else trained_on(args.recordings, model)
         told = [shown, *_comparisons(args, wanted, pipeline, recorded, shown.result)]
     controller = Controller(only_lifted=args.only_lifted)
@@ -205,7 +205,7 @@ def _replay(args: argparse.Namespace, stop: StopSignal) -> int:
         told.append(controller)
     if recorded is not None:
         recorded.tell(shown)
-    timing = Timing(
+    timing = LoopTiming(
         wanted.max_age_ns if recorded is None else NO_SILENCE_NS,
         sleep=Sleep(boot_clock=time.monotonic_ns),  # a recording is as old after it as before
     )
@@ -248,7 +248,7 @@ def _comparisons(
     wanted: Scene,
     pipeline: Pipeline,
     recorded: Recorded | None,
-    result: Summary,
+    result: RunSummary,
 ) -> Iterator[Companion]:
     """What judges the same grasps without a session, and without what outcomes teach."""
     # What they judge is what the other one judged: they have no joints to know the moment by.
@@ -306,7 +306,7 @@ def _parts(
     Raises `SessionFileError` if that is no session of this hand.
     """
     if recorded is None:
-        wanted = wanted.model_copy(update={"hand": scene.Hand(fingers=model.contract.fingers)})
+        wanted = wanted.model_copy(update={"hand": Hand(fingers=model.contract.fingers)})
         _need_labels(args, wanted)
         parts = Parts.of(wanted, model)
     else:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import faulthandler
 import os
-import re
 import resource
 import sys
 from contextlib import ExitStack
@@ -16,10 +14,10 @@ from typing import TYPE_CHECKING
 
 from daemon.process.signals import StopSignal
 from daemon.process.text import complain
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.run.runner import Runner
 from daemon.scene import SceneError
-from drivers.base import DriverError, RecordingError
+from drivers.base import DriverError, LinkCause, LinkError, RecordingError
 from models.contract import ModelError
 
 if TYPE_CHECKING:
@@ -51,20 +49,26 @@ def run(args: argparse.Namespace) -> int:
     except (SceneError, ModelError, RecordingError) as error:
         complain(error)
         return 2
-    except (PublishError, DriverError) as error:
-        complain(f"{error}{_held_by(str(error))}")
+    except PublishError as error:
+        complain(f"{error}{_held_by(error.taken)}")
+        return 1
+    except DriverError as error:
+        taken = None
+        if isinstance(error, LinkError) and error.cause is LinkCause.IN_USE:
+            taken = error.endpoint
+        complain(f"{error}{_held_by(taken)}")
         return 1
     return 0
 
 
-def _held_by(said: str) -> str:
-    """Who has the port that cannot be had, as far as that is what was said and may be known."""
-    address = re.search(r"\b(tcp|udp)://\S*:(\d+)", said)
-    if address is None or os.strerror(errno.EADDRINUSE) not in said:
+def _held_by(endpoint: str | None) -> str:
+    """Name the processes that hold a port, if there is one and /proc can be read."""
+    if endpoint is None:
         return ""
     from daemon.doctor.computer import port_holders
 
-    holders = port_holders(address[1], int(address[2]))
+    scheme, _, address = endpoint.partition("://")
+    holders = port_holders(scheme, int(address.rpartition(":")[2]))
     return f": {'; '.join(map(str, holders))}" if holders else ""
 
 
@@ -98,4 +102,4 @@ def _manager(stack: ExitStack) -> Systemd | None:
 def _printer() -> Printer:
     from daemon.run.printer import Printer
 
-    return Printer(as_json=False, prompt=True)
+    return Printer(as_json=False)

@@ -10,10 +10,10 @@ from pathlib import Path
 
 
 def read_regular(path: Path, max_bytes: int) -> bytes:
-    """The content of a regular file of at most `max_bytes` bytes; never waits for a pipe's writer.
+    """Return the content of a regular file; never wait for a pipe's writer.
 
-    Raises `OSError`, with a reason in `strerror`, for what cannot be read, is longer, or is no
-    regular file.
+    Raises `OSError`, with a reason in `strerror`, if it cannot be read, has more than `max_bytes`
+    bytes, or is no regular file.
     """
     if not stat.S_ISREG(path.stat().st_mode):
         raise OSError(errno.EINVAL, "not a regular file")
@@ -29,9 +29,8 @@ def write_atomically(
 ) -> None:
     """Put `content` at `path` in one step, in place of what is there; `mode` as in chmod(2).
 
-    Whoever looks, also after a power cut, sees the former file or the whole new one. Raises
-    `OSError` and leaves the former then. What is there is kept at `former` if that is given: at
-    every moment one of the two is there, and whole.
+    A reader sees the former file or the whole new one, also after a power cut. The former file is
+    kept at `former`, if that is given. Raises `OSError`, and leaves the former file in place.
     """
     part = path.with_name(f"{path.name}.{os.urandom(4).hex()}")
     handle = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)

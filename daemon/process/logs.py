@@ -14,11 +14,11 @@ SYSLOG_LEVELS = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 JOURNAL_ERROR = "<3>"
 """What a line of an error begins with in the journal."""
 BURST = 10
-"""Messages of one kind that may come ..."""
+"""Messages of one kind in a window. A fault that repeats must not fill the journal of a robot."""
 WINDOW_S = 60.0
-"""... within so long, s. A fault that repeats must not fill the journal of a robot."""
+"""Length of a window, s."""
 KINDS_MAX = 200
-"""Kinds of messages that are told apart; there are fewer in the code."""
+"""Kinds of messages that are told apart; the code has fewer."""
 
 
 def set_up(environment: Mapping[str, str]) -> None:
@@ -32,7 +32,7 @@ def set_up(environment: Mapping[str, str]) -> None:
 
 
 def is_journal(environment: Mapping[str, str]) -> bool:
-    """Whether stderr is the stream that systemd has connected to the journal (systemd.exec(5))."""
+    """Return True if stderr is systemd's stream to the journal (systemd.exec(5))."""
     try:
         there = os.fstat(2)
     except OSError:

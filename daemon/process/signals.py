@@ -10,25 +10,25 @@ from typing import Any, Protocol, Self
 
 STOPPING = (signal.SIGINT, signal.SIGTERM)
 WAKEUPS_MAX = 4096
-"""Bytes that a look takes out of the pipe: more signals than ever come between two."""
+"""Bytes that `take_reload` takes out of the pipe at once: one a signal."""
 
 
-class Stop(Protocol):
-    """What the loop looks at to know when to end."""
+class StopRequest(Protocol):
+    """Tells the loop when to end."""
 
     @property
     def received(self) -> signal.Signals | None:
-        """The signal by which the process is asked to stop; None before it."""
+        """Signal that stops the process; None before it."""
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when a signal arrives."""
+        """Return a descriptor that becomes readable when a signal arrives."""
 
     def take_reload(self) -> bool:
-        """Whether a reload is due since the last look."""
+        """Return True if a reload became due since the last call."""
 
 
 class StopSignal:
-    """Becomes set, and its descriptor readable, when the process is asked to stop."""
+    """Keeps the signal that stops the process, and makes a descriptor readable."""
 
     def __init__(self, *, reloads: bool = False) -> None:
         """With `reloads`, SIGHUP asks for a reload; else it does what it did before."""
@@ -40,11 +40,11 @@ class StopSignal:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def fileno(self) -> int:
-        """Descriptor that becomes readable when a signal arrives."""
+        """Return a descriptor that becomes readable when a signal arrives."""
         return self._read
 
     def take_reload(self) -> bool:
-        """Whether a reload was asked for since the last look."""
+        """Return True if SIGHUP came since the last call."""
         if not self._reload:
             return False
         self._reload = False
@@ -53,7 +53,7 @@ class StopSignal:
         return True
 
     def __enter__(self) -> Self:
-        """Take over the signals; only the main thread can."""
+        """Take over the signals. Only the main thread can."""
         self._former_wakeup = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         self._former = {number: signal.signal(number, self._handle) for number in self._signals}
         return self

@@ -1,5 +1,4 @@
-"""Whether the computer has slept: the monotonic clock stands still then, and what is old looks
-fresh afterwards."""
+"""Sleep of the computer: the monotonic clock stands still then, and old readings look fresh."""
 
 from __future__ import annotations
 
@@ -8,19 +7,17 @@ from collections.abc import Callable
 from functools import partial
 
 SLEPT_NS = 50_000_000
-"""By which the clocks must move apart, ns: a sleep takes seconds, the scheduler a moment between
-two looks at the clocks."""
-
+"""Least difference of the clocks that is a sleep, ns. A sleep takes seconds; the scheduler comes
+between two looks at the clocks for less."""
 LOOKS = 3
-"""At the start, so that one of them is not interrupted."""
-
+"""Looks at the clocks at the start, so that the scheduler interrupts at most some of them."""
 
 boottime_ns = partial(time.clock_gettime_ns, time.CLOCK_BOOTTIME)
-"""ns since the computer was started, those that it slept included (clock_gettime(2))."""
+"""Time since the computer was started, ns, with that of its sleep (clock_gettime(2))."""
 
 
 class Sleep:
-    """Tells whether the computer has slept since this object was made."""
+    """Notices that the computer has slept since this object was made."""
 
     def __init__(
         self,
@@ -30,9 +27,9 @@ class Sleep:
         """Both give ns; only `boot_clock` goes on in a sleep."""
         self._clock = clock
         self._boot_clock = boot_clock
-        # In this order a look that the scheduler interrupts takes no sleep for granted.
+        # In this order a look that the scheduler interrupts makes no sleep.
         self._slept_from_ns = SLEPT_NS + max(boot_clock() - clock() for _ in range(LOOKS))
 
     def has_slept(self) -> bool:
-        """True once the computer has slept. Takes a microsecond."""
+        """Return True once the computer has slept. Takes a microsecond."""
         return self._boot_clock() - self._clock() > self._slept_from_ns

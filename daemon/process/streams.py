@@ -17,9 +17,9 @@ FAILED = 1
 def guarded(command: Callable[[], int]) -> int:
     """Run a command whose standard output may fail, and return its exit code.
 
-    0 if whoever read the output has gone, as in `graspd replay | head`: nothing is wrong. 1 and
-    one line on stderr if it cannot be written. A failure of anything else is not touched. What
-    the output's encoding lacks is written as an escape sequence.
+    0 if the reader of the output has gone, as in `graspd replay | head`. 1 and one line on stderr
+    if it cannot be written. Other errors pass. Characters that the output's encoding lacks are
+    written as escape sequences.
     """
     raw = _take_over()
     try:

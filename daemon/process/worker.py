@@ -10,14 +10,13 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from queue import SimpleQueue
-from typing import ClassVar, Final, Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 R = TypeVar("R")
 
 SWITCH_S: Final = 0.0005
-"""Python's switch interval while a worker has a thread, s: how long that thread may keep the loop
+"""Python's switch interval from the first job on, s: how long a worker's thread may keep the loop
 waiting for the interpreter. The default is ten times as long."""
-ORDINARY_SWITCH_S: Final = sys.getswitchinterval()
 PROCESSORS: Final = frozenset(os.sched_getaffinity(0))
 """Processors of the process at its start, before realtime mode pins the loop to some of them."""
 
@@ -29,9 +28,6 @@ class Worker(Generic[R]):
 
     The thread starts with the first job. All methods are for the loop's thread.
     """
-
-    _with_thread: ClassVar[int] = 0
-    """Workers that have a thread."""
 
     def __init__(self, name: str) -> None:
         """`name` is that of the thread."""
@@ -81,9 +77,6 @@ class Worker(Generic[R]):
         self._jobs.put(None)
         thread.join(wait_s if self.busy else None)
         self.busy = False
-        Worker._with_thread -= 1
-        if not Worker._with_thread:
-            sys.setswitchinterval(ORDINARY_SWITCH_S)
         return not thread.is_alive()
 
     def _start_thread(self) -> bool:
@@ -100,7 +93,6 @@ class Worker(Generic[R]):
                 os.close(self._ended)
             return False
         self._thread = thread
-        Worker._with_thread += 1
         sys.setswitchinterval(SWITCH_S)
         return True
 

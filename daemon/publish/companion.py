@@ -35,7 +35,7 @@ class LoopEvent(Enum):
     """Readings before the next one were skipped, because they came too fast."""
 
 
-class Published(NamedTuple):
+class PublishedVerdict(NamedTuple):
     """A verdict that was published."""
 
     judgement: Judgement
@@ -89,7 +89,7 @@ class Companion:
     def on_event(self, event: LoopEvent) -> None:
         """Something has happened before the next reading."""
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """A verdict was published."""
 
     def on_outcome(self, report: Report) -> None:

@@ -9,6 +9,7 @@ pass until the loop has read them.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import threading
@@ -16,17 +17,16 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import zmq
 
-from daemon.publish.socket_file import OccupiedError, SocketFile
+from daemon.publish.listener import Listener, PublishError
 
 if TYPE_CHECKING:
     from zmq.auth.thread import ThreadAuthenticator
 
-    from daemon.process.signals import Stop
+    from daemon.process.signals import StopRequest
 
 log = logging.getLogger("graspd")
 
@@ -60,39 +60,6 @@ SUBSCRIBES_S: Final = 0.1
 """Time from a peer's handshake to its first subscription, s, at most."""
 ZAP_DOMAIN: Final = "graspd"
 """Sent with each question to the authenticator. libzmq asks no question without it (RFC 27)."""
-
-
-class PublishError(Exception):
-    """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Listener:
-    """An endpoint, and the socket file of an `ipc://` one."""
-
-    endpoint: str
-    file: SocketFile | None
-
-    @classmethod
-    def of(cls, endpoint: str, mode: int | None = None, group: str | None = None) -> Listener:
-        """Take the file of an `ipc://` endpoint. Raises `PublishError`."""
-        if not endpoint.startswith("ipc://"):
-            return cls(endpoint, None)
-        path = Path(endpoint.removeprefix("ipc://"))
-        try:
-            return cls(endpoint, SocketFile(path, mode, group))
-        except (OccupiedError, LookupError) as error:
-            raise PublishError(f"cannot publish on {endpoint}: {error}") from None
-        except OSError as error:
-            why = error.strerror or str(error)
-            if isinstance(error, FileNotFoundError) and not path.parent.exists():
-                why = f"there is no folder {path.parent}; `graspd doctor SCENE` says who makes it"
-            raise PublishError(f"cannot publish on {endpoint}: {why}") from error
-
-    def close(self) -> None:
-        """Remove the file."""
-        if self.file is not None:
-            self.file.close()
 
 
 @dataclass(slots=True)
@@ -215,7 +182,7 @@ class Door:
             proxy.start()
 
     def _socket(self, kind: int, sent: int = 1, received: int = 1) -> Socket:
-        """Return a socket that queues at most so many messages a peer in each direction."""
+        """Return a socket that queues at most `sent` and `received` messages of each peer."""
         made = self._context.socket(kind)
         made.linger = 0
         made.sndhwm, made.rcvhwm = sent, received
@@ -254,8 +221,8 @@ class Door:
         made.linger = LINGER_MS
         made.maxmsgsize = MESSAGE_MAX_BYTES
         made.handshake_ivl = HANDSHAKE_MS
-        if listener.file is not None:
-            made.use_fd = os.dup(listener.file.listener.fileno())  # libzmq closes it
+        if listener.socket is not None:
+            made.use_fd = os.dup(listener.socket.fileno())  # libzmq closes it
         else:
             made.ipv6 = "[" in listener.endpoint
             made.heartbeat_ivl = HEARTBEAT_MS
@@ -269,7 +236,10 @@ class Door:
             made.bind(listener.endpoint)
         except zmq.ZMQError as error:
             why = zmq.strerror(error.errno or 0)  # its own text names the endpoint again
-            raise PublishError(f"cannot bind {listener.endpoint}: {why}") from error
+            refusal = PublishError(f"cannot bind {listener.endpoint}: {why}")
+            if error.errno == errno.EADDRINUSE:
+                refusal.taken = listener.endpoint
+            raise refusal from error
 
     def fileno(self) -> int:
         """Return a descriptor that becomes readable when a question comes.
@@ -310,10 +280,10 @@ class Door:
         if self._echo.recv_multipart()[1] == self._unheard:
             self._unheard = b""
 
-    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+    def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
         """Wait until a peer has connected to hear messages.
 
-        False if there is none within `timeout_s` seconds, or when `stop` becomes readable.
+        Return False if none has within `timeout_s` seconds, or when `stop` becomes readable.
         """
         if self._monitor is None:
             raise RuntimeError("the door was not opened to wait")

@@ -1,4 +1,4 @@
-"""CURVE keys (RFC 26): the daemon's own pair, and the public keys of those who may connect."""
+"""CURVE keys (RFC 26): the daemon's own pair, and the public keys of peers that may connect."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 Z85_KEY = re.compile(rb"[0-9A-Za-z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 """A key of 32 bytes as text (RFC 32)."""
 CLIENTS_MAX = 1000
-"""Keys in the folder of those who may connect; more were put there by mistake."""
+"""Most keys of peers; more were put into the folder by mistake."""
 FILE_MAX_BYTES = 1 << 16
 """A key file has half a kilobyte."""
 SERVICE = "graspd"
@@ -28,16 +28,16 @@ LINKS_MAX = 40
 
 
 class KeysError(Exception):
-    """Keys are missing, wrong, or open to others; the message says which file."""
+    """Keys are missing, wrong, or open to other users; the message names the file."""
 
 
 class Clients(NamedTuple):
-    """Those who may connect."""
+    """Peers that may connect."""
 
     admitted: dict[bytes, str]
-    """Their names, by public key, Z85."""
+    """Names of peers, by public key, Z85."""
     refused: list[str]
-    """What is wrong with the other key files, which count for nothing."""
+    """Errors of the other key files, which admit no peer."""
 
 
 def make(folder: Path, name: str) -> tuple[Path, Path]:
@@ -66,10 +66,7 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
 
 
 def load_pair(path: Path) -> tuple[bytes, bytes]:
-    """Public and secret key, Z85, of a `.key_secret` file that nobody else may read.
-
-    Raises `KeysError`.
-    """
+    """Return public and secret key of a file that only its owner reads. Raises `KeysError`."""
     public, secret = _load(path, "the key")
     if secret is None:
         raise KeysError(f"{path}: has no secret key; name the {SECRET} file")
@@ -80,21 +77,18 @@ def load_pair(path: Path) -> tuple[bytes, bytes]:
 
 
 def load_own(path: Path) -> tuple[bytes, bytes]:
-    """Likewise, of the daemon: nobody else may write the file, nor a folder that leads to it."""
+    """Do the same for the daemon's file: only its owner may write it and the folders above."""
     _refuse_open(path)
     return load_pair(path)
 
 
 def load_public(path: Path, what: str = "the key") -> bytes:
-    """Public key, Z85, of a file that holds one; errors call it `what`. Raises `KeysError`."""
+    """Return the public key, Z85, of a file; errors call it `what`. Raises `KeysError`."""
     return _load(path, what)[0]
 
 
 def load_clients(folder: Path) -> Clients:
-    """Those who may connect, by the key files of a folder; a file that is wrong admits nobody.
-
-    Raises `KeysError` for a folder that cannot be read, or that others may write: nobody may.
-    """
+    """Read the key files of a folder. Raises `KeysError` if other users may write it."""
     _refuse_open(folder)
     try:
         paths = sorted(path for path in folder.iterdir() if path.suffix == PUBLIC)
@@ -132,9 +126,9 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
 
 
 def _refuse_open(path: Path) -> None:
-    """Raise `KeysError` if somebody else may write what is at a path, or put another thing there.
+    """Raise `KeysError` if another user may write or replace what is at a path.
 
-    By any folder on the way to it, also by those to which symbolic links lead.
+    Each folder on the way to it is checked, also those to which symbolic links lead.
     """
     at, ahead, links = Path("/"), [*reversed((Path.cwd() / path).parts[1:])], 0
     while True:
@@ -149,7 +143,7 @@ def _refuse_open(path: Path) -> None:
                 at = Path("/") if target.is_absolute() else at.parent
                 ahead += reversed(target.relative_to(target.anchor).parts)
             elif ahead and status.st_mode & stat.S_ISVTX:
-                _refuse_owner(at, status)  # what is in it only its owner may replace
+                _refuse_owner(at, status)  # only owners may replace files in it
             else:
                 _refuse_writers(at, status)
         except OSError as error:
@@ -161,7 +155,7 @@ def _refuse_open(path: Path) -> None:
 
 
 def _refuse_writers(path: Path, status: os.stat_result) -> None:
-    """Raise `KeysError` if others than its owner may write it."""
+    """Raise `KeysError` if users other than its owner may write it."""
     _refuse_owner(path, status)
     mode = stat.S_IMODE(status.st_mode)
     if mode & (stat.S_IWGRP | stat.S_IWOTH):

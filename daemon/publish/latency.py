@@ -1,4 +1,4 @@
-"""How late readings and verdicts are, in constant memory."""
+"""Delays of readings and verdicts, counted in constant memory."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ FLOOR_US = 0.1
 BUCKETS = math.ceil(math.log(1e8 / FLOOR_US) / math.log(STEP)) + 1
 """Enough to reach 100 s."""
 OUTAGE_PERIODS = 10
-"""A gap of this many periods is an outage, which is told as silence, and no jitter."""
+"""A gap of this many periods is an outage, which is reported as silence and is no jitter."""
 
 
 class LatencyHistogram:
-    """Counts durations in buckets of equal ratio, so that a year of readings needs no more room."""
+    """Counts durations in buckets of equal ratio: a year of readings needs no more memory."""
 
     def __init__(self) -> None:
         self.buckets = [0] * BUCKETS
@@ -35,18 +35,18 @@ class LatencyHistogram:
             self.max_us = duration_us
 
     def quantile_us(self, fraction: float) -> float:
-        """Duration, us, that `fraction` of all stay at or below, to 2 %; 0 if there is none."""
-        wanted = math.ceil(fraction * self.count)
-        seen = 0
-        for index, number in enumerate(self.buckets):
-            seen += number
-            if seen >= wanted and number:
+        """Return the duration, us, that `fraction` of all do not exceed, to 2 %; 0 if empty."""
+        rank = math.ceil(fraction * self.count)
+        below = 0
+        for index, durations in enumerate(self.buckets):
+            below += durations
+            if below >= rank and durations:
                 return min(FLOOR_US * STEP ** (index + 1), self.max_us)
         return 0.0
 
 
 class Deadlines:
-    """Counts since start; costs no memory that grows."""
+    """Counts late readings and jitter since the start."""
 
     def __init__(self) -> None:
         self.jitter = LatencyHistogram()

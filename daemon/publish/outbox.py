@@ -1,4 +1,4 @@
-"""Turns judgements into messages, encodes each once and sends it to every output."""
+"""Makes messages of judgements, encodes each once and sends it to every output."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
 
 import onnxruntime
 
@@ -45,7 +45,15 @@ class Output(Protocol):
         """Pass one message on, without blocking."""
 
     def wanted(self, topic: bytes) -> bool:
-        """Whether anybody gets what is sent on a topic."""
+        """Return True if a message of this topic is to be sent now."""
+
+
+class _Head(TypedDict):
+    """Fields that begin each message."""
+
+    boot_id: str
+    seq: int
+    t: float
 
 
 class Outbox:
@@ -68,15 +76,15 @@ class Outbox:
         `clock` gives monotonic ns, `wall_clock` seconds since 1970. `boot_id` is a new one unless
         given.
         """
-        self.latency = LatencyHistogram()
-        self.decisions: Counter[Decision] = Counter()
-        self.reasons: Counter[Reason] = Counter()
+        self._latency = LatencyHistogram()
+        self._decisions: Counter[Decision] = Counter()
+        self._reasons: Counter[Reason] = Counter()
         self._repaired: Counter[str] = Counter()
-        self._verdict_topic = f"verdict.{hand}".encode()
-        self._gate_topic = f"gate.{hand}".encode()
-        self._tactile_topic = f"tactile.{hand}".encode()
+        kinds = "verdict", "gate", "tactile", "outcome", "status"
+        self._topics = {kind: f"{kind}.{hand}".encode() for kind in kinds}
+        self._sent: Counter[str] = Counter()
+        """Messages of each kind."""
         self._fingers = tuple(fingers)
-        self._status_topic = f"status.{hand}".encode()
         self._model = model
         self._model_sha = model_sha256[:SHA_DIGITS]
         self._outputs = tuple(outputs)
@@ -84,12 +92,6 @@ class Outbox:
         self._wall_clock = wall_clock
         self.boot_id = uuid.uuid4().hex if boot_id is None else boot_id
         """Identifies this start of the daemon in all messages."""
-        self._verdict_seq = 0
-        self._gate_seq = 0
-        self._tactile_seq = 0
-        self._status_seq = 0
-        self._outcome_topic = f"outcome.{hand}".encode()
-        self._outcome_seq = 0
         self._versions = {
             "graspd": __version__,
             "onnxruntime": onnxruntime.__version__,
@@ -99,10 +101,10 @@ class Outbox:
     def verdict(
         self, judgement: Judgement, received_ns: int, silence_ns: int
     ) -> tuple[Verdict, bytes]:
-        """Send one verdict, and before it what the gate did; the message, and it encoded.
+        """Send one verdict, and before it the changes of the gate; return it, plain and encoded.
 
-        `received_ns` is when the driver handed the reading over, monotonic; `silence_ns` how long
-        no message may come before the consumer must take the grasp for unknown.
+        `received_ns`: time when the driver handed the reading over, monotonic. `silence_ns`: time
+        without a message after which subscribers take the grasp for unknown.
         """
         moment, worth = judgement.moment, judgement.assessment
         known = judgement.decision is not Decision.UNKNOWN
@@ -111,9 +113,7 @@ class Outbox:
         now_ns = self._clock()
         latency_us = max(now_ns - received_ns, 0) / 1e3
         message = Verdict(
-            boot_id=self.boot_id,
-            seq=self._verdict_seq,
-            t=self._wall_clock(),
+            **self._head("verdict"),
             t_mono_ns=judgement.t_ns,
             grasp=moment.grasp,
             verdict=judgement.decision,
@@ -141,12 +141,11 @@ class Outbox:
             motion_limits=moment.motion_limits,
         )
         payload = encode(message)
-        self._send(self._verdict_topic, payload)
-        self._verdict_seq += 1
-        self.latency.add(latency_us)
-        self.decisions[judgement.decision] += 1
+        self._send("verdict", payload)
+        self._latency.add(latency_us)
+        self._decisions[judgement.decision] += 1
         if judgement.reasons:
-            self.reasons.update(judgement.reasons)
+            self._reasons.update(judgement.reasons)
         if judgement.opinion.repaired:
             self._repaired.update(judgement.opinion.repaired)
         return message, payload
@@ -155,50 +154,46 @@ class Outbox:
         """Send how the lift of a grasp ended, and what was lifted if that is known."""
         boot_id, grasp = report.grasp
         message = OutcomeMessage(
-            boot_id=self.boot_id,
-            seq=self._outcome_seq,
-            t=self._wall_clock(),
+            **self._head("outcome"),
             t_mono_ns=self._clock(),
             grasp=grasp,
             outcome=report.outcome,
             object=report.object_name,
             grasp_boot_id=None if boot_id == self.boot_id else boot_id,
         )
-        self._outcome_seq += 1
-        self._send(self._outcome_topic, encode(message))
+        self._send("outcome", encode(message))
 
     def tactile(self, reading: TactileReading, joints: JointReading | None) -> None:
         """Send one reading, with the newest joint angles, to each output that wants it."""
-        payload: bytes | None = None
-        for output in self._outputs:
-            if output.wanted(self._tactile_topic):
-                if payload is None:
-                    payload = self._encoded(reading, joints)
-                output.send(self._tactile_topic, payload)
-
-    def _encoded(self, reading: TactileReading, joints: JointReading | None) -> bytes:
+        topic = self._topics["tactile"]
+        wanting = [output for output in self._outputs if output.wanted(topic)]
+        if not wanting:
+            return
         message = Tactile(
-            boot_id=self.boot_id,
-            seq=self._tactile_seq,
-            t=self._wall_clock(),
+            **self._head("tactile"),
             t_mono_ns=reading.t_ns,
             fingers=list(self._fingers),
             counts=reading.counts.tolist(),
             faults=reading.faults.tolist(),
             joints={} if joints is None else _angles(joints),
         )
-        self._tactile_seq += 1
-        return encode(message)
-
-    def _send(self, topic: bytes, payload: bytes) -> None:
-        for output in self._outputs:
+        payload = encode(message)
+        for output in wanting:
             output.send(topic, payload)
+
+    def _head(self, kind: str) -> _Head:
+        """Begin a message of this kind, which gets the next number."""
+        seq = self._sent[kind]
+        self._sent[kind] += 1
+        return _Head(boot_id=self.boot_id, seq=seq, t=self._wall_clock())
+
+    def _send(self, kind: str, payload: bytes) -> None:
+        for output in self._outputs:
+            output.send(self._topics[kind], payload)
 
     def _gate_change(self, t_ns: int, moment: Moment, change: GateChange) -> None:
         message = GateMessage(
-            boot_id=self.boot_id,
-            seq=self._gate_seq,
-            t=self._wall_clock(),
+            **self._head("gate"),
             t_mono_ns=t_ns,
             grasp=change.grasp,
             former=change.former,
@@ -208,8 +203,7 @@ class Outbox:
             motion=moment.motion,
             motion_limits=moment.motion_limits,
         )
-        self._gate_seq += 1
-        self._send(self._gate_topic, encode(message))
+        self._send("gate", encode(message))
 
     def status(
         self,
@@ -222,24 +216,18 @@ class Outbox:
         skipped_readings: int,
         overloaded: bool,
     ) -> Status:
-        """Send one status message.
-
-        `readings_hz` is how many came per second since the last one; `drivers` the counters of all
-        parts by name. `skipped_readings` and `overloaded` are as in `Status`.
-        """
+        """Send one status message. `drivers` has the counters of all parts, by name."""
         session, hand, trust = pipeline.session, pipeline.hand, pipeline.trust
         health = pipeline.health()
         if state is State.SILENT:
             health["link"] = Reason.STALE
         message = Status(
-            boot_id=self.boot_id,
-            seq=self._status_seq,
-            t=self._wall_clock(),
+            **self._head("status"),
             t_mono_ns=self._clock(),
             state=state,
             readings_hz=readings_hz,
-            verdicts={decision: self.decisions[decision] for decision in Decision},
-            reasons=dict(self.reasons),
+            verdicts={decision: self._decisions[decision] for decision in Decision},
+            reasons=dict(self._reasons),
             drivers=drivers,
             repaired=dict(self._repaired),
             session_grasps=None if session is None else session.grasps,
@@ -247,7 +235,7 @@ class Outbox:
             gate=None if hand is None else hand.gate.memory.state,
             tared=None if hand is None else list(hand.tared),
             health=health,
-            latency_us=_spread_us(self.latency),
+            latency_us=_spread_us(self._latency),
             jitter_us=_spread_us(deadlines.jitter) if deadlines.jitter.count else {},
             late_readings=deadlines.late,
             worst_age_ms=deadlines.worst_age_ms,
@@ -259,8 +247,7 @@ class Outbox:
             model_sha=self._model_sha,
             versions=self._versions,
         )
-        self._status_seq += 1
-        self._send(self._status_topic, encode(message))
+        self._send("status", encode(message))
         return message
 
 
@@ -281,7 +268,7 @@ def _learner(trust: Trust) -> LearnerHealth:
 
 
 def _angles(joints: JointReading) -> dict[str, float]:
-    """The joints that have an angle, rad: JSON has no NaN."""
+    """Return the joints that have an angle, rad. JSON has no NaN."""
     pairs = zip(joints.names, joints.position_rad.tolist(), strict=True)
     return {name: angle for name, angle in pairs if math.isfinite(angle)}
 

@@ -10,13 +10,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from daemon.publish.companion import Companion, Published, Requests
-from daemon.publish.door import Admission, Door, Listener, PublishError
+from daemon.publish.companion import Companion, PublishedVerdict, Requests
+from daemon.publish.door import Admission, Door
+from daemon.publish.listener import Listener, PublishError
 from daemon.publish.messages import Status
-from daemon.scene import Curve, Scene, SceneError
+from daemon.scene import Scene, SceneError
+from daemon.scene.scene import Curve
 
 if TYPE_CHECKING:
-    from daemon.process.signals import Stop
+    from daemon.process.signals import StopRequest
     from daemon.publish.keys import Clients
     from daemon.publish.questions import Questions
 
@@ -68,9 +70,9 @@ class Sockets(Companion):
     def _listen(self, wanted: Scene) -> None:
         publish = wanted.publish
         mode = None if publish.file_mode is None else int(publish.file_mode, 8)
-        self._publish = Listener.of(wanted.endpoint, mode, publish.group)
+        self._publish = Listener(wanted.endpoint, mode, publish.group)
         if wanted.ask_endpoint is not None:
-            self._ask = Listener.of(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
+            self._ask = Listener(wanted.ask_endpoint, wanted.ask_file_mode, wanted.ask_group)
             from daemon.publish.questions import Questions  # only where peers may ask
 
             self.questions = Questions(self._answer, round(wanted.gate.request_ms * 1e6))
@@ -131,7 +133,7 @@ class Sockets(Companion):
             if messages:
                 self.questions.take(messages, self._clock(), requests)
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Answer all questions, or those alone that have waited too long for a better answer."""
         if self.questions is None or not self.questions.waiting:
             return
@@ -157,7 +159,7 @@ class Sockets(Companion):
             counters["ask"] = dict(self.questions.counters)
         return counters
 
-    def wait_for_subscriber(self, timeout_s: float, stop: Stop | None = None) -> bool:
+    def wait_for_subscriber(self, timeout_s: float, stop: StopRequest | None = None) -> bool:
         """Wait until a peer has connected to hear messages; see `Door`."""
         return self._door is not None and self._door.wait_for_subscriber(timeout_s, stop)
 

@@ -19,14 +19,14 @@ import msgspec
 from msgspec.structs import replace
 
 from daemon.process.worker import Worker
-from daemon.publish.companion import Companion, LoopEvent, Published
+from daemon.publish.companion import Companion, LoopEvent, PublishedVerdict
 from daemon.record.files import RecordingFile, Retention
 from daemon.record.flat import flat
 from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
 from daemon.record.viewers import ForPeople
-from daemon.scene import Record
+from daemon.scene.scene import Record
 from drivers.base import JointReading, Reading
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ class Recorder(Companion):
         if isinstance(reading, JointReading):
             self._put(self._names[Topic.JOINTS], partial(Joints.of, reading))
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Record the counts that the network judged."""
         judgement = published.judgement
         if judgement.moment.judged and judgement.judged_counts is not None:

@@ -1,4 +1,4 @@
-"""The demo's table: the published method beside graspd on the same grasps, some in each line."""
+"""The demo's table: the published method beside graspd on the same grasps."""
 
 from __future__ import annotations
 
@@ -7,28 +7,24 @@ import sys
 from daemon.judge.network import Examined, Network
 from daemon.judge.reasons import Decision
 from daemon.process.text import Colour, coloured
-from daemon.publish.companion import Companion, Published
+from daemon.publish.companion import Companion, PublishedVerdict
 from daemon.run.summary import Tally
 from daemon.trust.trust import Trust
 from models.runtime import TactileModel
 
 GRASPS = 25
-"""In a line."""
+"""Grasps of one line."""
 PUBLISHED = "cnn1"
-"""The published network, in the zoo."""
+"""Name of the published network in the zoo."""
 COLUMNS = f"{'stable':>8}{'slipped':>15}{'good lifts kept':>18}"
 
 
 class Demo(Companion):
-    """Writes a line for every `GRASPS` grasps, and what it comes to at the end."""
+    """Writes a line for every `GRASPS` grasps, and the sums at the end."""
 
-    def __init__(self, published: TactileModel, *, prompt: bool) -> None:
-        """`published` judges every grasp as it comes, without session, outcomes or refusal.
-
-        With `prompt`, each line is flushed.
-        """
+    def __init__(self, published: TactileModel) -> None:
+        """`published` judges every grasp as it comes, without session, outcomes or refusal."""
         self._published = Network(published, 0.5)
-        self._prompt = prompt
         self._part = Tally(), Tally()
         self._whole = Tally(), Tally()
         self._grasps = 0
@@ -43,7 +39,7 @@ class Demo(Companion):
             coloured(f"{'grasps':10}{COLUMNS}{COLUMNS}", Colour.BOLD),
         )
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Count a grasp."""
         verdict, reading = published.verdict, published.reading
         note = None if reading is None else reading.annotation
@@ -82,8 +78,9 @@ class Demo(Companion):
         self._write(f"{grasps:10}{''.join(self._cells(tally, allowed) for tally in tallies)}")
 
     def _cells(self, tally: Tally, allowed: float | None) -> str:
-        """How often `stable` was said, how many of these slipped, share of the good lifts kept."""
-        (stable, slips), worth = tally.stable, tally.worth() or {}
+        """Return the `stable` verdicts, the slips among them, and the good lifts among them."""
+        stable, slips = tally.stable
+        worth = tally.worth() or {}
         share, kept = worth.get("slips_among_stable"), worth.get("coverage")
         slipped = f"{slips:9}" + (f"{100 * share:4.0f} %" if share is not None else f"{'-':>6}")
         if share is not None and allowed is not None:
@@ -93,5 +90,4 @@ class Demo(Companion):
 
     def _write(self, *lines: str) -> None:
         sys.stdout.writelines(f"{line}\n" for line in lines)
-        if self._prompt:
-            sys.stdout.flush()
+        sys.stdout.flush()

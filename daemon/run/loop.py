@@ -12,14 +12,14 @@ from functools import partial
 from typing import Final
 
 from daemon.judge.pipeline import Judgement, Pipeline
-from daemon.process.signals import Stop
+from daemon.process.signals import StopRequest
 from daemon.process.sleep import Sleep
 from daemon.publish.companion import (
     REPEATED,
     Answer,
     Companion,
     LoopEvent,
-    Published,
+    PublishedVerdict,
     at_once,
     hooks,
 )
@@ -64,7 +64,7 @@ class Ended(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
+class LoopTiming:
     """Clocks and waits of the loop."""
 
     max_age_ns: int
@@ -90,9 +90,9 @@ class Loop:
         drivers: Sequence[Driver],
         pipeline: Pipeline,
         outbox: Outbox,
-        stop: Stop,
+        stop: StopRequest,
         companions: Sequence[Companion],
-        timing: Timing,
+        timing: LoopTiming,
         keep: Callable[[Answer], None] = at_once,
     ) -> None:
         """`drivers` are open, the tactile one first; the caller closes them.
@@ -309,7 +309,7 @@ class Loop:
         verdict, payload = self._outbox.verdict(judgement, received_ns, silence_ns)
         is_answer = is_answer or verdict.judged or not self._pipeline.on_request
         grasp = GraspId(self._pipeline.boot_id, verdict.grasp)
-        published = Published(
+        published = PublishedVerdict(
             judgement, verdict, payload, reading, is_answer, grasp, self._pipeline.lifts
         )
         for on_verdict in self._on_verdict:

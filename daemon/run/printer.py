@@ -8,34 +8,30 @@ import time
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.process.text import Colour, coloured, printable
-from daemon.publish.companion import Companion, Published
+from daemon.publish.companion import Companion, PublishedVerdict
 from daemon.publish.messages import Verdict
-from daemon.run.summary import Summary
+from daemon.run.summary import RunSummary
 from daemon.trust.lift_book import Report
 from daemon.trust.trust import Trust
 from drivers.base import Annotation
 
 NAME_MAX = 80
-"""Characters of an object's name that are shown."""
+"""Longest name of an object that is shown, characters."""
 COLOURS = {Decision.STABLE: Colour.GREEN, Decision.SLIP: Colour.RED}
 
 
 class Printer(Companion):
     """Writes verdicts as they come, and a summary at the end."""
 
-    def __init__(self, *, as_json: bool, prompt: bool) -> None:
-        """With `as_json`, messages go to stdout as they are, and the summary as JSON to stderr.
-
-        With `prompt`, each line is flushed, also into a pipe: for readings that come in real time.
-        """
-        self._prompt = prompt
+    def __init__(self, *, as_json: bool) -> None:
+        """With `as_json`, write messages to stdout as they are, and the summary to stderr."""
         self._as_json = as_json
-        self.result = Summary()
+        self.result = RunSummary()
         self._start_s = time.monotonic()
         self._gate: GateState | None = None
 
-    def on_verdict(self, published: Published) -> None:
-        """Write one verdict, and how the lift of its grasp ended if the recording says so."""
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        """Write one verdict, and the outcome of its lift if the recording has it."""
         verdict, reading = published.verdict, published.reading
         annotation = reading.annotation if reading else None
         self.result.add(verdict, annotation.slipped if annotation else None)
@@ -43,22 +39,21 @@ class Printer(Companion):
             return
         line = published.payload.decode() if self._as_json else _line(verdict, annotation)
         sys.stdout.write(line + "\n")
-        if self._prompt:
-            sys.stdout.flush()
+        sys.stdout.flush()  # into a pipe too: readings may come in real time
 
     def _is_news(self, verdict: Verdict) -> bool:
-        """Whether people want to read it: behind a gate, where something changed."""
+        """Return True if something changed; without a gate, each verdict is of a new grasp."""
         if verdict.gate is None or verdict.judged or verdict.gate is not self._gate:
             self._gate = verdict.gate
             return True
         return False
 
     def on_outcome(self, report: Report) -> None:
-        """Count how a lift ended that was judged before."""
+        """Count the outcome of a lift that was judged before."""
         self.result.outcome(report.grasp.grasp, slipped=report.outcome == "slip")
 
     def summary(self, trust: Trust | None) -> None:
-        """Write the summary of everything since the start; `trust` is what outcomes have taught."""
+        """Write the summary since the start; `trust` is what outcomes have taught."""
         wall_s = time.monotonic() - self._start_s
         if self._as_json:
             sys.stdout.flush()

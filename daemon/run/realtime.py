@@ -8,12 +8,11 @@ import logging
 import os
 import resource
 from contextlib import suppress
-from types import TracebackType
 from typing import Self
 
 from daemon.publish.companion import Companion
 from daemon.publish.messages import Status
-from daemon.scene import Realtime
+from daemon.scene.scene import Realtime
 
 log = logging.getLogger("graspd")
 
@@ -24,11 +23,10 @@ CAP_IPC_LOCK = 14
 
 
 class RealtimeMode(Companion):
-    """Has the process run in realtime from `__enter__` to `__exit__`.
+    """Runs the process in realtime from `__enter__` to `__exit__`.
 
-    Only the thread that enters, the loop's, gets the priority: it comes before libzmq's threads,
-    which copy messages. What the system refuses is left out; one warning says which rights to
-    grant.
+    Only the loop's thread gets the priority, before libzmq's threads, which copy messages. One
+    warning says what the system refuses and which rights to grant.
     """
 
     def __init__(self, wanted: Realtime) -> None:
@@ -55,12 +53,7 @@ class RealtimeMode(Companion):
             log.warning("not quite realtime: %s", "; ".join(refused))
         return self
 
-    def __exit__(
-        self,
-        _kind: type[BaseException] | None,
-        _value: BaseException | None,
-        _trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_details: object) -> None:
         """Be an ordinary process again."""
         gc.enable()
         gc.unfreeze()
@@ -72,7 +65,7 @@ class RealtimeMode(Companion):
         _libc().munlockall()
 
     def on_status(self, status: Status) -> None:
-        """Collect garbage: once a second there is time for it."""
+        """Collect garbage, once a second."""
         gc.collect()
 
     def _pin(self, processors: set[int]) -> None:
@@ -108,12 +101,12 @@ class RealtimeMode(Companion):
 
 
 def _threads() -> list[int]:
-    """Threads of this process; one that has just ended is none."""
+    """Return the threads of this process."""
     return [int(name) for name in os.listdir("/proc/self/task")]
 
 
 def _may_lock() -> bool:
-    """Whether this process has the capability to lock any amount of memory."""
+    """Return True if this process has the capability to lock any amount of memory."""
     with open("/proc/self/status", encoding="utf-8") as file:
         effective = next((line for line in file if line.startswith("CapEff:")), "CapEff: 0")
     return bool(int(effective.split()[1], 16) >> CAP_IPC_LOCK & 1)

@@ -13,15 +13,15 @@ from drivers.base import TactileReading
 from models.contract import SeenCounts
 
 PERIOD_NS = 10_000_000
-"""Between two readings, ns: 100 Hz, as the tare expects."""
+"""Time between two readings, ns; 100 Hz, as the tare expects."""
 REST = 110
 """Untouched readings before the first grasp; a tare takes 100."""
 GRASP_EVERY, CLOSING, HELD = 65, 5, 45
 """Readings from one grasp to the next, and of it closing (and opening) and held."""
 FALL_COUNTS = 150.0
-"""A typical grasp lowers the electrodes here by none to three times as much."""
+"""An electrode falls by 0, 1, 2 or 3 times this in a typical grasp."""
 COUNTS_MAX = 4000.0
-"""Of an electrode at rest: short of saturated."""
+"""Highest count of an electrode at rest, below saturation."""
 
 
 def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
@@ -47,10 +47,10 @@ def grasps(seen: SeenCounts, readings: int) -> Iterator[NDArray[np.uint16]]:
 
 
 def rehearse(make: Callable[[Callable[[], int]], Pipeline], seen: SeenCounts) -> Pipeline:
-    """Judge one synthetic grasp, so that what the first real one needs is imported and allocated.
+    """Judge one synthetic grasp: imports and allocations of the first real one are done then.
 
-    `make` takes a clock, monotonic ns, and makes a pipeline with it, which is returned as the
-    rehearsal left it. `seen` is what its model was trained on.
+    `make` takes a clock, monotonic ns, and makes the pipeline that is returned. `seen` is what its
+    model was trained on.
     """
     now_ns = 0
     pipeline = make(lambda: now_ns)

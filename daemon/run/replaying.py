@@ -1,4 +1,4 @@
-"""What goes along with a replay: who tells how lifts ended, and who judges the same otherwise."""
+"""Companions of a replay: one tells outcomes, one judges the same grasps in another way."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.companion import Companion, PublishedVerdict, Requests
 from daemon.publish.messages import OBJECT_PATTERN
-from daemon.run.summary import Summary
+from daemon.run.summary import RunSummary
 from daemon.trust.lift_book import GraspId, Report
 from models.runtime import TactileModel
 
@@ -25,23 +25,22 @@ class _Lift(NamedTuple):
 
 
 class Controller(Companion):
-    """Tells how the lift of each judged grasp ended, as far as the recording says, once it is over.
+    """Tells the recorded outcome of each judged grasp after its verdict, before the next grasp.
 
-    As a robot's controller would over `[ask]`: after the verdict, and before the next grasp.
+    A robot's controller does so over `[ask]`.
     """
 
     def __init__(self, *, only_lifted: bool) -> None:
-        """With `only_lifted` it lifts on `stable` and where it is asked to supervise: what became
-        of the other grasps nobody knows."""
+        """With `only_lifted`, tell outcomes of `stable` verdicts and supervised lifts only."""
         self._only_lifted = only_lifted
         self._requests: Requests | None = None
         self._lift: _Lift | None = None
 
     def before_wait(self, requests: Requests) -> None:
-        """Remember whom to tell."""
+        """Keep `requests` for the outcomes."""
         self._requests = requests
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Take note of a grasp; the lift of the one before it is over."""
         verdict, reading = published.verdict, published.reading
         if self._lift is not None and self._lift.report.grasp.grasp != verdict.grasp:
@@ -61,12 +60,12 @@ class Controller(Companion):
         )
 
     def after_round(self) -> None:
-        """Where each reading is a grasp, its lift is over with it."""
+        """Tell the outcome if each reading is a grasp: the lift is over with it."""
         if self._lift is not None and self._lift.over:
             self.tell()
 
     def tell(self) -> None:
-        """Tell the outcome of the lift at hand, if there is one."""
+        """Tell the outcome of the current lift, if there is one."""
         lift, self._lift = self._lift, None
         if lift is None or self._requests is None or (self._only_lifted and not lift.allowed):
             return
@@ -74,22 +73,22 @@ class Controller(Companion):
 
 
 def _sent(object_name: str | None) -> str | None:
-    """The name, if it is one that an outcome may have: tables may have any."""
+    """Return the name if an outcome may have it. Tables may have any text."""
     return object_name if re.fullmatch(OBJECT_PATTERN, object_name or "") else None
 
 
 class Comparison(Companion):
     """Judges every judged grasp once more in another way, for the summary alone."""
 
-    def __init__(self, how: str, pipeline: Pipeline, result: Summary) -> None:
-        """`how` is a key of `Summary.compared`; to `pipeline` each reading is a grasp, and it has
+    def __init__(self, how: str, pipeline: Pipeline, result: RunSummary) -> None:
+        """`how` is a key of `RunSummary.compared`. To `pipeline` each reading is a grasp; it has
         the clock of the pipeline that made the verdicts."""
         self._how = how
         self._pipeline = pipeline
         self._result = result
         self._grasp: int | None = None
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         """Count what the first verdict on a grasp would have been."""
         verdict, reading = published.verdict, published.reading
         if reading is None:

@@ -1,4 +1,4 @@
-"""Running a scene file until told to stop, and taking it anew when told to."""
+"""Runs a scene file until told to stop, and reads it again when told to."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Assembly, Parts
 from daemon.process.signals import StopSignal
-from daemon.publish.door import PublishError
+from daemon.publish.listener import PublishError
 from daemon.publish.sockets import Sockets, plan
-from daemon.run.loop import Ended, Loop, Timing
+from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.run.reload import Reload
 from drivers.base import DriverError
 from models.contract import ModelError
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 AWAKE_RETRY_S, AWAKE_LOOK_S = 1.0, 0.1
-"""After a sleep, between two tries to open what is not there yet, and to look for signals, s."""
+"""After a sleep: time between two tries to open everything, and between looks for signals, s."""
 
 
 def prepare(path: Path) -> Parts:
@@ -89,13 +89,13 @@ class Runner:
         self._former: Parts | None = None
         """What ran before a reload, until what follows it runs."""
         self._trust: Trust | None = None
-        """Of the scene that ran last."""
+        """What outcomes taught in the scene that ran last."""
 
     def run(self) -> None:
         """Run until stopped or until a recording ends.
 
-        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`; at a
-        reload it logs them and whatever else is raised, and what ran before goes on.
+        Raises `SceneError`, `ModelError`, `RecordingError`, `PublishError` or `DriverError`. Errors
+        of a reload are logged, and the former scene goes on.
         """
         try:
             self._run(prepare(self._path))
@@ -133,7 +133,7 @@ class Runner:
                 return
 
     def _waits_for_the_rest(self, error: Exception) -> bool:
-        """Networks and disks may wake later than we do; whether to try again then."""
+        """Wait for networks and disks that wake later; return False if asked to stop."""
         log.warning("%s; another try in %g s", error, AWAKE_RETRY_S)
         until_s = time.monotonic() + AWAKE_RETRY_S
         while self._stop.received is None and time.monotonic() < until_s:
@@ -143,7 +143,7 @@ class Runner:
         return self._stop.received is None
 
     def _open_sockets(self, wanted: scene.Scene) -> Sockets:
-        """Those that are open, if the scene wants the same ones."""
+        """Open the sockets of a scene; keep the open ones if it wants the same."""
         if self._sockets is not None and self._sockets.plan == plan(wanted):
             return self._sockets
         if self._sockets is not None:
@@ -153,7 +153,7 @@ class Runner:
         return self._sockets
 
     def _work(self, parts: Parts) -> tuple[Ended, Parts | None]:
-        """Open everything and go round until something ends it; at a reload, what to run next."""
+        """Run one scene until something ends it; return why, and after a reload the next scene."""
         wanted = parts.scene
         with ExitStack() as stack:
             around = Assembly(parts, stack)
@@ -172,7 +172,7 @@ class Runner:
                 around.build_outbox(),
                 self._reload,
                 [companion for companion in companions if companion is not None],
-                Timing(wanted.max_age_ns),
+                LoopTiming(wanted.max_age_ns),
                 around.keep,
             )
             stack.callback(loop.close)
@@ -192,7 +192,7 @@ class Runner:
             self._manager.reloading()
 
     def _taken(self) -> Parts | None:
-        """What the scene file says now; None, and an error in the log, if that is wrong."""
+        """Return the scene that was prepared; None, and an error in the log, if it is wrong."""
         prepared = self._reload.take()
         if isinstance(prepared, Parts):
             log.info("%s: taken anew", self._path)
@@ -210,7 +210,7 @@ class Runner:
 
 
 def _is_told(error: Exception) -> bool:
-    """Whether it says what to mend, and not that graspd is wrong or out of memory."""
+    """Return True if the error is not a bug of graspd: its text says what to mend."""
     return isinstance(error, scene.SceneError | ModelError | PublishError | DriverError)
 
 

@@ -15,9 +15,9 @@ from daemon.publish.messages import Verdict
 from daemon.trust.trust import Trust
 
 WINDOW: Final = 50
-"""Lifts of `stable` verdicts in a row, of which the worst are told."""
+"""Length of the worst run of lifts of `stable` verdicts."""
 WAITING_MAX: Final = 1024
-"""Grasps whose outcome can still come; those before them count as unknown."""
+"""Most grasps whose outcome can still come; older ones have none."""
 WITHOUT_SESSION, WITHOUT_LEARNING = "without session calibration", "without learning"
 WORTH: Final = {
     "coverage": "coverage",
@@ -42,8 +42,7 @@ class Tally:
         self._latest: deque[bool] = deque(maxlen=WINDOW)
         """Whether the latest lifts of `stable` verdicts slipped."""
         self.worst: int | None = None
-        """Most slips among `WINDOW` lifts of `stable` verdicts in a row; None before there are so
-        many."""
+        """Most slips in `WINDOW` lifts of `stable` verdicts in a row; None before that many."""
 
     @property
     def labelled(self) -> int:
@@ -52,7 +51,7 @@ class Tally:
 
     @property
     def stable(self) -> tuple[int, int]:
-        """How many lifts of `stable` verdicts have a known outcome, and slips among them."""
+        """Lifts of `stable` verdicts with a known outcome, and the slips among them."""
         slips = self.confusion[True, False]
         return slips + self.confusion[False, False], slips
 
@@ -64,7 +63,7 @@ class Tally:
             self.outcome(decision, slipped=slipped)
 
     def outcome(self, decision: Decision, *, slipped: bool) -> None:
-        """Count how the lift of a grasp ended that was judged so."""
+        """Count the outcome of a lift after this decision."""
         self.slipped += slipped
         self.held += not slipped
         if decision is not Decision.UNKNOWN:
@@ -94,7 +93,7 @@ class Tally:
         )
 
     def worth(self) -> dict[str, float] | None:
-        """What `stable` is worth, by lifts whose outcome is known; None if there are none.
+        """Return how good `stable` is, by lifts of known outcome; None without any.
 
         `coverage` is the share of the lifts that held which were called `stable`.
         """
@@ -112,7 +111,7 @@ class Tally:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything as JSON-ready values."""
+        """Return everything as JSON-ready values."""
         return {
             "verdicts": {decision.value: self.decisions[decision] for decision in Decision},
             "reasons": {reason.value: number for reason, number in self.reasons.items()},
@@ -123,11 +122,11 @@ class Tally:
         }
 
     def counts(self) -> str:
-        """How often each decision came, for people."""
+        """Return the number of each decision, for people."""
         return ", ".join(f"{self.decisions[decision]} {decision}" for decision in Decision)
 
     def lines(self) -> Iterator[str]:
-        """Reasons and scores, for people."""
+        """Yield reasons and scores, for people."""
         if self.reasons:
             given = ", ".join(f"{number} {reason}" for reason, number in self.reasons.most_common())
             yield f"unknown because: {given}"
@@ -143,11 +142,11 @@ class Tally:
 
 
 def _fractions(parts: Mapping[str, tuple[int, int]]) -> dict[str, float]:
-    """Each part over its whole, where there is a whole."""
+    """Return each part over its whole, without those whose whole is 0."""
     return {name: part / whole for name, (part, whole) in parts.items() if whole}
 
 
-class Summary:
+class RunSummary:
     """Collects verdicts in constant memory.
 
     Behind a gate a grasp counts once, by its first judgement; else each reading does.
@@ -156,11 +155,11 @@ class Summary:
     def __init__(self) -> None:
         self.tally = Tally()
         self.compared = {WITHOUT_SESSION: Tally(), WITHOUT_LEARNING: Tally()}
-        """The same grasps judged otherwise; empty where that was not tried."""
+        """The same grasps judged in another way; empty unless tried."""
         self.trained_on: Sequence[str] = ()
         """Recordings that the model was trained on."""
         self._waiting: dict[int, list[tuple[Tally, Decision]]] = {}
-        """By grasp: what was said of those whose outcome is not known yet."""
+        """Decisions on grasps whose outcome is not known yet, by grasp."""
         self.repaired = 0
         """Verdicts made with at least one repaired electrode."""
         self.latency = LatencyHistogram()
@@ -169,11 +168,11 @@ class Summary:
         self.grasps = 0
         """Grasps that began, of these."""
         self.again = 0
-        """Judgements of grasps that had changed since they were judged."""
+        """Further judgements of a grasp, after a change."""
         self._judged_grasp: int | None = None
 
     def add(self, verdict: Verdict, slipped: bool | None) -> None:
-        """Count one verdict; `slipped` is how the lift ended, None where it was not recorded."""
+        """Count one verdict; `slipped` is the recorded outcome, None without one."""
         self.latency.add(verdict.latency_us)
         if verdict.gate is not None:
             self.readings += 1
@@ -188,12 +187,12 @@ class Summary:
         self.repaired += verdict.valid and bool(verdict.repaired)
 
     def compare(self, how: str, judgement: Judgement, slipped: bool | None, grasp: int) -> None:
-        """Count what would have been judged of a grasp, once for each way in `compared`."""
+        """Count the judgement of a grasp by one of the ways in `compared`."""
         tally = self.compared[how]
         self._add(tally, grasp, judgement.decision, judgement.reasons, slipped)
 
     def outcome(self, grasp: int, *, slipped: bool) -> None:
-        """How the lift of a grasp ended whose verdict is out, unless that is known already."""
+        """Count the outcome of a grasp after its verdict; only the first one counts."""
         for tally, decision in self._waiting.pop(grasp, ()):
             tally.outcome(decision, slipped=slipped)
 
@@ -212,10 +211,7 @@ class Summary:
                 del self._waiting[next(iter(self._waiting))]
 
     def as_dict(self, wall_s: float, trust: Trust | None) -> dict[str, Any]:
-        """Everything as JSON-ready values.
-
-        `wall_s` is how long the replay took, s; `trust` what outcomes have taught by its end.
-        """
+        """Return everything as JSON-ready values; `wall_s` is the time of the replay, s."""
         compared = {how: tally.as_dict() for how, tally in self._compared(trust)}
         return {
             **self.tally.as_dict(),
@@ -235,7 +231,7 @@ class Summary:
         }
 
     def _compared(self, trust: Trust | None) -> Iterator[tuple[str, Tally]]:
-        """What was tried; without learning only where something was learned."""
+        """Yield the ways that were tried; "without learning" only if outcomes were told."""
         for how, tally in self.compared.items():
             learned = trust is not None and bool(trust.lifts.told)
             if tally.decisions and (learned or how != WITHOUT_LEARNING):
@@ -247,7 +243,7 @@ class Summary:
         return {"readings": self.readings, "grasps": self.grasps, "judged_again": self.again}
 
     def lines(self, wall_s: float, trust: Trust | None) -> list[str]:
-        """The same for people."""
+        """Return the lines of the summary, for people."""
         total = self.tally.decisions.total()
         if self.readings:
             lines = [
@@ -279,7 +275,7 @@ class Summary:
 
 
 def _learned(trust: Trust | None) -> Iterator[str]:
-    """What outcomes have taught, and what became of the risk, for people."""
+    """Yield what outcomes taught and what became of the risk, for people."""
     if trust is None or not trust.lifts.told:
         return
     yield f"learned from {trust.learner.outcomes} outcomes"

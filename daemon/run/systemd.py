@@ -14,17 +14,14 @@ from daemon.publish.messages import Status
 log = logging.getLogger("graspd")
 
 FEEDINGS_PER_TIMEOUT = 4
-"""The watchdog is fed this often within its timeout; systemd asks for two at least."""
+"""Feedings within the watchdog's timeout; systemd asks for at least two."""
 RELOAD_PATIENCE_US = 60_000_000
-"""Reading a scene and loading its model may take so long before the watchdog bites."""
+"""Watchdog's timeout while a scene is read and its model loaded, us."""
 NS_PER_US = 1000
 
 
 class Systemd(Companion):
-    """Messages to the service manager that started this process.
-
-    One that does not listen costs a warning, and the daemon goes on.
-    """
+    """Sends messages to the service manager; warns once if it does not listen."""
 
     def __init__(
         self,
@@ -47,10 +44,7 @@ class Systemd(Companion):
 
     @classmethod
     def of(cls, environment: Mapping[str, str]) -> Systemd | None:
-        """The manager that the environment names; None if it names none that can be told.
-
-        As in sd_notify(3) and sd_watchdog_enabled(3).
-        """
+        """Return the manager that the environment names, by sd_notify(3), or None."""
         address = environment.get("NOTIFY_SOCKET", "")
         if address[:1] not in ("/", "@"):
             return None
@@ -59,14 +53,14 @@ class Systemd(Companion):
         return cls(address, int(timeout) if mine else None)
 
     def ready(self, what: str) -> None:
-        """Say that model and drivers are there, or again after a reload; `what` is for people."""
+        """Say that the daemon runs, at the start and after a reload; `what` is for people."""
         lines = ["READY=1", f"STATUS={what}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={self._watchdog_us}", "WATCHDOG=1"]
         self._send(*lines)
 
     def reloading(self) -> None:
-        """Say that the scene is read again; until `ready` the watchdog waits longer."""
+        """Say that the scene is read again. Until `ready` the watchdog waits longer."""
         lines = ["RELOADING=1", f"MONOTONIC_USEC={self._clock() // NS_PER_US}"]
         if self._watchdog_us is not None:
             lines += [f"WATCHDOG_USEC={RELOAD_PATIENCE_US}", "WATCHDOG=1"]
@@ -81,11 +75,11 @@ class Systemd(Companion):
         self._send(f"STATUS={in_a_line(status)}")
 
     def due_ns(self) -> int | None:
-        """When the watchdog wants to be fed next, monotonic ns; None if nobody watches."""
+        """Time of the next feeding of the watchdog, monotonic ns; None without a watchdog."""
         return None if self._watchdog_us is None else self._due_ns
 
     def after_round(self) -> None:
-        """Feed the watchdog, if it is time to."""
+        """Feed the watchdog if that is due."""
         if self._watchdog_us is not None and self._clock() >= self._due_ns:
             self._due_ns = self._clock() + self._period_ns
             self._send("WATCHDOG=1")

@@ -1,9 +1,8 @@
 """Sections of a scene that name a driver: `[tactile]` and `[joints]`."""
 
-# Annotations are no texts here: pydantic would evaluate each anew, at every start.
+# Without postponed annotations: pydantic would evaluate each of them at every start.
 
 import ipaddress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -12,11 +11,9 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    GetJsonSchemaHandler,
     ValidationInfo,
     field_validator,
 )
-from pydantic_core import CoreSchema
 
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger
@@ -24,17 +21,9 @@ from models.contract import Finger
 StrOrPath = TypeVar("StrOrPath", str, Path)
 
 
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """Unit of a number, for those who read the schema; `-` where it has none."""
-
-    symbol: str = "-"
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        """The schema of the number, with its `unit`; asked for by pydantic."""
-        return {**handler(schema), "unit": self.symbol}
+def unit(symbol: str = "-") -> Any:  # noqa: ANN401 - as pydantic's `Field`
+    """Name the unit of a number in the schema; `-` where it has none."""
+    return Field(json_schema_extra={"unit": symbol})
 
 
 def _without_nul(value: StrOrPath) -> StrOrPath:
@@ -53,7 +42,7 @@ def _beside_the_scene(path: Path, info: ValidationInfo) -> Path:
     return base / path
 
 
-Probability = Annotated[float, Field(ge=0.0, le=1.0), Unit()]
+Probability = Annotated[float, Field(ge=0.0, le=1.0), unit()]
 Name = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
 Address = Annotated[str, AfterValidator(_ip_address)]
 FilePath = Annotated[
@@ -73,17 +62,17 @@ class Section(BaseModel):
 class ReplayFaultsSection(Section):
     """`[tactile.faults]`: break the replayed sensor on purpose, to test what listens to graspd."""
 
-    off_from: Annotated[int, Field(ge=0), Unit("readings")] | None = None
+    off_from: Annotated[int, Field(ge=0), unit("readings")] | None = None
     """From this reading on nothing comes; unless given, all come."""
-    stuck_from: Annotated[int, Field(ge=1), Unit("readings")] | None = None
+    stuck_from: Annotated[int, Field(ge=1), unit("readings")] | None = None
     """From this reading on the counts are those of the reading before it; unless given, never."""
     garbage_probability: Probability = 0.0
     """Chance per reading that the counts are random 16-bit values."""
-    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), Unit("counts")] = 0
+    wrong_counts: Annotated[int, Field(ge=-COUNT_MAX, le=COUNT_MAX), unit("counts")] = 0
     """Constant offset added to the counts."""
-    slow_every: Annotated[int, Field(ge=1), Unit("readings")] = 1
+    slow_every: Annotated[int, Field(ge=1), unit("readings")] = 1
     """Only every n-th reading arrives."""
-    delayed_s: Annotated[float, Field(ge=0.0, le=3600.0), Unit("s")] = 0.0
+    delayed_s: Annotated[float, Field(ge=0.0, le=3600.0), unit("s")] = 0.0
     """Readings arrive this much late."""
     intermittent_probability: Probability = 0.0
     """Chance that a reading is lost."""
@@ -91,13 +80,13 @@ class ReplayFaultsSection(Section):
     """Fingers that stuck, garbage and wrong apply to; all unless given."""
     electrodes: (
         Annotated[
-            tuple[Annotated[int, Field(ge=1, le=ELECTRODES), Unit()], ...],
+            tuple[Annotated[int, Field(ge=1, le=ELECTRODES), unit()], ...],
             Field(min_length=1, strict=False),
         ]
         | None
     ) = None
     """Electrodes 1..24 that stuck, garbage and wrong apply to; all unless given."""
-    seed: Annotated[int, Field(ge=0), Unit()] = 0
+    seed: Annotated[int, Field(ge=0), unit()] = 0
     """Of the chance: the same seed breaks the same readings."""
 
 
@@ -110,9 +99,9 @@ class ReplayTactile(Section):
     """Grasp tables or streams (deploy/RECORDING.md), played one after the other."""
     pace: Literal["realtime", "fast"] = "realtime"
     """`fast`: as fast as they can be judged."""
-    speed: Annotated[float, Field(ge=1e-3, le=1e3), Unit()] = 1.0
+    speed: Annotated[float, Field(ge=1e-3, le=1e3), unit()] = 1.0
     """Factor on real time: 2 plays twice as fast. Not with pace `fast`."""
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), Unit("1/s")] = 100.0
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e5), unit("1/s")] = 100.0
     """Readings per second of a grasp table, which has no times of its own."""
     loop: bool = False
     """Begin again at the end, for ever."""
@@ -133,7 +122,7 @@ class SpiTactile(Section):
         Annotated[tuple[Finger, ...], Field(min_length=1, max_length=5, strict=False)] | None
     ) = None
     """Fingers in the order of the chip selects; `hand.fingers` unless given."""
-    baud: Annotated[int, Field(ge=115_200, le=12_000_000), Unit("bit/s")] = 921_600
+    baud: Annotated[int, Field(ge=115_200, le=12_000_000), unit("bit/s")] = 921_600
     """Line rate; USB CDC ignores it."""
 
 
@@ -152,16 +141,16 @@ class CanTactile(Section):
     """Fingers in the order of the board's words (`syntouch`); `hand.fingers` unless given."""
     format: Literal["syntouch", "sweep_fd"] = "syntouch"
     """SynTouch's frame per sample, or graspd's CAN FD frame per sweep and finger."""
-    arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), Unit()] | None = None
+    arbitration_id: Annotated[int, Field(ge=0, le=0x1FFF_FFFF), unit()] | None = None
     """Of the samples, or of finger `ff` of the sweep frames. With `syntouch`, where it is not
     documented, every frame of the right form is taken unless given."""
     sequence: Literal["electrodes", "all", "interleaved"] = "interleaved"
     """Order in which the board samples (`syntouch` only)."""
-    data_length: Annotated[int, Field(ge=3, le=8), Unit("bytes")] | None = None
+    data_length: Annotated[int, Field(ge=3, le=8), unit("bytes")] | None = None
     """Length of a sample frame, where the board pads it."""
-    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), Unit("bit/s")] | None = None
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000), unit("bit/s")] | None = None
     """Rate of the bus; not with socketcan, where it belongs to `ip link`."""
-    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), Unit("bit/s")] | None = None
+    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000), unit("bit/s")] | None = None
     """Rate of the data phase of CAN FD; not with socketcan."""
 
 

@@ -9,8 +9,8 @@ IPC_PATH_MAX_BYTES = 107
 """Longest path of a Unix socket on Linux (sun_path, less the closing NUL)."""
 
 
-def check_endpoint(endpoint: str) -> None:
-    """Raise ValueError unless ZeroMQ can bind here."""
+def check_endpoint(endpoint: str) -> str:
+    """Return an endpoint that ZeroMQ can bind to. Raises `ValueError`."""
     scheme, separator, address = endpoint.partition("://")
     if not separator or scheme not in {"ipc", "tcp"}:
         raise ValueError("must start with ipc:// or tcp://")
@@ -24,10 +24,11 @@ def check_endpoint(endpoint: str) -> None:
         raise ValueError(f"needs a path of 1 to {IPC_PATH_MAX_BYTES} bytes after ipc://")
     elif address.startswith("*"):
         raise ValueError("needs a path that subscribers can know, not '*'")
+    return endpoint
 
 
 def is_private(endpoint: str) -> bool:
-    """Whether only this computer can connect to an endpoint that ZeroMQ can bind to."""
+    """Return True if only this computer can connect to an endpoint of `check_endpoint`."""
     scheme, _, address = endpoint.partition("://")
     return scheme == "ipc" or _ip_address(address.rpartition(":")[0]).is_loopback
 

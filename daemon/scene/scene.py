@@ -1,6 +1,6 @@
 """The scene: one TOML file that says what this hand has and how to judge with it."""
 
-# Annotations are no texts here, as in `daemon.scene.drivers`.
+# Without postponed annotations, as in `daemon.scene.drivers`.
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,15 +28,14 @@ from daemon.scene.drivers import (
     Section,
     SpiTactile,
     Tactile,
-    Unit,
+    unit,
 )
 from daemon.scene.endpoints import check_endpoint, is_private
 from drivers import toml
 from models.contract import Finger
 
 SCENE_MAX_BYTES = 128 << 10
-"""A scene has a kilobyte, and one with the names of a thousand recordings a hundred; a larger file
-was named by mistake."""
+"""Largest scene file: one that names a thousand recordings has 100 kB."""
 
 STATE_DIRECTORY = Path("/var/lib/graspd")
 """Where a service keeps its state (file-hierarchy(7))."""
@@ -66,16 +65,15 @@ class Model(Section):
     """`[model]`: which network judges."""
 
     name: Name | None = None
-    """A model that ships with graspd or was added by `graspd models add`; `small-session` when
-    neither name nor path is given. For a hand of fewer fingers in its form for these, where graspd
-    ships one."""
+    """A model that ships with graspd or was added by `graspd models add`; `small-session` unless
+    name or path is given. A hand of fewer fingers gets its form for these, if there is one."""
     path: FilePath | None = None
     """A model file of your own, relative to the scene file."""
-    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0), Unit()] = Limits.slip_threshold
+    slip_threshold: Annotated[float, Field(gt=0.0, lt=1.0), unit()] = Limits.slip_threshold
     """`p_slip` from here on is slip."""
-    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0), Unit()] = Limits.min_confidence
-    """Less sure verdicts become `unknown`: `p_slip` of a slip, 1 - `p_slip` of a `stable` one must
-    reach this. It is no promise of how many are right: that is `[risk]`."""
+    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0), unit()] = Limits.min_confidence
+    """Least confidence: `p_slip` of a slip, 1 - `p_slip` of `stable`; below it the verdict is
+    `unknown`. How many `stable` ones are right is for `[risk]`."""
 
     @model_validator(mode="after")
     def _one_of_name_and_path(self) -> Self:
@@ -84,100 +82,94 @@ class Model(Section):
         return self
 
 
-class Session(Section):
+class SessionSection(Section):
     """`[session]`: where a session model keeps what it knows of today's sensors."""
 
     keep: bool | None = None
     """False: begin a new session at every start, and write nothing. Unless given, kept for live
     sensors and not for recordings."""
     learn: bool = True
-    """Whether what is judged counts as a grasp of the session."""
+    """True: judged grasps calibrate the session."""
     required: bool = False
-    """Whether nothing is judged before the session is calibrated."""
+    """True: verdicts are `unknown` until the session is calibrated."""
     file: FilePath | None = None
     """`/var/lib/graspd/<hand>.session.json` unless given."""
 
 
-class Risk(Section):
-    """`[risk]`: how many lifts of `stable` verdicts may slip. Without it, none are counted on.
+class RiskSection(Section):
+    """`[risk]`: how many lifts of `stable` verdicts may slip, by the outcomes that were told.
 
-    `stable` is said only as far as the outcomes that were told allow it.
+    Without it there is no such limit.
     """
 
-    max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), Unit()] = 0.05
+    max_slip_when_stable: Annotated[float, Field(ge=0.001, le=0.5), unit()] = 0.05
     """Share of the `stable` lifts that may slip."""
-    warm_up: Annotated[int, Field(ge=0, le=1000), Unit("outcomes")] = 50
-    """Outcomes, since the start of the session, until which all grasps are to be lifted under
-    supervision."""
-    explore: Annotated[float, Field(ge=0.0, le=1.0), Unit()] = 0.05
-    """Share of the grasps that are not `stable` to be lifted under supervision after that: without
-    their outcomes nobody learns that the rule is too strict."""
+    warm_up: Annotated[int, Field(ge=0, le=1000), unit("outcomes")] = 50
+    """Number of outcomes in the session before which all grasps are lifted under supervision."""
+    explore: Annotated[float, Field(ge=0.0, le=1.0), unit()] = 0.05
+    """Share of the grasps that are not `stable` to lift under supervision after that: only their
+    outcomes show that the rule is too strict."""
 
 
 class Learn(Section):
     """`[learn]`: what outcomes of lifts are used for."""
 
     enabled: bool = True
-    """Whether they change what is thought of later grasps."""
+    """True: outcomes change the verdicts of later grasps."""
 
 
 GateMode = Literal["settled", "every", "request"]
-Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0), Unit("ms")]
+Milliseconds = Annotated[float, Field(gt=0.0, le=10_000.0), unit("ms")]
 
 
-class Gate(Section):
+class GateSection(Section):
     """`[gate]`: when a grasp is judged, and when it is refused."""
 
     mode: GateMode | None = None
-    """`settled`: a grasp is judged when it has settled; `request`: when it has and the controller
-    asks; both anew for as long as the verdict stands. `every`: each reading is a grasp of its own,
-    for recordings alone: of live sensors most are of an open hand. Unless given, `settled` for live
-    sensors and for recorded streams, `every` for grasp tables."""
+    """`settled`: judge a grasp when it has settled; `request`: when the controller asks, too;
+    `every`: each reading is a grasp of its own, in recordings only. Unless given, `every` for grasp
+    tables, else `settled`."""
     max_age_ms: Milliseconds = Limits.max_age_ns / 1e6
-    """An older reading gives `unknown`; so does silence for that long."""
-    sweeps: Annotated[Literal[1, 3], Unit("readings")] | None = None
-    """What is judged: 1, a single reading; 3, each electrode's median of three fresh ones. Unless
-    given, 3, and with mode `every` 1."""
+    """An older reading gives `unknown`; silence for that long does, too."""
+    sweeps: Annotated[Literal[1, 3], unit("readings")] | None = None
+    """`1`: judge a single reading; `3`: each electrode's median of three. Unless given, 3; with
+    mode `every`, 1."""
     fingers: Annotated[tuple[Finger, ...], Field(min_length=1, strict=False)] | None = None
     """Fingers that must touch; all of `hand.fingers` unless given."""
-    contact_counts: Annotated[float, Field(ge=5, le=1000), Unit("counts")] = ContactLimits.counts
-    """A finger touches when three electrodes fall so far below their rest, and `contact_sigmas`."""
-    contact_sigmas: Annotated[float, Field(ge=3, le=100), Unit("sigma")] = ContactLimits.sigmas
+    contact_counts: Annotated[float, Field(ge=5, le=1000), unit("counts")] = ContactLimits.counts
+    """A finger touches when three electrodes fall this far below their baseline, and
+    `contact_sigmas`."""
+    contact_sigmas: Annotated[float, Field(ge=3, le=100), unit("sigma")] = ContactLimits.sigmas
     """The same in standard deviations of the finger's noise: both must be reached."""
-    false_alarms: Annotated[float, Field(ge=0.001, le=0.3), Unit()] = GateLimits.false_alarms
-    """Share of the time in which a hand that holds may be said to move. Less of it lets more slow
-    slides pass for stillness (deploy/JUDGING.md)."""
+    false_alarms: Annotated[float, Field(ge=0.001, le=0.3), unit()] = GateLimits.false_alarms
+    """Share of the time in which a still hand may be taken for moving. A smaller share lets more
+    slow slides pass for stillness (deploy/JUDGING.md)."""
     early: bool = GateLimits.early
-    """Judge a grasp as soon as nothing moves fast, marked `early`, and once more when it is known
-    that nothing slides slowly either."""
-    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), Unit("rad/s")] = JointLimits.rad_per_s
+    """True: judge as soon as nothing moves fast, marked `early`, and again when nothing slides
+    slowly either."""
+    joint_rad_per_s: Annotated[float, Field(ge=0.02, le=10), unit("rad/s")] = JointLimits.rad_per_s
     """A joint that turns faster is moving; only with `[joints]`."""
-    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), Unit("ms")] = (
+    joints_lost_ms: Annotated[float, Field(ge=200.0, le=10_000.0), unit("ms")] = (
         JointLimits.lost_ns / 1e6
     )
     """Late joint angles block a verdict no longer than this; only with `[joints]`."""
     request_ms: Milliseconds = GateLimits.request_ns / 1e6
-    """A question that cannot be answered with a judgement by then is answered with `unknown`."""
+    """A question without a judgement after this time is answered with `unknown`."""
     gap_ms: Milliseconds = GateLimits.gap_ns / 1e6
-    """After so long without a usable reading the grasp must settle anew. More than two periods
+    """After this long without a usable reading the grasp must settle again. More than two periods
     of the readings."""
-    change_counts: Annotated[float, Field(ge=10, le=1000), Unit("counts")] = (
+    change_counts: Annotated[float, Field(ge=10, le=1000), unit("counts")] = (
         GateLimits.change_counts
     )
-    """Electrodes of a finger that are so far from where they were judged, in the mean, are another
-    grasp."""
+    """A finger whose electrodes are this far, in the mean, from where they were judged holds
+    another grasp."""
 
 
-def _checked(endpoint: str) -> str:
-    check_endpoint(endpoint)
-    return endpoint
-
-
-Endpoint = Annotated[str, AfterValidator(_checked)]
+Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 FileMode = Annotated[str, Field(pattern=r"^0?[0-7]{3}$")]
-"""Of a socket's file, as in chmod: who may write may connect."""
+"""Mode of a socket's file, as in chmod: users who may write may connect."""
 OTHERS = 0o007
-"""Of a file's mode, what those have who are neither its owner nor in its group."""
+"""Bits of a file's mode for users who are neither its owner nor in its group."""
 
 
 class Publish(Section):
@@ -186,26 +178,26 @@ class Publish(Section):
     endpoint: Endpoint | None = None
     """`ipc:///run/graspd/<hand>.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
     addresses."""
-    high_water_mark: Annotated[int, Field(ge=1, le=100_000), Unit("messages")] = 1000
-    """Messages kept for a subscriber that is slow; those that come then are lost to it."""
-    tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), Unit("1/s")] = 25.0
-    """Readings published a second on `tactile.<hand>`; 0 publishes none. At the sensor's rate or
-    above, every reading goes. Recordings always have every reading."""
+    high_water_mark: Annotated[int, Field(ge=1, le=100_000), unit("messages")] = 1000
+    """Messages that wait for a slow subscriber; it loses further ones."""
+    tactile_hz: Annotated[float, Field(ge=0.0, le=10_000.0), unit("1/s")] = 25.0
+    """Readings published a second on `tactile.<hand>`; 0: none; at the sensor's rate or above, all.
+    Recordings always have every reading."""
     file_mode: FileMode | None = None
-    """Of the file of an `ipc://` socket, as in chmod: who may write may connect. As the umask has
-    it unless given."""
+    """Mode of the file of an `ipc://` socket, as in chmod: users who may write may connect. As the
+    umask has it unless given."""
     group: Name | None = None
-    """Of the file of an `ipc://` socket; the process's unless given."""
+    """Group of the file of an `ipc://` socket; the process's unless given."""
 
 
 class Curve(Section):
-    """`[curve]`: who may connect by `tcp://` (`graspd keys`). All that do need keys then."""
+    """`[curve]`: who may connect by `tcp://`; all peers need keys then (`graspd keys`)."""
 
     secret_key: FilePath
     """The daemon's own `.key_secret` file, of mode 0600."""
     clients: FilePath
-    """Folder with the `.key` files of those who may connect; looked at once a second. Nobody but
-    root and the daemon's user may write there: it lets nobody in then."""
+    """Folder with the `.key` files of peers that may connect, read again when it changes. If users
+    other than root and the daemon's may write there, no peer may connect."""
 
 
 class Ask(Section):
@@ -215,44 +207,44 @@ class Ask(Section):
     """`ipc:///run/graspd/<hand>.ask.ipc` unless given. `tcp://` needs `[curve]`, except on loopback
     addresses."""
     file_mode: FileMode | None = None
-    """Of the file of an `ipc://` socket: who may write may ask, and tell outcomes. That of
-    `[publish]` unless given, but others than owner and group may not ask then."""
+    """Mode of the file of an `ipc://` socket: users who may write may ask, and tell outcomes. That
+    of `[publish]` unless given, for owner and group only."""
     group: Name | None = None
-    """Of the file of an `ipc://` socket; that of `[publish]` unless given."""
+    """Group of the file of an `ipc://` socket; that of `[publish]` unless given."""
 
 
 class Realtime(Section):
-    """`[realtime]`: run before everything that is not. Without it nothing of this is done."""
+    """`[realtime]`: run in realtime. Without it the process is an ordinary one."""
 
-    priority: Annotated[int, Field(ge=1, le=98), Unit()] | None = 50
-    """Of SCHED_FIFO; below that of the hand's own controller."""
+    priority: Annotated[int, Field(ge=1, le=98), unit()] | None = 50
+    """Priority under SCHED_FIFO; below that of the hand's own controller."""
     cpus: (
-        Annotated[tuple[Annotated[int, Unit()], ...], Field(min_length=1, strict=False)] | None
+        Annotated[tuple[Annotated[int, unit()], ...], Field(min_length=1, strict=False)] | None
     ) = None
     """Processors to run on, numbered from 0; all unless given."""
     lock_memory: bool = True
-    """Keep what was touched in memory (mlockall), so that no reading waits for a disk."""
+    """Lock memory that was used (mlockall), so that no reading waits for a disk."""
 
 
 class Record(Section):
     """`[record]`: keep readings, verdicts and outcomes in MCAP files (extra `record`)."""
 
     directory: FilePath | None = None
-    """`/var/lib/graspd/record` unless given. Made if it is not there."""
-    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0), Unit("ms")] = 1000.0
-    """What a killed daemon or a power cut may cost at most."""
-    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0), Unit("MB")] = 256.0
+    """`/var/lib/graspd/record` unless given. Created if it is missing."""
+    flush_ms: Annotated[float, Field(ge=100.0, le=60_000.0), unit("ms")] = 1000.0
+    """Most that a killed daemon or a power cut loses."""
+    rotate_mb: Annotated[float, Field(ge=0.1, le=10_000.0), unit("MB")] = 256.0
     """A file that is larger is followed by the next."""
-    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0), Unit("minutes")] = 60.0
+    rotate_minutes: Annotated[float, Field(ge=0.01, le=10_080.0), unit("minutes")] = 60.0
     """A file that is older is followed by the next."""
-    keep_files: Annotated[int, Field(ge=1, le=100_000), Unit("files")] = 1000
-    """So many of this hand are kept; the oldest are removed."""
-    keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), Unit("MB")] = 4096.0
-    """All files of this hand together, the one being written included."""
-    images_hz: Annotated[float, Field(ge=0.0, le=1000.0), Unit("1/s")] = 10.0
-    """Tactile images a second, for viewers; 0 draws none. All counts are kept anyway."""
+    keep_files: Annotated[int, Field(ge=1, le=100_000), unit("files")] = 1000
+    """Most files of this hand; the oldest are removed."""
+    keep_mb: Annotated[float, Field(ge=1.0, le=10_000_000.0), unit("MB")] = 4096.0
+    """Most that all files of this hand have together, the one being written included."""
+    images_hz: Annotated[float, Field(ge=0.0, le=1000.0), unit("1/s")] = 10.0
+    """Tactile images a second, for viewers; 0 draws none. All counts are recorded anyway."""
     raw: bool = False
-    """Also keep what came over the link: CAN frames as candump text, serial bytes in frames."""
+    """True: also record the link: CAN frames as candump text, serial bytes in frames."""
 
 
 class Scene(Section):
@@ -264,10 +256,10 @@ class Scene(Section):
     joints: Joints | None = None
     """Where joint angles come from; the keys depend on `driver`. Without it none are used."""
     model: Model = Model()
-    session: Session = Session()
+    session: SessionSection = SessionSection()
     learn: Learn = Learn()
-    risk: Risk | None = None
-    gate: Gate = Gate()
+    risk: RiskSection | None = None
+    gate: GateSection = GateSection()
     publish: Publish = Publish()
     ask: Ask | None = None
     curve: Curve | None = None
@@ -322,12 +314,12 @@ class Scene(Section):
 
     @property
     def endpoint(self) -> str:
-        """Where verdicts are published."""
+        """Endpoint where verdicts are published."""
         return self.publish.endpoint or f"ipc:///run/graspd/{self.hand.name}.ipc"
 
     @property
     def ask_endpoint(self) -> str | None:
-        """Where questions are taken; None if nobody asks."""
+        """Endpoint where questions are taken; None: peers cannot ask."""
         if self.ask is None and self.gate.mode != "request":
             return None
         endpoint = None if self.ask is None else self.ask.endpoint
@@ -335,7 +327,7 @@ class Scene(Section):
 
     @property
     def ask_file_mode(self) -> int | None:
-        """Of the file of the socket for questions; None: as the umask has it."""
+        """Mode of the file of the socket for questions; None: as the umask has it."""
         if self.ask is not None and self.ask.file_mode is not None:
             return int(self.ask.file_mode, 8)
         mode = self.publish.file_mode
@@ -343,25 +335,25 @@ class Scene(Section):
 
     @property
     def ask_group(self) -> str | None:
-        """Of that file; None: the process's."""
+        """Group of that file; None: the process's."""
         own = None if self.ask is None else self.ask.group
         return own or self.publish.group
 
     @property
     def session_path(self) -> Path:
-        """Where the session is kept."""
+        """File of the session."""
         return self.session.file or STATE_DIRECTORY / f"{self.hand.name}.session.json"
 
     @property
     def record_directory(self) -> Path | None:
-        """Where recordings are kept; None if nothing is recorded."""
+        """Folder of the recordings; None: the scene does not record."""
         if self.record is None:
             return None
         return self.record.directory or STATE_DIRECTORY / "record"
 
     @property
     def keeps_session(self) -> bool:
-        """Whether the session outlives the daemon."""
+        """True if the session outlives the daemon."""
         if self.session.keep is None:
             return not isinstance(self.tactile, ReplayTactile)
         return self.session.keep

@@ -84,7 +84,7 @@ class DatagramReceiver:
         except OSError as error:
             self._socket.close()
             text = f"cannot listen on {endpoint}: {error.strerror}"
-            raise LinkError.from_errno(error, text) from error
+            raise LinkError.from_errno(error, text, str(endpoint)) from error
 
     @property
     def port(self) -> int:

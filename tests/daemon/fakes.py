@@ -81,7 +81,7 @@ class FakeModel:
 
 
 NO_LIFT = GraspId("", 0), LiftBook()
-"""Ends a `Published` of no grasp."""
+"""Ends a `PublishedVerdict` of no grasp."""
 
 
 class Clock:

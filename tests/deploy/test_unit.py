@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon.scene import STATE_DIRECTORY, Hand, Realtime, Scene
+from daemon.scene import Scene
 from daemon.scene.drivers import SpiTactile
+from daemon.scene.scene import STATE_DIRECTORY, Hand, Realtime
 from tests.deploy.staging import DEPLOY, INSTALLER
 
 UNIT = DEPLOY / "systemd/graspd@.service"

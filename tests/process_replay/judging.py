@@ -15,13 +15,14 @@ from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.recorder import header_now, header_of
 from daemon.judge.pipeline import Pipeline
-from daemon.publish.companion import Companion, Published, Requests
+from daemon.publish.companion import Companion, PublishedVerdict, Requests
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
 from daemon.record.recorder import Recorder
-from daemon.run.loop import Loop, Timing
+from daemon.run.loop import Loop, LoopTiming
 from daemon.scene import Scene
+from daemon.scene.scene import Record
 from daemon.trust.lift_book import GraspId, Report
 from drivers.base import DriverCounters, Fact, Reading, TactileReading
 from tests.process_replay.streams import FINGERS, PERIOD_NS, Clock
@@ -80,7 +81,7 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
         boot_id=BOOT_ID,
     )
     driver = _Driver(islice(case.readings(), case.readings_max), clock, live=case.slow)
-    timing = Timing(
+    timing = LoopTiming(
         wanted.max_age_ns,
         clock,
         rest=lambda _seconds: None,
@@ -100,7 +101,7 @@ def run(case: Case, record_in: Path | None = None) -> list[Message]:
 def _recorder(folder: Path, clock: Clock, pipeline: Pipeline, header: RecordingHeader) -> Recorder:
     return Recorder(
         Retention(folder, "right", BOOT_ID, keep_files=9, keep_bytes=10**9),
-        scene.Record(images_hz=0.0),
+        Record(images_hz=0.0),
         take_header=lambda: header_now(pipeline, header),
         clock=clock,
         wall_clock=clock,
@@ -179,7 +180,7 @@ class _World(Companion):
     def wanted(self, _topic: bytes) -> bool:
         return self._verdicts == 0
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         verdict = published.verdict
         self._verdicts += 1
         self._asking = self._case.asks and self._verdicts % ASKED_EVERY == 0

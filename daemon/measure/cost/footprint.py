@@ -94,21 +94,20 @@ def main(arguments: list[str]) -> int:
     import gc
     import importlib
 
-    from daemon.process.start import prepare
+    from daemon.process import set_up_libraries
 
-    prepare()
+    set_up_libraries()
     for name, modules in CORE:
         for module in modules:
             importlib.import_module(module)
         meter.take(name)
     gc.freeze()
-    gc.enable()
     import json
     from contextlib import ExitStack
     from pathlib import Path
 
     from daemon.process.text import complain
-    from daemon.publish.door import PublishError
+    from daemon.publish.listener import PublishError
     from daemon.scene import SceneError
     from drivers.base import DriverError
     from models.contract import ModelError
@@ -154,8 +153,8 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
 
 def _apart(wanted: Scene, folder: Path) -> Scene:
     """The scene with its sockets and its session in `folder`, playing recordings at once."""
-    from daemon.scene import Ask
     from daemon.scene.drivers import ReplayTactile
+    from daemon.scene.scene import Ask
 
     ask, tactile = wanted.ask, wanted.tactile
     if wanted.ask_endpoint is not None:
@@ -217,12 +216,12 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     outbox = around.build_outbox()
     meter.take("sockets")
     from daemon.process.signals import StopSignal
-    from daemon.run.loop import Loop, Timing
+    from daemon.run.loop import Loop, LoopTiming
     from daemon.run.reload import Reload
 
     stop = Reload(stack.enter_context(StopSignal()), lambda: parts, lambda: None)
     stack.callback(stop.close)
-    timing = Timing(parts.scene.max_age_ns)
+    timing = LoopTiming(parts.scene.max_age_ns)
     Loop(parts.drivers, parts.pipeline, outbox, stop, around.companions, timing)
     meter.take("loop")
     return outbox

@@ -36,6 +36,7 @@ def test_a_job_makes_the_descriptor_readable_and_gives_its_result_once(
     assert worker.submit(lambda: 7)
     readable, _, _ = select.select(worker.filenos(), [], [], PATIENCE_S)
     assert readable == worker.filenos() != []
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
     assert worker.take() == 7
     assert worker.take() is None
     assert worker.filenos() == []
@@ -95,22 +96,6 @@ def test_a_worker_that_was_closed_can_start_again() -> None:
     assert worker.close(PATIENCE_S)
     for thread in named_slow():
         thread.join(PATIENCE_S)
-
-
-def test_the_switch_interval_is_short_until_the_last_worker_is_closed() -> None:
-    ordinary_s = sys.getswitchinterval()
-    first, second = Worker[object]("slow"), Worker[object]("slow")
-    for worker in (first, second):
-        assert worker.submit(lambda: 1)
-    first.close(PATIENCE_S)
-    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
-    second.close(PATIENCE_S)
-    assert sys.getswitchinterval() == ordinary_s
-    second.close(PATIENCE_S)
-    assert first.submit(lambda: 1)
-    assert sys.getswitchinterval() == pytest.approx(SWITCH_S)
-    first.close(PATIENCE_S)
-    assert sys.getswitchinterval() == ordinary_s
 
 
 class _Large:

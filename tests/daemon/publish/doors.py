@@ -9,7 +9,8 @@ from typing import Self
 import zmq
 
 from daemon.publish.companion import Answer
-from daemon.publish.door import Door, Listener
+from daemon.publish.door import Door
+from daemon.publish.listener import Listener
 from daemon.trust.lift_book import Report
 
 WAIT_MS = 100_000
@@ -19,7 +20,7 @@ class Publisher:
     """A door that only publishes."""
 
     def __init__(self, endpoint: str, high_water_mark: int = 1000, *, awaits: bool = False) -> None:
-        self._listener = Listener.of(endpoint)
+        self._listener = Listener(endpoint)
         try:
             self.door = Door(
                 self._listener, high_water_mark=high_water_mark, awaits_subscriber=awaits

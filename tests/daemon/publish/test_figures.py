@@ -9,7 +9,7 @@ import pytest
 from daemon.judge.reasons import Decision, Reason
 from daemon.publish.latency import BUCKETS, LatencyHistogram
 from daemon.publish.messages import DECISION_CODE, Verdict
-from daemon.run.summary import WITHOUT_LEARNING, Summary, Tally
+from daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
 from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust
 
@@ -61,7 +61,7 @@ def verdict(outcome: Decision) -> Verdict:
 
 
 def test_scores_follow_their_definitions_with_slip_positive() -> None:
-    summary = Summary()
+    summary = RunSummary()
     cases = [
         (Decision.SLIP, True, 8),
         (Decision.STABLE, True, 2),
@@ -83,14 +83,14 @@ def test_scores_follow_their_definitions_with_slip_positive() -> None:
 
 
 def test_no_labels_means_no_scores() -> None:
-    summary = Summary()
+    summary = RunSummary()
     summary.add(verdict(Decision.STABLE), None)
     assert summary.tally.scores() is None
     assert not any("recorded" in line for line in summary.lines(1.0, None))
 
 
 def test_a_score_without_a_denominator_is_left_out() -> None:
-    summary = Summary()
+    summary = RunSummary()
     summary.add(verdict(Decision.STABLE), False)
     assert summary.tally.scores() == {"accuracy": 1.0}
 
@@ -123,7 +123,7 @@ def test_what_stable_is_worth_counts_each_lift_of_known_outcome() -> None:
 
 
 def test_an_outcome_that_comes_later_counts_as_if_it_had_been_recorded() -> None:
-    early, late = Summary(), Summary()
+    early, late = RunSummary(), RunSummary()
     for grasp, slipped in enumerate((True, False, True, False), 1):
         said = verdict(Decision.STABLE if grasp < 3 else Decision.SLIP)
         said = msgspec.structs.replace(said, grasp=grasp)
@@ -136,7 +136,7 @@ def test_an_outcome_that_comes_later_counts_as_if_it_had_been_recorded() -> None
 
 
 def test_without_learning_is_shown_where_something_was_learned() -> None:
-    summary, trust = Summary(), Trust("model", 2)
+    summary, trust = RunSummary(), Trust("model", 2)
     grasp = GraspId("boot", 1)
     summary.add(verdict(Decision.STABLE), True)
     summary.compared[WITHOUT_LEARNING].add(Decision.SLIP, (), slipped=True)

@@ -10,7 +10,7 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,15 @@ from daemon import scene
 from daemon.judge.network import Opinion
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Moment
-from daemon.publish.companion import Published
-from daemon.publish.door import PublishError
+from daemon.publish.companion import PublishedVerdict
+from daemon.publish.listener import PublishError
 from daemon.publish.messages import decode_status, decode_verdict
 from daemon.publish.sockets import Sockets, plan
 from daemon.trust.lift_book import GraspId, LiftBook
-from drivers.recordings.csv_player import DEMO_TABLE
 from tests.daemon.fakes import Clock
 from tests.daemon.publish.doors import Asked, Peers
+from tests.kit.scenes import demo_scene
+from tests.kit.waiting import wait_until
 
 PATIENCE_MS = 100_000
 HOSTILE_MESSAGES = 10_000
@@ -54,13 +55,6 @@ def wanted(
 
 GOLDEN = Path(__file__).parent / "golden"
 STATUS = decode_status((GOLDEN / "status.json").read_bytes())
-
-
-def until(done: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_MS / 1e3
-    while not done():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.002)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +101,7 @@ def test_questions_and_outcomes_reach_the_loop_and_are_answered(
             sockets.before_wait(requests)
             return bool(requests.times and requests.outcomes)
 
-        until(has_come)
+        wait_until(has_come)
         (report,) = requests.outcomes
         assert report[:3] == (GraspId("0" * 32, 7), "slip", None)
         assert asker.recv() == b'{"v":1,"ok":true}'
@@ -130,7 +124,7 @@ def test_a_peer_that_asks_lift_claims_the_grasp_that_its_answer_is_about(
         sockets.questions.take([[b"dashboard", b"judge"], [b"controller", b"lift"]], 0, Asked())
         verdict = decode_verdict((GOLDEN / "verdict_stable.json").read_bytes())
         judgement = Judgement(0, Decision.STABLE, (), 0.1, Moment(number), Opinion(0.1, ()))
-        sockets.on_verdict(Published(judgement, verdict, b"{}", None, True, grasp, lifts))
+        sockets.on_verdict(PublishedVerdict(judgement, verdict, b"{}", None, True, grasp, lifts))
         assert len(sockets.questions.waiting) == 0
     assert lifts.may_report(grasp, b"controller")
     assert lifts.may_report(grasp, b"dashboard") == (number == 0)
@@ -160,11 +154,7 @@ def test_a_proxy_that_has_ended_ends_the_loop(
 
 def test_a_daemon_whose_proxy_ends_ends_with_an_error(tmp_path: Path) -> None:
     """So systemd starts it again: only the code 2 of a wrong scene forbids that."""
-    scene = tmp_path / "scene.toml"
-    scene.write_text(
-        f'[tactile]\ndriver = "replay"\nloop = true\nrecordings = ["{DEMO_TABLE}"]\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/v"\n'
-    )
+    scene = demo_scene(tmp_path, "loop = true")
     code = (
         "import sys, time, zmq; zmq.proxy = lambda *_sockets: time.sleep(1.0); "
         f"from daemon.cli import main; sys.exit(main(['run', {str(scene)!r}]))"
@@ -284,7 +274,7 @@ def test_ten_thousand_hostile_messages_do_no_harm(
             questions.answer(b"{}")
             return bool(friend.poll(0) and asker.poll(0))
 
-        until(served)
+        wait_until(served)
         assert friend.recv_multipart() == [b"verdict.right", b"{}"]
         assert asker.recv() == b"{}"
         if door == "ask":

@@ -22,14 +22,14 @@ from daemon.assembly.recorder import build_recorder
 from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateCause
-from daemon.publish.companion import LoopEvent, Published
+from daemon.publish.companion import LoopEvent, PublishedVerdict
 from daemon.publish.messages import Status, Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter, header_of
 from daemon.record.recorder import Recorder
-from daemon.scene import Record
+from daemon.scene.scene import Record
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
@@ -167,7 +167,9 @@ class Daemon:
         self._now_ns = reading.t_ns
         self._outbox.tactile(reading, None)
         judgement = self.pipeline.judge(reading)
-        self.recorder.on_verdict(Published(judgement, NO_VERDICT, b"", reading, True, *NO_LIFT))
+        self.recorder.on_verdict(
+            PublishedVerdict(judgement, NO_VERDICT, b"", reading, True, *NO_LIFT)
+        )
         self.pipeline.learn()
         if reading.seq % 100 == 99:
             time.sleep(0.05)

@@ -25,7 +25,8 @@ from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.record.topics import schemas
-from daemon.scene import Record, SceneError
+from daemon.scene import SceneError
+from daemon.scene.scene import Record
 from drivers.base import JointReading
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording

@@ -22,7 +22,7 @@ from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.recorder import Recorder
 from daemon.record.topics import EVENT, Event, Exchanged, Topic, schemas
 from daemon.record.viewers import INFO, SCALE, WARNING, Journal, Painter, RawImage
-from daemon.scene import Record
+from daemon.scene.scene import Record
 from daemon.trust.learner import LearnerState
 from drivers.base import JointReading, TactileReading
 from drivers.recordings.csv_rows import open_recording

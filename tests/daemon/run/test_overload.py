@@ -16,14 +16,14 @@ import pytest
 from daemon.judge.decision import ContactLimits, GateLimits, HandLimits
 from daemon.judge.reasons import Decision, Reason
 from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion, LoopEvent, Published
-from daemon.publish.messages import Status, Verdict, decode_status
+from daemon.publish.companion import LoopEvent
 from daemon.publish.outbox import Outbox
-from daemon.run.loop import DRAINS_MAX, Loop, Timing
+from daemon.run.loop import DRAINS_MAX, Loop, LoopTiming
 from daemon.run.overload import YIELD_AFTER_NS, YIELD_MAX_NS, LoadShedder, mark_repeats
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline, reading
 from tests.daemon.judge.test_only_stable_if import POSES
+from tests.kit.loops import LoopBench
 
 START_NS = Clock().now_ns
 PERIOD_NS = 10 * MS
@@ -52,20 +52,8 @@ class LiveDriver(FakeDriver):
         return taken  # type: ignore[return-value]
 
 
-class ClockSelector(selectors.SelectSelector):
-    """Moves the clock instead of waiting; no descriptor is ever ready."""
-
-    def __init__(self, clock: Clock) -> None:
-        super().__init__()
-        self.clock = clock
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        self.clock.now_ns += round((timeout or 0.0) * 1e9)
-        return []
-
-
-class Bench(Companion):
-    """A loop on a clock of its own, which stands still but for what judging costs."""
+class OverloadedLoop(LoopBench):
+    """A loop whose verdicts cost time, run to its end."""
 
     def __init__(
         self,
@@ -75,36 +63,10 @@ class Bench(Companion):
         *,
         hand: HandLimits | None = None,
     ) -> None:
-        self.clock = clock
-        self.cost_ns = cost_ns
-        self.judged: list[tuple[Verdict, TactileReading]] = []
-        self.statuses: list[Status] = []
+        super().__init__(driver, clock, cost_ns=cost_ns, hand=hand, max_age_ms=1000)
         self.angles: list[int] = []
         self.gaps = 0
-        self.rests_s: list[float] = []
-        self.rounds_ns: list[int] = []
-        """When the loop had gone round."""
-        self.driver = driver
-        with StopSignal() as stop:
-            loop = Loop(
-                [driver],
-                pipeline(FakeModel(), clock, hand=hand, max_age_ns=SECOND_NS),
-                Outbox("right", FINGERS, "fake", "ab" * 32, [self], clock, lambda: 1.79e9),
-                stop,
-                [self],
-                Timing(SECOND_NS, clock, rest=self._rest, selector=lambda: ClockSelector(clock)),
-            )
-            with closing(loop):
-                loop.run()
-
-    def _rest(self, seconds: float) -> None:
-        self.rests_s.append(seconds)
-        self.clock.now_ns += round(seconds * 1e9)
-
-    def on_verdict(self, published: Published) -> None:
-        self.clock.now_ns += self.cost_ns()
-        if published.reading is not None:
-            self.judged.append((published.verdict, published.reading))
+        self.run()
 
     def on_reading(self, reading: Reading) -> None:
         if isinstance(reading, JointReading):
@@ -113,28 +75,18 @@ class Bench(Companion):
     def on_event(self, event: LoopEvent) -> None:
         self.gaps += event is LoopEvent.SKIPPED
 
-    def after_round(self) -> None:
-        self.rounds_ns.append(self.clock())
-
-    def send(self, topic: bytes, payload: bytes) -> None:
-        if topic == b"status.right":
-            self.statuses.append(decode_status(payload))
-
-    def wanted(self, _topic: bytes) -> bool:
-        return False
-
 
 def stream(seconds: float, period_ns: int = PERIOD_NS) -> list[Reading]:
     number = round(seconds * SECOND_NS / period_ns)
     return [reading(START_NS + seq * period_ns, seq, seq) for seq in range(number)]
 
 
-def flood(cost_ns: int, seconds: float = 3.0, at_once: int = 1000) -> Bench:
+def flood(cost_ns: int, seconds: float = 3.0, at_once: int = 1000) -> OverloadedLoop:
     clock = Clock()
-    return Bench(LiveDriver(stream(seconds), clock, at_once), clock, lambda: cost_ns)
+    return OverloadedLoop(LiveDriver(stream(seconds), clock, at_once), clock, lambda: cost_ns)
 
 
-@pytest.mark.parametrize("times", [1.5, 3.0, 10.0, 50.0])
+@pytest.mark.parametrize("times", [1.5, 10.0])
 def test_at_any_overload_the_newest_is_judged_and_all_are_accounted_for(times: float) -> None:
     cost_ns = round(times * PERIOD_NS)
     bench = flood(cost_ns, 4.0)
@@ -164,7 +116,7 @@ def test_what_can_be_judged_in_time_is_judged_whole() -> None:
 def test_a_stall_that_can_be_caught_up_costs_no_reading() -> None:
     clock = Clock()
     costs = itertools.chain([0] * 20, [95 * MS], itertools.repeat(MS // 2))
-    bench = Bench(LiveDriver(stream(1.0), clock), clock, lambda: next(costs))
+    bench = OverloadedLoop(LiveDriver(stream(1.0), clock), clock, lambda: next(costs))
     assert [seen.seq for _, seen in bench.judged] == list(range(100))
     assert bench.statuses[-1].skipped_readings == 0
 
@@ -173,7 +125,7 @@ def test_a_recording_is_judged_row_by_row_however_long_that_takes() -> None:
     clock = Clock()
     driver = LiveDriver(stream(1.0), clock)
     driver.live = False
-    bench = Bench(driver, clock, lambda: 30 * MS)
+    bench = OverloadedLoop(driver, clock, lambda: 30 * MS)
     assert [seen.seq for _, seen in bench.judged] == list(range(100))
     assert bench.statuses[-1].skipped_readings == 0
     assert not any(status.overloaded for status in bench.statuses)
@@ -200,7 +152,7 @@ def test_it_is_said_once_when_it_begins_and_once_when_it_is_over(
         return 30 * MS if clock() < START_NS + 5 * SECOND_NS else 0
 
     with caplog.at_level(logging.INFO, "graspd"):
-        bench = Bench(LiveDriver(stream(13.0), clock), clock, cost_ns)
+        bench = OverloadedLoop(LiveDriver(stream(13.0), clock), clock, cost_ns)
     times_s = [(status.t_mono_ns - START_NS) / SECOND_NS for status in bench.statuses]
     said = [status.overloaded for status in bench.statuses]
     assert said[:2] == [False, False]
@@ -213,7 +165,7 @@ def test_it_is_said_once_when_it_begins_and_once_when_it_is_over(
 def test_a_single_stall_is_counted_and_no_overload(caplog: pytest.LogCaptureFixture) -> None:
     clock = Clock()
     costs = itertools.chain([MS] * 20, [SECOND_NS // 2], itertools.repeat(MS))
-    bench = Bench(LiveDriver(stream(3.0), clock), clock, lambda: next(costs))
+    bench = OverloadedLoop(LiveDriver(stream(3.0), clock), clock, lambda: next(costs))
     assert bench.statuses[-1].skipped_readings == 49
     assert not any(status.overloaded for status in bench.statuses)
     assert not caplog.records
@@ -226,7 +178,7 @@ def test_joints_are_all_followed_in_their_order() -> None:
         for number, item in enumerate(stream(2.0))
     ]
     both = [item for pair in zip(angles, stream(2.0), strict=True) for item in pair]
-    bench = Bench(LiveDriver(both, clock), clock, lambda: 30 * MS)
+    bench = OverloadedLoop(LiveDriver(both, clock), clock, lambda: 30 * MS)
     assert bench.angles == list(range(200))
     assert bench.statuses[-1].skipped_readings > 100
 
@@ -241,7 +193,7 @@ def test_the_newest_is_that_of_all_that_the_driver_has() -> None:
 def test_a_driver_that_always_has_more_does_not_hold_the_loop() -> None:
     clock = Clock()
     driver = LiveDriver(stream(2.0, PERIOD_NS // 200), clock, at_once=20)
-    bench = Bench(driver, clock, lambda: 30 * MS)
+    bench = OverloadedLoop(driver, clock, lambda: 30 * MS)
     rounds = len(bench.rounds_ns)
     assert driver.calls <= (DRAINS_MAX + 1) * rounds
     assert max(np.diff(bench.rounds_ns)) < 200 * MS
@@ -279,7 +231,7 @@ def test_a_sensor_that_freezes_among_what_is_left_out_is_never_stable() -> None:
             assert isinstance(item, TactileReading)
             item.counts[:] = came[at].counts  # type: ignore[union-attr]
     first = {came[at].t_ns for at in range(100, 200, 10)}
-    bench = Bench(LiveDriver(came, clock), clock, lambda: 35 * MS)
+    bench = OverloadedLoop(LiveDriver(came, clock), clock, lambda: 35 * MS)
     frozen = [
         (verdict, seen)
         for verdict, seen in bench.judged
@@ -333,7 +285,7 @@ def busy(seed: int, clock: Clock) -> Iterator[int]:
             yield cost_ns
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
     judged = []
     for live in (False, True):
@@ -341,7 +293,7 @@ def test_what_is_stable_in_overload_would_be_stable_without(seed: int) -> None:
         costs = busy(seed, clock) if live else itertools.repeat(0)
         driver = LiveDriver([msgspec.structs.replace(item) for item in grasps(seed)], clock)
         driver.live = live
-        bench = Bench(driver, clock, costs.__next__, hand=LIMITS)
+        bench = OverloadedLoop(driver, clock, costs.__next__, hand=LIMITS)
         judged.append({seen.seq: verdict for verdict, seen in bench.judged})
         skipped = bench.statuses[-1].skipped_readings
     without, overloaded = judged
@@ -367,7 +319,7 @@ def test_what_moved_where_readings_were_left_out_must_settle_anew() -> None:
         return 15 * MS if 200 * PERIOD_NS < clock() - START_NS < 215 * PERIOD_NS else 0
 
     driver = LiveDriver(came, clock)
-    bench = Bench(driver, clock, cost_ns, hand=LIMITS)
+    bench = OverloadedLoop(driver, clock, cost_ns, hand=LIMITS)
     said = {seen.seq: verdict for verdict, seen in bench.judged}
     assert said[199].verdict is Decision.STABLE
     first_skipped = min(set(range(250)) - set(said))
@@ -435,7 +387,7 @@ def test_a_slow_processor_that_always_finds_work_is_no_reason_not_to_rest() -> N
             Outbox("right", FINGERS, "fake", "ab" * 32, []),
             stop,
             [],
-            Timing(60 * SECOND_NS, rest=rest, selector=BusySelector),
+            LoopTiming(60 * SECOND_NS, rest=rest, selector=BusySelector),
         )
         with closing(loop):
             loop.run()

@@ -10,33 +10,30 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import zmq
 
 from daemon import scene
 from daemon.assembly import assembly
 from daemon.assembly.parts import Parts
 from daemon.judge.reasons import GateState
-from daemon.publish.messages import State, Status, Verdict, decode_status, decode_verdict
+from daemon.publish.messages import decode_status
 from daemon.run.realtime import RealtimeMode
 from daemon.run.rehearsal import rehearse
 from daemon.run.runner import rehearse_grasp
-from daemon.scene import Realtime
+from daemon.scene.scene import Realtime
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.twins.grasps.grasps import Counts, recorded_counts
-from tests.daemon.processes import TIMEOUT_S, start
 from tests.threads import at_work
 
 WORLD = """
 import ctypes, os, resource, sys
 from daemon.run.realtime import RealtimeMode
-from daemon.scene import Realtime
+from daemon.scene.scene import Realtime
 """
 NOBODY = 65534
 STATUS = Path(__file__).parents[1] / "publish" / "golden" / "status.json"
@@ -212,62 +209,6 @@ def p_slips(parts: Parts, rows: list[Counts]) -> list[float | None]:
     ]
 
 
-class Twin:
-    """An SPI bridge that sweeps as fast as it is told, and all that the daemon says of it."""
-
-    def __init__(self, folder: Path, listener: zmq.Socket[bytes], *, realtime: bool) -> None:
-        self._path = folder / "twin"
-        # Where that may be: the daemon leaves it half of the machine, whoever else is at work.
-        self._before = ("chrt", "-f", "2") if realtime else ("nice", "-n", "-15")
-        self._listener = listener
-        self._process: subprocess.Popen[str] | None = None
-        self.statuses: list[Status] = []
-        self.judged = 0
-        """Readings that were not left out: verdicts, but for those that say that nothing came."""
-        self._silences = 0
-        self._seq = -1
-
-    def sweep(self, rate_hz: float) -> None:
-        self.stop()
-        play = ("--recording", DEMO_TABLE, "--loop")
-        options = ("--path", self._path, "--rate", rate_hz, *play)
-        self._process = start("twin", "spi", *options, before=self._before)
-
-    def stop(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:
-            process.terminate()
-            process.communicate(timeout=TIMEOUT_S)
-
-    def hear(self, seconds: float, until: Callable[[Status], bool]) -> bool:
-        """Listen until something is said; whether it was in time."""
-        deadline_s = time.monotonic() + seconds
-        while (left_s := deadline_s - time.monotonic()) > 0.0:
-            if self._listener.poll(round(left_s * 1e3)):
-                topic, payload = self._listener.recv_multipart()
-                if topic.startswith(b"verdict."):
-                    self._count(decode_verdict(payload))
-                    continue
-                self.statuses.append(decode_status(payload))
-                if until(self.statuses[-1]):
-                    return True
-        return False
-
-    def _count(self, verdict: Verdict) -> None:
-        self._seq = verdict.seq
-        self._silences += verdict.still_ms is None
-        self.judged = self._seq + 1 - self._silences
-
-
-def too_many(former: Status, later: Status) -> bool:
-    """Whether, between two statuses, a fifth more readings came than were judged."""
-    came = later.drivers["spi"]["readings"] - former.drivers["spi"]["readings"]
-    skipped = later.skipped_readings - former.skipped_readings
-    return came >= OVERLOAD * (came - skipped) > 0
-
-
-OVERLOAD = 1.2
-RATES_HZ = (2000, 4000, 8000, 16_000, 32_000)
 RTTIME_US = 1_000_000
 """As `LimitRTTIME` of the unit, but a fifth: so long may it compute without sleeping."""
 
@@ -295,60 +236,3 @@ print("lives on")
         tmp_path,
     )
     assert said.endswith("lives on\n")
-
-
-@pytest.mark.parametrize("realtime", [False, True])
-def test_an_overloaded_daemon_lives_on_and_accounts_for_all(tmp_path: Path, realtime: bool) -> None:
-    if realtime and not fifo_may_be_had():
-        pytest.skip("SCHED_FIFO is refused here")
-    path = tmp_path / "scene.toml"
-    path.write_text(
-        f'[tactile]\ndriver = "spi"\nport = "{tmp_path}/twin"\n[model]\nname = "cnn1"\n'
-        f'[publish]\nendpoint = "ipc://{tmp_path}/graspd"\ntactile_hz = 10000\n'
-        + ("[realtime]\npriority = 1\nlock_memory = false\n" if realtime else "")
-    )
-    limit = ("prlimit", f"--rttime={RTTIME_US}:{2 * RTTIME_US}")
-    slowed = ("env", "PYTHONTRACEMALLOC=1", *limit)  # else it is near as fast as the twin
-    with (
-        zmq.Context() as context,
-        context.socket(zmq.SUB) as listener,
-        context.socket(zmq.SUB) as burden,
-        ExitStack() as stack,
-    ):
-        for topic in ("status.", "verdict."):
-            listener.subscribe(topic)
-        listener.rcvhwm = 0  # a test that is held up loses nothing
-        listener.connect(f"ipc://{tmp_path}/graspd")
-        burden.rcvhwm = 1  # it never reads
-        burden.subscribe("tactile.")  # so each reading takes long enough to be too many
-        burden.connect(f"ipc://{tmp_path}/graspd")
-        twin = Twin(tmp_path, listener, realtime=realtime)
-        stack.callback(twin.stop)
-        daemon = stack.enter_context(start("run", path, before=slowed))
-        stack.callback(daemon.terminate)
-        twin.sweep(20)
-        assert twin.hear(60.0, lambda status: True)
-        for rate_hz in RATES_HZ:
-            twin.sweep(rate_hz)
-            twin.hear(8.0, lambda status: status.overloaded)
-            former = twin.statuses[-1]
-            twin.hear(3.2, lambda status: False)
-            if former.overloaded and too_many(former, twin.statuses[-1]):
-                break
-        assert too_many(former, twin.statuses[-1])
-        assert all(status.overloaded for status in twin.statuses if status.seq > former.seq)
-        twin.sweep(20)
-        assert twin.hear(20.0, lambda status: not status.overloaded)
-        calm = twin.statuses[-1]
-        twin.stop()
-        assert twin.hear(5.0, lambda status: status.state is State.SILENT)
-        last = twin.statuses[-1]
-        daemon.terminate()
-        _, said = daemon.communicate(timeout=TIMEOUT_S)
-    assert daemon.returncode == 0, said
-    assert len({status.boot_id for status in twin.statuses}) == 1
-    times_ns = [status.t_mono_ns for status in twin.statuses]
-    assert max(b - a for a, b in itertools.pairwise(times_ns)) < 2_000_000_000
-    assert said.count("overloaded:") == said.count("overload is over") == 1
-    assert last.drivers["spi"]["readings"] == twin.judged + last.skipped_readings
-    assert last.skipped_readings == calm.skipped_readings

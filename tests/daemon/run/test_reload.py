@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import select
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,8 +17,8 @@ from daemon.assembly.parts import Parts
 from daemon.process.signals import StopSignal
 from daemon.run import reload
 from daemon.run.reload import Reload
+from tests.kit.waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 100.0
 PARTS = cast(Parts, object())
 
 
@@ -58,13 +57,6 @@ def hang_up() -> None:
     os.kill(os.getpid(), signal.SIGHUP)
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.002)
-
-
 @pytest.fixture(autouse=True)
 def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reload, "PERIOD_NS", 50_000_000)
@@ -76,7 +68,7 @@ def test_the_loop_goes_on_until_there_is_what_to_run() -> None:
         assert found.filenos() == []
         hang_up()
         assert not found.take_reload()
-        wait_for(lambda: len(preparing.began) == 1)
+        wait_until(lambda: len(preparing.began) == 1)
         assert preparing.began != [threading.get_native_id()]
         assert preparing.told == 1
         for _ in range(100):
@@ -100,12 +92,12 @@ def test_whatever_is_raised_is_handed_over() -> None:
         preparing.ends = fail
         preparing.go.release()
         hang_up()
-        wait_for(found.take_reload)
+        wait_until(found.take_reload)
         assert found.take() is error
         preparing.ends = lambda: PARTS
         preparing.go.release()
         hang_up()
-        wait_for(found.take_reload)
+        wait_until(found.take_reload)
         assert found.take() is PARTS
 
 
@@ -113,63 +105,32 @@ def test_a_storm_prepares_one_scene_and_one_more() -> None:
     with reloading() as (found, preparing):
         hang_up()
         found.take_reload()
-        wait_for(lambda: len(preparing.began) == 1)
+        wait_until(lambda: len(preparing.began) == 1)
         for _ in range(500):
             hang_up()
             assert not found.take_reload()
         preparing.go.release()
-        wait_for(found.take_reload)
+        wait_until(found.take_reload)
         found.take()
         preparing.go.release()
-        wait_for(found.take_reload)  # what came in between is not forgotten
+        wait_until(found.take_reload)  # what came in between is not forgotten
         found.take()
         time.sleep(0.1)
         assert not found.take_reload()
         assert len(preparing.began) == preparing.told == 2
 
 
-def test_preparations_keep_their_distance() -> None:
-    with reloading() as (found, preparing):
-        preparing.go.release(100)
-        began_s = time.monotonic()
-        end_s = began_s + 0.5
-        while time.monotonic() < end_s:
-            hang_up()
-            if found.take_reload():
-                found.take()
-        assert 2 <= len(preparing.began) <= 0.5 / 0.05 + 2
-
-
 def test_the_end_does_not_wait_for_what_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reload, "END_S", 0.05)
-    switch_s = sys.getswitchinterval()
     with reloading() as (found, preparing):
         hang_up()
         found.take_reload()
-        wait_for(lambda: bool(preparing.began))
+        wait_until(lambda: bool(preparing.began))
         began_s = time.monotonic()
         found.close()
         assert time.monotonic() - began_s < 5.0
-        assert sys.getswitchinterval() == switch_s
         preparing.go.release()
-        wait_for(lambda: "reload" not in [thread.name for thread in threading.enumerate()])
-
-
-def test_the_end_cuts_short_what_waits_for_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reload, "PERIOD_NS", 60_000_000_000)
-    with reloading() as (found, preparing):
-        preparing.go.release(2)
-        for _ in range(2):
-            hang_up()
-            found.take_reload()
-            if not preparing.began:
-                wait_for(found.take_reload)
-                found.take()
-        began_s = time.monotonic()
-        found.close()
-        assert time.monotonic() - began_s < 5.0
-        assert len(preparing.began) == 1
-        monkeypatch.setattr(found, "close", lambda: None)
+        wait_until(lambda: "reload" not in [thread.name for thread in threading.enumerate()])
 
 
 def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
@@ -181,7 +142,7 @@ def test_the_loop_is_woken_for_the_next_preparation_only_where_one_is_requested(
         preparing.go.release()
         began_ns = time.monotonic_ns()
         hang_up()
-        wait_for(found.take_reload)
+        wait_until(found.take_reload)
         found.take()
         assert found.due_ns() is None
         hang_up()

@@ -9,10 +9,10 @@ import pytest
 
 from daemon.judge.health import SWEEPS
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.companion import Answer, Published
+from daemon.publish.companion import Answer, PublishedVerdict
 from daemon.publish.messages import decode_verdict
 from daemon.run.replaying import Comparison, Controller
-from daemon.run.summary import WITHOUT_SESSION, Summary
+from daemon.run.summary import WITHOUT_SESSION, RunSummary
 from daemon.trust.lift_book import Report
 from drivers.base import Annotation
 from tests.daemon.fakes import NO_LIFT, Clock, FakeModel, pipeline, reading
@@ -47,7 +47,7 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
     verdict = decode_verdict(GOLDEN.read_bytes())
     lifted = msgspec.structs.replace(reading(0), annotation=note)
     judgement = pipeline(FakeModel(), Clock()).judge(lifted)
-    controller.on_verdict(Published(judgement, verdict, b"", lifted, True, *NO_LIFT))
+    controller.on_verdict(PublishedVerdict(judgement, verdict, b"", lifted, True, *NO_LIFT))
     controller.tell()
     assert requests.told == [("slip", told)]
 
@@ -56,7 +56,7 @@ def test_an_object_is_told_by_a_name_that_outcomes_may_have(
 def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
     between: int, fresh: bool
 ) -> None:
-    clock, result = Clock(), Summary()
+    clock, result = Clock(), RunSummary()
     run, compared = pipeline(FakeModel(), clock), pipeline(FakeModel(), clock)
     comparison = Comparison(WITHOUT_SESSION, compared, result)
     verdict = decode_verdict(GOLDEN.read_bytes())
@@ -66,7 +66,7 @@ def test_a_comparison_finds_a_grasp_that_comes_again_as_fresh_as_the_run_does(
         last = run.judge(new)
         judged = seq in (0, len(seeds) - 1)
         told = msgspec.structs.replace(verdict, judged=judged, grasp=1 + seq)
-        comparison.on_verdict(Published(last, told, b"", new, True, *NO_LIFT))
+        comparison.on_verdict(PublishedVerdict(last, told, b"", new, True, *NO_LIFT))
     tally = result.compared[WITHOUT_SESSION]
     assert tally.decisions.total() == 2
     assert tally.decisions[Decision.UNKNOWN] == tally.reasons[Reason.FROZEN] == (not fresh)

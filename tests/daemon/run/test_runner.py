@@ -165,7 +165,6 @@ def test_a_hand_of_another_name_gets_its_topic_and_a_new_socket(running: Running
     ("changes", "word"),
     [
         ({"model": "no-such"}, "no-such"),
-        ({"hand": "Not A Name"}, "hand.name"),
         ({"recording": "/missing.csv"}, "/missing.csv"),
         ({"socket": "no/such/folder"}, "cannot publish"),
     ],
@@ -187,10 +186,9 @@ def test_a_wrong_scene_changes_nothing_and_is_told(
     assert "the former scene goes on" in said
 
 
-@pytest.mark.parametrize("text", ["[hand\n", ".".join(["a"] * 24_000) + " = 1"])
-def test_a_broken_file_changes_nothing_not_even_the_count(running: Running, text: str) -> None:
+def test_a_broken_file_changes_nothing_not_even_the_count(running: Running) -> None:
     before = running.verdict()
-    running.scene.write_text(text)
+    running.scene.write_text("[hand\n")
     running.hang_up()
     running.told("READY=1")
     after = running.verdict()

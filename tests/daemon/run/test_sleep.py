@@ -5,12 +5,11 @@ from __future__ import annotations
 import pytest
 
 from daemon.judge.reasons import Decision, Reason
-from daemon.process.signals import StopSignal
 from daemon.process.sleep import Sleep
 from daemon.publish.messages import State
 from daemon.run.loop import Ended
 from tests.daemon.fakes import MS, Clock, FakeDriver, FakeModel, reading
-from tests.daemon.run.test_loop import Bench
+from tests.kit.loops import LoopBench
 
 HOUR_NS = 3600 * 1000 * MS
 
@@ -31,22 +30,20 @@ class Sleeper(FakeModel):
 def test_a_reading_of_before_a_sleep_gives_no_verdict_however_fresh_it_looks() -> None:
     clock, boot = Clock(), Clock()
     driver = FakeDriver([reading(clock(), seed) for seed in range(9)], clock)
-    with StopSignal() as stop:
-        bench = Bench(driver, clock, stop, Sleeper(boot), sleep=Sleep(clock, boot))
-        assert bench.run() is Ended.SLEPT
+    bench = LoopBench(driver, clock, model=Sleeper(boot), sleep=Sleep(clock, boot))
+    assert bench.run() is Ended.SLEPT
     *before, last = bench.verdicts
     assert [verdict.verdict for verdict in before] == [Decision.STABLE] * 2
     assert (last.verdict, last.reasons) == (Decision.UNKNOWN, [Reason.STALE])
-    assert bench.output.statuses()[-1].state is State.STOPPING
+    assert bench.statuses[-1].state is State.STOPPING
 
 
 def test_who_comes_late_after_a_sleep_is_told_nothing_of_before_it() -> None:
     clock, boot = Clock(), Clock()
     sleep = Sleep(clock, boot)
     boot.now_ns += HOUR_NS
-    with StopSignal() as stop:
-        bench = Bench(FakeDriver([reading(clock())], clock), clock, stop, sleep=sleep)
-        assert bench.run() is Ended.SLEPT  # before it has looked who has come
+    bench = LoopBench(FakeDriver([reading(clock())], clock), clock, sleep=sleep)
+    assert bench.run() is Ended.SLEPT  # before it has read anything
     assert [verdict.verdict for verdict in bench.verdicts] == [Decision.UNKNOWN]
 
 

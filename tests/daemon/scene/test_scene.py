@@ -10,9 +10,10 @@ from typing import get_args
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from daemon.scene import SCENE_MAX_BYTES, Scene, SceneError, load
+from daemon.scene import Scene, SceneError, load
 from daemon.scene.drivers import ReplayFaultsSection, ReplayTactile
 from daemon.scene.endpoints import check_endpoint
+from daemon.scene.scene import SCENE_MAX_BYTES
 from drivers.recordings.faults import ReplayFaults
 
 GOOD = """

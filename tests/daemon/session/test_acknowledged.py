@@ -13,10 +13,10 @@ import pytest
 import zmq
 
 from daemon.process.signals import StopSignal
-from daemon.publish.companion import Companion, Published
+from daemon.publish.companion import Companion, PublishedVerdict
 from daemon.publish.outbox import Outbox
 from daemon.publish.sockets import Sockets
-from daemon.run.loop import Ended, Loop, Timing
+from daemon.run.loop import Ended, Loop, LoopTiming
 from daemon.scene import parse
 from daemon.session.file import SessionFile, load
 from daemon.session.keeper import WAIT_S, SessionKeeper
@@ -47,7 +47,7 @@ class Controller(Companion):
         self.answered_at: int | None = None
         self.answer: dict[str, Any] | None = None
 
-    def on_verdict(self, published: Published) -> None:
+    def on_verdict(self, published: PublishedVerdict) -> None:
         self.verdicts += 1
         if self.verdicts == 3:
             self.socket.send(f"outcome {BOOT} {published.verdict.grasp} slip".encode())
@@ -94,7 +94,7 @@ class Lab:
                 driver = FakeDriver([reading(clock(), seed) for seed in range(READINGS)], clock)
                 outbox = Outbox("right", FINGERS, "fake", "0" * 64, [sockets], clock, boot_id=BOOT)
                 companions = [sockets, keeper, self.controller]
-                timing = Timing(100 * MS, clock)
+                timing = LoopTiming(100 * MS, clock)
                 loop = Loop([driver], judge, outbox, stop, companions, timing, keeper.keep)
                 with closing(loop):
                     self.ended = loop.run()

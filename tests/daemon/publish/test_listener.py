@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.publish.door import PublishError
-from daemon.publish.socket_file import SocketFile
+from daemon.publish.listener import Listener, PublishError
 from tests.daemon.publish.doors import Publisher
 
 
@@ -156,10 +155,10 @@ def test_a_folder_that_cannot_be_written_is_one_line() -> None:
 
 
 def test_a_bind_that_fails_leaves_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(_self: SocketFile) -> None:
+    def fail(*_arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(SocketFile, "_bind", fail)
+    monkeypatch.setattr(Listener, "_bind", fail)
     with pytest.raises(PublishError, match="No space left"):
         Publisher(f"ipc://{tmp_path}/v")
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,153 @@
+"""Endpoints to listen on. A socket file replaces only the socket of a process that has ended."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import grp
+import os
+import socket
+import stat
+from contextlib import ExitStack
+from pathlib import Path
+
+BACKLOG = 100
+"""Connections that wait to be accepted; the number that libzmq asks for."""
+
+
+class PublishError(Exception):
+    """A socket cannot be had, or has ended: fix the endpoint or stop the program that holds it."""
+
+    taken: str | None = None
+    """Endpoint that another program holds, if that is the reason."""
+
+
+class Listener:
+    """An endpoint, and the listening socket of an `ipc://` one.
+
+    A file at its path is replaced only if it is a socket of a dead process. `PATH.lock` is held
+    meanwhile: of two processes that find a dead socket, one takes its place and the other is
+    refused. `close` removes both files.
+    """
+
+    def __init__(self, endpoint: str, mode: int | None = None, group: str | None = None) -> None:
+        """`mode` and `group` are those of the file; the process's unless given.
+
+        Raises `PublishError` and leaves no file if there can be no socket.
+        """
+        self.endpoint = endpoint
+        self.socket: socket.socket | None = None
+        self._mode = mode
+        self._identity: tuple[int, int] | None = None
+        self._lock: int | None = None
+        if not endpoint.startswith("ipc://"):
+            return
+        self._path = Path(endpoint.removeprefix("ipc://"))
+        self._lock_path = Path(f"{self._path}.lock")
+        try:
+            self._take(None if group is None else _group_id(group))
+        except (OSError, PublishError) as error:
+            self.close()
+            why = getattr(error, "strerror", None) or str(error)
+            if isinstance(error, FileNotFoundError) and not self._path.parent.exists():
+                folder = self._path.parent
+                why = f"there is no folder {folder}; `graspd doctor SCENE` says who makes it"
+            raise PublishError(f"cannot publish on {endpoint}: {why}") from error
+
+    def _take(self, group: int | None) -> None:
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        _refuse_other_kinds(self._path)
+        self._lock = _locked(self._lock_path)
+        self._bind(self.socket, group)
+
+    def _bind(self, made: socket.socket, group: int | None) -> None:
+        path = self._path
+        try:
+            made.bind(str(path))
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise
+            _refuse_living(path)
+            path.unlink()
+            made.bind(str(path))
+        self._identity = _identity(path)
+        if group is not None and group != path.stat().st_gid:
+            os.chown(path, -1, group)
+        if self._mode is not None:
+            os.chmod(path, self._mode)
+        made.listen(BACKLOG)  # not before: no peer has connected while all could
+
+    def close(self) -> None:
+        """Stop listening, and remove both files. May be called again."""
+        if self.socket is not None:
+            self.socket.close()
+        lock, self._lock = self._lock, None
+        if lock is None:
+            return
+        with contextlib.suppress(OSError):  # the folder is gone or was locked
+            if self._identity is not None and _identity(self._path) == self._identity:
+                self._path.unlink()
+        with contextlib.suppress(OSError):
+            self._lock_path.unlink()
+        os.close(lock)
+
+
+def _group_id(name: str) -> int:
+    try:
+        return grp.getgrnam(name).gr_gid
+    except KeyError:
+        raise PublishError(f"there is no group {name}") from None
+
+
+def _identity(path: Path) -> tuple[int, int]:
+    status = path.lstat()
+    return status.st_dev, status.st_ino
+
+
+def _refuse_other_kinds(path: Path) -> None:
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise PublishError(f"{path} is there and is no socket")
+
+
+def _refuse_living(path: Path) -> None:
+    _refuse_other_kinds(path)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe:
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            return  # the process that bound it has ended
+        except OSError:  # a full queue, another type of socket, no permission: it is alive
+            pass
+    raise PublishError(f"{path} is the socket of another program that runs")
+
+
+def _locked(path: Path) -> int:
+    """Return a descriptor of the lock file, locked."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    while True:
+        descriptor = os.open(path, flags, 0o600)
+        with ExitStack() as stack:
+            stack.callback(os.close, descriptor)
+            status = os.fstat(descriptor)
+            if not stat.S_ISREG(status.st_mode) or status.st_size:
+                raise PublishError(f"{path} is there and is no lock of graspd")
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise PublishError("another graspd publishes there") from None
+            if _is_at(path, status):
+                stack.pop_all()
+                return descriptor
+            # Its former holder removed it after we had opened it.
+
+
+def _is_at(path: Path, status: os.stat_result) -> bool:
+    try:
+        return _identity(path) == (status.st_dev, status.st_ino)
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,133 @@
+"""A loop on a clock of the test, with everything around it replaced."""
+
+from __future__ import annotations
+
+import selectors
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
+
+from daemon.judge.decision import HandLimits
+from daemon.process.signals import StopSignal
+from daemon.process.sleep import Sleep
+from daemon.publish.companion import Answer, Companion, PublishedVerdict, at_once
+from daemon.publish.messages import Status, Verdict, decode_status
+from daemon.publish.outbox import Outbox
+from daemon.run.loop import Ended, Loop, LoopTiming
+from daemon.trust.trust import Trust
+from drivers.base import TactileReading
+from tests.daemon.fakes import FINGERS, MS, Clock, FakeDriver, FakeModel, pipeline
+
+
+class SentMessages:
+    """Keeps what was sent to it."""
+
+    def __init__(self) -> None:
+        self.sent: list[tuple[bytes, bytes]] = []
+        self.wants_tactile = False
+
+    def send(self, topic: bytes, payload: bytes) -> None:
+        self.sent.append((topic, payload))
+
+    def wanted(self, _topic: bytes) -> bool:
+        return self.wants_tactile
+
+    @property
+    def topics(self) -> list[bytes]:
+        return [topic for topic, _ in self.sent]
+
+    def statuses(self) -> list[Status]:
+        return [decode_status(payload) for topic, payload in self.sent if topic == b"status.right"]
+
+
+class ClockSelector(selectors.SelectSelector):
+    """Moves the clock instead of waiting; no descriptor is ever ready."""
+
+    def __init__(self, clock: Clock) -> None:
+        super().__init__()
+        self.clock = clock
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        self.clock.now_ns += round((timeout or 0.0) * 1e9)
+        return []
+
+
+class LoopBench(Companion):
+    """A loop, and what came out of it."""
+
+    def __init__(
+        self,
+        driver: FakeDriver,
+        clock: Clock,
+        *,
+        stop: StopSignal | None = None,
+        model: FakeModel | None = None,
+        companions: Sequence[Companion] = (),
+        boot_id: str | None = None,
+        trust: Trust | None = None,
+        keep: Callable[[Answer], None] = at_once,
+        hand: HandLimits | None = None,
+        max_age_ms: int = 100,
+        sleep: Sleep | None = None,
+        cost_ns: Callable[[], int] | None = None,
+    ) -> None:
+        """Without `stop` the bench has one of its own, which `run` closes.
+
+        With `cost_ns` time stands still but for waits and for what each verdict costs.
+        """
+        self.driver = driver
+        self.clock = clock
+        self.output = SentMessages()
+        self.verdicts: list[Verdict] = []
+        self.payloads: list[bytes] = []
+        self.judged: list[tuple[Verdict, TactileReading]] = []
+        self.rests_s: list[float] = []
+        self.rounds_ns: list[int] = []
+        """Time at the end of each round."""
+        self._cost_ns = cost_ns
+        self._stop = StopSignal() if stop is None else stop
+        self._owns_stop = stop is None
+        self.pipeline = pipeline(
+            model or FakeModel(), clock, hand=hand, trust=trust, max_age_ns=max_age_ms * MS
+        )
+        self.pipeline.boot_id = boot_id or ""
+        timing = LoopTiming(max_age_ms * MS, clock, Sleep() if sleep is None else sleep)
+        if cost_ns is not None:
+            timing = LoopTiming(
+                max_age_ms * MS, clock, rest=self._rest, selector=lambda: ClockSelector(clock)
+            )
+        outputs = [self.output]
+        self.loop = Loop(
+            [driver],
+            self.pipeline,
+            Outbox(
+                "right", FINGERS, "fake", "ab" * 32, outputs, clock, lambda: 5.0, boot_id=boot_id
+            ),
+            self._stop,
+            [self, *companions],
+            timing,
+            keep,
+        )
+
+    def run(self) -> Ended:
+        """Run the loop to its end."""
+        with closing(self.loop), self._stop if self._owns_stop else nullcontext():
+            return self.loop.run()
+
+    @property
+    def statuses(self) -> list[Status]:
+        return self.output.statuses()
+
+    def on_verdict(self, published: PublishedVerdict) -> None:
+        if self._cost_ns is not None:
+            self.clock.now_ns += self._cost_ns()
+        self.verdicts.append(published.verdict)
+        self.payloads.append(published.payload)
+        if published.reading is not None:
+            self.judged.append((published.verdict, published.reading))
+
+    def after_round(self) -> None:
+        self.rounds_ns.append(self.clock())
+
+    def _rest(self, seconds: float) -> None:
+        self.rests_s.append(seconds)
+        self.clock.now_ns += round(seconds * 1e9)
