@@ -18,52 +18,47 @@ from rich.console import Console
 from rich.live import Live
 
 from daemon.process.signals import StopSignal
-from daemon.watch.pixels import Canvas
 from daemon.watch.terminal import draw
-from daemon.watch.watching import TICK_S, Watched, snapshots
+from daemon.watch.watching import TICK_S, HandFeed, snapshots
 
 SIGNALS_MAX = 64
-"""Bytes that a look takes out of the pipe of signals."""
+"""Most bytes taken at once from the pipe of signals."""
 
 
 def can_draw() -> bool:
-    """Whether standard output is a terminal with a cursor that can be moved."""
+    """Return True if standard output is a terminal with a cursor that can be moved."""
     console = Console()
     return console.is_terminal and not console.is_dumb_terminal
 
 
-def show(hands: Sequence[Watched]) -> None:
-    """Draw on standard output until told to stop; needs a terminal there."""
-    console = Console()
-    canvas = Canvas(
-        colour=console.color_system is not None and not console.no_color,
-        ascii_only=console.options.ascii_only,
-    )
-    with StopSignal() as stop, Pause() as pause:
-        keys = Keys(stop)
+def show(hands: Sequence[HandFeed]) -> None:
+    """Draw on standard output, which must be a terminal, until told to stop."""
+    console = Console(highlight=False)
+    with StopSignal() as stop, Suspension() as suspension:
+        keyboard = Keyboard(stop)
         while True:
-            with keys.unseen(), Live(console=console, screen=True, auto_refresh=False) as live:
-                for seen in snapshots(hands, lambda: keys.wait() or pause.asked):
-                    size = console.width, console.height
-                    live.update(draw(seen, *size, canvas, keys.tabs % len(hands)), refresh=True)
-            if stop.received is not None or not pause.asked:
+            with (
+                keyboard.unbuffered(),
+                Live(console=console, screen=True, auto_refresh=False) as live,
+            ):
+                for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
+                    live.update(draw(seen, console.width, keyboard.tabs % len(hands)), refresh=True)
+            if stop.received is not None or not suspension.asked:
                 return
             now = time.strftime("%H:%M:%S")
-            console.out(
-                f"graspd watch stopped at {now}: unknown until it goes on (fg)", highlight=False
-            )
-            pause.stop()
+            console.print(f"graspd watch stopped at {now}: unknown until it goes on (fg)")
+            suspension.stop()
 
 
-class Pause:
-    """Ctrl-Z: the picture must not stay where nobody draws it any more."""
+class Suspension:
+    """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
 
     def __init__(self) -> None:
-        """Not asked yet."""
+        """Start without a request."""
         self.asked = False
 
     def __enter__(self) -> Self:
-        """Take over SIGTSTP, unless it is ignored; only the main thread can."""
+        """Take over SIGTSTP, unless it is ignored. Only the main thread can."""
         self._former = signal.getsignal(signal.SIGTSTP)
         self._take_over()
         return self
@@ -72,7 +67,7 @@ class Pause:
         signal.signal(signal.SIGTSTP, self._former)
 
     def stop(self) -> None:
-        """Stop as asked; comes back when the process is continued."""
+        """Stop the process; return when it is continued."""
         self.asked = False
         signal.signal(signal.SIGTSTP, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTSTP)
@@ -86,18 +81,18 @@ class Pause:
         self.asked = True
 
 
-class Keys:
-    """What is typed: `q` ends, Tab shows the next hand."""
+class Keyboard:
+    """Typed keys: `q` ends, Tab shows the next hand."""
 
     def __init__(self, stop: StopSignal) -> None:
-        """Without a keyboard yet; signals are waited for too."""
+        """Wait for `stop` too; read no keys before `unbuffered`."""
         self.tabs = 0
         """How often Tab was typed."""
         self._stop = stop
         self._keyboard: int | None = None
 
     def wait(self) -> bool:
-        """Wait for a tick; true for a signal and for `q`."""
+        """Wait for a tick; return True after a signal that ends, or `q`."""
         keyboard = self._keyboard
         waited = [self._stop.fileno()] if keyboard is None else [self._stop.fileno(), keyboard]
         ready, _, _ = select.select(waited, [], [], TICK_S)
@@ -112,8 +107,8 @@ class Keys:
         return typed[:1] in {b"q", b"Q", b""}
 
     @contextlib.contextmanager
-    def unseen(self) -> Iterator[None]:
-        """Have keys come at once and unseen, where standard input is a terminal."""
+    def unbuffered(self) -> Iterator[None]:
+        """Read keys at once and without echo, if standard input is a terminal."""
         if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
             yield
             return

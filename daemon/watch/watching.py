@@ -1,4 +1,4 @@
-"""Hands the messages of feeds to their views, and takes snapshots of them at a steady rate."""
+"""Hands the messages of each feed to its view, and takes snapshots at a steady rate."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from daemon.watch.snapshot import Snapshot
 from daemon.watch.view import SNAPSHOTS_HZ, View
 
 TICK_S = 0.02
-"""Between two looks at what has come: how exactly silence is timed, s."""
+"""Time between two looks at the feeds, s; silence is timed this exactly."""
 
 
-class Watched(NamedTuple):
-    """A hand, where its messages come from and what they come to."""
+class HandFeed(NamedTuple):
+    """The messages of one hand, and the view that takes them."""
 
     feed: Feed
     view: View
 
 
-def snapshots(hands: Sequence[Watched], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
+def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
     """Yield a snapshot of each hand ten times a second until `is_over()`, which waits `TICK_S`."""
     due_s = 0.0
     while not is_over():
