@@ -243,28 +243,17 @@ def test_what_a_settled_grasp_was_judged_by_is_recorded_with_its_number(
         assert np.ravel(content["counts"]).tolist() == expected
 
 
-def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon = Daemon(tmp_path, monkeypatch)
-    expected = []
-    for reading in sweeps()[:2000]:
-        if reading.seq == 1250:
-            assert daemon.pipeline.session is not None
-            assert daemon.pipeline.session.grasps > 0
-            daemon.pipeline.sensors_exchanged()
-        expected.append(daemon.judge(reading))
-    daemon.recorder.close()
-    assert expected[1249].reasons != expected[1250].reasons
-    paths = files(tmp_path)
-    assert again(*paths) == expected
+def assert_played_alike(folder: Path, expected: list[Judgement]) -> None:
+    """The whole run, and each of its files alone, are judged as they were."""
+    paths = files(folder)
     assert len(paths) > 3
+    assert again(*paths) == expected
     for path in paths:
         times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
         assert again(path) == [each for each in expected if each.t_ns in times]
 
 
-def test_sensors_that_are_back_bring_their_session_into_the_replay_too(
+def test_exchanged_sensors_and_their_return_are_played_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon = Daemon(tmp_path, monkeypatch)
@@ -277,11 +266,8 @@ def test_sensors_that_are_back_bring_their_session_into_the_replay_too(
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
     assert states[0].grasps > 3 > states[1].grasps
-    paths = files(tmp_path)
-    assert again(*paths) == expected
-    for path in paths:
-        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
-        assert again(path) == [each for each in expected if each.t_ns in times]
+    assert expected[1249].reasons != expected[1250].reasons
+    assert_played_alike(tmp_path, expected)
 
 
 def test_where_readings_were_left_out_the_replay_knows_too(
@@ -301,12 +287,7 @@ def test_where_readings_were_left_out_the_replay_knows_too(
     daemon.recorder.close()
     changes = [change for each in expected for change in each.moment.changes]
     assert [change.cause for change in changes].count(GateCause.GAP) > 3
-    paths = files(tmp_path)
-    assert again(*paths) == expected
-    assert len(paths) > 3
-    for path in paths:
-        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
-        assert again(path) == [each for each in expected if each.t_ns in times]
+    assert_played_alike(tmp_path, expected)
 
 
 def rewritten(path: Path, to: Path, judge: bytes, number: int) -> Path:

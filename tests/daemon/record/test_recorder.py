@@ -24,9 +24,7 @@ from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
-from daemon.record.topics import schemas
 from daemon.scene import Record, SceneError
-from drivers.base import JointReading
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.bench import kill_recorder
@@ -117,43 +115,6 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     assert path.stat().st_mode & 0o777 == 0o640
 
 
-def test_an_angle_that_there_is_not_is_left_out_and_its_joint_named(
-    tmp_path: Path, make: Make
-) -> None:
-    recorder = make()
-    recorder.on_reading(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
-    recorder.close()
-    (path,) = (tmp_path / "record").iterdir()
-    assert messages(path) == [
-        (
-            "joints",
-            {
-                "v": 1,
-                "seq": 3,
-                "t_mono_ns": 5,
-                "names": ["FFJ3", "THJ4"],
-                "position_rad": {"FFJ3": 0.25},
-            },
-        )
-    ]
-
-
-def test_every_kind_of_message_has_a_schema_that_is_an_object() -> None:
-    found = schemas()
-    published = {"verdict", "gate", "tactile", "outcome", "status"}
-    recorded = {"joints", "judged", "asked", "exchanged", "skipped", "image", "log"}
-    assert set(found) == published | recorded
-    for _, text in found.values():
-        assert json.loads(text)["type"] == "object"
-
-
-def test_what_was_sent_is_in_the_file_while_it_is_still_written(tmp_path: Path, make: Make) -> None:
-    recorder = make()
-    recorder.send(TOPIC, payload(7))
-    wait_until(lambda: recorder.counters["record"]["recorded"] == 1)
-    assert numbers(tmp_path) == [7]
-
-
 def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
     tmp_path: Path, make: Make
 ) -> None:
@@ -167,15 +128,6 @@ def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
     paths = sorted((tmp_path / "record").iterdir())
     assert 4 <= len(paths) <= 12  # 300 of 2 kB each, compressed from hex
     assert numbers(tmp_path) == list(range(300))
-
-
-def test_files_follow_each_other_by_age(tmp_path: Path, make: Make) -> None:
-    recorder = make(rotate_minutes=0.01)
-    while recorder.counters["record"]["files"] < 3:
-        recorder.on_status(NO_STATUS)
-        time.sleep(0.01)
-    recorder.close()
-    assert len(list((tmp_path / "record").iterdir())) == 3
 
 
 def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
