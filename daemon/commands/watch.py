@@ -19,8 +19,7 @@ from daemon.process.text import complain
 from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
 from daemon.watch.feed import Feed, load_keys
-from daemon.watch.view import View
-from daemon.watch.watching import HandFeed
+from daemon.watch.view import HandFeed, View
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Where the daemon publishes unless its scene says otherwise."""

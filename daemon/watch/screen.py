@@ -19,7 +19,7 @@ from rich.live import Live
 
 from daemon.process.signals import StopSignal
 from daemon.watch.terminal import draw
-from daemon.watch.watching import TICK_S, HandFeed, snapshots
+from daemon.watch.view import TICK_S, HandFeed, snapshots
 
 SIGNALS_MAX = 64
 """Most bytes taken at once from the pipe of signals."""
@@ -54,13 +54,13 @@ class Suspension:
     """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
 
     def __init__(self) -> None:
-        """Start without a request."""
         self.asked = False
 
     def __enter__(self) -> Self:
         """Take over SIGTSTP, unless it is ignored. Only the main thread can."""
         self._former = signal.getsignal(signal.SIGTSTP)
-        self._take_over()
+        if self._former is not signal.SIG_IGN:
+            signal.signal(signal.SIGTSTP, self._ask)
         return self
 
     def __exit__(self, *_details: object) -> None:
@@ -71,13 +71,9 @@ class Suspension:
         self.asked = False
         signal.signal(signal.SIGTSTP, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTSTP)
-        self._take_over()
+        signal.signal(signal.SIGTSTP, self._ask)
 
-    def _take_over(self) -> None:
-        if self._former is not signal.SIG_IGN:
-            signal.signal(signal.SIGTSTP, self._handle)
-
-    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+    def _ask(self, _number: int, _frame: FrameType | None) -> None:
         self.asked = True
 
 
@@ -89,22 +85,22 @@ class Keyboard:
         self.tabs = 0
         """How often Tab was typed."""
         self._stop = stop
-        self._keyboard: int | None = None
+        self._waited = [stop.fileno()]
+        """Descriptors of signals and, while keys are read, of the keyboard."""
 
     def wait(self) -> bool:
         """Wait for a tick; return True after a signal that ends, or `q`."""
-        keyboard = self._keyboard
-        waited = [self._stop.fileno()] if keyboard is None else [self._stop.fileno(), keyboard]
-        ready, _, _ = select.select(waited, [], [], TICK_S)
+        ready, _, _ = select.select(self._waited, [], [], TICK_S)
         if self._stop.fileno() in ready:
             os.read(self._stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
         if self._stop.received is not None:
             return True
-        if keyboard is None or keyboard not in ready:
-            return False
-        typed = os.read(keyboard, 64)
-        self.tabs += typed.count(b"\t")
-        return typed[:1] in {b"q", b"Q", b""}
+        for keyboard in ready:
+            if keyboard != self._stop.fileno():
+                typed = os.read(keyboard, 64)
+                self.tabs += typed.count(b"\t")
+                return typed[:1] in {b"q", b"Q", b""}
+        return False
 
     @contextlib.contextmanager
     def unbuffered(self) -> Iterator[None]:
@@ -112,10 +108,12 @@ class Keyboard:
         if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
             yield
             return
-        self._keyboard = sys.stdin.fileno()
-        former = termios.tcgetattr(self._keyboard)
+        keyboard = sys.stdin.fileno()
+        former = termios.tcgetattr(keyboard)
+        self._waited.append(keyboard)
         try:
-            tty.setcbreak(self._keyboard)
+            tty.setcbreak(keyboard)
             yield
         finally:
-            termios.tcsetattr(self._keyboard, termios.TCSADRAIN, former)
+            self._waited.remove(keyboard)
+            termios.tcsetattr(keyboard, termios.TCSADRAIN, former)

@@ -1,14 +1,16 @@
-"""The state of one hand, from the messages that arrived and the time since the last one."""
+"""The state of one hand, from the messages of its feed and the time since the last one."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import msgspec
 
 from daemon.judge.reasons import ADVICE, WATCHED_LIFT, Decision, GateState, Reason
+from daemon.process.sleep import boottime_ns
 from daemon.publish.messages import (
     GateMessage,
     OutcomeMessage,
@@ -23,11 +25,14 @@ from daemon.publish.messages import (
 )
 from daemon.watch import figures
 from daemon.watch.evidence import SUPERVISED, doubt, rests_on, stillness
+from daemon.watch.feed import Feed
 from daemon.watch.fingers import Fingers
 from daemon.watch.grasps import OPEN, GraspLog
 from daemon.watch.history import History
 from daemon.watch.snapshot import Line, Snapshot, Tone
 
+TICK_S = 0.02
+"""Time between two looks at the feeds, s; silence is timed this exactly."""
 SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
 EXPECTED = {
@@ -203,3 +208,23 @@ def _health(status: Status) -> list[Line]:
     return lines + [
         Line(f"{part} {reason.value}", ADVICE[reason]) for part, reason in status.health.items()
     ]
+
+
+class HandFeed(NamedTuple):
+    """The messages of one hand, and the view that takes them."""
+
+    feed: Feed
+    view: View
+
+
+def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
+    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits `TICK_S`."""
+    due_s = 0.0
+    while not is_over():
+        for feed, view in hands:
+            for topic, payload in feed.take():
+                view.take(topic, payload, feed.empty_ns)  # what has waited is old
+            view.link = feed.link
+        if time.monotonic() >= due_s:
+            due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
+            yield [view.snapshot(boottime_ns()) for _, view in hands]

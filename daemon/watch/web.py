@@ -21,7 +21,7 @@ from typing import Any, Final
 import msgspec
 
 from daemon.process.signals import StopSignal
-from daemon.watch.watching import TICK_S, HandFeed, snapshots
+from daemon.watch.view import TICK_S, HandFeed, snapshots
 
 log = logging.getLogger("graspd.watch")
 

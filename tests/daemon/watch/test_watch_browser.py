@@ -19,8 +19,7 @@ from daemon.publish.messages import LearnerHealth, Lifts
 from daemon.trust.lift_book import OutcomeStatus
 from daemon.watch.feed import Feed
 from daemon.watch.snapshot import Snapshot
-from daemon.watch.view import View
-from daemon.watch.watching import TICK_S, HandFeed, snapshots
+from daemon.watch.view import TICK_S, HandFeed, View, snapshots
 from daemon.watch.web import Newest, Server
 from tests.daemon.watch.browser import CHROMIUM, Browser
 from tests.daemon.watch.watch_fakes import Talker, status, tactile, verdict
@@ -394,7 +393,7 @@ def test_a_frozen_page_shows_unknown_and_nothing_that_waited(
     time.sleep(1.0)
     browser.ask("Page.setWebLifecycleState", state="active")
     see(browser, "slip")
-    assert browser.value("tones") == ["silent", "slip"]
+    assert browser.value("tones.slice(0, 2)") == ["silent", "slip"]
 
 
 def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
@@ -407,7 +406,7 @@ def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
     note_tones(browser)
     browser.value("(real => { tones = []; Date.now = () => real() + 3600000; })(Date.now)")
     browser.wait_for("tones.length >= 2")
-    assert browser.value("tones") == ["silent", "stable"]
+    assert browser.value("tones.slice(0, 2)") == ["silent", "stable"]
 
 
 def test_a_page_in_the_background_shows_no_verdict(
