@@ -19,7 +19,7 @@ from daemon.publish.messages import encode
 from models.layout import D1
 from models.training.data.datasets import read_table
 from tests.daemon.processes import graspd
-from tests.daemon.record.recorded import IGNORED_FIELDS, Lab, messages, without_null, work
+from tests.daemon.record.recorded import Lab, compared, messages, without_null, work
 
 GRASPS = 4
 
@@ -28,11 +28,6 @@ GRASPS = 4
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Lab:
     """Twelve seconds in a lab, judged by the network that knows no session."""
     return work(tmp_path_factory.mktemp("lab"), GRASPS, '[model]\nname = "cnn1"\n')
-
-
-def compared(verdict: dict[str, Any]) -> dict[str, Any]:
-    said = {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
-    return dict(without_null(said))
 
 
 def of_kind(path: Path, kind: str) -> list[dict[str, Any]]:

@@ -23,7 +23,7 @@ from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateCause
 from daemon.publish.companion import LoopEvent, Published
-from daemon.publish.messages import Status, Verdict
+from daemon.publish.messages import Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
@@ -33,25 +33,12 @@ from daemon.scene import Record
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
 
-BOOT = "0123456789abcdef" * 2
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12
-NO_VERDICT, NO_STATUS = cast(Verdict, None), cast(Status, None)
-"""The recorder gets both as messages."""
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 100
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
-HEADER = RecordingHeader(
-    fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
-)
+NO_VERDICT = cast(Verdict, None)
+"""A recorder gets the verdict as a message."""
 
 
 class Loop:

@@ -12,31 +12,23 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from daemon import scene
-from daemon.publish.messages import Status
 from daemon.record import recorder as recorder_module
 from daemon.record.files import Retention
-from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
 from daemon.scene import Record, SceneError
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.bench import kill_recorder
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
 
-BOOT = "0123456789abcdef" * 2
-HEADER = RecordingHeader(
-    fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
-)
 TOPIC = b"verdict.right"
-NO_STATUS = cast(Status, None)
-"""The recorder gets it as a message."""
 
 
 def retention(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Retention:
@@ -72,13 +64,6 @@ def numbers(folder: Path) -> list[int]:
     return [content["number"] for path in paths for _, content in messages(path)]
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 100
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
 def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: Make) -> None:
     recorder = make()
     for number in range(1000):
@@ -108,7 +93,7 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     with open_recording(path) as stream:
         recording = McapReader(path, stream)
         (message,) = recording
-    assert recording.header.fingers == ("ff",)
+    assert recording.header.fingers == ("ff", "th")
     assert recording.header.boot_id == BOOT
     assert before_ns <= message.at_ns <= after_ns
     assert abs(recording.header.wall_minus_monotonic_ns + after_ns - time.time_ns()) < 10**9

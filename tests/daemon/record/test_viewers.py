@@ -18,7 +18,6 @@ from daemon.publish.companion import LoopEvent
 from daemon.publish.messages import State
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
-from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.recorder import Recorder
@@ -29,13 +28,9 @@ from daemon.trust.learner import LearnerState
 from drivers.base import JointReading, TactileReading
 from models.layout import D1
 from models.session_statistics import SessionState
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import BOOT, HEADER, messages
 from tests.daemon.watch.watch_fakes import status, tactile, verdict
 
-BOOT = "0123456789abcdef" * 2
-HEADER = RecordingHeader(
-    fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
-)
 PLAIN = ("boolean", "string", "number", "integer")
 TIME = {"sec": "integer", "nsec": "integer"}
 WELL_KNOWN: dict[str, dict[str, Any]] = {
