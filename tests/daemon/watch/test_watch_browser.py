@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
 import pytest
 
 from daemon.judge.reasons import Decision
 from daemon.publish.messages import LearnerHealth, Lifts
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.watch.feed import Feed
 from daemon.watch.snapshot import Snapshot
-from daemon.watch.view import TICK_S, HandFeed, View, snapshots
-from daemon.watch.web import Newest, Server
+from daemon.watch.view import View
 from tests.daemon.watch.browser import CHROMIUM, Browser
+from tests.daemon.watch.pages import Page, serving_hands
 from tests.daemon.watch.watch_fakes import Talker, status, tactile, verdict
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
@@ -35,51 +31,6 @@ COLOURS = {
 CARD = "rgb(23, 27, 34)"
 """What is behind the letters in the dark where nothing is promised."""
 BANNER = "document.querySelector('.banner')"
-
-
-@contextlib.contextmanager
-def serving(publish: Callable[[Newest], None], port: int = 0) -> Iterator[Server]:
-    """Serve the page while `publish` puts snapshots."""
-    server = Server(port, Newest())
-    jobs = (lambda: server.serve_forever(0.02)), (lambda: publish(server.newest))
-    threads = [threading.Thread(target=job) for job in jobs]
-    for thread in threads:
-        thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        for thread in threads:
-            thread.join()
-        server.server_close()
-
-
-class Page:
-    """A server of the page that can be stopped and started again at its port."""
-
-    def __init__(self, endpoint: str) -> None:
-        self._endpoint = endpoint
-        self._stack = contextlib.ExitStack()
-        self._over = threading.Event()
-        self.port = 0
-
-    @property
-    def address(self) -> str:
-        return f"http://localhost:{self.port}/"
-
-    def start(self) -> None:
-        self._over.clear()
-        self.port = self._stack.enter_context(serving(self._publish, self.port)).server_port
-        self._stack.callback(self._over.set)
-
-    def _publish(self, newest: Newest) -> None:
-        with Feed(self._endpoint) as feed:
-            hands = [HandFeed(feed, View(self._endpoint))]
-            for seen in snapshots(hands, lambda: self._over.wait(TICK_S)):
-                newest.put(msgspec.json.encode(seen))
-
-    def stop(self) -> None:
-        self._stack.close()
 
 
 @pytest.fixture
@@ -326,41 +277,30 @@ def seen_of_a_whole_hand(view: View, hand: str, seq: int, decision: Decision) ->
 def test_a_whole_hand_fits_one_window_and_several_one_page(
     browser: Browser, names: list[str], width: int, fits: bool, theme: Theme
 ) -> None:
-    over = threading.Event()
     views = [View(f"ipc:///tmp/{name}") for name in names]
-    decisions = (Decision.STABLE, Decision.SLIP)
 
-    def publish(newest: Newest) -> None:
-        seq = 0
-        while not over.wait(0.05):
-            hands = zip(views, names, decisions, strict=False)
-            seen = [seen_of_a_whole_hand(view, name, seq, said) for view, name, said in hands]
-            newest.put(msgspec.json.encode(seen))
-            seq += 1
+    def seen(seq: int) -> list[Snapshot]:
+        hands = zip(views, names, (Decision.STABLE, Decision.SLIP), strict=False)
+        return [seen_of_a_whole_hand(view, name, seq, said) for view, name, said in hands]
 
-    with serving(publish) as server:
-        try:
-            browser.look(width, 800, theme)
-            browser.go(f"http://127.0.0.1:{server.server_port}/")
-            browser.wait_for("document.querySelectorAll('.grasps tr').length >= 8")
-            browser.wait_for(f"document.querySelectorAll('.hand').length == {len(names)}")
-            assert browser.value("document.documentElement.scrollWidth <= innerWidth")
-            inside = browser.value("document.documentElement.scrollHeight <= innerHeight")
-            assert inside or not fits
-            tones = browser.value(
-                "[...document.querySelectorAll('.banner')].map(b => b.dataset.tone)"
-            )
-            assert tones == ["stable", "slip"][: len(names)]
-            several = {1: "stable - graspd", 2: "left stable, right slip - graspd"}
-            assert browser.value("document.title") == several[len(names)]
-            cut = (
-                "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div,"
-                " h2')].filter(e => e.scrollWidth > e.clientWidth + 1 && e.clientWidth)"
-                ".map(e => e.innerText)"
-            )
-            assert browser.value(cut) == []
-        finally:
-            over.set()
+    with serving_hands(seen) as address:
+        browser.look(width, 800, theme)
+        browser.go(address)
+        browser.wait_for("document.querySelectorAll('.grasps tr').length >= 8")
+        browser.wait_for(f"document.querySelectorAll('.hand').length == {len(names)}")
+        assert browser.value("document.documentElement.scrollWidth <= innerWidth")
+        inside = browser.value("document.documentElement.scrollHeight <= innerHeight")
+        assert inside or not fits
+        tones = browser.value("[...document.querySelectorAll('.banner')].map(b => b.dataset.tone)")
+        assert tones == ["stable", "slip"][: len(names)]
+        several = {1: "stable - graspd", 2: "left stable, right slip - graspd"}
+        assert browser.value("document.title") == several[len(names)]
+        cut = (
+            "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div,"
+            " h2')].filter(e => e.scrollWidth > e.clientWidth + 1 && e.clientWidth)"
+            ".map(e => e.innerText)"
+        )
+        assert browser.value(cut) == []
 
 
 def note_tones(browser: Browser) -> None:
@@ -424,22 +364,16 @@ def test_a_page_in_the_background_shows_no_verdict(
 
 def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
     """The way gets five seconds longer, as through a tunnel that hung."""
-    late_s, over = 0.0, threading.Event()
+    late_s = 0.0
     view = View("ipc:///tmp/any", wall=lambda: time.time() - late_s)
 
-    def publish(newest: Newest) -> None:
-        seq = 0
-        while not over.wait(0.05):
-            view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
-            newest.put(msgspec.json.encode([view.snapshot(0)]))
-            seq += 1
+    def seen(seq: int) -> list[Snapshot]:
+        view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
+        return [view.snapshot(0)]
 
-    with serving(publish) as server:
-        try:
-            browser.go(f"http://127.0.0.1:{server.server_port}/")
-            see(browser, "stable")
-            note_tones(browser)
-            late_s = 5.0
-            browser.wait_for("tones.includes('silent')")
-        finally:
-            over.set()
+    with serving_hands(seen) as address:
+        browser.go(address)
+        see(browser, "stable")
+        note_tones(browser)
+        late_s = 5.0
+        browser.wait_for("tones.includes('silent')")
