@@ -19,8 +19,7 @@ from daemon.process.text import complain
 from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
 from daemon.watch.feed import Feed, load_keys
-from daemon.watch.view import View
-from daemon.watch.watching import Watched
+from daemon.watch.view import HandFeed, View
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Where the daemon publishes unless its scene says otherwise."""
@@ -95,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
             hands = []
             for target in _targets(args):
                 feed = stack.enter_context(_feed(target, _keys(args, target)))
-                hands.append(Watched(feed, View(target.endpoint, target.hand)))
+                hands.append(HandFeed(feed, View(target.endpoint, target.hand)))
             if args.foxglove:
                 return _foxglove(hands, args.port or FOXGLOVE_PORT)
             return _page(hands, args.port or PORT) if args.web else _terminal(hands)
@@ -140,7 +139,7 @@ def _keys(args: argparse.Namespace, target: Target) -> tuple[bytes, bytes, bytes
     return load_keys(args.keys, target.server_key)
 
 
-def _terminal(hands: list[Watched]) -> int:
+def _terminal(hands: list[HandFeed]) -> int:
     if not sys.stdout.isatty():
         raise UsageError("watch draws on a terminal; see --web, or `graspd run --print` for a pipe")
     try:
@@ -154,7 +153,7 @@ def _terminal(hands: list[Watched]) -> int:
     return 0
 
 
-def _page(hands: list[Watched], port: int) -> int:
+def _page(hands: list[HandFeed], port: int) -> int:
     from daemon.watch.web import serve
 
     try:
@@ -165,7 +164,7 @@ def _page(hands: list[Watched], port: int) -> int:
     return 0
 
 
-def _foxglove(hands: list[Watched], port: int) -> int:
+def _foxglove(hands: list[HandFeed], port: int) -> int:
     try:
         from daemon.record.live import LiveServer
     except ModuleNotFoundError as error:

@@ -1,5 +1,5 @@
-"""Makes a grasp table, in the layout of the BioTac SP Stability Set, of recorded grasps whose
-outcome is known: the counts by which each was judged last before it was told."""
+"""Makes a grasp table of recorded grasps with known outcomes, in the layout of the BioTac SP
+Stability Set. A row has the counts by which the grasp was judged last before its outcome."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.publish.messages import decode_outcome
+from daemon.publish.messages import OutcomeMessage, decode_outcome
 from daemon.record.mcap import McapReader, RecordedMessage
 from daemon.record.topics import Judged, Topic, decode_judged
 from drivers.base import ELECTRODES, RecordingError
@@ -42,91 +42,89 @@ class Export:
     grasps: dict[GraspId, Grasp] = field(default_factory=dict)
     """In the order of their outcomes."""
     without_outcome: int = 0
-    """Left out: grasps that were judged and have no outcome."""
+    """Left out: judged grasps without an outcome."""
     repaired: int = 0
-    """Left out: grasps with an outcome of which electrodes were repaired to judge them."""
+    """Left out: grasps with an outcome that were judged with repaired electrodes."""
     repeated: int = 0
-    """Left out: grasps with the very counts of one before, as a recording played in a loop has."""
+    """Left out: grasps with the counts of an earlier one, as a recording in a loop has them."""
     unjoined: int = 0
     """Outcomes of grasps without judged counts before them in the recordings."""
     cut_off: int = 0
     """Files that were cut off or are damaged."""
+    judged: dict[GraspId, Judged] = field(default_factory=dict)
+    """Last judged counts of each grasp."""
+
+    def take(self, message: RecordedMessage) -> GraspId | None:
+        """Take the next message; return the grasp of an outcome.
+
+        Raises `ValueError` or `OverflowError` for a malformed message.
+        """
+        if message.kind == Topic.JUDGED:
+            judgement = decode_judged(message.payload)
+            self.judged[judgement.boot_id, judgement.grasp] = judgement
+        if message.kind != Topic.OUTCOME:
+            return None
+        outcome = decode_outcome(message.payload)
+        grasp = outcome.grasp_boot_id or outcome.boot_id, outcome.grasp
+        self._join(grasp, outcome)
+        return grasp
+
+    def _join(self, grasp: GraspId, outcome: OutcomeMessage) -> None:
+        judged = self.judged.get(grasp)
+        if judged is None:
+            self.unjoined += 1
+        elif judged.repaired:
+            self.repaired += grasp not in self.grasps
+        else:
+            shape = len(self.fingers), ELECTRODES
+            counts = np.array(judged.counts, dtype=np.uint16).reshape(shape)
+            self.grasps[grasp] = Grasp(counts, outcome.outcome == "slip", outcome.object)
+
+    def leave_out_repeats(self) -> None:
+        """Keep the first of the grasps that have the same counts, and count the others."""
+        first: dict[bytes, GraspId] = {}
+        for grasp, row in self.grasps.items():
+            first.setdefault(row.counts.tobytes(), grasp)
+        self.repeated = len(self.grasps) - len(first)
+        self.grasps = {grasp: self.grasps[grasp] for grasp in first.values()}
 
 
 def collect(paths: Sequence[Path]) -> Export:
-    """The grasps of recordings, given in the order of time.
+    """Return the grasps of recordings, given in the order of time.
 
     Raises `RecordingError` for a file that cannot be read, has other fingers than the first, or
     does not have the counts that were judged.
     """
-    joining = _Joining()
-    found = joining.found
+    export = Export()
+    told: set[GraspId | None] = set()
     for path in paths:
         with open_recording(path) as stream:
             recording = McapReader(path, stream)
             header = recording.header
             if not header.says_judged:
                 raise RecordingError(path, "does not say which counts were judged")
-            if found.fingers and header.fingers != found.fingers:
+            if export.fingers and header.fingers != export.fingers:
                 raise RecordingError(path, f"has other fingers than {paths[0]}")
-            found.fingers = header.fingers
+            export.fingers = header.fingers
             for message in recording:
                 try:
-                    joining.take(message)
+                    told.add(export.take(message))
                 except (ValueError, OverflowError) as error:
                     raise RecordingError(path, f"{message.kind} message: {error}") from error
-            found.cut_off += recording.cut_off
-    found.without_outcome = len(joining.judged.keys() - joining.told)
-    leave_out_repeats(found)
-    return found
+            export.cut_off += recording.cut_off
+    export.without_outcome = len(export.judged.keys() - told)
+    export.leave_out_repeats()
+    return export
 
 
-def leave_out_repeats(found: Export) -> None:
-    """Keep the first of the grasps that have the same counts, and count the others."""
-    first: dict[bytes, GraspId] = {}
-    for grasp, row in found.grasps.items():
-        first.setdefault(row.counts.tobytes(), grasp)
-    found.repeated = len(found.grasps) - len(first)
-    found.grasps = {grasp: found.grasps[grasp] for grasp in first.values()}
-
-
-class _Joining:
-    """Joins judged counts and outcomes by grasp."""
-
-    def __init__(self) -> None:
-        self.found = Export()
-        self.judged: dict[GraspId, Judged] = {}
-        self.told: set[GraspId] = set()
-
-    def take(self, message: RecordedMessage) -> None:
-        """Take in the next message. Raises `ValueError` or `OverflowError` if it is malformed."""
-        if message.kind == Topic.JUDGED:
-            judgement = decode_judged(message.payload)
-            self.judged[judgement.boot_id, judgement.grasp] = judgement
-        elif message.kind == Topic.OUTCOME:
-            outcome = decode_outcome(message.payload)
-            grasp = outcome.grasp_boot_id or outcome.boot_id, outcome.grasp
-            self.told.add(grasp)
-            judged = self.judged.get(grasp)
-            if judged is None:
-                self.found.unjoined += 1
-            elif judged.repaired:
-                self.found.repaired += grasp not in self.found.grasps
-            else:
-                shape = len(self.found.fingers), ELECTRODES
-                counts = np.array(judged.counts, dtype=np.uint16).reshape(shape)
-                slipped = outcome.outcome == "slip"
-                self.found.grasps[grasp] = Grasp(counts, slipped, outcome.object)
-
-
-def write(out: TextIO, found: Export, object_name: str) -> None:
+def write(out: TextIO, export: Export, object_name: str) -> None:
     """Write the table, one row a grasp: object, 1 for slip or 0 for stable, counts by finger.
 
-    `object_name` is for grasps of which no object was told. Raises `OSError`.
+    `object_name` is for grasps without a told object. Raises `OSError`.
     """
     writer = csv.writer(out, lineterminator="\n")
-    names = [name for finger in found.fingers for name in electrode_columns(finger)]
+    names = [name for finger in export.fingers for name in electrode_columns(finger)]
     writer.writerow([OBJECT, SLIPPED, *names])
-    for grasp in found.grasps.values():
+    for grasp in export.grasps.values():
         name = object_name if grasp.object_name is None else grasp.object_name
         writer.writerow([name, int(grasp.slipped), *grasp.counts.ravel().tolist()])

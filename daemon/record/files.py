@@ -1,4 +1,4 @@
-"""Files of a recording: their names, how many are kept, and how they are put on the disk."""
+"""Files of a recording: their names, how many are kept, and how they reach the disk."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 MODE: Final = 0o640
-"""Of files: what a hand grasped is nobody else's business."""
+"""Mode of the files: what a hand grasped is not for all users."""
 _STAMP: Final = r"\d{8}T\d{6}Z-[0-9a-f]{8}-\d{4,}"
 
 
@@ -24,30 +24,30 @@ class Retention:
     hand: str
     boot_id: str
     keep_files: int
-    """Recordings to keep at most, link logs with theirs."""
+    """Most recordings to keep; link logs go with theirs."""
     keep_bytes: int
-    """Size to keep at most, bytes."""
+    """Largest size of all files, bytes."""
     wall_clock: Callable[[], int] = time.time_ns
 
-    def name(self, number: int) -> Path:
-        """Path of file `number` of the run, from 0, without its ending; names sort by time."""
+    def path(self, number: int, ending: str) -> Path:
+        """Return the path of file `number` of the run, from 0; names sort by time."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self.wall_clock() // 1_000_000_000))
-        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}"
+        return self.directory / f"{self.hand}-{stamp}-{self.boot_id[:8]}-{number:04}{ending}"
 
     def make_room(self, expected_bytes: int) -> int:
-        """Delete the oldest recordings until one more of `expected_bytes` may come.
+        """Delete the oldest recordings until one more of `expected_bytes` fits; count them.
 
-        Returns how many were deleted. Makes the directory if needed. Raises `OSError`.
+        Makes the directory if needed. Raises `OSError`.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        found = self._recordings()
-        total = sum(size for _, size in found.values())
+        recordings = self._recordings()
+        total = sum(size for _, size in recordings.values())
         removed = 0
-        for stem in sorted(found):
-            few = len(found) - removed < self.keep_files
+        for stamp in sorted(recordings):
+            few = len(recordings) - removed < self.keep_files
             if few and total + expected_bytes <= self.keep_bytes:
                 break
-            paths, size = found[stem]
+            paths, size = recordings[stamp]
             for path in paths:
                 path.unlink(missing_ok=True)
             total -= size
@@ -55,21 +55,21 @@ class Retention:
         return removed
 
     def _recordings(self) -> dict[str, tuple[list[Path], int]]:
-        """Paths and total size, bytes, of each recording, by its name without hand and ending."""
+        """Return paths and total size, bytes, of each recording, by the stamp in its name."""
         pattern = re.compile(rf"{re.escape(self.hand)}-({_STAMP})\.(mcap|can\.log|serial)")
-        found: dict[str, tuple[list[Path], int]] = {}
+        recordings: dict[str, tuple[list[Path], int]] = {}
         for path in self.directory.iterdir():
             match = pattern.fullmatch(path.name)
             if match is None:
                 continue
             with contextlib.suppress(FileNotFoundError):
-                paths, size = found.get(match[1], ([], 0))
-                found[match[1]] = ([*paths, path], size + path.stat().st_size)
-        return found
+                paths, size = recordings.get(match[1], ([], 0))
+                recordings[match[1]] = ([*paths, path], size + path.stat().st_size)
+        return recordings
 
 
 class RecordingFile:
-    """One file that is being written. All methods raise `OSError` if the disk does not take it."""
+    """One file that is being written. All methods raise `OSError` if the disk refuses."""
 
     def __init__(self, path: Path) -> None:
         """Create the file, which must not exist."""
@@ -82,7 +82,7 @@ class RecordingFile:
         self._stream.write(content)
 
     def flush(self) -> int:
-        """Put all that was written on the disk; return the file's size, bytes."""
+        """Put everything written on the disk; return the file's size, bytes."""
         self._stream.flush()
         os.fdatasync(self._stream.fileno())
         return self._stream.tell()
@@ -95,12 +95,12 @@ class RecordingFile:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close after an error; what is buffered may be lost."""
+        """Close after an error; buffered bytes may be lost."""
         with contextlib.suppress(OSError):
             self._stream.close()
 
     def remove(self) -> None:
-        """Close and delete the file, which has nothing but a header."""
+        """Close and delete the file."""
         self.abandon()
         with contextlib.suppress(OSError):
             self._path.unlink()

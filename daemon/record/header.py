@@ -1,4 +1,4 @@
-"""The header of each file of a recording: which scene and model judge, and in which state."""
+"""The header of each file of a recording: scene, model, and the judge's state at its beginning."""
 
 from __future__ import annotations
 
@@ -13,19 +13,16 @@ from models.session_statistics import SessionState
 _TEXTS: Final = ("boot_id", "model", "model_sha256", "judge", "trust")
 """Fields that are texts, or bytes in base64; the others are JSON."""
 _OLDER: Final = {"trust": "", "says_judged": "false"}
-"""What the headers of older recordings lack."""
+"""Fields that older recordings lack."""
 
 
 class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
-    """What a file says about the run of the daemon that wrote it.
-
-    With the state where the file begins, it is judged alike without those before it.
-    """
+    """Describes the run that wrote the file. Its state lets the file be judged alone."""
 
     fingers: tuple[str, ...]
     """Fingers of a reading, in the order of its rows."""
     joints: bool
-    """Whether the hand had joint angles."""
+    """True if the hand had joint angles."""
     boot_id: str
     """As in the verdicts of the run."""
     scene: dict[str, dict[str, Any]]
@@ -34,23 +31,22 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
     """Name of the model that judged."""
     model_sha256: str
     file: int = 0
-    """Number of the file within its run, from 0; skips one where the disk has failed."""
+    """Number of the file within its run, from 0; skips one where the disk failed."""
     wall_minus_monotonic_ns: int = 0
     """To subtract from the file's log times, wall time, for the daemon's monotonic time, ns."""
     judge: bytes = b""
-    """The judge's state, as `daemon.judge.memory.encode` gives it; empty if it is not known."""
+    """The judge's state, from `daemon.judge.memory.encode`; empty if not known."""
     axis_ns: int = 0
     """`t_ns` less `made_ns` of the readings, ns; 0 for live readings."""
     session: SessionState | None = None
     """Statistics of the session; None if the model needs none."""
     trust: bytes = b""
-    """What outcomes have taught, as `daemon.trust.trust.encode` gives it; empty if nothing learns.
-    """
+    """What outcomes have taught, from `daemon.trust.trust.encode`; empty if nothing learns."""
     says_judged: bool = True
-    """Whether the file has `judged` messages."""
+    """True if the file has `judged` messages."""
 
     def texts(self) -> dict[str, str]:
-        """The fields as texts, for the metadata record of an MCAP file."""
+        """Return the fields as texts, for the metadata record of an MCAP file."""
         return {
             name: value if name in _TEXTS else msgspec.json.encode(value).decode()
             for name, value in msgspec.to_builtins(self).items()
@@ -58,7 +54,7 @@ class RecordingHeader(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, texts: Mapping[str, str]) -> Self:
-        """Read a header back from what `texts` gave, as it stands in an MCAP file.
+        """Read a header back from its `texts`.
 
         Raises `KeyError` for a field that is missing and `ValueError` for a wrong one.
         """

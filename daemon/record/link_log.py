@@ -1,4 +1,4 @@
-"""What comes over a link, on its way into a file beside the recording."""
+"""Bytes and frames of a link, on their way into a file beside the recording."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from daemon.scene.drivers import CanTactile, SpiTactile, Tactile
 from drivers.base import Driver
 
 EARLY_MAX: Final = 1000
-"""Entries held while the recorder is not there yet: those of the link's opening."""
+"""Entries held until the recorder starts: those of the link's opening."""
 
 Sink = Callable[[tuple[object, ...], int], None]
 """Takes an entry and its monotonic time, ns."""
 
 
 class Tap:
-    """Passes on what comes over a link; holds it until it is connected."""
+    """Passes on the traffic of a link; holds it until it is connected."""
 
     def __init__(
         self,
@@ -26,30 +26,33 @@ class Tap:
         encode: Callable[..., bytes],
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`ending` is that of the file. `encode` gives the bytes of an entry in the file, by its
-        monotonic time, ns; what makes wall time of that, ns; and the parts of the entry."""
+        """`ending` is that of the file.
+
+        `encode` gives the bytes of an entry in the file. It takes the monotonic time of the entry,
+        ns, the offset of the wall clock from that, ns, and the parts of the entry.
+        """
         self.ending = ending
         self.encode = encode
         self._clock = clock
         self._early: deque[tuple[tuple[object, ...], int]] = deque(maxlen=EARLY_MAX)
-        self._sink: Sink = self._hold
+        self._sink: Sink | None = None
 
     def connect(self, sink: Sink) -> None:
-        """Hand over what is held, and from now on everything at once."""
+        """Hand over what is held, and everything later at once."""
         while self._early:
             sink(*self._early.popleft())
         self._sink = sink
 
     def take(self, *entry: object) -> None:
-        """Take what a driver tells of its link: CAN frames, or bytes of a serial line."""
-        self._sink(entry, self._clock())
-
-    def _hold(self, entry: tuple[object, ...], at_ns: int) -> None:
-        self._early.append((entry, at_ns))
+        """Take what a driver reads from its link: CAN frames, or bytes of a serial line."""
+        if self._sink is None:
+            self._early.append((entry, self._clock()))
+        else:
+            self._sink(entry, self._clock())
 
 
 def tap_of(driver: Driver, section: Tactile) -> Tap | None:
-    """A tap on the link of a driver; None for one that has no link of these kinds."""
+    """Return a tap on the link of a driver; None if it is neither CAN nor serial."""
     if isinstance(section, CanTactile):
         from drivers.can.driver import CanBridgeDriver
         from drivers.recordings.can_log import encode_frames

@@ -1,4 +1,4 @@
-"""Serves what a daemon publishes to Lichtblick and Foxglove, live, under the schemas of recordings.
+"""Serves a daemon's messages to Lichtblick and Foxglove, live, under the schemas of recordings.
 
 Needs the package `foxglove-sdk` (extra `foxglove`).
 """
@@ -14,29 +14,29 @@ import foxglove
 import msgspec
 
 from daemon.record.flat import flat
-from daemon.record.topics import Topic, schemas
-from daemon.record.viewers import ForPeople
+from daemon.record.topics import schemas
+from daemon.record.viewers import Viewer
 
 ADDRESS: Final = "127.0.0.1"
-"""Nobody who connects is asked who it is, so nobody of another computer can."""
+"""Loopback alone: the server does not check who connects."""
 BACKLOG: Final = 256
 """Messages that may wait for a viewer, a second of them; a slow one loses the oldest."""
 IMAGES_HZ: Final = 10.0
 CHANNELS_MAX: Final = 128
-"""Topics that are served: of some ten hands. No more are taken up."""
+"""Most topics that are served: those of some ten hands."""
 
 
 class LiveServer:
     """A WebSocket server for viewers, in threads of the library."""
 
     def __init__(self, port: int, wall_clock: Callable[[], int] = time.time_ns) -> None:
-        """Serve on a port of this computer, 0 for any free one. Raises `RuntimeError` if not."""
+        """Serve on a port of this computer, 0 for any free one. Raises `RuntimeError` if taken."""
         self._wall_clock = wall_clock
-        # Its threads log through Python: one that holds a lock would wait for who waits for it.
+        # Its threads would log through Python, and wait for a thread that waits for their lock.
         foxglove.set_log_level(logging.CRITICAL)
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
-        self._people: dict[str, ForPeople] = {}
+        self._viewers: dict[str, Viewer] = {}
         """By hand."""
         self._server = foxglove.start_server(
             name="graspd",
@@ -48,13 +48,13 @@ class LiveServer:
 
     @property
     def port(self) -> int:
-        """Where it serves."""
+        """Port that it serves."""
         return int(self._server.port)
 
     def send(self, topic: bytes, payload: bytes) -> None:
-        """Pass on a published message; what is none of a daemon's is passed over."""
+        """Pass on a published message; ignore one that no daemon publishes."""
         kind, _, hand = topic.decode(errors="replace").partition(".")
-        if kind not in list(Topic):
+        if kind not in schemas():
             return
         try:
             message = msgspec.json.decode(payload)
@@ -62,12 +62,11 @@ class LiveServer:
             return
         now_ns = self._wall_clock()
         self._log(kind, hand, msgspec.json.encode(flat(message)), now_ns)
-        if hand not in self._people and len(self._people) < CHANNELS_MAX:
-            self._people[hand] = ForPeople(IMAGES_HZ)
-        people = self._people.get(hand)
-        if people is None:
-            return
-        for made, content in people.of(kind, message, now_ns):
+        if hand not in self._viewers:
+            if len(self._viewers) >= CHANNELS_MAX:
+                return
+            self._viewers[hand] = Viewer(IMAGES_HZ)
+        for made, content in self._viewers[hand].of(kind, message, now_ns):
             self._log(made, hand, content, now_ns)
 
     def _log(self, kind: str, hand: str, payload: bytes, at_ns: int) -> None:

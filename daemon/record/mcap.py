@@ -8,11 +8,10 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from io import BytesIO
 from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO, Final, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -32,20 +31,19 @@ from drivers.recordings.csv_rows import open_recording
 METADATA: Final = "graspd"
 """Name of the metadata record that every file of graspd begins with."""
 RECORD_MAX_BYTES: Final = 64 << 20
-"""graspd's chunks have a megabyte; a record whose length is given as far more is damaged."""
+"""Largest record; graspd's chunks have 1 MB. A record that claims far more is damaged."""
 CHUNK_MAX_BYTES: Final = 8 << 20
-"""Of what a chunk unpacks to, at once in memory; graspd's have a megabyte, other tools make four of
-it."""
+"""Largest unpacked chunk, which is in memory at once; graspd's have 1 MB, other tools' 4 MB."""
 RATIO_MAX: Final = 100
-"""How many times as large as packed all chunks may be, beyond the first `CHUNK_MAX_BYTES`. Held
-grasps pack to a twelfth, a sensor that says nothing but zeros to a thirty-sixth."""
+"""Largest unpacked size of all chunks beyond the first `CHUNK_MAX_BYTES`, per packed byte. Held
+grasps pack to a twelfth, a sensor that sends only zeros to a thirty-sixth."""
 
 _DAMAGE = (
     *(McapError, CRCValidationError, struct.error, zstandard.ZstdError, UnicodeDecodeError),
     *(OverflowError, MemoryError),
 )
-"""What the library raises for a file that is no MCAP, damaged or cut off; the last two for lengths
-beyond all memory."""
+"""Errors of the library for a file that is damaged, cut off or no MCAP; the last two come from
+lengths beyond all memory."""
 
 
 class McapWriter(RecordingFile):
@@ -57,7 +55,7 @@ class McapWriter(RecordingFile):
         self._offset_ns = header.wall_minus_monotonic_ns
         self._writer = Writer(self._stream)
         self._channels: dict[bytes, tuple[int, Iterator[int]]] = {}
-        """Number of each topic's channel, and the numbers of its messages."""
+        """Number of each topic's channel, and the next numbers of its messages."""
         try:
             self._writer.start(profile="", library="graspd")
             self._writer.add_metadata(METADATA, header.texts())
@@ -82,7 +80,6 @@ class McapWriter(RecordingFile):
         return self._writer.register_channel(topic, "json", schema)
 
     def flush(self) -> int:
-        """Put all that was written on the disk; return the file's size, bytes."""
         self._writer.flush()
         return super().flush()
 
@@ -96,20 +93,19 @@ class McapWriter(RecordingFile):
         super().close()
 
 
-@dataclass(frozen=True, slots=True)
-class RecordedMessage:
+class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     kind: str
-    """First part of its topic's name: a `Topic`, or one that is not known here."""
+    """First part of its topic's name: a `Topic`, or an unknown one."""
     at_ns: int
-    """When it was recorded, ns, by the monotonic clock of the daemon that did."""
+    """Time of recording, ns, by the monotonic clock of the recording daemon."""
     payload: bytes
     """JSON."""
 
 
 class McapReader:
-    """Reads one file: its header at once, its messages by iterating, which can be done once.
+    """Reads one file: its header at once, its messages by iterating, once.
 
     The iteration ends where the file is damaged, as if it ended there. It raises `RecordingError`
     for a file that unpacks to more than any recording of graspd.
@@ -119,13 +115,13 @@ class McapReader:
         """`stream` is the opened file at `path`. Raises `RecordingError` if it is not graspd's."""
         self._path = path
         self.cut_off = False
-        """After iterating: whether the file was cut off or is damaged."""
+        """After iterating: True if the file was cut off or is damaged."""
         reader = StreamReader(
             stream, emit_chunks=True, validate_crcs=True, record_size_limit=RECORD_MAX_BYTES
         )
         self._records = reader.records
         self._spare_bytes = CHUNK_MAX_BYTES
-        """What may be unpacked still."""
+        """Bytes that may still be unpacked."""
         self._kinds: dict[int, str] = {}
         self.header = self._read_header()
 
@@ -157,7 +153,7 @@ class McapReader:
             self.cut_off = True
 
     def _inner_records(self) -> Iterator[McapRecord]:
-        """All records, those in chunks too."""
+        """Yield all records, those in chunks too."""
         for record in self._records:
             if isinstance(record, Chunk):
                 yield from _within(self._unpacked(record))
@@ -165,7 +161,6 @@ class McapReader:
                 yield record
 
     def _unpacked(self, chunk: Chunk) -> bytes:
-        """What is in a chunk."""
         self._spare_bytes += RATIO_MAX * len(chunk.data)
         room = min(self._spare_bytes, CHUNK_MAX_BYTES)
         content = _unpack(chunk.compression, chunk.data, room + 1)
@@ -184,8 +179,8 @@ class McapReader:
 
 
 def _within(chunk: bytes) -> Iterator[McapRecord]:
-    """Channels and messages in what a chunk unpacks to, one after another: all at once take a
-    hundred times its memory."""
+    """Yield channels and messages of an unpacked chunk, one by one: all at once take a hundred
+    times its memory."""
     stream = ReadDataStream(BytesIO(chunk))
     while stream.count < len(chunk):
         kind, length = stream.read1(), stream.read8()
@@ -198,8 +193,7 @@ def _within(chunk: bytes) -> Iterator[McapRecord]:
 
 
 def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
-    """What a chunk holds, cut at `max_bytes`: never more than that is made of it. None for one that
-    takes more than a chunk may have only to begin with it."""
+    """Unpack at most `max_bytes` of a chunk; return None if its window alone is too large."""
     unpacked = content
     if compression == "zstd":
         if zstandard.get_frame_parameters(content).window_size > CHUNK_MAX_BYTES:
@@ -218,6 +212,6 @@ def _unpack(compression: str, content: bytes, max_bytes: int) -> bytes | None:
 
 
 def header_of(path: Path) -> RecordingHeader:
-    """The header of the file at `path`. Raises `RecordingError` if there is none."""
+    """Return the header of the file at `path`. Raises `RecordingError` if there is none."""
     with open_recording(path) as stream:
         return McapReader(path, stream).header

@@ -1,4 +1,4 @@
-"""Plays recordings as a driver: the same readings, as old as they were when they were recorded."""
+"""Plays recordings as a driver: the same readings, as old as they were when recorded."""
 
 from __future__ import annotations
 
@@ -31,15 +31,14 @@ _Item = Reading | RecordedEvent
 
 @dataclass(slots=True)
 class McapCounters(DriverCounters):
-    """What is counted while recordings are played."""
+    """Counts of a replay."""
 
     late: int = 0
-    """Readings handed over more than one period after they were due."""
+    """Readings handed over more than a period after they were due."""
     malformed: int = 0
-    """Messages on the topics of readings, outcomes or exchanges that are none, or not of these
-    fingers."""
+    """Broken messages, and readings of other fingers."""
     cut_off: int = 0
-    """Files that were cut off, as by a daemon that was killed, or are damaged."""
+    """Files that were cut off, as by a killed daemon, or are damaged."""
 
 
 class McapReplayDriver(RecordedDriver[_Item]):
@@ -67,13 +66,13 @@ class McapReplayDriver(RecordedDriver[_Item]):
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_event: Callable[[RecordedEvent], None] | None = None
-        """Called where something other than a reading was recorded that concerns the judge."""
+        """Called with each recorded event that the judge must know of."""
         self._reset()
 
     def _reset(self) -> None:
         self.counters = McapCounters()
         self.period_ns: int | None = None
-        """Shortest time, ns, between two readings so far, as played."""
+        """Shortest time between two readings so far, ns, as played."""
         self._last_ns: int | None = None
 
     def open(self) -> None:
@@ -88,7 +87,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
         self.timeline.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
-        """The next reading if it is due. An event that is due is told, and gives none."""
+        """Return the next reading if it is due. An event that is due goes to `on_event` instead."""
         taken = self.timeline.take()
         if taken is None:
             return ()
@@ -124,7 +123,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
                     _log.warning("%s: ends without an end; played as far as it goes", path)
 
     def _items_of(self, message: RecordedMessage) -> Sequence[_Item]:
-        """Readings, events or outcomes in a message, in their order; none for any other one."""
+        """Return the readings, events or outcomes of a message, in their order."""
         try:
             if message.kind == Topic.TACTILE:
                 reading, asked = tactile_reading(message.payload, self._fingers)

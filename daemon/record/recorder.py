@@ -1,6 +1,6 @@
-"""Records readings, published messages and events in files, without ever holding up the loop.
+"""Records readings, published messages and events in files, without delaying the loop.
 
-The loop appends to a bounded queue and a thread writes: a slow or full disk costs entries, which
+The loop appends to a bounded queue and a thread writes. A slow or full disk costs entries, which
 are counted, and no time of the loop.
 """
 
@@ -25,7 +25,7 @@ from daemon.record.flat import flat
 from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapWriter
 from daemon.record.topics import EVENT, Exchanged, Joints, Judged, Topic
-from daemon.record.viewers import ForPeople
+from daemon.record.viewers import Viewer
 from daemon.scene.scene import Record
 from drivers.base import JointReading, Reading
 
@@ -38,19 +38,17 @@ if TYPE_CHECKING:
 log = logging.getLogger("graspd")
 
 QUEUE_MAX: Final = 20_000
-"""Entries that may wait for the disk, some 12 MB: a minute of readings at 100 Hz, with verdicts
-and joints. Beyond, the newest are dropped."""
+"""Longest queue, entries: some 12 MB, a minute of readings at 100 Hz. Later entries are dropped."""
 RETRY_NS: Final = 60_000_000_000
-"""From a failure of the disk to the next try, ns."""
+"""Time from a failure of the disk to the next try, ns."""
 ROUNDS_PER_FLUSH: Final = 10
-"""How often the thread empties the queue between two flushes: seldom, so that it hardly ever needs
-the interpreter when the loop does."""
+"""Times that the thread empties the queue per flush: few, so that it seldom needs the interpreter
+when the loop does."""
 FLUSH_AFTER: Final = 0.8
-"""Part of the flush interval after which a flush is due: with a round and the writing, nothing
+"""Part of the flush interval after which a flush is due: with a round and the writing, no entry
 waits longer than the interval."""
 CLOSE_S: Final = 0.5
-"""How long `close` waits for the thread, s."""
-
+"""Longest time that `close` waits for the thread, s."""
 
 MakeHeader = Callable[[], RecordingHeader]
 """Encodes a state that the loop has copied; called in the thread."""
@@ -66,18 +64,16 @@ _Entry = tuple[int, bytes, object]
 
 @dataclass(slots=True, eq=False)
 class _Open:
-    """Files that are being written, and since when, monotonic ns."""
+    """The files that are being written."""
 
-    messages: McapWriter
-    link_log: RecordingFile | None
+    files: list[RecordingFile]
+    """Messages; then the link log, if there is one."""
     offset_ns: int
+    """Wall time less monotonic time, ns."""
     since_ns: int
+    """Start of the files, monotonic ns."""
     unflushed: int = 0
-    """Entries that are written to these files, but perhaps not yet on the disk."""
-
-    def all(self) -> list[RecordingFile]:
-        """One or two files."""
-        return [self.messages] if self.link_log is None else [self.messages, self.link_log]
+    """Entries that are written, but perhaps not yet on the disk."""
 
 
 class Recorder(Companion):
@@ -95,9 +91,9 @@ class Recorder(Companion):
     ) -> None:
         """Start the thread, which creates the first file.
 
-        `take_header` copies what is known, for the header of a file, which lacks only what each
-        file has of its own. It is called in the loop, here and where a file is to end: after a
-        status, when no reading is being judged. `tap` gives what comes over the link.
+        `take_header` copies the state for the header of a file. The loop calls it here, and after a
+        status where a file is to end: then no reading is being judged. `tap` gives the link's
+        traffic.
         """
         self._retention = retention
         self._rotate_bytes = round(options.rotate_mb * 1e6)
@@ -110,8 +106,8 @@ class Recorder(Companion):
         self._queue: deque[_Entry] = deque()
         self._names = {topic: f"{topic}.{retention.hand}".encode() for topic in Topic}
         self._last_topic = b""
-        """That of the newest entry."""
-        self._for_people = ForPeople(options.images_hz)
+        """Topic of the newest entry."""
+        self._viewer = Viewer(options.images_hz)
         self._counted = Counter(recorded=0, lost=0, files=0, removed=0, failures=0)
         self._dropped = 0
         self._open: _Open | None = None
@@ -133,7 +129,7 @@ class Recorder(Companion):
         self._put(topic, payload)
 
     def wanted(self, topic: bytes) -> bool:
-        """Always: what nobody subscribes to is recorded all the same."""
+        """Return True: a recording needs no subscriber."""
         return True
 
     def on_reading(self, reading: Reading) -> None:
@@ -149,19 +145,19 @@ class Recorder(Companion):
             self._put(self._names[Topic.JUDGED], making)
 
     def on_event(self, event: LoopEvent) -> None:
-        """Record an event; a question that follows another one adds nothing."""
+        """Record an event, but only the first of equal ones in a row."""
         topic = self._names[Topic(event.value)]
         if topic != self._last_topic:
             self._put(topic, EVENT)
 
     def on_status(self, status: Status) -> None:
-        """Copy the state if the thread waits for it to go on in new files."""
+        """Copy the state if the thread waits for it to begin new files."""
         if self._wants_turn:
             self._wants_turn = False
             self._queue.append((self._clock(), NEXT_FILES, self._take_header()))
 
     def exchanged(self, session: SessionState | None, learned: LearnerState | None) -> None:
-        """Record that a sensor is another one than before, and what was known of the new ones."""
+        """Record that a sensor was exchanged, and what was known of the new ones."""
         self._put(self._names[Topic.EXCHANGED], partial(Exchanged, session, learned))
 
     def _put(self, topic: bytes, content: object, at_ns: int | None = None) -> None:
@@ -173,14 +169,13 @@ class Recorder(Companion):
 
     @property
     def counters(self) -> dict[str, dict[str, int]]:
-        """Since the start: entries `recorded`, `dropped` because the disk was too slow, and `lost`
-        when it failed; `files` begun and `removed`, `failures`; `writing`, 1 while a file is open.
-        """
+        """Entries `recorded`, `dropped` by a slow disk and `lost` by a failed one; `files` begun
+        and `removed`, `failures`; `writing` is 1 while a file is open."""
         writing = int(self._open is not None)
         return {"record": {**self._counted, "dropped": self._dropped, "writing": writing}}
 
     def close(self) -> None:
-        """Write what is queued and end the files; give up if the disk does not answer in time."""
+        """Write the queue and end the files; give up if the disk does not answer in time."""
         if self._stopping.is_set():
             return
         self._stopping.set()
@@ -201,11 +196,11 @@ class Recorder(Companion):
             self._finish()
 
     def go_round(self) -> None:
-        """Write what is queued; after a failure lose it until the next try is due."""
+        """Write the queue; after a failure lose it until the next try is due."""
         entries = [self._queue.popleft() for _ in range(len(self._queue))]
         now_ns = self._clock()
         if self._open is None and (self._retry_due_ns is None or now_ns >= self._retry_due_ns):
-            self._turn()
+            self._ask_for_turn()
         for at_ns, topic, content in entries:
             if topic == NEXT_FILES:
                 self._take_turn(cast(MakeHeader, content), now_ns)
@@ -216,13 +211,13 @@ class Recorder(Companion):
         if self._open is not None and now_ns >= self._flush_due_ns:
             self._flush(self._open, now_ns)
 
-    def _turn(self) -> None:
-        """Go on in new files where the loop next copies its state."""
+    def _ask_for_turn(self) -> None:
+        """Begin new files where the loop next copies its state."""
         if not self._awaits_turn:
             self._awaits_turn = self._wants_turn = True
 
     def _take_turn(self, make_header: MakeHeader, now_ns: int) -> None:
-        """Go on in new files, except for the few entries that come after `close`."""
+        """Begin new files, except for the few entries that come after `close`."""
         self._awaits_turn = False
         if self._open is None or not self._stopping.is_set():
             self._finish()
@@ -231,88 +226,84 @@ class Recorder(Companion):
     def _begin(self, now_ns: int, header: RecordingHeader) -> None:
         """Create the next files, if the disk takes them."""
         offset_ns = self._wall_clock() - now_ns
+        header = replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns)
+        path = self._retention.path(self._number, ".mcap")
+        files: list[RecordingFile] = []
         try:
             self._counted["removed"] += self._retention.make_room(self._rotate_bytes)
-            name = self._retention.name(self._number)
-            path = name.with_name(f"{name.name}.mcap")
-            messages = McapWriter(
-                path,
-                replace(header, file=self._number, wall_minus_monotonic_ns=offset_ns),
-            )
-            link_log = None
-            try:
-                if self._tap is not None:
-                    link_log = RecordingFile(name.with_name(f"{name.name}{self._tap.ending}"))
-            except OSError:
-                messages.remove()
-                raise
+            files.append(McapWriter(path, header))
+            if self._tap is not None:
+                files.append(RecordingFile(path.with_suffix(self._tap.ending)))
         except OSError as error:
+            for file in files:
+                file.remove()
             self._fail(error)
             return
         log.info("record: %s", path)
         self._retry_due_ns = None
         self._number += 1
         self._counted["files"] += 1
-        self._open = _Open(messages, link_log, offset_ns, now_ns)
+        self._open = _Open(files, offset_ns, now_ns)
 
-    def _write(self, files: _Open, topic: bytes, content: object, at_ns: int) -> None:
-        files.unflushed += 1
+    def _write(self, current: _Open, topic: bytes, content: object, at_ns: int) -> None:
+        current.unflushed += 1
         try:
-            if topic != LINK:
-                self._write_message(files, topic, content, at_ns)
-            elif files.link_log is not None and self._tap is not None:
+            if topic == LINK and self._tap is not None:
                 entry = cast(tuple[object, ...], content)
-                files.link_log.append(self._tap.encode(at_ns, files.offset_ns, *entry))
+                current.files[-1].append(self._tap.encode(at_ns, current.offset_ns, *entry))
+            else:
+                self._write_message(current, topic, content, at_ns)
         except OSError as error:
             self._fail(error)
 
-    def _write_message(self, files: _Open, topic: bytes, content: object, at_ns: int) -> None:
-        """Write a message, and what it comes to for people."""
+    def _write_message(self, current: _Open, topic: bytes, content: object, at_ns: int) -> None:
+        """Write a message, and log lines and images made of it."""
         if callable(content):
             message = msgspec.to_builtins(content())
         else:
             message = msgspec.json.decode(cast(bytes, content))
-        files.messages.write(topic, msgspec.json.encode(flat(message)), at_ns)
-        kind, wall_ns = topic.partition(b".")[0].decode(), at_ns + files.offset_ns
-        for made, payload in self._for_people.of(kind, message, wall_ns):
-            files.messages.write(self._names[Topic(made)], payload, at_ns)
+        file = cast(McapWriter, current.files[0])
+        file.write(topic, msgspec.json.encode(flat(message)), at_ns)
+        kind = topic.partition(b".")[0].decode()
+        for made, payload in self._viewer.of(kind, message, at_ns + current.offset_ns):
+            file.write(self._names[Topic(made)], payload, at_ns)
 
-    def _flush(self, files: _Open, now_ns: int) -> None:
+    def _flush(self, current: _Open, now_ns: int) -> None:
         try:
-            size = sum(file.flush() for file in files.all())
+            size = sum(file.flush() for file in current.files)
         except OSError as error:
             self._fail(error)
             return
-        self._counted["recorded"] += files.unflushed
-        files.unflushed = 0
+        self._counted["recorded"] += current.unflushed
+        current.unflushed = 0
         self._flush_due_ns = now_ns + round(self._flush_ns * FLUSH_AFTER)
-        if size >= self._rotate_bytes or now_ns - files.since_ns >= self._rotate_ns:
-            self._turn()
+        if size >= self._rotate_bytes or now_ns - current.since_ns >= self._rotate_ns:
+            self._ask_for_turn()
 
     def _finish(self) -> None:
-        files = self._open
-        if files is None:
+        current = self._open
+        if current is None:
             return
         try:
-            for file in files.all():
+            for file in current.files:
                 file.close()
         except OSError as error:
             self._fail(error)
             return
         self._open = None
-        self._counted["recorded"] += files.unflushed
+        self._counted["recorded"] += current.unflushed
 
     def _fail(self, error: OSError) -> None:
-        """After a failure of the disk: warn, the first time, and try again later."""
-        files, self._open = self._open, None
+        """Count a failure of the disk, warn of the first one, and try again later."""
+        current, self._open = self._open, None
         self._number += 1  # the next file does not go on where the last one ends
-        if files is not None:
-            self._counted["lost"] += files.unflushed
-            for file in files.all():
+        if current is not None:
+            self._counted["lost"] += current.unflushed
+            for file in current.files:
                 file.abandon()
         self._counted["failures"] += 1
-        first = self._retry_due_ns is None
+        is_first = self._retry_due_ns is None
         self._retry_due_ns = self._clock() + RETRY_NS
-        say = log.warning if first else log.debug
+        say = log.warning if is_first else log.debug
         where = self._retention.directory
         say("record: %s: %s; nothing is recorded", where, error.strerror or error)

@@ -1,4 +1,4 @@
-"""The topics of a recording, and those of its messages that are not published."""
+"""The topics of a recording, and the messages on them that are not published."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from models.session_statistics import SessionState
 _ANGLES = msgspec.Meta(
     extra_json_schema={"properties": {name: {"type": "number"} for name in sorted(JOINTS)}}
 )
-"""So that a viewer offers them by name."""
+"""Lets a viewer offer the joints by name."""
 
 
 class Joints(msgspec.Struct, frozen=True, kw_only=True):
@@ -43,11 +43,11 @@ class Joints(msgspec.Struct, frozen=True, kw_only=True):
     """Monotonic time, ns, of the reading's last byte."""
     names: tuple[str, ...]
     position_rad: Annotated[dict[str, float], _ANGLES]
-    """Of each joint that has a valid angle, rad."""
+    """Angle of each joint that has a valid one, rad."""
 
     @classmethod
     def of(cls, reading: JointReading) -> Self:
-        """The message for `reading`."""
+        """Return the message for `reading`."""
         pairs = zip(reading.names, reading.position_rad.tolist(), strict=True)
         angles = {name: angle for name, angle in pairs if angle == angle}
         return cls(
@@ -72,7 +72,7 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, boot_id: str, judgement: Judgement) -> Self:
-        """The message for a judgement with `judged_counts`, in the run `boot_id`."""
+        """Return the message for a judgement with `judged_counts`, in the run `boot_id`."""
         counts = judgement.judged_counts
         return cls(
             boot_id=boot_id,
@@ -88,48 +88,51 @@ class Event(msgspec.Struct, frozen=True):
 
 
 class Exchanged(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A sensor is another one than before; empty unless that one was known already."""
+    """A sensor was exchanged; empty unless the new one was known."""
 
     session: SessionState | None = None
-    """What was known of them."""
+    """What was known of the new sensors."""
     learned: LearnerState | None = None
     """What outcomes had taught of them."""
 
 
 class Topic(StrEnum):
-    """First part of a topic's name, `<kind>.<hand>`, and the struct of its messages."""
-
-    message: type[msgspec.Struct]
-
-    def __new__(cls, kind: str, message: type[msgspec.Struct] = Event) -> Self:
-        """A member is the string `kind`, with the attribute `message`."""
-        topic = str.__new__(cls, kind)
-        topic._value_ = kind
-        topic.message = message
-        return topic
+    """First part of a topic's name, `<kind>.<hand>`."""
 
     # Written by the outbox:
-    TACTILE = "tactile", Tactile  # read by replay
-    VERDICT = "verdict", Verdict  # read by other tools
-    GATE = "gate", GateMessage  # read by other tools
-    STATUS = "status", Status  # read by other tools
-    OUTCOME = "outcome", OutcomeMessage  # read by replay and export
+    TACTILE = "tactile"
+    VERDICT = "verdict"
+    GATE = "gate"
+    STATUS = "status"
+    OUTCOME = "outcome"
     # Written by the recorder:
-    JOINTS = "joints", Joints  # read by replay
-    JUDGED = "judged", Judged  # read by export
-    ASKED = "asked"  # read by replay: somebody asked for a judgement
-    EXCHANGED = "exchanged", Exchanged  # read by replay
-    SKIPPED = "skipped"  # read by replay: readings before the next one were left out
+    JOINTS = "joints"
+    JUDGED = "judged"
+    ASKED = "asked"
+    """A controller has asked for a judgement."""
+    EXCHANGED = "exchanged"
+    SKIPPED = "skipped"
+    """Readings before the next one were left out."""
+    # Made of them for viewers:
+    IMAGE = "image"
+    LOG = "log"
 
-    # Made of them for people, read by viewers:
-    IMAGE = "image", RawImage
-    LOG = "log", Log
 
-
-_FAMILY: Final = {Topic.IMAGE: "foxglove", Topic.LOG: "foxglove"}
-"""Whose schema a topic has, if it is not ours: viewers know it by its name."""
-
-EVENTS: Final = frozenset(topic for topic in Topic if topic.message is Event)
+MESSAGES: Final[dict[Topic, type[msgspec.Struct]]] = {
+    Topic.TACTILE: Tactile,
+    Topic.VERDICT: Verdict,
+    Topic.GATE: GateMessage,
+    Topic.STATUS: Status,
+    Topic.OUTCOME: OutcomeMessage,
+    Topic.JOINTS: Joints,
+    Topic.JUDGED: Judged,
+    Topic.ASKED: Event,
+    Topic.EXCHANGED: Exchanged,
+    Topic.SKIPPED: Event,
+    Topic.IMAGE: RawImage,
+    Topic.LOG: Log,
+}
+EVENTS: Final = (Topic.ASKED, Topic.SKIPPED)
 EVENT: Final = b"{}"
 """Payload of an event."""
 
@@ -139,28 +142,30 @@ _decode = msgspec.json.Decoder(dict[str, Any]).decode
 
 @cache
 def schemas() -> dict[str, tuple[str, bytes]]:
-    """By topic: name and JSON Schema of its messages."""
-    return {
-        topic.value: (
-            f"{_FAMILY.get(topic, 'graspd')}.{topic.message.__name__}",
-            json.dumps(schema_of(topic.message)).encode(),
-        )
-        for topic in Topic
-    }
+    """Return name and JSON Schema of the messages of each topic.
+
+    Viewers know `foxglove.RawImage` and `foxglove.Log` by name.
+    """
+    described = {}
+    for topic, message in MESSAGES.items():
+        family = "foxglove" if message in (RawImage, Log) else "graspd"
+        schema = json.dumps(schema_of(message)).encode()
+        described[topic.value] = f"{family}.{message.__name__}", schema
+    return described
 
 
 def decode_judged(payload: bytes) -> Judged:
-    """A `judged` message. Raises `ValueError` if the payload is not one."""
+    """Decode a `judged` message. Raises `ValueError` for any other payload."""
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
     return msgspec.convert(content, Judged)
 
 
 def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileReading, bool]:
-    """The reading of a `tactile` message, reduced to `fingers`, in their order; and whether
-    somebody asked for a judgement before it, as older recordings say in it.
+    """Return the reading of a `tactile` message, reduced to `fingers`, in their order.
 
-    Raises `ValueError` or `OverflowError` if the payload is not such a message.
+    The second value is True if an older recording says in it that a controller asked before it.
+    Raises `ValueError` or `OverflowError` for any other payload.
     """
     content = _decode(payload)
     content["counts"] = table(content.get("counts"))
@@ -176,13 +181,11 @@ def tactile_reading(payload: bytes, fingers: Sequence[str]) -> tuple[TactileRead
 
 
 def joint_reading(payload: bytes) -> JointReading:
-    """The reading of a `joints` message. Raises `ValueError` if the payload is not one."""
+    """Return the reading of a `joints` message. Raises `ValueError` for any other payload."""
     content = _decode(payload)
     angles = content.get("position_rad")
     if isinstance(angles, list):  # as older recordings have them
-        if len(angles) != len(content.get("names", ())):
-            raise ValueError("as many names as angles are needed")
-        pairs = zip(content["names"], angles, strict=True)
+        pairs = zip(map(str, content.get("names", "")), angles, strict=True)
         content["position_rad"] = {name: angle for name, angle in pairs if angle is not None}
     message = msgspec.convert(content, Joints)
     if not message.position_rad.keys() <= set(message.names):

@@ -1,9 +1,9 @@
-"""What a recording says once more for people: tactile images as `foxglove.RawImage`, and what
-changed as `foxglove.Log`, which viewers show without knowing anything of graspd."""
+"""What viewers show without knowing graspd, made of its messages: tactile images as
+`foxglove.RawImage`, and changes as `foxglove.Log`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Annotated, Final
 
 import msgspec
@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
-from daemon.publish.messages import Count, GateMessage, OutcomeMessage, State
+from daemon.publish.messages import (
+    Count,
+    GateMessage,
+    OutcomeMessage,
+    State,
+    Status,
+    Tactile,
+    Verdict,
+)
 from drivers.base import ELECTRODES
 from models.levels import FULL, HEIGHT, PIXELS, WIDTH, Rest, fall_of, levels_of
 
@@ -28,7 +36,7 @@ _COLOURS: Final = {
     80: (251, 180, 26),
     100: (252, 255, 190),
 }
-"""By level: blue is risen, yellow pressed the most."""
+"""Colours by level: blue is risen, yellow pressed the most."""
 _PALETTE = np.array(
     [
         np.interp(np.arange(-FULL, FULL + 1), list(_COLOURS), channel)
@@ -36,7 +44,18 @@ _PALETTE = np.array(
     ]
 ).T.astype(np.uint8)
 _MARK = np.array((0, 220, 220), np.uint8)
-"""Of an electrode whose count is faulty."""
+"""Colour of an electrode whose count is faulty."""
+
+Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
+_TYPES: Final[dict[str, type[Message]]] = {
+    "verdict": Verdict,
+    "gate": GateMessage,
+    "tactile": Tactile,
+    "outcome": OutcomeMessage,
+    "status": Status,
+}
+Line = tuple[int, str, str]
+"""Level, name and text."""
 
 
 class Time(msgspec.Struct, frozen=True):
@@ -47,7 +66,7 @@ class Time(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, wall_ns: int) -> Time:
-        """The time `wall_ns`, ns since 1970."""
+        """Return the time `wall_ns`, ns since 1970."""
         return cls(*divmod(max(wall_ns, 0), 1_000_000_000))
 
 
@@ -81,125 +100,109 @@ class Log(msgspec.Struct, frozen=True, kw_only=True):
     line: int = 0
 
 
-class _Verdict(msgspec.Struct, frozen=True):
-    """What is read of a verdict here."""
+class Viewer:
+    """Makes log and images of the messages of one hand."""
 
-    grasp: int
-    verdict: Decision
-    reasons: list[Reason]
-    p_slip: float | None = None
-    gate: GateState | None = None
+    def __init__(self, images_hz: float) -> None:
+        """Draw at most `images_hz` images a second; 0 draws none."""
+        self._journal, self._painter = Journal(), Painter(images_hz)
 
+    def of(self, kind: str, content: object, wall_ns: int) -> Iterator[tuple[str, bytes]]:
+        """Yield kind and payload of what a message comes to; nothing for a malformed one.
 
-class _Tactile(msgspec.Struct, frozen=True):
-    """What is read of a reading here; counts and faults by finger."""
-
-    fingers: list[str]
-    counts: list[list[int]]
-    faults: list[list[int]]
-
-
-class _Status(msgspec.Struct, frozen=True):
-    """What is read of a status here."""
-
-    state: State
-    health: dict[str, Reason]
-
-
-_Line = tuple[int, str, str]
-"""Level, name and text."""
+        `content` is the message as JSON has it, `kind` the first part of its topic.
+        """
+        if kind not in _TYPES:
+            return
+        try:
+            message: Message = msgspec.convert(content, _TYPES[kind])
+            image = self._painter.paint(message, wall_ns)
+        except ValueError:
+            return
+        for level, name, text in self._journal.lines(message):
+            log = Log(timestamp=Time.of(wall_ns), level=level, name=name, message=text)
+            yield "log", msgspec.json.encode(log)
+        if image is not None:
+            yield "image", msgspec.json.encode(image)
 
 
 class Journal:
     """Says in words what changes from message to message."""
 
     def __init__(self) -> None:
-        """Nothing was said yet."""
-        self._verdict: tuple[object, ...] = ()
+        self._verdict: tuple[int, Decision, list[Reason]] | None = None
         self._state: State | None = None
         self._health: dict[str, Reason] = {}
-        self._readers: dict[str, Callable[[object], Iterator[_Line]]] = {
-            "gate": self._gate,
-            "verdict": self._of_verdict,
-            "outcome": self._outcome,
-            "status": self._status,
-        }
 
-    def of(self, kind: str, content: object, wall_ns: int) -> list[Log]:
-        """What a message of a kind of topic, as JSON has it, changes; nothing for a broken one."""
-        if kind not in self._readers:
+    def lines(self, message: Message) -> list[Line]:
+        """Return what the message changes."""
+        match message:
+            case GateMessage():
+                text = f"{message.former} to {message.state} ({message.cause})"
+                return [(INFO, "gate", f"grasp {message.grasp}: {text}")]
+            case Verdict():
+                return self._of_verdict(message)
+            case OutcomeMessage():
+                lifted = "" if message.object is None else f", {message.object}"
+                text = f"the lift ended in {message.outcome}{lifted}"
+                return [(INFO, "outcome", f"grasp {message.grasp}: {text}")]
+            case Status():
+                return self._of_status(message)
+        return []
+
+    def _of_verdict(self, message: Verdict) -> list[Line]:
+        verdict = message.grasp, message.verdict, message.reasons
+        if verdict == self._verdict:
             return []
-        stamp = Time.of(wall_ns)
-        try:
-            return [
-                Log(timestamp=stamp, level=level, name=name, message=text)
-                for level, name, text in self._readers[kind](content)
-            ]
-        except msgspec.ValidationError:
-            return []
+        self._verdict = verdict
+        why = "; ".join(f"{reason}: {ADVICE[reason]}" for reason in message.reasons)
+        if message.p_slip is not None:
+            why = f"slips with a probability of {message.p_slip:.1%}"
+        level = WARNING if message.verdict is Decision.SLIP else INFO
+        return [(level, "verdict", f"grasp {message.grasp}: {message.verdict} ({why})")]
 
-    def _gate(self, content: object) -> Iterator[_Line]:
-        gate = msgspec.convert(content, GateMessage)
-        yield INFO, "gate", f"grasp {gate.grasp}: {gate.former} to {gate.state} ({gate.cause})"
-
-    def _of_verdict(self, content: object) -> Iterator[_Line]:
-        seen = msgspec.convert(content, _Verdict)
-        now = seen.grasp, seen.verdict, seen.reasons
-        if now == self._verdict:
-            return
-        self._verdict = now
-        level = WARNING if seen.verdict is Decision.SLIP else INFO
-        why = "; ".join(f"{reason}: {ADVICE[reason]}" for reason in seen.reasons)
-        if seen.p_slip is not None:
-            why = f"slips with a probability of {seen.p_slip:.1%}"
-        yield level, "verdict", f"grasp {seen.grasp}: {seen.verdict} ({why})"
-
-    def _outcome(self, content: object) -> Iterator[_Line]:
-        told = msgspec.convert(content, OutcomeMessage)
-        what = "" if told.object is None else f", {told.object}"
-        yield INFO, "outcome", f"grasp {told.grasp}: the lift ended in {told.outcome}{what}"
-
-    def _status(self, content: object) -> Iterator[_Line]:
-        seen = msgspec.convert(content, _Status)
-        if seen.state is not self._state:
-            level = WARNING if seen.state is State.SILENT else INFO
-            yield level, "state", str(seen.state)
-        for part, reason in seen.health.items():
+    def _of_status(self, message: Status) -> list[Line]:
+        lines = []
+        if message.state is not self._state:
+            level = WARNING if message.state is State.SILENT else INFO
+            lines.append((level, "state", str(message.state)))
+        for part, reason in message.health.items():
             if self._health.get(part) is not reason:
-                yield WARNING, "health", f"{part}: {reason}: {ADVICE[reason]}"
-        for part in self._health.keys() - seen.health.keys():
-            yield INFO, "health", f"{part}: well again"
-        self._state, self._health = seen.state, seen.health
+                lines.append((WARNING, "health", f"{part}: {reason}: {ADVICE[reason]}"))
+        well = self._health.keys() - message.health.keys()
+        lines += [(INFO, "health", f"{part}: well again") for part in well]
+        self._state, self._health = message.state, message.health
+        return lines
 
 
 class Painter:
-    """Draws readings, so many a second, by where each finger rests, which it learns."""
+    """Draws readings by where each finger rests, which it learns."""
 
     def __init__(self, images_hz: float) -> None:
-        """Draw `images_hz` images a second at most; 0 draws none."""
+        """Draw at most `images_hz` images a second; 0 draws none."""
         self._period_ns = round(1e9 / images_hz) if images_hz else None
         self._due_ns = 0
         self._gate: GateState | None = None
         self._rests: dict[str, Rest] = {}
 
-    def of(self, kind: str, content: object, wall_ns: int) -> RawImage | None:
-        """The image of a reading of wall time `wall_ns`, ns, if one is due; None for all others."""
-        if self._period_ns is None or kind not in ("tactile", "verdict"):
-            return None
-        try:
-            if kind == "verdict":
-                self._gate = msgspec.convert(content, _Verdict).gate
-            elif not 0 < self._due_ns - wall_ns <= self._period_ns:
-                image = self._image(msgspec.convert(content, _Tactile), wall_ns)
-                late_ns = wall_ns - self._due_ns
-                on_time = 0 <= late_ns < self._period_ns
-                self._due_ns = (self._due_ns if on_time else wall_ns) + self._period_ns
-                return image
-        except ValueError:  # a message that is broken has no image
-            pass
-        return None
+    def paint(self, message: Message, wall_ns: int) -> RawImage | None:
+        """Return the image of a reading of wall time `wall_ns`, ns, if one is due.
 
-    def _image(self, reading: _Tactile, wall_ns: int) -> RawImage:
+        Raises `ValueError` for a reading whose parts do not fit.
+        """
+        if isinstance(message, Verdict):
+            self._gate = message.gate
+        if not isinstance(message, Tactile) or self._period_ns is None:
+            return None
+        late_ns = wall_ns - self._due_ns
+        if -self._period_ns <= late_ns < 0:
+            return None
+        image = self._image(message, wall_ns)
+        is_on_time = late_ns < self._period_ns and late_ns >= 0
+        self._due_ns = (self._due_ns if is_on_time else wall_ns) + self._period_ns
+        return image
+
+    def _image(self, reading: Tactile, wall_ns: int) -> RawImage:
         shape = len(reading.fingers), ELECTRODES
         counts = np.array(reading.counts, np.float64).reshape(shape)
         sound = np.array(reading.faults).reshape(shape) == 0
@@ -221,7 +224,7 @@ class Painter:
     def _finger(
         self, name: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """One finger, shape (`HEIGHT`, `WIDTH`, 3); `counts` and `sound` have shape (24,)."""
+        """Draw one finger, shape (`HEIGHT`, `WIDTH`, 3); `counts`, `sound` have shape (24,)."""
         rest = self._rests.setdefault(name, Rest())
         if self._gate is GateState.IDLE:
             rest.learn(counts, sound)
@@ -229,19 +232,3 @@ class Painter:
         pixels = _PALETTE[levels_of(fall, from_rest=rest.counts is not None) + FULL]
         pixels[np.array(PIXELS)[~sound]] = _MARK
         return pixels.reshape(HEIGHT, WIDTH, 3)
-
-
-class ForPeople:
-    """What the messages of one hand come to, on topics `log` and `image`."""
-
-    def __init__(self, images_hz: float) -> None:
-        """`images_hz` as in `Painter`."""
-        self._journal, self._painter = Journal(), Painter(images_hz)
-
-    def of(self, kind: str, content: object, wall_ns: int) -> Iterator[tuple[str, bytes]]:
-        """Kind and payload of what is said and drawn of a message, as JSON has it."""
-        for line in self._journal.of(kind, content, wall_ns):
-            yield "log", msgspec.json.encode(line)
-        image = self._painter.of(kind, content, wall_ns)
-        if image is not None:
-            yield "image", msgspec.json.encode(image)

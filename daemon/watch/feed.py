@@ -1,4 +1,4 @@
-"""The subscriber of `graspd watch`: connects to a daemon like any other, and takes messages."""
+"""The subscriber of `graspd watch`: connects to a daemon and takes its messages."""
 
 from __future__ import annotations
 
@@ -13,46 +13,42 @@ from daemon.process.sleep import boottime_ns
 from daemon.publish.keys import load_pair, load_public
 
 TOPICS: Final = ("verdict.", "gate.", "tactile.", "status.", "outcome.")
-WAITING_MAX = 2000
-"""Messages that wait here; at 100 Hz those of seven seconds. More are lost, and seen as lost."""
-TAKEN_MAX = 5000
-"""Messages taken at a time, more than can wait: after a pause the newest is there at once."""
-PAUSE_NS = 1_000_000_000
-"""Who has not looked for longer connects anew: what waits is old, and what is new may be lost."""
-RETRY_NS = 5_000_000_000
-"""After being turned away: libzmq does not try again by itself, and the key may be known by then.
+WAITING_MAX: Final = 2000
+"""Messages that wait in the socket: seven seconds of them. Later ones are lost, and counted."""
+TAKEN_MAX: Final = 5000
+"""Messages taken at once, more than can wait: after a pause the newest is there at once."""
+PAUSE_NS: Final = 1_000_000_000
+"""After a pause of this length, ns, connect again: waiting messages are old, newer ones lost."""
+RETRY_NS: Final = 5_000_000_000
+"""Time, ns, from a refusal to the next try. libzmq does not try again; the key may be known then.
 """
-MESSAGE_MAX_BYTES = 1 << 20
-"""A status has some kilobytes; who sends more is no daemon."""
+MESSAGE_MAX_BYTES: Final = 1 << 20
+"""Largest message; a status has some kilobytes."""
 HEARTBEAT_MS, HEARTBEAT_TIMEOUT_MS = 1000, 3000
-"""On TCP, as the daemon has them, ms."""
+"""Heartbeats on TCP, as the daemon has them, ms."""
 RECONNECT_MS, RECONNECT_MAX_MS = 100, 1000
-"""Before connecting again, at first and at most, ms."""
+"""Shortest and longest time before connecting again, ms."""
 NOT_CONNECTED: Final = "not connected"
+WANTS_KEY: Final = "turned away: the daemon wants a key (--keys)"
 EVENTS: Final = {
     int(zmq.EVENT_HANDSHAKE_SUCCEEDED): "connected",
     int(zmq.EVENT_DISCONNECTED): NOT_CONNECTED,
     int(zmq.EVENT_CONNECT_RETRIED): NOT_CONNECTED,
     int(zmq.EVENT_HANDSHAKE_FAILED_AUTH): "turned away: the daemon does not know this key",
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): WANTS_KEY,
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): WANTS_KEY,
 }
-"""What the connection is like after an event."""
-REFUSALS: Final = {
-    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): (
-        "turned away: the daemon wants a key (--keys)",
-        "turned away: this daemon takes no keys",
-    ),
-    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): (
-        "turned away: the daemon wants a key (--keys)",
-        "turned away: is the daemon's key right?",
-    ),
+"""State of the connection after an event."""
+EVENTS_WITH_KEYS: Final = EVENTS | {
+    int(zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL): "turned away: this daemon takes no keys",
+    int(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL): "turned away: is the daemon's key right?",
 }
-"""The same without keys and with keys."""
-FOLLOW = 2
-"""Events that follow when one is turned away, and say less: disconnected, will be tried again."""
+FOLLOW: Final = 2
+"""Events after a refusal that say less: disconnected, retried."""
 
 
 class Feed:
-    """Subscribed to all topics of an endpoint until `close`; connects again by itself."""
+    """Subscribes to all topics of an endpoint until `close`; reconnects by itself."""
 
     def __init__(
         self,
@@ -60,21 +56,21 @@ class Feed:
         keys: tuple[bytes, bytes, bytes] | None = None,
         clock: Callable[[], int] = boottime_ns,
     ) -> None:
-        """`keys`: own public and secret key and the daemon's public one, Z85, where it needs them;
-        `clock` gives ns, also while the computer sleeps.
+        """`keys`: own public and secret key and the daemon's public one, Z85; `clock` gives ns,
+        also while the computer sleeps.
 
-        Raises `zmq.ZMQError` for an endpoint that is none.
+        Raises `zmq.ZMQError` for a malformed endpoint.
         """
         self.link = "connecting"
-        """What the connection is like, in words."""
+        """State of the connection, in words."""
         self._endpoint = endpoint
         self._keys = keys
         self._clock = clock
         self._taken_ns = self._opened_ns = clock()
         self.empty_ns = self._opened_ns
-        """When nothing waited: what `take` gives has come since, and may be as old."""
+        """When no message waited; those that `take` gives have come since, and may be as old."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._events = EVENTS | {event: says[keys is not None] for event, says in REFUSALS.items()}
+        self._events = EVENTS if keys is None else EVENTS_WITH_KEYS
         self._follow = 0
         self._open()
 
@@ -91,7 +87,7 @@ class Feed:
         if self._endpoint.startswith("tcp://"):
             self._socket.heartbeat_ivl = HEARTBEAT_MS
             self._socket.heartbeat_timeout = HEARTBEAT_TIMEOUT_MS
-        self._monitor = self._socket.get_monitor_socket(sum(EVENTS) + sum(REFUSALS))
+        self._monitor = self._socket.get_monitor_socket(sum(EVENTS))
         try:
             self._socket.connect(self._endpoint)
         except zmq.ZMQError:
@@ -101,9 +97,9 @@ class Feed:
             self._socket.subscribe(topic)
 
     def take(self) -> Iterator[tuple[bytes, bytes]]:
-        """Topic and payload of each message that has come; never waits."""
-        self._connect_anew_if_need_be()
-        self._look_at_link()
+        """Yield topic and payload of each message that has come; never wait."""
+        self._reconnect_if_needed()
+        self._update_link()
         for _ in range(TAKEN_MAX):
             before_ns = self._clock()
             try:
@@ -114,21 +110,21 @@ class Feed:
             if len(frames) == 2:
                 yield frames[0], frames[1]
 
-    def _connect_anew_if_need_be(self) -> None:
+    def _reconnect_if_needed(self) -> None:
         now_ns = self._clock()
         paused = now_ns - self._taken_ns > PAUSE_NS
         self._taken_ns = now_ns
         if paused or (self.is_turned_away and now_ns - self._opened_ns > RETRY_NS):
             self._opened_ns = self.empty_ns = now_ns
-            self._let_go()
+            self._close_sockets()
             self._open()
 
     @property
     def is_turned_away(self) -> bool:
-        """Whether the daemon does not let us in."""
+        """True if the daemon refused the connection."""
         return self.link.startswith("turned away")
 
-    def _look_at_link(self) -> None:
+    def _update_link(self) -> None:
         while self._monitor.poll(0):
             event = int(recv_monitor_message(self._monitor)["event"])
             link = self._events.get(event, self.link)
@@ -139,11 +135,11 @@ class Feed:
             self._follow = FOLLOW if self.is_turned_away else 0
 
     def close(self) -> None:
-        """Let go of the endpoint. May be called again."""
-        self._let_go()
+        """Disconnect. May be called again."""
+        self._close_sockets()
         self._context.term()
 
-    def _let_go(self) -> None:
+    def _close_sockets(self) -> None:
         if not self._socket.closed:
             self._socket.disable_monitor()
             self._monitor.close(0)
@@ -157,7 +153,7 @@ class Feed:
 
 
 def load_keys(own: Path, daemon: Path) -> tuple[bytes, bytes, bytes]:
-    """Own public and secret key, and the daemon's public one, Z85.
+    """Return own public and secret key, and the daemon's public one, Z85.
 
     `own` is a `.key_secret` file of mode 0600, `daemon` the daemon's `.key`. Raises `KeysError`.
     """

@@ -1,4 +1,4 @@
-"""What is drawn of a finger: its tactile image for the eye, what is wrong in it, how it moves."""
+"""The tactile image of each finger for the page, what is wrong in it, and how the finger moves."""
 
 from __future__ import annotations
 
@@ -6,22 +6,23 @@ from collections.abc import Collection
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from models.levels import FULL as FULL
-from models.levels import HEIGHT as HEIGHT
-from models.levels import PIXELS, fall_of, levels_of
-from models.levels import WIDTH as WIDTH
-from models.levels import Rest as Rest
+from daemon.publish.messages import Tactile, Verdict
+from models.contract import Finger
+from models.layout import ELECTRODES
+from models.levels import PIXELS, Rest, fall_of, levels_of
+
+OLD_NS = 1_000_000_000
+"""Older images are not shown: they would look alive."""
 
 
 class FingerMotion(msgspec.Struct, frozen=True, kw_only=True):
-    """How a finger moves, in units of its own noise."""
+    """Motion of a finger, in units of its own noise."""
 
     now: float | None
     """None: not known, which is not 0."""
     limit: float
-    """What it is at most while the finger is still."""
+    """Most motion of a finger that is still."""
 
 
 class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,40 +32,75 @@ class FingerImage(msgspec.Struct, frozen=True, kw_only=True):
     touches: bool | None
     """None: not known."""
     from_rest: bool
-    """Whether levels are falls below the rest; else deviations from the finger's own median."""
+    """True if levels are falls below the rest, else deviations from the finger's own median."""
     levels: list[int]
-    """By pixel, `HEIGHT` rows of `WIDTH`: 0 at rest, `FULL` pressed the most, below 0 risen."""
+    """By pixel, 12 rows of 11: 0 at rest, 100 pressed the most, below 0 risen."""
     deepest: int
     """Largest fall of an electrode, counts."""
     marked: list[int]
     """Pixels of the electrodes that are faulty or were repaired."""
     motion: FingerMotion | None
-    """None where nobody says: each reading is a grasp of its own."""
+    """None if each reading is a grasp of its own."""
 
 
-def image(
-    name: str,
-    counts: NDArray[np.float64],
-    sound: NDArray[np.bool_],
-    rest: NDArray[np.float64] | None,
-    *,
-    touches: bool | None,
-    repaired: Collection[str] = (),
-    motion: FingerMotion | None = None,
-) -> FingerImage:
-    """The image of one reading of a finger; `counts`, `sound` and `rest` have shape (24,).
+class Fingers:
+    """Takes readings, learns where fingers rest, and draws the newest reading."""
 
-    Electrodes that are not `sound` are drawn as the median of the others, and marked.
-    """
-    marked = {PIXELS[index] for index in np.flatnonzero(~sound)}
-    marked |= {PIXELS[number - 1] for number in range(1, 25) if f"{name}_{number}" in repaired}
-    fall = fall_of(counts, sound, rest)
-    return FingerImage(
-        name=name,
-        touches=touches,
-        from_rest=rest is not None,
-        levels=levels_of(fall, from_rest=rest is not None).tolist(),
-        deepest=round(float(fall.max())),
-        marked=sorted(marked),
-        motion=motion,
-    )
+    def __init__(self) -> None:
+        self._tactile: Tactile | None = None
+        self._tactile_ns = 0
+        self._rests: dict[str, Rest] = {}
+
+    def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
+        """Take a reading that arrived at `now_ns`; return False if its parts do not fit.
+
+        `resting` names the fingers that touch nothing and are tared.
+        """
+        lengths = {len(tactile.fingers), len(tactile.counts), len(tactile.faults)}
+        rows = [*tactile.counts, *tactile.faults]
+        if len(lengths) != 1 or any(len(row) != ELECTRODES for row in rows):
+            return False
+        self._tactile, self._tactile_ns = tactile, now_ns
+        for index, finger in enumerate(tactile.fingers):
+            if finger in resting:
+                rest = self._rests.setdefault(finger, Rest())
+                rest.learn(np.array(tactile.counts[index]), np.array(tactile.faults[index]) == 0)
+        return True
+
+    def images(self, verdict: Verdict, now_ns: int) -> list[FingerImage]:
+        """Draw the newest reading; nothing if it is old by `now_ns`."""
+        tactile = self._tactile
+        if tactile is None or now_ns - self._tactile_ns > OLD_NS:
+            return []
+        return [self._image(tactile, index, verdict) for index in range(len(tactile.fingers))]
+
+    def _image(self, tactile: Tactile, index: int, verdict: Verdict) -> FingerImage:
+        """Draw one finger. Electrodes that are not sound get the median of the others."""
+        name = tactile.fingers[index]
+        counts = np.array(tactile.counts[index], dtype=np.float64)
+        sound = np.array(tactile.faults[index]) == 0
+        electrodes = range(1, ELECTRODES + 1)
+        repaired = [f"{name}_{number}" in verdict.repaired for number in electrodes]
+        rest = self._rests[name].counts if name in self._rests else None
+        fall = fall_of(counts, sound, rest)
+        return FingerImage(
+            name=name,
+            touches=None if verdict.contact is None else name in verdict.contact,
+            from_rest=rest is not None,
+            levels=levels_of(fall, from_rest=rest is not None).tolist(),
+            deepest=round(float(fall.max())),
+            marked=sorted(PIXELS[electrode] for electrode in np.flatnonzero(~sound | repaired)),
+            motion=_motion(verdict, name),
+        )
+
+    @property
+    def joints(self) -> dict[str, float]:
+        """Angles of the newest reading, rad."""
+        return {} if self._tactile is None else self._tactile.joints
+
+
+def _motion(verdict: Verdict, finger: Finger) -> FingerMotion | None:
+    if verdict.motion is None:
+        return None
+    limit = (verdict.motion_limits or {}).get(finger, 0.0)
+    return FingerMotion(now=verdict.motion.get(finger) if limit > 0.0 else None, limit=limit)

@@ -14,8 +14,7 @@ let came = now(), looked = now();
 let fastest = Infinity;  // way of a snapshot on this connection, with the difference of the clocks, ms
 
 function text(node, value) { if (node.textContent !== value) node.textContent = value; }
-function number(value, unit = "", digits = 0) { return value === null ? "-" : value.toFixed(digits) + unit; }
-function percent(share) { return number(100 * share, " %"); }
+function percent(share) { return `${(100 * share).toFixed(0)} %`; }
 function clock(seconds) { return new Date(1000 * seconds).toTimeString().slice(0, 8); }
 function called(grasp) { return grasp.verdict + (grasp.p_slip === null ? "" : " " + percent(grasp.p_slip)); }
 function rgb(hex) { return [1, 3, 5].map(at => parseInt(hex.slice(at, at + 2), 16)); }
@@ -60,9 +59,9 @@ function lines(parent, items) {
     text(node.children[0], line.what); text(node.children[1], ": " + line.advice);
   });
 }
-function rows(table, pairs) {
-  children(table, pairs, () => element("tr", element("td"), element("td")), (node, [name, value]) => {
-    text(node.children[0], name); text(node.children[1], String(value));
+function rows(table, items) {
+  children(table, items, () => element("tr", element("td"), element("td")), (node, line) => {
+    text(node.children[0], line.what); text(node.children[1], line.advice);
   });
 }
 
@@ -91,7 +90,7 @@ function drawMotion(bar, words, motion) {
   const {now, limit} = motion;
   bar.dataset.motion = now === null ? "unknown" : now > limit ? "moving" : "still";
   bar.style.setProperty("--share", `${now === null ? 0 : Math.min(50 * now / limit, 100)}%`);
-  text(words, now === null ? "motion unknown" : `moves ${number(now, "", 1)} / ${number(limit, " \u03c3", 1)}`);
+  text(words, now === null ? "motion unknown" : `moves ${now.toFixed(1)} / ${limit.toFixed(1)} \u03c3`);
 }
 
 // A lane for each kind of verdict, below it the probability of slip, and the minutes before now.
@@ -152,7 +151,7 @@ class Hand {
     this.say("clock", clock(Date.now() / 1000));
     this.part("banner").dataset.tone = tone;
     this.say("verdict", this.headline());
-    const p = none ? null : seen.p_slip, last = none ? null : seen.judged;
+    const p = none ? null : seen.p_slip, last = none ? null : seen.grasps[0] ?? null;
     const was = last !== null && tone !== "silent" && seen.verdict === "unknown" && last.verdict !== "unknown";
     this.say("was", was && last.grasp === seen.grasp ? `${last.held ? "judged" : "past:"} ${called(last)}` : "");
     this.say("evidence", none ? "" : seen.evidence);
@@ -187,7 +186,7 @@ class Hand {
   headline() { return gone || this.seen === null ? "unknown" : this.seen.headline; }
 
   drawGrasp(none, quiet) {
-    const seen = this.seen, gate = none ? null : seen.gate, newest = seen.judged;
+    const seen = this.seen, gate = none ? null : seen.gate, newest = seen.grasps[0] ?? null;
     this.say("grasp", String(seen.grasp ?? "-"));
     children(this.part("gate"), STATES, () => element("li"), (node, state) => {
       text(node, state); node.className = state === gate ? "now" : "";
@@ -224,7 +223,7 @@ class Hand {
   }
 
   drawTables() {
-    const {timing: time, session, counts} = this.seen;
+    const {counts} = this.seen;
     this.say("counts", Object.entries(counts).map(([name, count]) => `${count} ${name}`).join(", "));
     children(this.part("grasps"), this.seen.grasps,
       () => element("tr", element("td"), element("td", element("i"), element("span")), element("td"), element("td")),
@@ -237,27 +236,7 @@ class Hand {
         text(node.children[3], grasp.lift);
         node.children[3].className = grasp.ended === null ? "faint" : grasp.verdict === "stable" && grasp.ended === "slip" ? "bad" : "";
       });
-    rows(this.part("learning"), this.seen.learning.map(line => [line.what, line.advice]));
-    rows(this.part("timing"), [
-      ["readings, verdicts", `${number(time.readings_hz, " /s")}, ${number(time.verdicts_hz, " /s")}`],
-      ["age of the last", number(time.age_ms, " ms", 1)],
-      ["latency p50, p99", `${number(time.p50_us, " us")}, ${number(time.p99_us, " us")}`],
-      ["longest latency", number(time.max_us, " us")],
-      ["jitter p99", number(time.jitter_p99_us, " us")],
-      ["late", number(time.late, " readings")],
-      ["worst age", number(time.worst_age_ms, " ms")],
-      ["lost here", number(time.lost, " messages")],
-      ["not understood", number(time.not_understood, " messages")],
-    ]);
-    rows(this.part("session"), [
-      ["session", session === null ? "not needed" : `${session.grasps} grasps, ${session.calibrated ? "" : "not yet "}calibrated`],
-      ["repaired now", this.seen.repaired.join(", ") || "nothing"],
-    ]);
-    rows(this.part("drivers"), [
-      ...Object.entries(this.seen.drivers).flatMap(([driver, counters]) =>
-        Object.entries(counters).filter(([, count]) => count).map(([name, count]) => [`${driver} ${name}`, count])),
-      ...Object.entries(this.seen.versions),
-    ]);
+    for (const name of ["learning", "timing", "session", "drivers"]) rows(this.part(name), this.seen[name]);
   }
 }
 

@@ -18,109 +18,102 @@ from rich.console import Console
 from rich.live import Live
 
 from daemon.process.signals import StopSignal
-from daemon.watch.pixels import Canvas
 from daemon.watch.terminal import draw
-from daemon.watch.watching import TICK_S, Watched, snapshots
+from daemon.watch.view import TICK_S, HandFeed, snapshots
 
 SIGNALS_MAX = 64
-"""Bytes that a look takes out of the pipe of signals."""
+"""Most bytes taken at once from the pipe of signals."""
 
 
 def can_draw() -> bool:
-    """Whether standard output is a terminal with a cursor that can be moved."""
+    """Return True if standard output is a terminal with a cursor that can be moved."""
     console = Console()
     return console.is_terminal and not console.is_dumb_terminal
 
 
-def show(hands: Sequence[Watched]) -> None:
-    """Draw on standard output until told to stop; needs a terminal there."""
-    console = Console()
-    canvas = Canvas(
-        colour=console.color_system is not None and not console.no_color,
-        ascii_only=console.options.ascii_only,
-    )
-    with StopSignal() as stop, Pause() as pause:
-        keys = Keys(stop)
+def show(hands: Sequence[HandFeed]) -> None:
+    """Draw on standard output, which must be a terminal, until told to stop."""
+    console = Console(highlight=False)
+    with StopSignal() as stop, Suspension() as suspension:
+        keyboard = Keyboard(stop)
         while True:
-            with keys.unseen(), Live(console=console, screen=True, auto_refresh=False) as live:
-                for seen in snapshots(hands, lambda: keys.wait() or pause.asked):
-                    size = console.width, console.height
-                    live.update(draw(seen, *size, canvas, keys.tabs % len(hands)), refresh=True)
-            if stop.received is not None or not pause.asked:
+            with (
+                keyboard.unbuffered(),
+                Live(console=console, screen=True, auto_refresh=False) as live,
+            ):
+                for seen in snapshots(hands, lambda: keyboard.wait() or suspension.asked):
+                    live.update(draw(seen, console.width, keyboard.tabs % len(hands)), refresh=True)
+            if stop.received is not None or not suspension.asked:
                 return
             now = time.strftime("%H:%M:%S")
-            console.out(
-                f"graspd watch stopped at {now}: unknown until it goes on (fg)", highlight=False
-            )
-            pause.stop()
+            console.print(f"graspd watch stopped at {now}: unknown until it goes on (fg)")
+            suspension.stop()
 
 
-class Pause:
-    """Ctrl-Z: the picture must not stay where nobody draws it any more."""
+class Suspension:
+    """Ctrl-Z: the last verdict must not stay on the screen while nothing is drawn."""
 
     def __init__(self) -> None:
-        """Not asked yet."""
         self.asked = False
 
     def __enter__(self) -> Self:
-        """Take over SIGTSTP, unless it is ignored; only the main thread can."""
+        """Take over SIGTSTP, unless it is ignored. Only the main thread can."""
         self._former = signal.getsignal(signal.SIGTSTP)
-        self._take_over()
+        if self._former is not signal.SIG_IGN:
+            signal.signal(signal.SIGTSTP, self._ask)
         return self
 
     def __exit__(self, *_details: object) -> None:
         signal.signal(signal.SIGTSTP, self._former)
 
     def stop(self) -> None:
-        """Stop as asked; comes back when the process is continued."""
+        """Stop the process; return when it is continued."""
         self.asked = False
         signal.signal(signal.SIGTSTP, signal.SIG_DFL)
         os.kill(os.getpid(), signal.SIGTSTP)
-        self._take_over()
+        signal.signal(signal.SIGTSTP, self._ask)
 
-    def _take_over(self) -> None:
-        if self._former is not signal.SIG_IGN:
-            signal.signal(signal.SIGTSTP, self._handle)
-
-    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+    def _ask(self, _number: int, _frame: FrameType | None) -> None:
         self.asked = True
 
 
-class Keys:
-    """What is typed: `q` ends, Tab shows the next hand."""
+class Keyboard:
+    """Typed keys: `q` ends, Tab shows the next hand."""
 
     def __init__(self, stop: StopSignal) -> None:
-        """Without a keyboard yet; signals are waited for too."""
+        """Wait for `stop` too; read no keys before `unbuffered`."""
         self.tabs = 0
         """How often Tab was typed."""
         self._stop = stop
-        self._keyboard: int | None = None
+        self._waited = [stop.fileno()]
+        """Descriptors of signals and, while keys are read, of the keyboard."""
 
     def wait(self) -> bool:
-        """Wait for a tick; true for a signal and for `q`."""
-        keyboard = self._keyboard
-        waited = [self._stop.fileno()] if keyboard is None else [self._stop.fileno(), keyboard]
-        ready, _, _ = select.select(waited, [], [], TICK_S)
+        """Wait for a tick; return True after a signal that ends, or `q`."""
+        ready, _, _ = select.select(self._waited, [], [], TICK_S)
         if self._stop.fileno() in ready:
             os.read(self._stop.fileno(), SIGNALS_MAX)  # also of signals that do not end it
         if self._stop.received is not None:
             return True
-        if keyboard is None or keyboard not in ready:
-            return False
-        typed = os.read(keyboard, 64)
-        self.tabs += typed.count(b"\t")
-        return typed[:1] in {b"q", b"Q", b""}
+        for keyboard in ready:
+            if keyboard != self._stop.fileno():
+                typed = os.read(keyboard, 64)
+                self.tabs += typed.count(b"\t")
+                return typed[:1] in {b"q", b"Q", b""}
+        return False
 
     @contextlib.contextmanager
-    def unseen(self) -> Iterator[None]:
-        """Have keys come at once and unseen, where standard input is a terminal."""
+    def unbuffered(self) -> Iterator[None]:
+        """Read keys at once and without echo, if standard input is a terminal."""
         if sys.stdin is None or sys.stdin.closed or not sys.stdin.isatty():
             yield
             return
-        self._keyboard = sys.stdin.fileno()
-        former = termios.tcgetattr(self._keyboard)
+        keyboard = sys.stdin.fileno()
+        former = termios.tcgetattr(keyboard)
+        self._waited.append(keyboard)
         try:
-            tty.setcbreak(self._keyboard)
+            tty.setcbreak(keyboard)
             yield
         finally:
-            termios.tcsetattr(self._keyboard, termios.TCSADRAIN, former)
+            self._waited.remove(keyboard)
+            termios.tcsetattr(keyboard, termios.TCSADRAIN, former)

@@ -1,4 +1,4 @@
-"""All that is shown at one moment; the terminal draws it, and the page gets it as JSON."""
+"""Everything that is shown of one hand at one moment: the terminal draws it, the page gets JSON."""
 
 from __future__ import annotations
 
@@ -10,50 +10,31 @@ from daemon.watch.fingers import FingerImage
 
 
 class Tone(StrEnum):
-    """The verdict in seven kinds, a colour each, that an operator tells apart at a glance."""
+    """The verdict in seven kinds, each with its own colour."""
 
     STABLE = "stable"
     LEANS = "leans"
-    """Called `stable`, but lifts have not shown yet that this is a promise that is kept."""
+    """`stable`, but lifts have not yet shown that this promise is kept."""
     SLIP = "slip"
     LEARNING = "learning"
     """Unknown, and to be lifted while a person watches."""
     WAITING = "waiting"
-    """Unknown, as it should be: nothing is grasped, or the grasp has not settled yet."""
+    """Unknown as expected: nothing is grasped, or the grasp has not settled yet."""
     TROUBLE = "trouble"
-    """Unknown, because something is wrong or out of the ordinary."""
+    """Unknown, because something is wrong or unusual."""
     SILENT = "silent"
-    """Unknown, because no message comes."""
-
-
-TONE_CODE = {
-    Tone.STABLE: "s",
-    Tone.LEANS: "l",
-    Tone.SLIP: "x",
-    Tone.LEARNING: "u",
-    Tone.WAITING: "w",
-    Tone.TROUBLE: "t",
-    Tone.SILENT: ".",
-}
-"""In `Snapshot.history`."""
-WORST_FIRST = (
-    *(Tone.SLIP, Tone.TROUBLE, Tone.SILENT, Tone.LEARNING),
-    *(Tone.STABLE, Tone.LEANS, Tone.WAITING),
-)
-"""Of several moments in one column, the first of these is shown."""
-MOMENTS = 300
-"""Seconds that the timeline goes back: five minutes."""
+    """Unknown, because no message arrives."""
 
 
 class Line(msgspec.Struct, frozen=True):
-    """Something to know, and what to do about it."""
+    """A label and its text: a reason and advice, or a figure and its value."""
 
     what: str
     advice: str
 
 
-class Judged(msgspec.Struct, frozen=True, kw_only=True):
-    """What a grasp was judged to be last, which may not stand any more."""
+class JudgedGrasp(msgspec.Struct, frozen=True, kw_only=True):
+    """The last verdict of a grasp, which may not hold any more."""
 
     verdict: str
     p_slip: float | None
@@ -62,84 +43,58 @@ class Judged(msgspec.Struct, frozen=True, kw_only=True):
     ended: str | None
     """How the lift ended, if the controller has told it: `stable` or `slip`."""
     lift: str
-    """The same in short words, for the eye: `held`, `slipped`, `not told`, or `-`."""
+    """The same in short words: `held`, `slipped`, `not told`, or `-`."""
     supervised: bool
-    """Whether it was to be lifted while a person watches."""
+    """True if it was to be lifted while a person watches."""
     held: bool
-    """Whether it is still the grasp of the hand; else it is past."""
-
-
-class Session(msgspec.Struct, frozen=True, kw_only=True):
-    """How far the session is calibrated."""
-
-    grasps: int
-    calibrated: bool
-
-
-class Timing(msgspec.Struct, frozen=True, kw_only=True):
-    """Rates as they arrive here, delays as the daemon tells them."""
-
-    verdicts_hz: float
-    readings_hz: float | None
-    age_ms: float | None
-    p50_us: float | None
-    p99_us: float | None
-    max_us: float | None
-    jitter_p99_us: float | None
-    late: int | None
-    worst_age_ms: float | None
-    lost: int
-    """Verdicts that did not arrive, by gaps of `seq`."""
-    not_understood: int
-    """Messages that are not of this version, or not of graspd."""
+    """True while the hand still holds it."""
 
 
 class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known now."""
+    """The state of one hand."""
 
     endpoint: str
     link: str
+    """State of the connection, in words."""
     hand: str | None
     t: float
-    """Wall-clock seconds since 1970 here."""
+    """Wall-clock seconds since 1970 on this computer."""
     last_t: float | None
-    """The same of the last verdict's arrival: of a silent hand, all figures are of then."""
+    """Arrival of the last verdict, likewise; the figures of a silent hand are of that time."""
     tone: Tone
     verdict: str
-    """`stable`, `slip` or `unknown`; unknown too when no message comes."""
+    """`stable`, `slip` or `unknown`; unknown too when no message arrives."""
     headline: str
-    """The same as it is to be shown: a `stable` that is no promise only leans to it."""
+    """The verdict as it is shown: a `stable` without evidence only leans to stable."""
     evidence: str
     """What the verdict rests on; empty before the first message."""
-    learning: list[Line]
-    """How learning goes, what matters most first."""
     p_slip: float | None
     why: list[Line]
+    """Reasons of the verdict, with advice."""
     grasp: int | None
     gate: str | None
     contact: list[str] | None
+    """Fingers that touch; None: not known."""
     still: str
-    """For how long the hand has been still, in words; `-` where nobody says."""
-    judged: Judged | None
-    """The newest of `grasps`."""
-    grasps: list[Judged]
-    """The last grasps, the newest first."""
+    """How long the hand has been still, in words; `-`: not known."""
+    grasps: list[JudgedGrasp]
+    """The last judged grasps, the newest first."""
+    counts: dict[str, int]
+    """Grasps since watch began, by the last verdict of each."""
     fingers: list[FingerImage]
     joints: dict[str, float]
     """Angles, rad."""
     health: list[Line]
-    repaired: list[str]
-    session: Session | None
-    timing: Timing
+    """What is wrong with the hand, and what to do."""
     state: str | None
     """Of the daemon: `running`, `silent` or `stopping`."""
-    counts: dict[str, int]
-    """Grasps seen here, by the verdict that each had last."""
-    drivers: dict[str, dict[str, int]]
     model: str | None
-    versions: dict[str, str]
+    learning: list[Line]
+    timing: list[Line]
+    session: list[Line]
+    drivers: list[Line]
+    """Counters of the drivers that are not 0, and versions."""
     history: list[str]
-    """Tones of each second of the last five minutes, the oldest second and the worst tone first;
-    see `TONE_CODE`."""
+    """Tones of each of the last 300 seconds, the oldest first, as letters; see `TONE_CODE`."""
     history_p: list[int]
-    """The same for the highest probability of slip, %; -1 where there is none."""
+    """Highest probability of slip of each of these seconds, %; -1: none."""

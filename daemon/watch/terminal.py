@@ -1,237 +1,157 @@
-"""Snapshots as text for a terminal: one hand from 60 columns on, several beside each other."""
+"""Snapshots as tables for a terminal. Tactile images and the last five minutes are on the page."""
 
 from __future__ import annotations
 
-import textwrap
+import math
 import time
 from collections.abc import Sequence
 
-from rich.console import Group
+from rich.console import Group, RenderableType
+from rich.table import Table
 from rich.text import Text
 
 from daemon.process.text import printable
-from daemon.watch.blocks import (
-    BOLD,
-    DIM,
-    GAP,
-    JOINT,
-    Items,
-    aside,
-    beside,
-    columns,
-    figures,
-    flow,
-    grasps_and_joints,
-    images,
-    images_end,
-    line,
-    percent,
-)
-from daemon.watch.lanes import AXIS_LINES, LANES, PLOT_LINES, lanes, plot, strip
-from daemon.watch.pixels import Canvas
-from daemon.watch.snapshot import Snapshot, Tone
+from daemon.watch.fingers import FingerImage, FingerMotion
+from daemon.watch.snapshot import JudgedGrasp, Line, Snapshot, Tone
 
-LARGE = (96, 33)
-"""Columns and lines of a hand from which on its images are large."""
-WIDE = 150
-"""Columns from which on the reasons stand beside the verdict, and the figures in tables."""
-NARROW = 70
-"""Columns below which the field of the verdict is narrow, and there are more lines for reasons."""
-HIGH = 26
-"""Lines from which on there are three for reasons."""
-BANNER_LINES, BANNER, BANNER_NARROW = 5, 24, 20
-"""Lines and columns of the coloured field that has the verdict in its middle."""
-LIST_LINES = 6
-"""Of the last grasps and the joints where they stand below the images."""
-FACTS = 45
-"""Columns beside the field of the verdict below which words are left out."""
-HAND_COLUMNS, HAND_LINES = 80, 24
-"""What a hand needs for a place of its own where several are shown."""
+STYLES = {
+    Tone.STABLE: "bold #ffffff on #2da44e",
+    Tone.LEANS: "#7fa98a",
+    Tone.LEARNING: "bold #ffffff on #2f7de0",
+    Tone.SLIP: "bold #ffffff on #e5484d",
+    Tone.WAITING: "bold #ffffff on #57606a",
+    Tone.TROUBLE: "bold #ffffff on #d98e00",
+    Tone.SILENT: "bold #ffffff on #8250df",
+}
+"""Colours differ in lightness too, for people who cannot tell red from green."""
+OLD = "dim italic"
+"""Figures of a daemon that is silent."""
+HAND_COLUMNS = 80
+"""Columns that a hand needs beside another one."""
+HALF_BAR = 10
+"""Columns of a bar up to its mark, and from there to its end."""
 NAME_MAX = 40
 """Characters of a name that came in a message."""
 
+Row = tuple[str, str]
+"""Label and text."""
 
-def draw(
-    hands: Sequence[Snapshot], width: int, height: int, canvas: Canvas, chosen: int = 0
-) -> Group:
-    """The snapshots for a terminal of `width` x `height` characters, cut to what fits.
 
-    Hands have places beside or below each other; where there is no room, `chosen` is the index of
-    the one that is shown, and of the others there is a line each.
+def draw(hands: Sequence[Snapshot], width: int, chosen: int = 0) -> RenderableType:
+    """Return tables of the hands for a terminal of `width` columns.
+
+    Hands without room beside each other have a line each; only the `chosen` one has a table.
     """
-    number, several = len(hands), len(hands) > 1
-    signs = canvas.legend() if height >= HAND_LINES else []
-    footer = _footer(width, signs)
-    left = height - len(footer)
-    rows: list[Text] = []
-    if several and width // number < HAND_COLUMNS and left // number < HAND_LINES:
-        footer = _footer(width, signs, "  tab next hand")
-        rows = [_one_line(seen, canvas) for seen in hands if seen is not hands[chosen]]
-        rows += _hand(hands[chosen], width, height - len(rows) - len(footer), canvas)
-    elif several and width // number < HAND_COLUMNS:
-        share = left // number
-        for seen in hands:
-            rows += _padded(_hand(seen, width, share, canvas), share)
-    else:
-        share = (width + GAP) // number - GAP
-        for at, seen in enumerate(hands):
-            rows = beside(rows, at * (share + GAP), _hand(seen, share, left, canvas))
-    return Group(*rows, *footer)
+    if len(hands) == 1:
+        return _hand(hands[0], "q ends")
+    if width // len(hands) >= HAND_COLUMNS:
+        beside = Table.grid(expand=True, padding=(0, 2))
+        for _ in hands:
+            beside.add_column(ratio=1)
+        beside.add_row(*[_hand(hand, "q ends") for hand in hands])
+        return beside
+    others = [_verdict(hand) for hand in hands if hand is not hands[chosen]]
+    return Group(*others, _hand(hands[chosen], "q ends, tab shows the next hand"))
 
 
-def _padded(rows: list[Text], number: int) -> list[Text]:
-    return rows[:number] + [Text()] * (number - len(rows))
+def _hand(seen: Snapshot, keys: str) -> RenderableType:
+    """Return the table of a hand, what matters most first."""
+    table = Table.grid(padding=(0, 2, 0, 0))
+    table.add_column(style="dim", no_wrap=True)
+    for label, text in [*_verdict_rows(seen), *_health(seen)]:
+        table.add_row(label, Text(text))
+    for label, text in _figures(seen):
+        table.add_row(label, Text(text), style=OLD if seen.tone is Tone.SILENT else None)
+    # An operator sees this clock stand still when nothing is drawn any more.
+    clock = time.strftime("%H:%M:%S", time.localtime(seen.t))
+    model = printable(seen.model or "no model yet", NAME_MAX)
+    header = Text(f"graspd {clock} ({keys})  {seen.state or '-'}  {model}")
+    return Group(_verdict(seen), header, table)
 
 
-def _hand(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]:
-    """At most `height` lines; what matters less goes first where there is no room."""
-    large = width >= LARGE[0] and height >= LARGE[1]
-    verdict = _verdict(seen, width, height, canvas)
-    pictures = images(seen, width, canvas, large=large)
-    known = figures(seen, NAME_MAX)
-    below = aside(known, width, dim=seen.tone is Tone.SILENT)
-    first = "".join(f"{each.what}: {each.advice}" for each in seen.health[:1])
-    health = 2 if len(first) > width else 1
-    left = height - 1 - len(verdict) - len(pictures) - AXIS_LINES - health
-    if left < 0:
-        left += len(pictures)
-        pictures = []
-    below = below[: max(left, 0)]
-    left -= len(below)
-    if width - images_end(seen, width, large=large) < JOINT and left > LIST_LINES:
-        pictures += grasps_and_joints(seen, width, LIST_LINES)
-        left -= LIST_LINES + 1
-    timeline = strip(seen, width, canvas)
-    if left >= LANES - 1:
-        timeline = lanes(seen, width, canvas)
-        left -= LANES - 1
-        if left >= PLOT_LINES:
-            timeline = plot(seen, width, canvas) + timeline
-            left -= PLOT_LINES
-    if width >= WIDE:
-        tables = columns(known, width, dim=seen.tone is Tone.SILENT)
-        if left >= len(tables) - len(below):
-            left -= len(tables) - len(below)
-            below = tables
-    rows = [_header(seen), *verdict, *pictures, *timeline, *below]
-    return [*rows, *_health(seen, width, canvas, max(left, 0) + health)][: max(height, 0)]
-
-
-def _header(seen: Snapshot) -> Text:
-    return line(
-        ("graspd ", BOLD),
-        (name(seen.hand or "-"), BOLD),
-        # Of the picture: an operator sees it stand still where nothing is drawn any more.
-        (time.strftime("  %H:%M:%S", time.localtime(seen.t)), BOLD),
-        (f"  {seen.state or '-'}", BOLD),
-        (f"  {name(seen.model or 'no model yet')}", DIM),
+def _verdict(seen: Snapshot) -> Text:
+    """Return the verdict in its colour, between the name of the hand and the first reason."""
+    name = printable(seen.hand or "-", NAME_MAX)
+    why = seen.why[0].what if seen.why else ""
+    word = f" {seen.headline.upper()} "
+    probability = "" if seen.p_slip is None else f" slip probability {100 * seen.p_slip:.0f} %,"
+    return Text.assemble(
+        (f"{name} ", "bold"), (word, STYLES[seen.tone]), f"{probability} {why}", no_wrap=True
     )
 
 
-def _footer(width: int, signs: list[Text], keys: str = "") -> list[Text]:
-    rows = [line(("q ", BOLD), (f"ends{keys}", DIM))]
-    for sign in signs:
-        if len(rows[-1]) + GAP + len(sign) > width:
-            rows.append(line())
-        rows[-1].append(" " * GAP if len(rows[-1]) else "").append_text(sign)
-    return rows
-
-
-def _one_line(seen: Snapshot, canvas: Canvas) -> Text:
-    said = f" {seen.headline.upper()}{percent(seen.p_slip)} "
-    why = f" {seen.why[0].what}" if seen.why else ""
-    hand = name(seen.hand or "-")
-    return line((f"{hand} ", BOLD), (said, canvas.banner(seen.tone)), (why, ""))
-
-
-def _verdict(seen: Snapshot, width: int, height: int, canvas: Canvas) -> list[Text]:
-    banner = BANNER if width >= NARROW else BANNER_NARROW
-    room = width - banner - 2
-    facts = _facts(seen, canvas, min(room, 60) if width >= WIDE else room)
-    number = max(BANNER_LINES, len(facts))
-    words = [""] * number
-    words[BANNER_LINES // 2] = seen.headline.upper()
-    words[BANNER_LINES // 2 + 1] = _former(seen)
-    style = canvas.banner(seen.tone)
-    rows = [line((word.center(banner)[:banner], style)) for word in words]
-    rows = beside(rows, banner + 2, facts)
-    if width >= WIDE:
-        at = banner + 2 + 60
-        said = [line((seen.evidence, BOLD)), *_why(seen, width - at, number - 1, canvas)]
-        return beside(rows, at, said)
-    evidence = [line((part, BOLD)) for part in textwrap.wrap(seen.evidence, width)[:2]]
-    lines = 2 if height < HIGH else 3 if width >= NARROW else 4
-    return [*rows, *(evidence or [Text()]), *_why(seen, width, lines, canvas)]
-
-
-def _former(seen: Snapshot) -> str:
-    """What the grasp was judged to be before, where that does not stand any more."""
-    last = seen.judged
-    if last is None or last.verdict == "unknown" or last.grasp != seen.grasp:
-        return ""
-    if seen.verdict != "unknown" or seen.tone is Tone.SILENT:
-        return ""
-    return f"({'judged' if last.held else 'past:'} {last.verdict}{percent(last.p_slip)})"
-
-
-def _facts(seen: Snapshot, canvas: Canvas, width: int) -> list[Text]:
-    dim = seen.tone is Tone.SILENT
+def _verdict_rows(seen: Snapshot) -> list[Row]:
+    """Return the rows of the verdict, of the grasp in the hand, and of its fingers."""
     touches = "not known" if seen.contact is None else " ".join(seen.contact) or "nothing"
-    rows: list[Items] = [
-        [("grasp", "-" if seen.grasp is None else str(seen.grasp)), ("gate", seen.gate or "-")],
-        [("touches", touches), ("still", seen.still)],
-    ]
-    found = [row for items in rows for row in flow(items, width, gap=3, bold=True, dim=dim)]
-    share = "-" if seen.p_slip is None else f"{100 * seen.p_slip:.0f} %"
-    bar = canvas.bar(seen.p_slip, max(min(width - 24, 30), 5), seen.tone)
-    found.append(line(("slip probability ", DIM), (f"{share:6}", BOLD)).append_text(bar))
-    last, judged = seen.judged, "last judged" if width >= FACTS else "judged"
-    if last is None:
-        return [*found, line((f"{judged} ", DIM), ("-", BOLD))]
-    past = "" if last.held else ", past"
-    said = f"{last.verdict}{percent(last.p_slip)}"
-    style = DIM if dim else BOLD
+    number = "-" if seen.grasp is None else seen.grasp
+    grasp = f"{number}, gate {seen.gate or '-'}, touches {touches}, still {seen.still}"
     return [
-        *found,
-        line((f"{judged} ", DIM), (said, style), (f", {last.ago_s:.0f} s ago{past}", DIM)),
-        line(
-            *(("its lift ", DIM), (last.lift, style)),
-            (", supervised" if last.supervised else "", DIM),
-        ),
+        *_labelled("why", seen.why),
+        ("evidence", seen.evidence),
+        ("grasp", grasp),
+        *[(finger.name, _finger(finger)) for finger in seen.fingers],
     ]
 
 
-def _why(seen: Snapshot, width: int, number: int, canvas: Canvas) -> list[Text]:
-    """Always as many lines, so that what is below does not jump."""
-    pairs = [(each.what, each.advice) for each in seen.why]
-    return _padded(_advice(pairs, width, number, canvas, seen.tone), number)
-
-
-def _advice(
-    pairs: list[tuple[str, str]], width: int, number: int, canvas: Canvas, tone: Tone
-) -> list[Text]:
-    """At most `number` lines: wrapped if that is enough for all, else each in a line."""
-    style = canvas.style(tone)
-    found = []
-    for what, advice in pairs[:number]:
-        wrapped = textwrap.wrap(f"{what}: {advice}", width) or [""]
-        first = line((wrapped[0][: len(what)], style), (wrapped[0][len(what) :], ""))
-        found += [first, *[line((f"{part}", "")) for part in wrapped[1:]]]
-    if len(found) <= number:
-        return found
-    return [line((what, style), (f": {advice}", "")) for what, advice in pairs[:number]]
-
-
-def _health(seen: Snapshot, width: int, canvas: Canvas, lines: int) -> list[Text]:
+def _health(seen: Snapshot) -> list[Row]:
     if not seen.health:
-        return [line(("health ", DIM), ("all is well" if seen.state else "not known", ""))]
-    shown = seen.health[: lines if len(seen.health) <= lines else lines - 1]
-    pairs = [(name(each.what), each.advice) for each in shown]
-    found = _advice(pairs, width, lines - (len(shown) < len(seen.health)), canvas, Tone.TROUBLE)
-    more = len(seen.health) - len(shown)
-    return [*found, line((f"and {more} more that is not well", BOLD))] if more else found
+        return [("health", "all is well" if seen.state else "not known")]
+    return _labelled("health", seen.health)
 
 
-def name(text: str, length: int = NAME_MAX) -> str:
-    """A name that came in a message, harmless for a terminal."""
-    return printable(text, length)
+def _labelled(label: str, lines: Sequence[Line]) -> list[Row]:
+    """Return a row for each line; the first one has the label."""
+    texts = [f"{printable(line.what, NAME_MAX)}: {line.advice}" for line in lines]
+    labels = [label] + [""] * len(texts)
+    return list(zip(labels, texts, strict=False))
+
+
+def _finger(finger: FingerImage) -> str:
+    depth = f", fall {finger.deepest} counts" if finger.from_rest else ""
+    return ("-" if finger.motion is None else _motion(finger.motion)) + depth
+
+
+def _motion(motion: FingerMotion) -> str:
+    """Return a bar: up to the mark the finger is still, at the end it moves twice as much."""
+    if motion.now is None:
+        return "motion not known"
+    share = min(motion.now / motion.limit, 2.0)
+    still = min(round(share * HALF_BAR), HALF_BAR)
+    moving = math.ceil(max(share - 1.0, 0.0) * HALF_BAR)
+    bar = f"{'#' * still:-<{HALF_BAR}}|{'#' * moving:-<{HALF_BAR}}"
+    return f"{bar} moves {motion.now:.3g} of {motion.limit:.3g}"
+
+
+def _figures(seen: Snapshot) -> list[Row]:
+    """Return the rows of figures, which stay in view when the daemon is silent."""
+    rows = []
+    if seen.tone is Tone.SILENT and seen.last_t is not None:
+        then = time.strftime("%H:%M:%S", time.localtime(seen.last_t))
+        ago_s = seen.t - seen.last_t
+        rows = [("last message", f"{then}, {ago_s:.0f} s ago; figures of then")]
+    counts = [f"{count} {decision}" for decision, count in seen.counts.items()]
+    grasps = [_past(grasp) for grasp in seen.grasps]
+    angles = sorted(seen.joints.items())
+    joints = [f"{printable(name, 5)} {math.degrees(rad):.1f}°" for name, rad in angles]
+    return [
+        *rows,
+        ("grasps seen", ", ".join(counts)),
+        ("last grasps", "; ".join(grasps) or "-"),
+        ("learning", _flow(seen.learning)),
+        *[(line.what, printable(line.advice, NAME_MAX)) for line in seen.session],
+        ("timing", _flow(seen.timing)),
+        ("joints", ", ".join(joints) or "none"),
+        ("endpoint", f"{printable(seen.endpoint, 2 * NAME_MAX)} {seen.link}"),
+    ]
+
+
+def _past(grasp: JudgedGrasp) -> str:
+    probability = "" if grasp.p_slip is None else f" {100 * grasp.p_slip:.0f} %"
+    supervised = ", supervised" if grasp.supervised else ""
+    lift = "" if grasp.lift == "-" else f", {grasp.lift}"
+    return f"{grasp.grasp} {grasp.verdict}{probability}{lift}{supervised}"
+
+
+def _flow(lines: Sequence[Line]) -> str:
+    texts = [f"{line.what} {printable(line.advice, NAME_MAX)}" for line in lines]
+    return "; ".join(texts) or "-"

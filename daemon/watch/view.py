@@ -1,16 +1,16 @@
-"""The state of one hand, by the messages that came and by how long none came."""
+"""The state of one hand, from the messages of its feed and the time since the last one."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from daemon.judge.reasons import ADVICE, WATCHED_LIFT, Decision, GateState, Reason
+from daemon.process.sleep import boottime_ns
 from daemon.publish.messages import (
     GateMessage,
     OutcomeMessage,
@@ -23,30 +23,28 @@ from daemon.publish.messages import (
     decode_tactile,
     decode_verdict,
 )
-from daemon.watch.evidence import WATCHED, doubt, learning, rests_on, stillness
-from daemon.watch.fingers import FingerImage, FingerMotion, Rest, image
-from daemon.watch.grasps import OPEN, Grasps
-from daemon.watch.snapshot import Line, Session, Snapshot, Timing, Tone
-from daemon.watch.timeline import Timeline
-from models.contract import Finger
-from models.layout import ELECTRODES
+from daemon.watch import figures
+from daemon.watch.evidence import SUPERVISED, doubt, rests_on, stillness
+from daemon.watch.feed import Feed
+from daemon.watch.fingers import Fingers
+from daemon.watch.grasps import OPEN, GraspLog
+from daemon.watch.history import History
+from daemon.watch.snapshot import Line, Snapshot, Tone
 
+TICK_S = 0.02
+"""Time between two looks at the feeds, s; silence is timed this exactly."""
 SNAPSHOTS_HZ = 10
-"""How often a snapshot is taken, 1/s."""
-RATE_OVER = SNAPSHOTS_HZ
-"""Snapshots that a rate is taken over: a second."""
-TACTILE_OLD_NS = 1_000_000_000
-"""Images older than this are not shown: they would look alive."""
-AS_IT_SHOULD_BE = {
+"""Snapshots a second; a rate is taken over as many of them."""
+EXPECTED = {
     Reason.NO_CONTACT,
     Reason.MOVING,
     Reason.SETTLING,
     Reason.NOT_TARED,
     Reason.NOT_ASKED,
 }
-"""Reasons of a grasp that is on its way."""
+"""Reasons of a hand that is open, or of a grasp that settles."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
-NOTHING_CAME = "no message has come yet: is graspd running on this endpoint?"
+NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 
 Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
 DECODERS: dict[str, Callable[[bytes], Message]] = {
@@ -56,16 +54,16 @@ DECODERS: dict[str, Callable[[bytes], Message]] = {
     "outcome": decode_outcome,
     "status": decode_status,
 }
-"""By what a topic begins with."""
+"""By first part of a topic."""
 
 
 class View:
-    """Takes messages and gives a `Snapshot` at any time. Constant memory, no socket."""
+    """Takes messages and gives a `Snapshot` at any time. Uses constant memory and no socket."""
 
     def __init__(
         self, endpoint: str, hand: str | None = None, wall: Callable[[], float] = time.time
     ) -> None:
-        """Of one `hand`, or of the first that is heard of."""
+        """Show one `hand`; None: the first whose message arrives."""
         self.link = "connecting"
         self._endpoint = endpoint
         self._hand = hand
@@ -73,14 +71,12 @@ class View:
         self._verdict: Verdict | None = None
         self._verdict_ns = 0
         self._gate: GateState | None = None
-        self._tactile: Tactile | None = None
-        self._tactile_ns = 0
         self._status: Status | None = None
-        self._grasps = Grasps()
-        self._rests: dict[str, Rest] = {}
-        self._received = self._lost = self._not_understood = 0
-        self._rate_marks: deque[tuple[int, int]] = deque(maxlen=RATE_OVER + 1)
-        self._timeline = Timeline()
+        self._grasps = GraspLog()
+        self._fingers = Fingers()
+        self._received = self._lost = self._unreadable = 0
+        self._rate_marks: deque[tuple[int, int]] = deque(maxlen=SNAPSHOTS_HZ + 1)
+        self._history = History()
 
     def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
         """Take one message that arrived at `now_ns`, monotonic ns of this computer."""
@@ -91,7 +87,7 @@ class View:
         try:
             message = decode(payload)
         except (msgspec.DecodeError, UnicodeDecodeError):
-            self._not_understood += 1
+            self._unreadable += 1
             return
         self._hand = hand
         match message:
@@ -100,7 +96,8 @@ class View:
             case GateMessage():
                 self._gate = message.state
             case Tactile():
-                self._take_tactile(message, now_ns)
+                fits = self._fingers.take(message, now_ns, self._resting())
+                self._unreadable += not fits
             case OutcomeMessage():
                 self._grasps.end(message)
             case Status():
@@ -116,84 +113,68 @@ class View:
         self._verdict, self._verdict_ns, self._gate = verdict, now_ns, verdict.gate
         self._grasps.take(verdict, now_ns)
 
-    def _take_tactile(self, tactile: Tactile, now_ns: int) -> None:
-        if not len(tactile.fingers) == len(tactile.counts) == len(tactile.faults):
-            self._not_understood += 1
-            return
-        self._tactile, self._tactile_ns = tactile, now_ns
-        tared = () if self._status is None else self._status.tared or ()
-        if self._gate is not GateState.IDLE:
-            return
-        for index, finger in enumerate(tactile.fingers):
-            counts, sound = _arrays(tactile, index)
-            if finger in tared and counts is not None:
-                self._rests.setdefault(finger, Rest()).learn(counts, sound)
-
     def snapshot(self, now_ns: int) -> Snapshot:
-        """What is to be seen at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
-        tone, why = self._finding(now_ns)
-        verdict = self._verdict
-        stands = verdict is not None and tone in {Tone.STABLE, Tone.LEANS, Tone.SLIP}
-        p_slip = verdict.p_slip if verdict is not None and stands else None
-        said = verdict.verdict.value if verdict is not None and stands else "unknown"
-        self._timeline.add(now_ns, tone, p_slip)
-        if tone is not Tone.SILENT or not self._rate_marks:
-            self._rate_marks.append((now_ns, self._received))
+        """Return what is to be seen at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
+        tone, why = self._verdict_now(now_ns)
         silent = tone is Tone.SILENT
-        status = self._status
-        grasps = self._grasps.last(now_ns, None if silent else self._held())
+        last, status = self._verdict, self._status
+        verdict = None if silent else last
+        judged = verdict if tone in {Tone.STABLE, Tone.LEANS, Tone.SLIP} else None
+        p_slip = None if judged is None else judged.p_slip
+        word = "unknown" if judged is None else judged.verdict.value
+        self._history.add(now_ns, tone, p_slip)
+        if not silent:
+            self._rate_marks.append((now_ns, self._received))
+        seconds = self._history.seconds()
         wall_t = self._wall()
         return Snapshot(
             endpoint=self._endpoint,
             link=self.link,
             hand=self._hand,
             t=wall_t,
-            last_t=None if verdict is None else wall_t - (now_ns - self._verdict_ns) / 1e9,
+            last_t=None if last is None else wall_t - (now_ns - self._verdict_ns) / 1e9,
             tone=tone,
-            verdict=said,
-            headline="leans to stable" if tone is Tone.LEANS else said,
-            evidence="" if verdict is None or silent else rests_on(verdict),
-            learning=learning(verdict, status),
+            verdict=word,
+            headline="leans to stable" if tone is Tone.LEANS else word,
+            evidence="" if verdict is None else rests_on(verdict),
             p_slip=p_slip,
             why=why,
-            grasp=None if verdict is None else verdict.grasp,
+            grasp=None if last is None else last.grasp,
             gate=None if self._gate is None or silent else self._gate.value,
-            contact=None if verdict is None or silent else _names(verdict.contact),
-            still=stillness(None if verdict is None or silent else verdict.still_ms),
-            judged=grasps[0] if grasps else None,
-            grasps=grasps,
-            fingers=[] if silent else self._images(now_ns),
-            joints={} if self._tactile is None or silent else self._tactile.joints,
-            health=[] if status is None or silent else _health(status),
-            repaired=[] if verdict is None or silent else verdict.repaired,
-            session=_session(status),
-            timing=self._timing(),
-            state=None if status is None or silent else status.state.value,
+            contact=None if verdict is None or verdict.contact is None else list(verdict.contact),
+            still=stillness(None if verdict is None else verdict.still_ms),
+            grasps=self._grasps.last(now_ns, None if silent else self._held()),
             counts=self._grasps.counts(),
-            drivers={} if status is None else status.drivers,
-            model=None if verdict is None else f"{verdict.model} {verdict.model_sha}",
-            versions={} if status is None else status.versions,
-            history=self._timeline.tones,
-            history_p=self._timeline.shares,
+            fingers=[] if verdict is None else self._fingers.images(verdict, now_ns),
+            joints={} if silent else self._fingers.joints,
+            health=[] if status is None or silent else _health(status),
+            state=None if status is None or silent else status.state.value,
+            model=None if last is None else f"{last.model} {last.model_sha}",
+            learning=figures.learning(last, status),
+            timing=figures.timing(last, status, self._rate_hz(), self._lost, self._unreadable),
+            session=figures.session(verdict, status),
+            drivers=figures.drivers(status),
+            history=[codes for codes, _ in seconds],
+            history_p=[share for _, share in seconds],
         )
 
-    def _finding(self, now_ns: int) -> tuple[Tone, list[Line]]:
-        """What holds now, by the rule for subscribers: silence means unknown."""
+    def _verdict_now(self, now_ns: int) -> tuple[Tone, list[Line]]:
+        """Return the current verdict and its reasons. Silence means unknown."""
         verdict = self._verdict
         if verdict is None:
-            return Tone.SILENT, [Line("silent", NOTHING_CAME), Line("link", self.link)]
+            return Tone.SILENT, [Line("silent", NO_MESSAGE), Line("link", self.link)]
         silent_ms = (now_ns - self._verdict_ns) / 1e6
         if silent_ms > verdict.silence_ms:
-            long = f"{silent_ms:.0f} ms" if silent_ms < 1e4 else f"{silent_ms / 1e3:.0f} s"
-            silence = Line("silent", f"no message for {long}")
+            duration = f"{silent_ms:.0f} ms" if silent_ms < 1e4 else f"{silent_ms / 1e3:.0f} s"
+            silence = Line("silent", f"no message for {duration}")
             return Tone.SILENT, [silence, Line("link", self.link)]
         if verdict.verdict is Decision.UNKNOWN:
             why = [Line(reason.value, ADVICE[reason]) for reason in verdict.reasons]
             if verdict.supervised and WATCHED_LIFT.issuperset(verdict.reasons):
-                return Tone.LEARNING, [WATCHED, *why]
-            quiet = AS_IT_SHOULD_BE.issuperset(verdict.reasons)
-            return Tone.WAITING if quiet else Tone.TROUBLE, why
-        also = [WATCHED] if verdict.supervised else []
+                return Tone.LEARNING, [SUPERVISED, *why]
+            is_expected = EXPECTED.issuperset(verdict.reasons)
+            return Tone.WAITING if is_expected else Tone.TROUBLE, why
+        also = [SUPERVISED] if verdict.supervised else []
         if verdict.session_calibrated is False:
             also.append(Line("less sure", ADVICE[Reason.NOT_CALIBRATED]))
         if verdict.verdict is Decision.SLIP:
@@ -204,81 +185,46 @@ class View:
             return Tone.LEANS, [Line("leans to stable", why_not or "supervised"), *also]
         return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
 
-    def _images(self, now_ns: int) -> list[FingerImage]:
-        tactile, verdict = self._tactile, self._verdict
-        if tactile is None or now_ns - self._tactile_ns > TACTILE_OLD_NS:
-            return []
-        contact = None if verdict is None else verdict.contact
-        images = []
-        for index, finger in enumerate(tactile.fingers):
-            counts, sound = _arrays(tactile, index)
-            if counts is None:
-                continue
-            rest = self._rests.get(finger)
-            images.append(
-                image(
-                    finger,
-                    counts,
-                    sound,
-                    None if rest is None else rest.counts,
-                    touches=None if contact is None else finger in contact,
-                    repaired=() if verdict is None else verdict.repaired,
-                    motion=_motion(verdict, finger),
-                )
-            )
-        return images
+    def _resting(self) -> Sequence[str]:
+        """Return the fingers that are tared, while the gate says that nothing touches."""
+        if self._status is None or self._gate is not GateState.IDLE:
+            return ()
+        return self._status.tared or ()
 
     def _held(self) -> tuple[str, int] | None:
         verdict = self._verdict
         return None if verdict is None or self._gate in OPEN else (verdict.boot_id, verdict.grasp)
 
-    def _timing(self) -> Timing:
-        verdict, status = self._verdict, self._status
+    def _rate_hz(self) -> float:
+        if not self._rate_marks:
+            return 0.0
         (first_ns, before), (last_ns, received) = self._rate_marks[0], self._rate_marks[-1]
         elapsed_s = (last_ns - first_ns) / 1e9
-        delays = {} if status is None else status.latency_us
-        return Timing(
-            verdicts_hz=(received - before) / elapsed_s if elapsed_s > 0.0 else 0.0,
-            readings_hz=None if status is None else status.readings_hz,
-            age_ms=None if verdict is None else verdict.age_ms,
-            p50_us=delays.get("p50"),
-            p99_us=delays.get("p99"),
-            max_us=delays.get("max"),
-            jitter_p99_us=None if status is None else status.jitter_us.get("p99"),
-            late=None if status is None else status.late_readings,
-            worst_age_ms=None if status is None else status.worst_age_ms,
-            lost=self._lost,
-            not_understood=self._not_understood,
-        )
-
-
-def _arrays(tactile: Tactile, index: int) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
-    """Counts of a finger, None if they are not 24, and which of them are sound; shapes (24,)."""
-    counts, faults = tactile.counts[index], tactile.faults[index]
-    if not len(counts) == len(faults) == ELECTRODES:
-        return None, np.zeros(ELECTRODES, dtype=np.bool_)
-    return np.array(counts, dtype=np.float64), np.array(faults) == 0
-
-
-def _motion(verdict: Verdict | None, finger: Finger) -> FingerMotion | None:
-    if verdict is None or verdict.motion is None:
-        return None
-    limit = (verdict.motion_limits or {}).get(finger, 0.0)
-    return FingerMotion(now=verdict.motion.get(finger) if limit > 0.0 else None, limit=limit)
-
-
-def _names(fingers: Sequence[str] | None) -> list[str] | None:
-    return None if fingers is None else list(fingers)
+        return (received - before) / elapsed_s if elapsed_s > 0.0 else 0.0
 
 
 def _health(status: Status) -> list[Line]:
-    found = [Line("overloaded", OVERLOADED)] if status.overloaded else []
-    return found + [
+    lines = [Line("overloaded", OVERLOADED)] if status.overloaded else []
+    return lines + [
         Line(f"{part} {reason.value}", ADVICE[reason]) for part, reason in status.health.items()
     ]
 
 
-def _session(status: Status | None) -> Session | None:
-    if status is None or status.session_grasps is None:
-        return None
-    return Session(grasps=status.session_grasps, calibrated=bool(status.session_calibrated))
+class HandFeed(NamedTuple):
+    """The messages of one hand, and the view that takes them."""
+
+    feed: Feed
+    view: View
+
+
+def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
+    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits `TICK_S`."""
+    due_s = 0.0
+    while not is_over():
+        for feed, view in hands:
+            for topic, payload in feed.take():
+                view.take(topic, payload, feed.empty_ns)  # what has waited is old
+            view.link = feed.link
+        if time.monotonic() >= due_s:
+            due_s = max(due_s + 1 / SNAPSHOTS_HZ, time.monotonic() + TICK_S)
+            yield [view.snapshot(boottime_ns()) for _, view in hands]

@@ -21,61 +21,56 @@ from typing import Any, Final
 import msgspec
 
 from daemon.process.signals import StopSignal
-from daemon.watch.watching import TICK_S, Watched, snapshots
+from daemon.watch.view import TICK_S, HandFeed, snapshots
 
 log = logging.getLogger("graspd.watch")
 
-ADDRESS = "127.0.0.1"
+ADDRESS: Final = "127.0.0.1"
 HOSTS: Final = {"127.0.0.1", "localhost", "[::1]"}
-"""What a browser of this computer calls this computer. Another name that leads here is one that a
-foreign page was given to get at what is on loopback (DNS rebinding)."""
+"""Names of this computer. A foreign page may bring another name to reach loopback (DNS rebinding).
+"""
 SITES: Final = {None, "none", "same-origin"}
 """`Sec-Fetch-Site` of requests that no other site's page has made."""
-PAGES_MAX = 8
+PAGES_MAX: Final = 8
 """Pages that may be open at a time."""
-CONNECTIONS_MAX = 16
-"""Connections, each of which has a thread; a browser keeps one for the page and asks for others."""
-PATIENCE_S = 5.0
-"""How long a browser may take to ask and to take the page, or to take a snapshot, s."""
-GIVES_WAY_S = 0.25
-"""After so long without being served, s, a connection gives way to a new one when all are taken:
-on this computer, a browser asks and takes the page within milliseconds."""
-SEND_BUFFER_BYTES = 32 * 1024
-"""Of a connection: a browser that is slow has a few snapshots before it, and misses the rest."""
-RETRY_MS = 1000
-"""When a browser that lost the connection tries again, ms."""
+CONNECTIONS_MAX: Final = 16
+"""Connections, each with a thread; a browser keeps one for its page and needs others to ask."""
+PATIENCE_S: Final = 5.0
+"""Longest time for a request and its answer, or for one snapshot, s."""
+GIVES_WAY_S: Final = 0.25
+"""Age, s, from which a request that is not answered gives way to a new connection. A browser of
+this computer has its page within milliseconds."""
+SEND_BUFFER_BYTES: Final = 32 * 1024
+"""Send buffer of a connection: some snapshots. A slow browser misses the later ones."""
+RETRY_MS: Final = 1000
+"""Time after which a browser connects again, ms."""
 
 
 class Newest:
-    """The newest snapshot, for threads that wait for it. Who is slow misses those between."""
+    """The newest snapshot, for threads that wait for it. Slow threads miss those between."""
 
     def __init__(self) -> None:
-        """Without a snapshot."""
+        """Start without a snapshot."""
         self._changed = threading.Condition()
         self._payload = b""
-        self._number = 0
+        self.number = 0
+        """Number of the newest; 0 before the first."""
         self.closed = False
 
-    @property
-    def number(self) -> int:
-        """Of the newest; 0 before the first."""
-        with self._changed:
-            return self._number
-
     def put(self, payload: bytes) -> None:
-        """Replace it."""
+        """Replace the snapshot."""
         with self._changed:
-            self._payload, self._number = payload, self._number + 1
+            self._payload, self.number = payload, self.number + 1
             self._changed.notify_all()
 
     def after(self, number: int) -> tuple[int, bytes]:
-        """Number and payload of one that is newer than `number`; the same number if closed."""
+        """Wait for one newer than `number`; return its number and payload, b"" if closed."""
         with self._changed:
-            self._changed.wait_for(lambda: self.closed or self._number > number)
-            return (number, b"") if self.closed else (self._number, self._payload)
+            self._changed.wait_for(lambda: self.closed or self.number > number)
+            return self.number, b"" if self.closed else self._payload
 
     def close(self) -> None:
-        """Let all go who wait."""
+        """End all waiting."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
@@ -94,20 +89,20 @@ class Server(ThreadingHTTPServer):
         self.page, self.policy = load_page()
         self.pages = threading.BoundedSemaphore(PAGES_MAX)
         self._places = threading.BoundedSemaphore(CONNECTIONS_MAX)
-        self._open: dict[socket.socket, float] = {}
-        """Connections, and when each is cut off at the latest, monotonic s; oldest first."""
+        self._ends: dict[socket.socket, float] = {}
+        """By connection, the oldest first: when it is cut off at the latest, monotonic s."""
         self._lock = threading.Lock()
         super().__init__((ADDRESS, port), _Handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Give a connection a thread, if there is one left for it or another gives way."""
+        """Serve a connection in a thread of its own, if one is free or another gives way."""
         if not self._places.acquire(blocking=False):
-            self._cut_off_before(time.monotonic() + PATIENCE_S - GIVES_WAY_S, at_most=1)
+            self._cut_off(time.monotonic() + PATIENCE_S - GIVES_WAY_S, at_most=1)
             if not self._places.acquire(timeout=GIVES_WAY_S):
                 self.shutdown_request(request)
                 return
         with self._lock:
-            self._open[request] = time.monotonic() + PATIENCE_S
+            self._ends[request] = time.monotonic() + PATIENCE_S
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
@@ -116,29 +111,32 @@ class Server(ThreadingHTTPServer):
             super().process_request_thread(request, client_address)
         finally:
             with self._lock:
-                self._open.pop(request, None)
+                self._ends.pop(request, None)
             self._places.release()
 
     def service_actions(self) -> None:
-        """Cut off who takes too long; called several times a second."""
-        self._cut_off_before(time.monotonic())
+        """Cut off connections that take too long; called several times a second."""
+        self._cut_off(time.monotonic())
 
     def keep(self, request: socket.socket) -> None:
-        """Let a connection stay as long as it takes its snapshots."""
+        """Let a connection stay while it takes its snapshots."""
         with self._lock:
-            self._open[request] = math.inf
+            self._ends[request] = math.inf
 
-    def _cut_off_before(self, due_s: float, at_most: int = CONNECTIONS_MAX) -> None:
-        """Cut off connections that are due by then, the oldest first. Their threads end soon."""
+    def _cut_off(self, due_s: float, at_most: int = CONNECTIONS_MAX) -> None:
+        """Cut off connections that end by `due_s`, the oldest first; their threads end soon."""
         with self._lock:
-            late = [request for request, end_s in self._open.items() if end_s <= due_s][:at_most]
+            late = [request for request, end_s in self._ends.items() if end_s <= due_s][:at_most]
             for request in late:
-                self._open[request] = math.inf
+                self._ends[request] = math.inf
         for request in late:
-            _cut_off(request)
+            try:
+                request.shutdown(socket.SHUT_RDWR)
+            except OSError:
+                log.debug("a browser had gone already")
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Browsers that go without a word are no news."""
+        """Log a failure; a browser that has gone is no error."""
         failure = sys.exception()
         gone = isinstance(failure, OSError)
         log.log(logging.DEBUG if gone else logging.ERROR, "%s: %r", client_address, failure)
@@ -146,7 +144,7 @@ class Server(ThreadingHTTPServer):
     def server_close(self) -> None:
         """Cut off all browsers and wait for their threads."""
         self.newest.close()
-        self._cut_off_before(math.inf)
+        self._cut_off(math.inf)
         super().server_close()
 
 
@@ -159,21 +157,28 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = PATIENCE_S
 
     def setup(self) -> None:
-        """Keep what waits for a slow browser small."""
+        """Keep the backlog of a slow browser small."""
         self.request.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         super().setup()
 
     def parse_request(self) -> bool:
-        """Refuse what is not asked by a page of ours."""
+        """Refuse what a page of this server does not ask."""
         if not super().parse_request():
             return False
-        refused = _refusal(self.command, self.headers)
-        if refused is not None:
-            self.send_error(refused)
-        return refused is None
+        hosts = self.headers.get_all("Host") or []
+        is_ours = len(hosts) == 1 and re.sub(r":[0-9]{1,5}$", "", hosts[0].lower()) in HOSTS
+        if self.command != "GET":
+            self.send_error(HTTPStatus.METHOD_NOT_ALLOWED)
+        elif not is_ours:
+            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+        elif self.headers.get("Sec-Fetch-Site") not in SITES:
+            self.send_error(HTTPStatus.FORBIDDEN)
+        else:
+            return True
+        return False
 
     def do_GET(self) -> None:
-        """The page, or the snapshots as they come."""
+        """Send the page, or the snapshots as they come."""
         path = self.path.partition("?")[0]
         if path == "/":
             self._begin("text/html; charset=utf-8")
@@ -195,63 +200,44 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def _stream(self) -> None:
+        newest = self.server.newest
         if not self.server.pages.acquire(blocking=False):
             self.send_error(HTTPStatus.SERVICE_UNAVAILABLE, f"{PAGES_MAX} pages are open")
             return
         try:
             self.server.keep(self.request)
-            number = self.server.newest.number  # the next one is sent first: this may be old
+            number = newest.number  # the next one is sent first: this may be old
             self._begin("text/event-stream")
             self.wfile.write(f"retry: {RETRY_MS}\n\n".encode())
-            while not self.server.newest.closed:
-                number, payload = self.server.newest.after(number)
+            while not newest.closed:
+                number, payload = newest.after(number)
                 if payload:
                     self.wfile.write(b"data: " + payload + b"\n\n")
         finally:
             self.server.pages.release()
 
     def log_message(self, format: str, *args: object) -> None:  # noqa: A002
-        """Nothing on the terminal; the log, if somebody wants it."""
+        """Write nothing to the terminal, only to the log."""
         log.debug(format, *args)
 
 
-def _refusal(command: str, headers: Any) -> HTTPStatus | None:  # noqa: ANN401
-    if command != "GET":
-        return HTTPStatus.METHOD_NOT_ALLOWED
-    hosts = headers.get_all("Host") or []
-    if len(hosts) != 1 or re.sub(r":[0-9]{1,5}$", "", hosts[0].lower()) not in HOSTS:
-        return HTTPStatus.MISDIRECTED_REQUEST
-    if headers.get("Sec-Fetch-Site") not in SITES:
-        return HTTPStatus.FORBIDDEN
-    return None
-
-
 def load_page() -> tuple[bytes, str]:
-    """The page, and the policy that lets it run its own script and style and nothing else."""
+    """Return the page, and the policy that lets it run its own script and style alone."""
     folder = resources.files("daemon.watch")
     text = folder.joinpath("page.html").read_text("utf-8")
-    digests = []
+    policy = "default-src 'none'; "
     for element, file in (("script", "page.js"), ("style", "page.css")):
         content = folder.joinpath(file).read_text("utf-8")
         text = text.replace(f"<{element}></{element}>", f"<{element}>{content}</{element}>")
-        digest = hashlib.sha256(content.encode()).digest()
-        digests.append(f"{element}-src 'sha256-{base64.b64encode(digest).decode()}'; ")
-    policy = (
-        f"default-src 'none'; {''.join(digests)}connect-src 'self'; "
-        "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        policy += f"{element}-src 'sha256-{digest}'; "
+    policy += "connect-src 'self'; img-src data:; "
+    policy += "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
     return text.encode(), policy
 
 
-def _cut_off(request: socket.socket) -> None:
-    try:
-        request.shutdown(socket.SHUT_RDWR)
-    except OSError:
-        log.debug("a browser had gone already")
-
-
-def serve(hands: Sequence[Watched], port: int) -> None:
-    """Serve the page until SIGINT or SIGTERM. Raises `OSError` if the port is not to be had."""
+def serve(hands: Sequence[HandFeed], port: int) -> None:
+    """Serve the page until SIGINT or SIGTERM. Raises `OSError` if the port is taken."""
     newest = Newest()
     with StopSignal() as stop, Server(port, newest) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.1,), name="page")
@@ -259,13 +245,13 @@ def serve(hands: Sequence[Watched], port: int) -> None:
         try:
             sys.stdout.write(f"http://{ADDRESS}:{server.server_port}/ (Ctrl-C ends)\n")
             sys.stdout.flush()
-            for seen in snapshots(hands, lambda: _asked_to_stop(stop)):
+            for seen in snapshots(hands, lambda: _is_asked_to_stop(stop)):
                 newest.put(msgspec.json.encode(seen))
         finally:
             server.shutdown()
             thread.join()
 
 
-def _asked_to_stop(stop: StopSignal) -> bool:
+def _is_asked_to_stop(stop: StopSignal) -> bool:
     select.select([stop.fileno()], [], [], TICK_S)
     return stop.received is not None

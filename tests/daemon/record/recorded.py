@@ -4,23 +4,45 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import zmq
 
-from daemon.publish.messages import Verdict, decode_verdict
+from daemon.publish.messages import Status, Verdict, decode_verdict
+from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
+
+BOOT = "0123456789abcdef" * 2
+HEADER = RecordingHeader(
+    fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
+)
+NO_STATUS = cast(Status, None)
+"""A recorder gets the status as a message."""
 
 IGNORED_FIELDS = frozenset(
     {"boot_id", "seq", "t", "t_mono_ns", "age_ms", "latency_us", "silence_ms"}
 )
 """Fields of a verdict that are of the run and not of the readings: a recording that is played again
 gives all others bit for bit."""
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + TIMEOUT_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def compared(verdict: dict[str, Any]) -> dict[str, Any]:
+    """What a replay of a recorded verdict must say again."""
+    said = {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
+    return dict(without_null(said))
 
 
 def without_null(value: Any) -> Any:  # noqa: ANN401

@@ -17,7 +17,7 @@ from drivers.recordings.can_log import CanLog
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.link_log_player import LinkLogDriver
 from tests.daemon.processes import TIMEOUT_S, graspd, start, wait_for
-from tests.daemon.record.recorded import IGNORED_FIELDS, messages, without_null
+from tests.daemon.record.recorded import compared, messages
 
 GROUP = "ff15:7079:7468:6f6e:6465:6d6f:6d63:6173"
 LINKS = {
@@ -71,11 +71,6 @@ def record(kind: str, folder: Path) -> tuple[Path, Path]:
 def of_can(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The recording of a board and its link log; the scene is in the folder above them."""
     return record("can", tmp_path_factory.mktemp("can"))
-
-
-def compared(verdict: dict[str, Any]) -> dict[str, Any]:
-    said = {name: value for name, value in verdict.items() if name not in IGNORED_FIELDS}
-    return dict(without_null(said))
 
 
 def test_serial_bytes_through_the_real_decoder_give_the_verdicts_that_were_given(

@@ -28,7 +28,7 @@ pytest.importorskip("foxglove", reason="extra foxglove")
 GOLDEN = ROOT / "tests" / "daemon" / "publish" / "golden"
 
 
-class Viewer:
+class ViewerClient:
     """A WebSocket client (RFC 6455) that speaks the protocol of Foxglove's viewers."""
 
     def __init__(self, port: int) -> None:
@@ -125,7 +125,7 @@ def test_a_viewer_gets_channels_and_messages_that_their_schemas_allow(hand: Hand
         for kind, payload in sent.items():
             hand.send(f"{kind}.right", payload)
         hand.send("verdict.strange", b"no json")
-        viewer = Viewer(hand.port)
+        viewer = ViewerClient(hand.port)
         wanted = {f"{kind}.right" for kind in (*sent, "image", "log")}
         channels = viewer.channels(wanted)
         assert channels.keys() == wanted
@@ -154,10 +154,10 @@ def test_no_thread_of_the_library_asks_python_to_log() -> None:
     script = """
         import logging
         from daemon.record.live import LiveServer
-        from tests.daemon.record.test_live import Viewer
+        from tests.daemon.record.test_live import ViewerClient
         with LiveServer(0) as server:
             server.send(b"status.right", b"{}")
-            viewer = Viewer(server.port)
+            viewer = ViewerClient(server.port)
             (channel,) = viewer.channels({"status.right"}).values()
             wanted = [{"id": 7, "channelId": channel["id"]}]
             viewer.tell({"op": "subscribe", "subscriptions": wanted})

@@ -312,24 +312,3 @@ def test_a_chunk_that_is_not_what_it_says_is_damage(compression: str, content: b
     reader = McapReader(Path("a.mcap"), io.BytesIO(with_chunk(compression, content, 100)))
     assert list(reader) == []
     assert reader.cut_off
-
-
-def test_what_packs_best_is_far_from_the_limit(tmp_path: Path) -> None:
-    """A sensor that says nothing but zeros."""
-    path = tmp_path / "a.mcap"
-    file = McapWriter(path, header(*FINGERS, joints=False))
-    for number in range(5000):
-        tactile = Tactile(
-            boot_id=BOOT,
-            seq=number,
-            t=number / 100,
-            t_mono_ns=number * PERIOD_NS,
-            fingers=["ff", "mf", "rf", "lf", "th"],
-            counts=[[0] * 24] * 5,
-            faults=[[1] * 24] * 5,
-        )
-        file.write(b"tactile.right", encode(tactile), number * PERIOD_NS)
-    file.close()
-    found = read(path.read_bytes())
-    assert len(found) == 5000
-    assert sum(len(message.payload) for message in found) < RATIO_MAX * path.stat().st_size / 1.5

@@ -23,7 +23,7 @@ from daemon.assembly.recordings import RecordedRun
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import GateCause
 from daemon.publish.companion import LoopEvent, PublishedVerdict
-from daemon.publish.messages import Status, Verdict
+from daemon.publish.messages import Verdict
 from daemon.publish.outbox import Outbox
 from daemon.record.files import Retention
 from daemon.record.header import RecordingHeader
@@ -33,25 +33,12 @@ from daemon.scene.scene import Record
 from drivers.base import TactileReading
 from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
 
-BOOT = "0123456789abcdef" * 2
 STATUS, VERDICT = b"status.right", b"verdict.right"
 START_NS = 10**12
-NO_VERDICT, NO_STATUS = cast(Verdict, None), cast(Status, None)
-"""The recorder gets both as messages."""
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 100
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
-HEADER = RecordingHeader(
-    fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
-)
+NO_VERDICT = cast(Verdict, None)
+"""A recorder gets the verdict as a message."""
 
 
 class Loop:
@@ -245,28 +232,17 @@ def test_what_a_settled_grasp_was_judged_by_is_recorded_with_its_number(
         assert np.ravel(content["counts"]).tolist() == expected
 
 
-def test_an_exchange_of_sensors_is_played_again_in_the_whole_run_and_in_each_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    daemon = Daemon(tmp_path, monkeypatch)
-    expected = []
-    for reading in sweeps()[:2000]:
-        if reading.seq == 1250:
-            assert daemon.pipeline.session is not None
-            assert daemon.pipeline.session.grasps > 0
-            daemon.pipeline.sensors_exchanged()
-        expected.append(daemon.judge(reading))
-    daemon.recorder.close()
-    assert expected[1249].reasons != expected[1250].reasons
-    paths = files(tmp_path)
-    assert again(*paths) == expected
+def assert_played_alike(folder: Path, expected: list[Judgement]) -> None:
+    """The whole run, and each of its files alone, are judged as they were."""
+    paths = files(folder)
     assert len(paths) > 3
+    assert again(*paths) == expected
     for path in paths:
         times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
         assert again(path) == [each for each in expected if each.t_ns in times]
 
 
-def test_sensors_that_are_back_bring_their_session_into_the_replay_too(
+def test_exchanged_sensors_and_their_return_are_played_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     daemon = Daemon(tmp_path, monkeypatch)
@@ -279,11 +255,8 @@ def test_sensors_that_are_back_bring_their_session_into_the_replay_too(
         expected.append(daemon.judge(reading))
     daemon.recorder.close()
     assert states[0].grasps > 3 > states[1].grasps
-    paths = files(tmp_path)
-    assert again(*paths) == expected
-    for path in paths:
-        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
-        assert again(path) == [each for each in expected if each.t_ns in times]
+    assert expected[1249].reasons != expected[1250].reasons
+    assert_played_alike(tmp_path, expected)
 
 
 def test_where_readings_were_left_out_the_replay_knows_too(
@@ -303,12 +276,7 @@ def test_where_readings_were_left_out_the_replay_knows_too(
     daemon.recorder.close()
     changes = [change for each in expected for change in each.moment.changes]
     assert [change.cause for change in changes].count(GateCause.GAP) > 3
-    paths = files(tmp_path)
-    assert again(*paths) == expected
-    assert len(paths) > 3
-    for path in paths:
-        times = {content["t_mono_ns"] for kind, content in messages(path) if kind == "tactile"}
-        assert again(path) == [each for each in expected if each.t_ns in times]
+    assert_played_alike(tmp_path, expected)
 
 
 def rewritten(path: Path, to: Path, judge: bytes, number: int) -> Path:

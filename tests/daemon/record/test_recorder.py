@@ -12,34 +12,24 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from daemon import scene
-from daemon.publish.messages import Status
 from daemon.record import recorder as recorder_module
 from daemon.record.files import Retention
-from daemon.record.header import RecordingHeader
 from daemon.record.mcap import McapReader, McapWriter
 from daemon.record.recorder import QUEUE_MAX, Recorder
-from daemon.record.topics import schemas
 from daemon.scene import SceneError
 from daemon.scene.scene import Record
-from drivers.base import JointReading
 from drivers.recordings.csv_player import DEMO_RECORDING
 from drivers.recordings.csv_rows import open_recording
 from tests.bench import kill_recorder
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
 
-BOOT = "0123456789abcdef" * 2
-HEADER = RecordingHeader(
-    fingers=("ff",), joints=False, boot_id=BOOT, scene={}, model="any", model_sha256=""
-)
 TOPIC = b"verdict.right"
-NO_STATUS = cast(Status, None)
-"""The recorder gets it as a message."""
 
 
 def retention(folder: Path, keep_files: int = 10, keep_bytes: int = 10**9) -> Retention:
@@ -75,13 +65,6 @@ def numbers(folder: Path) -> list[int]:
     return [content["number"] for path in paths for _, content in messages(path)]
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 100
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
 def test_what_is_recorded_stands_in_the_file_in_its_order(tmp_path: Path, make: Make) -> None:
     recorder = make()
     for number in range(1000):
@@ -111,48 +94,11 @@ def test_a_file_says_what_the_daemon_says_of_itself_and_gives_its_clock(
     with open_recording(path) as stream:
         recording = McapReader(path, stream)
         (message,) = recording
-    assert recording.header.fingers == ("ff",)
+    assert recording.header.fingers == ("ff", "th")
     assert recording.header.boot_id == BOOT
     assert before_ns <= message.at_ns <= after_ns
     assert abs(recording.header.wall_minus_monotonic_ns + after_ns - time.time_ns()) < 10**9
     assert path.stat().st_mode & 0o777 == 0o640
-
-
-def test_an_angle_that_there_is_not_is_left_out_and_its_joint_named(
-    tmp_path: Path, make: Make
-) -> None:
-    recorder = make()
-    recorder.on_reading(JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan])))
-    recorder.close()
-    (path,) = (tmp_path / "record").iterdir()
-    assert messages(path) == [
-        (
-            "joints",
-            {
-                "v": 1,
-                "seq": 3,
-                "t_mono_ns": 5,
-                "names": ["FFJ3", "THJ4"],
-                "position_rad": {"FFJ3": 0.25},
-            },
-        )
-    ]
-
-
-def test_every_kind_of_message_has_a_schema_that_is_an_object() -> None:
-    found = schemas()
-    published = {"verdict", "gate", "tactile", "outcome", "status"}
-    recorded = {"joints", "judged", "asked", "exchanged", "skipped", "image", "log"}
-    assert set(found) == published | recorded
-    for _, text in found.values():
-        assert json.loads(text)["type"] == "object"
-
-
-def test_what_was_sent_is_in_the_file_while_it_is_still_written(tmp_path: Path, make: Make) -> None:
-    recorder = make()
-    recorder.send(TOPIC, payload(7))
-    wait_until(lambda: recorder.counters["record"]["recorded"] == 1)
-    assert numbers(tmp_path) == [7]
 
 
 def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
@@ -168,15 +114,6 @@ def test_files_follow_each_other_by_size_and_nothing_is_lost_between(
     paths = sorted((tmp_path / "record").iterdir())
     assert 4 <= len(paths) <= 12  # 300 of 2 kB each, compressed from hex
     assert numbers(tmp_path) == list(range(300))
-
-
-def test_files_follow_each_other_by_age(tmp_path: Path, make: Make) -> None:
-    recorder = make(rotate_minutes=0.01)
-    while recorder.counters["record"]["files"] < 3:
-        recorder.on_status(NO_STATUS)
-        time.sleep(0.01)
-    recorder.close()
-    assert len(list((tmp_path / "record").iterdir())) == 3
 
 
 def old(folder: Path, hour: int, size: int, ending: str = "mcap") -> Path:
@@ -372,8 +309,8 @@ def test_without_the_extra_it_is_said_what_to_install(tmp_path: Path, command: l
 
 
 def test_a_daemon_that_is_killed_loses_no_more_than_the_flush_interval(tmp_path: Path) -> None:
-    losses_ms = kill_recorder.kill_often(tmp_path, kills=3, seed=1)
-    assert len(losses_ms) == 3
+    losses_ms = kill_recorder.kill_often(tmp_path, kills=2, seed=1)
+    assert len(losses_ms) == 2
     assert max(losses_ms) <= kill_recorder.FLUSH_MS
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,28 +13,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.companion import LoopEvent
-from daemon.publish.messages import Tactile, encode
+from daemon.publish.messages import State
 from daemon.record.files import Retention
 from daemon.record.flat import flat, schema_of, table
-from daemon.record.header import RecordingHeader
-from daemon.record.mcap import McapReader, McapWriter
+from daemon.record.mcap import McapWriter
 from daemon.record.player import McapReplayDriver, RecordedEvent
 from daemon.record.recorder import Recorder
-from daemon.record.topics import EVENT, Event, Exchanged, Topic, schemas
-from daemon.record.viewers import INFO, SCALE, WARNING, Journal, Painter, RawImage
+from daemon.record.topics import Exchanged, Topic, schemas
+from daemon.record.viewers import INFO, SCALE, WARNING, Viewer
 from daemon.scene.scene import Record
 from daemon.trust.learner import LearnerState
 from drivers.base import JointReading, TactileReading
-from drivers.recordings.csv_rows import open_recording
 from models.layout import D1
 from models.session_statistics import SessionState
-from tests.daemon.record.recorded import messages
+from tests.daemon.record.recorded import BOOT, HEADER, messages
+from tests.daemon.watch.watch_fakes import status, tactile, verdict
 
-BOOT = "0123456789abcdef" * 2
-HEADER = RecordingHeader(
-    fingers=("ff", "th"), joints=True, boot_id=BOOT, scene={}, model="any", model_sha256=""
-)
 PLAIN = ("boolean", "string", "number", "integer")
 TIME = {"sec": "integer", "nsec": "integer"}
 WELL_KNOWN: dict[str, dict[str, Any]] = {
@@ -91,23 +88,6 @@ def test_a_viewer_can_read_the_schema_of_every_topic(topic: Topic) -> None:
     assert list(faults(schema, topic)) == []
 
 
-@pytest.mark.parametrize(
-    ("schema", "fault"),
-    [
-        ({"type": "object", "properties": {"v": {"enum": [1]}}}, "a.v: type None"),
-        ({"type": "object", "properties": {"v": {"$ref": "#/$defs/V"}}}, "a.v: $ref"),
-        ({"type": "object", "properties": {"v": {"type": ["number", "null"]}}}, "type ['number'"),
-        ({"type": "object", "properties": {"v": {"anyOf": []}}}, "a.v: anyOf"),
-        ({"type": "object"}, "a: an object without properties"),
-        ({"type": "object", "properties": {}, "$defs": {}}, "a: $defs"),
-        ({"type": "array", "items": {"type": "array"}}, "a: an array of array"),
-        ({"type": "string", "contentEncoding": "base32"}, "a: contentEncoding base32"),
-    ],
-)
-def test_the_checker_finds_what_a_viewer_cannot_read(schema: dict[str, Any], fault: str) -> None:
-    assert any(fault in found for found in faults(schema, "a"))
-
-
 @pytest.mark.parametrize("topic", [Topic.IMAGE, Topic.LOG])
 def test_what_viewers_know_by_name_has_their_fields(topic: Topic) -> None:
     name, text = schemas()[topic]
@@ -150,22 +130,32 @@ def test_a_list_of_counts_becomes_the_table_again(rows: int) -> None:
     assert table(flat(counts)) == table(counts) == counts
 
 
-def reading(counts: NDArray[np.int64], faulty: tuple[int, int] | None = None) -> dict[str, Any]:
-    wrong = np.zeros((2, 24), int)
-    if faulty is not None:
-        wrong[faulty] = 1
-    return {"fingers": ["ff", "th"], "counts": counts.tolist(), "faults": wrong.tolist()}
+def reading(counts: NDArray[np.int64], faulty: tuple[int, ...] = ()) -> object:
+    return json.loads(tactile(0, *counts.tolist(), faulty=faulty))
 
 
-def verdict(gate: str | None, **more: object) -> dict[str, Any]:
-    return {"grasp": 1, "verdict": "unknown", "reasons": [], "gate": gate, **more}
+def open_hand(gate: GateState | None = GateState.IDLE) -> object:
+    return json.loads(verdict(0, gate=gate))
 
 
-def pixels(image: RawImage | None) -> NDArray[np.uint8]:
-    """Colour of each pixel of the tactile image."""
-    assert image is not None
-    assert (image.encoding, image.step) == ("rgb8", 3 * image.width)
-    whole = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+def said(viewer: Viewer, kind: str, content: object) -> list[tuple[int, str, str]]:
+    made = [json.loads(payload) for kind, payload in viewer.of(kind, content, 5) if kind == "log"]
+    return [(line["level"], line["name"], line["message"]) for line in made]
+
+
+def drawn(viewer: Viewer, content: object, wall_ns: int = 10**8) -> NDArray[np.uint8] | None:
+    """Colour of each pixel of the tactile image of a reading; None if there is none."""
+    images = [
+        json.loads(payload)
+        for kind, payload in viewer.of("tactile", content, wall_ns)
+        if kind == "image"
+    ]
+    if not images:
+        return None
+    (image,) = images
+    assert (image["encoding"], image["step"]) == ("rgb8", 3 * image["width"])
+    data = base64.b64decode(image["data"])
+    whole = np.frombuffer(data, np.uint8).reshape(image["height"], image["width"], 3)
     small = whole[::SCALE, ::SCALE]
     assert np.array_equal(small.repeat(SCALE, 0).repeat(SCALE, 1), whole)
     return small
@@ -176,17 +166,19 @@ DARK, YELLOW, CYAN, BLACK = (38, 44, 54), (252, 255, 190), (0, 220, 220), (0, 0,
 
 
 def test_a_pressed_electrode_shines_where_it_is_and_nothing_else_does() -> None:
-    painter = Painter(10.0)
-    painter.of("verdict", verdict("idle"), 0)
+    viewer = Viewer(10.0)
+    said(viewer, "verdict", open_hand())
     for number in range(1, 30):
-        still = pixels(painter.of("tactile", reading(REST), number * 10**8))
+        still = drawn(viewer, reading(REST), number * 10**8)
+    assert still is not None
     assert still.shape == (12, 2 * 11 + 1, 3)
     assert {tuple(one) for one in still[:, 12:].reshape(-1, 3).tolist()} == {DARK}
     assert {tuple(one) for one in still[:, 11].tolist()} == {BLACK}
     pressed = REST.copy()
     pressed[1, 6] = 300  # E7 of the thumb, 1700 counts below rest
-    painter.of("verdict", verdict("judged"), 0)
-    image = pixels(painter.of("tactile", reading(pressed, faulty=(0, 3)), 30 * 10**8))
+    said(viewer, "verdict", open_hand(GateState.JUDGED))
+    image = drawn(viewer, reading(pressed, faulty=(3,)), 30 * 10**8)
+    assert image is not None
     assert tuple(image[D1.rows[6], 12 + D1.columns[6]]) == YELLOW
     assert tuple(image[D1.rows[3], D1.columns[3]]) == CYAN
     others = [(row, 12 + column) for row, column in zip(D1.rows, D1.columns, strict=True)]
@@ -195,102 +187,80 @@ def test_a_pressed_electrode_shines_where_it_is_and_nothing_else_does() -> None:
 
 
 def test_without_a_gate_an_image_shows_how_electrodes_differ() -> None:
-    painter = Painter(10.0)
-    painter.of("verdict", verdict(None), 0)
-    counts = REST + np.arange(24)
-    image = pixels(painter.of("tactile", reading(counts), 10**8)).astype(int)
-    red = [image[row, column, 0] for row, column in zip(D1.rows, D1.columns, strict=True)]
+    viewer = Viewer(10.0)
+    said(viewer, "verdict", open_hand(None))
+    image = drawn(viewer, reading(REST + np.arange(24)))
+    assert image is not None
+    red = [int(image[row, column, 0]) for row, column in zip(D1.rows, D1.columns, strict=True)]
     assert red[0] == max(red) > 200
     assert image[D1.rows[23], D1.columns[23], 2] > 150  # the highest count is blue
 
 
 @pytest.mark.parametrize(("images_hz", "images"), [(10.0, 10), (0.0, 0), (1000.0, 100)])
-def test_so_many_images_are_drawn_a_second(images_hz: float, images: int) -> None:
-    painter = Painter(images_hz)
-    drawn = [painter.of("tactile", reading(REST), 10**18 + n * 10_000_000) for n in range(100)]
-    assert sum(image is not None for image in drawn) == images
+def test_images_come_at_the_rate_of_the_option(images_hz: float, images: int) -> None:
+    viewer = Viewer(images_hz)
+    made = [drawn(viewer, reading(REST), 10**18 + n * 10_000_000) for n in range(100)]
+    assert sum(image is not None for image in made) == images
 
 
 def test_images_go_on_where_the_clock_was_set_back() -> None:
-    painter = Painter(10.0)
-    assert painter.of("tactile", reading(REST), 10**18) is not None
-    assert painter.of("tactile", reading(REST), 10**18 - 10**12) is not None
+    viewer = Viewer(10.0)
+    assert drawn(viewer, reading(REST), 10**18) is not None
+    assert drawn(viewer, reading(REST), 10**18 - 10**12) is not None
 
 
 @pytest.mark.parametrize(
-    "broken",
+    ("kind", "content"),
     [
-        {},
-        {"fingers": ["ff"], "counts": [[1, 2]], "faults": [[0, 0]]},
-        {**reading(REST), "faults": 0},
+        ("tactile", {}),
+        ("tactile", {**json.loads(tactile(0, [2000] * 24)), "faults": 0}),
+        ("tactile", {**json.loads(tactile(0, [2000] * 24)), "counts": [[1, 2]]}),
+        *[(kind, {"grasp": "one"}) for kind in ("gate", "verdict", "outcome", "status", "joints")],
     ],
 )
-def test_a_broken_reading_has_no_image(broken: dict[str, Any]) -> None:
-    assert Painter(10.0).of("tactile", broken, 10**9) is None
-
-
-def said(journal: Journal, kind: str, content: dict[str, Any]) -> list[tuple[int, str, str]]:
-    return [(line.level, line.name, line.message) for line in journal.of(kind, content, 5 * 10**9)]
+def test_a_broken_message_comes_to_nothing(kind: str, content: object) -> None:
+    assert list(Viewer(10.0).of(kind, content, 10**9)) == []
 
 
 def test_a_verdict_is_said_when_it_changes_and_not_again() -> None:
-    journal = Journal()
-    (line,) = said(journal, "verdict", verdict("closing", reasons=["moving"]))
+    viewer = Viewer(0.0)
+    moving = json.loads(verdict(0, grasp=1, reasons=[Reason.MOVING]))
+    (line,) = said(viewer, "verdict", moving)
     assert line[:2] == (INFO, "verdict")
     assert line[2].startswith("grasp 1: unknown (moving: fingers or object move")
-    assert said(journal, "verdict", verdict("closing", reasons=["moving"])) == []
-    slip = {"grasp": 1, "verdict": "slip", "reasons": [], "p_slip": 0.813}
-    assert said(journal, "verdict", slip) == [
+    assert said(viewer, "verdict", moving) == []
+    slip = json.loads(verdict(1, Decision.SLIP, grasp=1, p_slip=0.813))
+    assert said(viewer, "verdict", slip) == [
         (WARNING, "verdict", "grasp 1: slip (slips with a probability of 81.3%)")
     ]
-    assert said(journal, "verdict", {**slip, "p_slip": 0.9}) == []
+    assert said(viewer, "verdict", {**slip, "p_slip": 0.9}) == []
 
 
 def test_gate_outcome_state_and_health_are_said() -> None:
-    journal = Journal()
+    viewer = Viewer(0.0)
     golden = Path(__file__).parents[1] / "publish" / "golden"
     gate = json.loads((golden / "gate.json").read_bytes())
-    (line,) = said(journal, "gate", gate)
+    (line,) = said(viewer, "gate", gate)
     assert line[0] == INFO
     assert f"{gate['former']} to {gate['state']} ({gate['cause']})" in line[2]
     outcome = json.loads((golden / "outcome.json").read_bytes())
-    (line,) = said(journal, "outcome", outcome)
+    (line,) = said(viewer, "outcome", outcome)
     assert f"grasp {outcome['grasp']}: the lift ended in {outcome['outcome']}" in line[2]
-    well = {"state": "running", "health": {}}
-    ill = {"state": "running", "health": {"ff_7": "electrode-dead"}}
-    assert said(journal, "status", well) == [(INFO, "state", "running")]
-    (line,) = said(journal, "status", ill)
+    well, ill = json.loads(status(0, health={})), json.loads(status(1))
+    assert said(viewer, "status", well) == [(INFO, "state", "running")]
+    (line,) = said(viewer, "status", ill)
     assert line[:2] == (WARNING, "health")
     assert line[2].startswith("ff_7: electrode-dead: ")
-    assert said(journal, "status", ill) == []
-    assert said(journal, "status", well) == [(INFO, "health", "ff_7: well again")]
-    (line,) = said(journal, "status", {"state": "silent", "health": {"link": "stale"}})[:1]
-    assert line == (WARNING, "state", "silent")
-
-
-@pytest.mark.parametrize("kind", ["gate", "verdict", "outcome", "status", "joints", "log"])
-def test_a_broken_message_is_not_said(kind: str) -> None:
-    assert said(Journal(), kind, {"grasp": "one"}) == []
+    assert said(viewer, "status", ill) == []
+    assert said(viewer, "status", well) == [(INFO, "health", "ff_7: well again")]
+    silent = json.loads(status(2, state=State.SILENT, health={"link": Reason.STALE}))
+    assert said(viewer, "status", silent)[0] == (WARNING, "state", "silent")
 
 
 def recorder(folder: Path) -> Recorder:
     options = Record(flush_ms=100.0)
     return Recorder(
         Retention(folder, "right", BOOT, 9, 10**9), options, take_header=lambda: lambda: HEADER
-    )
-
-
-def tactile(number: int, counts: NDArray[np.int64] = REST) -> bytes:
-    return encode(
-        Tactile(
-            boot_id=BOOT,
-            seq=number,
-            t=0.0,
-            t_mono_ns=number,
-            fingers=["ff", "th"],
-            counts=counts.tolist(),
-            faults=np.zeros((2, 24), int).tolist(),
-        )
     )
 
 
@@ -305,7 +275,7 @@ def test_questions_in_a_row_are_one_event(tmp_path: Path) -> None:
         if number:
             writing.on_event(LoopEvent.ASKED)
             writing.on_event(LoopEvent.ASKED)
-        writing.send(b"tactile.right", tactile(number))
+        writing.send(b"tactile.right", tactile(number, *REST.tolist()))
     writing.close()
     found = recorded(tmp_path)
     assert [kind for kind, _ in found] == ["tactile", "asked", "tactile", "asked", "tactile"]
@@ -320,7 +290,7 @@ def test_questions_around_an_event_stay_around_it(tmp_path: Path, event: str) ->
     else:
         writing.exchanged(None, None)
     writing.on_event(LoopEvent.ASKED)
-    writing.send(b"tactile.right", tactile(0))
+    writing.send(b"tactile.right", tactile(0, *REST.tolist()))
     writing.close()
     found = recorded(tmp_path)
     assert [kind for kind, _ in found] == ["asked", event, "asked", "tactile"]
@@ -344,7 +314,7 @@ def test_what_was_recorded_is_played_with_its_questions(tmp_path: Path) -> None:
     angles = JointReading(5, 3, ("FFJ3", "THJ4"), np.array([0.25, np.nan]))
     writing.on_reading(angles)
     writing.on_event(LoopEvent.ASKED)
-    writing.send(b"tactile.right", tactile(0, counts))
+    writing.send(b"tactile.right", tactile(0, *counts.tolist()))
     writing.close()
     (path,) = tmp_path.glob("*.mcap")
     joints, asked, played = play(path)
@@ -363,7 +333,7 @@ def test_an_older_recording_is_played_alike(tmp_path: Path) -> None:
     joints = {"v": 1, "seq": 3, "t_mono_ns": 5, "names": ["FFJ3", "THJ4"]}
     old = json.dumps({**joints, "position_rad": [0.25, None]}).encode()
     file.write(b"joints.right", old, 1)
-    asking = {**json.loads(tactile(0, counts)), "asked": True}
+    asking = {**json.loads(tactile(0, *counts.tolist())), "asked": True}
     file.write(b"tactile.right", json.dumps(asking).encode(), 3)
     file.close()
     angles, asked, played = play(path)
@@ -389,13 +359,3 @@ def test_an_exchange_comes_back_as_it_was(tmp_path: Path) -> None:
         while not driver.exhausted:
             driver.read_ready()
     assert told == [Exchanged(session, learned)]
-
-
-def test_an_event_has_a_schema_too(tmp_path: Path) -> None:
-    assert {topic for topic in Topic if topic.message is Event} == {Topic.ASKED, Topic.SKIPPED}
-    writing = recorder(tmp_path)
-    writing.on_event(LoopEvent.SKIPPED)
-    writing.close()
-    (path,) = tmp_path.glob("*.mcap")
-    with open_recording(path) as stream:
-        assert [message.payload for message in McapReader(path, stream)] == [EVENT]

@@ -4,66 +4,33 @@ from __future__ import annotations
 
 import json
 import re
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-import msgspec
 import pytest
 
 from daemon.judge.reasons import Decision
 from daemon.publish.messages import LearnerHealth, Lifts
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.watch.feed import Feed
+from daemon.watch.snapshot import Snapshot
 from daemon.watch.view import View
-from daemon.watch.watching import TICK_S, Watched, snapshots
-from daemon.watch.web import Newest, Server
 from tests.daemon.watch.browser import CHROMIUM, Browser
+from tests.daemon.watch.pages import Page, serving_hands
 from tests.daemon.watch.watch_fakes import Talker, status, tactile, verdict
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: apt install chromium")
 
+Theme = Literal["light", "dark"]
 COLOURS = {
     "light": {"stable": "rgb(26, 127, 55)", "slip": "rgb(207, 34, 46)"},
     "dark": {"stable": "rgb(31, 128, 64)", "slip": "rgb(208, 53, 60)"},
 }
 """Green and red of both themes, as the page's style has them."""
+CARD = "rgb(23, 27, 34)"
+"""What is behind the letters in the dark where nothing is promised."""
 BANNER = "document.querySelector('.banner')"
-
-
-class Page:
-    """A server of the page that can be stopped and started again at its port."""
-
-    def __init__(self, endpoint: str) -> None:
-        self._endpoint = endpoint
-        self.port = 0
-        self._over = threading.Event()
-
-    def start(self) -> None:
-        self._over.clear()
-        self._server = Server(self.port, Newest())
-        self.port = self._server.server_port
-        self._threads = [
-            threading.Thread(target=self._server.serve_forever, args=(0.02,)),
-            threading.Thread(target=self._publish),
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def _publish(self) -> None:
-        with Feed(self._endpoint) as feed:
-            hands = [Watched(feed, View(self._endpoint))]
-            for seen in snapshots(hands, lambda: self._over.wait(TICK_S)):
-                self._server.newest.put(msgspec.json.encode(seen))
-
-    def stop(self) -> None:
-        self._over.set()
-        self._server.shutdown()
-        for thread in self._threads:
-            thread.join()
-        self._server.server_close()
 
 
 @pytest.fixture
@@ -90,6 +57,7 @@ def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 def browser(chromium: Browser) -> Iterator[Browser]:
     with chromium.blank() as made:
         yield made
+        assert made.complaints == []
 
 
 def see(browser: Browser, tone: str) -> None:
@@ -100,72 +68,61 @@ def text(browser: Browser, element: str) -> str:
     return str(browser.value(f"document.querySelector('.{element}').innerText"))
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
-def test_the_page_shows_verdict_images_and_advice_in_both_themes(
-    tmp_path: Path,
-    page: Page,
-    talker: Talker,
-    browser: Browser,
-    theme: Literal["light", "dark"],
-    width: int,
-    height: int,
+def background(browser: Browser) -> object:
+    return browser.value(f"getComputedStyle({BANNER}).backgroundColor")
+
+
+@pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (390, "dark")])
+def test_the_page_shows_verdict_images_and_advice(
+    page: Page, talker: Talker, browser: Browser, width: int, theme: Theme
 ) -> None:
-    browser.look(width, height, theme)
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.look(width, 844, theme)
+    browser.go(page.address)
+    see(browser, "waiting")
+    first = text(browser, "clock")
+    assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
     for decision, share in ((Decision.STABLE, "25 %"), (Decision.SLIP, "75 %")):
         talker.decision = decision
         see(browser, decision.value)
         assert text(browser, "verdict") == decision.value.upper()
         assert share in text(browser, "p")
-        colour = browser.value(f"getComputedStyle({BANNER}).backgroundColor")
-        assert colour == COLOURS[theme][decision.value]
+        assert background(browser) == COLOURS[theme][decision.value]
     browser.wait_for("document.querySelectorAll('figure canvas').length == 2")
     assert text(browser, "who") == "graspd right"
-    assert "FFJ3" in text(browser, "joints")
-    assert "28.6°" in text(browser, "joints")
+    assert "FFJ3\n28.6°" in text(browser, "joints")
     assert "ff_7 electrode-dead: " in text(browser, "health")
+    assert "latency p50, p99\t250 us, 500 us" in text(browser, "timing")
     # Nothing is wider than the window, and the images are drawn: not all of one colour.
     assert browser.value("document.documentElement.scrollWidth <= innerWidth")
-    assert (
-        browser.value(
-            "(c => new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
-            "(document.querySelector('figure canvas'))"
-        )
-        > 8
+    colours = browser.value(
+        "(c => new Set(c.getContext('2d').getImageData(0, 0, c.width, c.height).data).size)"
+        "(document.querySelector('figure canvas'))"
     )
-    browser.picture(tmp_path / "page.png")
-    assert (tmp_path / "page.png").read_bytes().startswith(b"\x89PNG")
-    assert browser.complaints == []
+    assert colours > 8
+    browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
 
 
-CARD = {"light": "rgb(255, 255, 255)", "dark": "rgb(23, 27, 34)"}
-"""What is behind the letters where nothing is promised."""
-
-
-@pytest.mark.parametrize("theme", ["light", "dark"])
 def test_a_stable_that_lifts_have_not_earned_is_hollow(
-    page: Page, talker: Talker, browser: Browser, theme: Literal["light", "dark"]
+    page: Page, talker: Talker, browser: Browser
 ) -> None:
     talker.more = {"p_slip": 0.44, "risk": None, "outcomes": 0}
     talker.decision = Decision.STABLE
-    browser.look(1280, 800, theme)
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.look(1280, 800, "dark")
+    browser.go(page.address)
     see(browser, "leans")
     assert text(browser, "verdict") == "LEANS TO STABLE"
     assert browser.value("document.title") == "leans to stable - graspd"
-    assert browser.value(f"getComputedStyle({BANNER}).backgroundColor") == CARD[theme]
+    assert background(browser) == CARD
     assert text(browser, "evidence") == "network 30 %, no outcome told yet"
     assert "slip probability 44 %" in text(browser, "p")
     assert not text(browser, "why").startswith("lift")
     talker.more = {}
     see(browser, "stable")
     assert "rests on 57 lifts; of 41 `stable` ones 2 slipped" in text(browser, "evidence")
-    assert browser.value(f"getComputedStyle({BANNER}).backgroundColor") == COLOURS[theme]["stable"]
-    assert browser.complaints == []
+    assert background(browser) == COLOURS["dark"]["stable"]
 
 
-def test_each_finger_s_motion_is_a_bar_and_what_is_not_known_is_none(
+def test_each_finger_has_a_bar_of_motion_and_unknown_is_not_zero(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     def bars() -> object:
@@ -175,24 +132,18 @@ def test_each_finger_s_motion_is_a_bar_and_what_is_not_known_is_none(
         )
 
     browser.look(1280, 800)
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.go(page.address)
     talker.decision = Decision.STABLE
     see(browser, "stable")
     assert text(browser, "still") == "-"
     assert browser.value("[...document.querySelectorAll('.moves')].every(bar => bar.hidden)")
-    talker.more = {
-        "still_ms": 130.5,
-        "motion": {"ff": 1.0, "th": None},
-        "motion_limits": {"ff": 1.25, "th": 1.0},
-    }
+    limits = {"motion_limits": {"ff": 1.25, "th": 1.0}}
+    talker.more = {"still_ms": 130.5, "motion": {"ff": 1.0, "th": None}, **limits}
     browser.wait_for("document.querySelector('.still').innerText == '130 ms, may slide'")
-    known = [
-        "still",
-        "40%",
-        False,
-        "moves 1.0 / 1.3 \u03c3",
-    ]  # by hand: half of 1 / 1.25
-    assert bars() == [known, ["unknown", "0%", False, "motion unknown"]]
+    assert bars() == [
+        ["still", "40%", False, "moves 1.0 / 1.3 \u03c3"],  # by hand: half of 1 / 1.25
+        ["unknown", "0%", False, "motion unknown"],
+    ]
     talker.more |= {"still_ms": 0.0, "motion": {"ff": 2.0, "th": 9.0}}
     browser.wait_for("document.querySelector('.still').innerText == '0 ms'")
     assert bars() == [
@@ -203,14 +154,13 @@ def test_each_finger_s_motion_is_a_bar_and_what_is_not_known_is_none(
     see(browser, "silent")
     assert text(browser, "still") == "-"
     assert bars() == []
-    assert browser.complaints == []
 
 
-def test_past_grasps_stay_and_so_does_the_verdict_until_the_next_one(
+def test_the_last_verdict_stays_until_the_next_grasp_and_then_in_the_list(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     browser.look(1280, 800)
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.go(page.address)
     talker.decision = Decision.STABLE
     see(browser, "stable")
     assert text(browser, "was") == ""
@@ -228,36 +178,14 @@ def test_past_grasps_stay_and_so_does_the_verdict_until_the_next_one(
         "7\t●stable 25 %\t\tnot told",
     ]
     assert "slips of `stable`\t2 of 41 lifts, at most 9.5" in text(browser, "learning")
-    assert browser.complaints == []
 
 
-def test_silence_of_the_daemon_and_of_the_server_are_unknown_and_both_end(
+def test_silence_of_daemon_or_server_is_unknown_with_dim_figures(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     talker.decision = Decision.STABLE
     browser.look(1280, 800)
-    browser.go(f"http://localhost:{page.port}/")
-    see(browser, "stable")
-    talker.decision = None
-    see(browser, "silent")
-    assert text(browser, "verdict") == "UNKNOWN"
-    assert "silent: no message for " in text(browser, "why")
-    talker.decision = Decision.SLIP
-    see(browser, "slip")
-    page.stop()
-    see(browser, "silent")
-    why = text(browser, "why")
-    assert why.startswith("no connection: graspd watch does not answer; no message from graspd ")
-    page.start()
-    see(browser, "slip")
-
-
-def test_figures_of_a_dead_daemon_are_dimmed_and_have_their_time(
-    page: Page, talker: Talker, browser: Browser
-) -> None:
-    talker.decision = Decision.STABLE
-    browser.look(1280, 800)
-    browser.go(f"http://localhost:{page.port}/")
+    browser.go(page.address)
     see(browser, "stable")
     browser.wait_for("document.querySelector('.timing').innerText.includes('250 us')")
     figure = "getComputedStyle(document.querySelector('.timing td'))"
@@ -266,35 +194,43 @@ def test_figures_of_a_dead_daemon_are_dimmed_and_have_their_time(
     talker.decision = None
     see(browser, "silent")
     died = time.time()
+    assert text(browser, "verdict") == "UNKNOWN"
+    assert "silent: no message for " in text(browser, "why")
     assert browser.value(f"{figure}.fontStyle") == "italic"
     assert browser.value(f"{figure}.color") == "rgb(91, 101, 112)"  # --faint
     assert "250 us" in text(browser, "timing")
     said = re.fullmatch(r"figures are of (\d\d:\d\d:\d\d), the last message", text(browser, "old"))
     assert said
     assert said[1] in {time.strftime("%H:%M:%S", time.localtime(died - ago)) for ago in range(5)}
+    talker.decision = Decision.SLIP
+    see(browser, "slip")
     page.stop()
-    browser.wait_for("document.querySelector('.why').innerText.startsWith('no connection')")
-    assert text(browser, "old") == said[0]
+    see(browser, "silent")
+    why = text(browser, "why")
+    assert why.startswith("no connection: graspd watch does not answer; no message from graspd ")
     page.start()
+    see(browser, "slip")
+    browser.complaints.clear()  # the browser says that there was no server
 
 
-def test_the_timeline_is_there_again_when_the_page_is_loaded_anew(
+def test_the_timeline_is_there_again_on_a_page_that_is_reloaded(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     talker.decision = Decision.SLIP
     browser.look(1280, 800)
-    browser.go(f"http://localhost:{page.port}/")
+    browser.go(page.address)
     see(browser, "slip")
     time.sleep(2.0)  # of which three seconds of the clock are seen, or two
     talker.decision = Decision.STABLE
     see(browser, "stable")
     browser.go("about:blank")
-    browser.go(f"http://localhost:{page.port}/")
+    browser.go(page.address)
     see(browser, "stable")
-    seconds = browser.value("document.querySelector('.timeline').ariaLabel")
-    found = re.search(r"slip (\d+) s", seconds)
-    assert found
-    assert int(found[1]) >= 2
+    slips = re.search(
+        r"slip (\d+) s", browser.value("document.querySelector('.timeline').ariaLabel")
+    )
+    assert slips
+    assert int(slips[1]) >= 2
     # It is drawn: below the first lane's name and the minutes there is something of its colour.
     assert browser.value(
         "(c => { const all = c.getContext('2d').getImageData(0, 0, c.width, 12).data; let n = 0;"
@@ -305,7 +241,7 @@ def test_the_timeline_is_there_again_when_the_page_is_loaded_anew(
 
 
 FIVE = ["ff", "mf", "rf", "lf", "th"]
-FULL = {
+WHOLE = {
     "fingers": FIVE,
     "counts": [[3000] * 24] * 5,
     "faults": [[0] * 24] * 5,
@@ -316,43 +252,40 @@ FULL = {
 """A reading of a whole hand, with as many joints as there are."""
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize(
-    ("names", "width", "fits"),
-    [(["right"], 1280, True), (["left", "right"], 1280, False), (["left", "right"], 400, False)],
-)
-def test_all_of_a_hand_is_in_one_window_and_several_are_in_one_page(
-    browser: Browser, names: list[str], width: int, fits: bool, theme: Literal["light", "dark"]
-) -> None:
-    server, over = Server(0, Newest()), threading.Event()
-    views = [View(f"ipc:///tmp/{name}") for name in names]
+def seen_of_a_whole_hand(view: View, hand: str, seq: int, decision: Decision) -> Snapshot:
     lifts = Lifts(reported=41, outstanding=1, unreported=3)
-    learner = LearnerHealth(
-        enabled=True, outcomes=5, told={OutcomeStatus.TAKEN: 5}, uncertainty=0.4
-    )
-    whole = json.dumps(json.loads(tactile(0)) | FULL).encode()
+    told = {OutcomeStatus.TAKEN: 5}
+    learner = LearnerHealth(enabled=True, outcomes=5, told=told, uncertainty=0.4)
+    reading = json.dumps(json.loads(tactile(0)) | WHOLE).encode()
     motion = dict.fromkeys(FIVE, 1.2)
-    more = {"contact": FIVE, "still_ms": 130.0, "motion": motion}
+    more: dict[str, Any] = {"contact": FIVE, "still_ms": 130.0, "motion": motion}
+    said = verdict(seq, decision, motion_limits=motion, grasp=seq // 9, **more)
+    view.take(f"status.{hand}".encode(), status(seq, lifts=lifts, learner=learner), 0)
+    view.take(f"tactile.{hand}".encode(), reading, 0)
+    view.take(f"verdict.{hand}".encode(), said, 0)
+    return view.snapshot(0)
 
-    def put() -> None:
-        seq = 0
-        while not over.wait(0.05):
-            for view, decision in zip(views, (Decision.STABLE, Decision.SLIP), strict=False):
-                hand = view.snapshot(0).endpoint.rpartition("/")[2].encode()
-                said = status(seq, lifts=lifts, learner=learner)
-                view.take(b"status." + hand, said, 0)
-                view.take(b"tactile." + hand, whole, 0)
-                told = verdict(seq, decision, motion_limits=motion, grasp=seq // 9, **more)
-                view.take(b"verdict." + hand, told, 0)
-            server.newest.put(msgspec.json.encode([view.snapshot(0) for view in views]))
-            seq += 1
 
-    threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]
-    for thread in threads:
-        thread.start()
-    try:
+@pytest.mark.parametrize(
+    ("names", "width", "fits", "theme"),
+    [
+        (["right"], 1280, True, "light"),
+        (["left", "right"], 1280, False, "dark"),
+        (["left", "right"], 400, False, "light"),
+    ],
+)
+def test_a_whole_hand_fits_one_window_and_several_one_page(
+    browser: Browser, names: list[str], width: int, fits: bool, theme: Theme
+) -> None:
+    views = [View(f"ipc:///tmp/{name}") for name in names]
+
+    def seen(seq: int) -> list[Snapshot]:
+        hands = zip(views, names, (Decision.STABLE, Decision.SLIP), strict=False)
+        return [seen_of_a_whole_hand(view, name, seq, said) for view, name, said in hands]
+
+    with serving_hands(seen) as address:
         browser.look(width, 800, theme)
-        browser.go(f"http://127.0.0.1:{server.server_port}/")
+        browser.go(address)
         browser.wait_for("document.querySelectorAll('.grasps tr').length >= 8")
         browser.wait_for(f"document.querySelectorAll('.hand').length == {len(names)}")
         assert browser.value("document.documentElement.scrollWidth <= innerWidth")
@@ -362,24 +295,16 @@ def test_all_of_a_hand_is_in_one_window_and_several_are_in_one_page(
         assert tones == ["stable", "slip"][: len(names)]
         several = {1: "stable - graspd", 2: "left stable, right slip - graspd"}
         assert browser.value("document.title") == several[len(names)]
-        heads = browser.value("[...document.querySelectorAll('.who')].map(b => b.innerText)")
-        assert heads == [f"graspd {name}" for name in names]
         cut = (
-            "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div, h2')]"
-            ".filter(e => e.scrollWidth > e.clientWidth + 1 && e.clientWidth).map(e => e.innerText)"
+            "[...document.querySelectorAll('.verdict, td, .why li, figure span, .joints div,"
+            " h2')].filter(e => e.scrollWidth > e.clientWidth + 1 && e.clientWidth)"
+            ".map(e => e.innerText)"
         )
         assert browser.value(cut) == []
-        assert browser.complaints == []
-    finally:
-        over.set()
-        server.shutdown()
-        for thread in threads:
-            thread.join()
-        server.server_close()
 
 
 def note_tones(browser: Browser) -> None:
-    """From now on, or from when it is frozen, the page keeps in `tones` what was to be seen."""
+    """Keep in `tones` what the page shows from now on, or since it was frozen."""
     browser.value(
         "tones = []; document.addEventListener('freeze', () => { tones = []; });"
         f" new MutationObserver(() => {{ const tone = {BANNER}.dataset.tone;"
@@ -394,11 +319,11 @@ def hide(browser: Browser, hidden: str) -> None:
     browser.value(f"Object.defineProperty(document, 'hidden', {value})")
 
 
-def test_a_page_that_was_frozen_shows_unknown_and_nothing_of_what_waited(
+def test_a_frozen_page_shows_unknown_and_nothing_that_waited(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     talker.decision = Decision.STABLE
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.go(page.address)
     see(browser, "stable")
     hide(browser, "false")  # as far as the page knows
     note_tones(browser)
@@ -408,8 +333,7 @@ def test_a_page_that_was_frozen_shows_unknown_and_nothing_of_what_waited(
     time.sleep(1.0)
     browser.ask("Page.setWebLifecycleState", state="active")
     see(browser, "slip")
-    assert browser.value("tones") == ["silent", "slip"]
-    assert browser.complaints == []
+    assert browser.value("tones.slice(0, 2)") == ["silent", "slip"]
 
 
 def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
@@ -417,19 +341,19 @@ def test_after_a_sleep_of_the_computer_the_page_shows_unknown_first(
 ) -> None:
     """Only the wall clock has gone on meanwhile."""
     talker.decision = Decision.STABLE
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.go(page.address)
     see(browser, "stable")
     note_tones(browser)
     browser.value("(real => { tones = []; Date.now = () => real() + 3600000; })(Date.now)")
     browser.wait_for("tones.length >= 2")
-    assert browser.value("tones") == ["silent", "stable"]
+    assert browser.value("tones.slice(0, 2)") == ["silent", "stable"]
 
 
 def test_a_page_in_the_background_shows_no_verdict(
     page: Page, talker: Talker, browser: Browser
 ) -> None:
     talker.decision = Decision.STABLE
-    browser.go(f"http://127.0.0.1:{page.port}/")
+    browser.go(page.address)
     see(browser, "stable")
     for hidden, tone in (("true", "silent"), ("false", "stable")):
         hide(browser, hidden)
@@ -438,38 +362,18 @@ def test_a_page_in_the_background_shows_no_verdict(
         assert browser.value("document.title") == f"{text(browser, 'verdict').lower()} - graspd"
 
 
-def test_the_page_has_a_clock_that_goes_on(page: Page, talker: Talker, browser: Browser) -> None:
-    browser.go(f"http://127.0.0.1:{page.port}/")
-    see(browser, "waiting")
-    first = text(browser, "clock")
-    assert re.fullmatch(r"\d\d:\d\d:\d\d", first)
-    browser.wait_for(f"document.querySelector('.clock').innerText > '{first}'")
-
-
 def test_snapshots_that_waited_on_their_way_are_not_shown(browser: Browser) -> None:
     """The way gets five seconds longer, as through a tunnel that hung."""
-    server, late_s, over = Server(0, Newest()), 0.0, threading.Event()
+    late_s = 0.0
     view = View("ipc:///tmp/any", wall=lambda: time.time() - late_s)
 
-    def put() -> None:
-        seq = 0
-        while not over.wait(0.05):
-            view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
-            server.newest.put(msgspec.json.encode([view.snapshot(0)]))
-            seq += 1
+    def seen(seq: int) -> list[Snapshot]:
+        view.take(b"verdict.right", verdict(seq, Decision.STABLE), 0)
+        return [view.snapshot(0)]
 
-    threads = [threading.Thread(target=each) for each in (put, server.serve_forever)]
-    for thread in threads:
-        thread.start()
-    try:
-        browser.go(f"http://127.0.0.1:{server.server_port}/")
+    with serving_hands(seen) as address:
+        browser.go(address)
         see(browser, "stable")
         note_tones(browser)
         late_s = 5.0
         browser.wait_for("tones.includes('silent')")
-    finally:
-        over.set()
-        server.shutdown()
-        for thread in threads:
-            thread.join()
-        server.server_close()

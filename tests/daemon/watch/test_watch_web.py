@@ -11,11 +11,9 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
 
-import msgspec
 import pytest
 
 from daemon.watch import web
-from daemon.watch.view import View
 from daemon.watch.web import (
     CONNECTIONS_MAX,
     GIVES_WAY_S,
@@ -181,16 +179,6 @@ def test_a_page_gets_nothing_old_and_all_that_follows(server: Server) -> None:
         for number in range(3, 10):
             server.newest.put(b'{"n":%d}' % number)
             assert next(coming) == {"n": number}
-
-
-def test_a_snapshot_is_one_line(server: Server) -> None:
-    seen = View("ipc:///tmp/line\nbreak").snapshot(0)
-    with ExitStack() as stack:
-        coming = events(opened(server, stack))
-        server.newest.put(msgspec.json.encode(seen))
-        found = next(coming)
-    assert isinstance(found, dict)
-    assert found["endpoint"] == "ipc:///tmp/line\nbreak"
 
 
 def test_a_browser_that_does_not_read_misses_snapshots_and_holds_up_nobody(server: Server) -> None:

@@ -11,7 +11,6 @@ from rich.console import Console
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
 from daemon.trust.risk import RiskReport
-from daemon.watch.pixels import Canvas
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.terminal import draw
 from daemon.watch.view import View
@@ -108,13 +107,11 @@ def after(*messages: tuple[bytes, bytes], at_ns: int = 0) -> View:
     return seen
 
 
-def text_of(
-    seen: Snapshot | list[Snapshot], width: int, height: int, canvas: Canvas, chosen: int = 0
-) -> list[str]:
+def text_of(seen: Snapshot | list[Snapshot], width: int = 80, chosen: int = 0) -> list[str]:
+    """The lines of a terminal without colours."""
     hands = seen if isinstance(seen, list) else [seen]
     file = io.StringIO()
-    console = Console(file=file, width=width, height=height, color_system=None)
-    console.print(draw(hands, width, height, canvas, chosen))
+    Console(file=file, width=width, color_system=None).print(draw(hands, width, chosen))
     return file.getvalue().splitlines()
 
 

@@ -1,0 +1,167 @@
+"""The subscriber of `graspd watch`: nothing old after a pause, and why it is turned away."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon import scene
+from daemon.judge.reasons import Decision
+from daemon.publish.keys import KeysError, make
+from daemon.publish.messages import decode_verdict
+from daemon.publish.sockets import Sockets
+from daemon.watch.feed import Feed, load_keys
+from daemon.watch.view import View
+from tests.daemon.fakes import Clock
+from tests.daemon.publish.doors import Publisher
+from tests.daemon.watch.watch_fakes import MS, verdict
+from tests.ports import free_port
+
+PATIENCE_S = 100.0
+
+
+@pytest.fixture
+def endpoint(tmp_path: Path) -> str:
+    return f"ipc://{tmp_path}/v"
+
+
+def test_what_waited_while_nobody_looked_is_not_shown(endpoint: str) -> None:
+    clock = Clock()
+    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+
+        def came(decision: Decision, seq: int) -> list[bytes]:
+            deadline_s = time.monotonic() + PATIENCE_S
+            while not (found := [payload for _, payload in feed.take()]):
+                assert time.monotonic() < deadline_s
+                publisher.send(b"verdict.right", verdict(seq, decision))
+                time.sleep(0.01)
+            return found
+
+        came(Decision.STABLE, 0)
+        for seq in range(1, 50):
+            publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
+        time.sleep(0.1)
+        clock.now_ns += 1001 * MS
+        assert list(feed.take()) == []
+        for payload in came(Decision.SLIP, 50):
+            assert decode_verdict(payload).seq == 50
+
+
+def test_what_has_waited_may_be_as_old_as_the_last_look_at_an_empty_queue(endpoint: str) -> None:
+    clock = Clock()
+    with Publisher(endpoint) as publisher, Feed(endpoint, clock=clock) as feed:
+        deadline_s, seq = time.monotonic() + PATIENCE_S, 0
+        while not list(feed.take()):
+            assert time.monotonic() < deadline_s
+            publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
+            seq += 1
+            time.sleep(0.01)
+        while list(feed.take()):
+            pass
+        looked_ns = clock.now_ns
+        publisher.send(b"verdict.right", verdict(seq, Decision.STABLE))
+        time.sleep(0.2)
+        clock.now_ns += 900 * MS
+        view = View(endpoint)
+        for topic, payload in feed.take():
+            view.take(topic, payload, feed.empty_ns)
+        assert view.snapshot(clock.now_ns).verdict == "unknown"
+        assert view.snapshot(looked_ns).verdict == "stable"
+
+
+@pytest.fixture
+def address() -> str:
+    return f"tcp://127.0.0.1:{free_port()}"
+
+
+@pytest.fixture
+def door(tmp_path: Path, address: str) -> Iterator[Sockets]:
+    """A daemon's sockets that admit the key `known`."""
+    make(tmp_path, "daemon")
+    make(tmp_path / "clients", "known")
+    for name in ("known.key", "known.key_secret"):
+        (tmp_path / name).write_bytes((tmp_path / "clients" / name).read_bytes())
+        (tmp_path / name).chmod(0o600)
+    make(tmp_path, "stranger")
+    content = {
+        "tactile": {"driver": "replay", "recordings": ["any.csv"]},
+        "publish": {"endpoint": address},
+        "curve": {"secret_key": "daemon.key_secret", "clients": "clients"},
+    }
+    with Sockets(scene.parse(content, tmp_path / "scene.toml")) as made:
+        yield made
+
+
+def hears(door: Sockets, feed: Feed, until: Callable[[bool], bool]) -> None:
+    deadline_s = time.monotonic() + PATIENCE_S
+    heard = False
+    while not until(heard):
+        assert time.monotonic() < deadline_s, feed.link
+        door.send(b"verdict.right", verdict(0))
+        time.sleep(0.01)
+        heard = heard or any(topic == b"verdict.right" for topic, _ in feed.take())
+
+
+def test_a_known_key_is_let_in(tmp_path: Path, address: str, door: Sockets) -> None:
+    keys = load_keys(tmp_path / "known.key_secret", tmp_path / "daemon.key")
+    with Feed(address, keys) as feed:
+        hears(door, feed, lambda heard: heard)
+        assert feed.link == "connected"
+
+
+@pytest.mark.parametrize(
+    ("own", "server", "said"),
+    [
+        ("stranger", "daemon", "the daemon does not know this key"),
+        ("known", "stranger", "is the daemon's key right?"),
+        (None, None, "the daemon wants a key"),
+    ],
+)
+def test_whoever_is_turned_away_is_told_why(
+    tmp_path: Path,
+    address: str,
+    door: Sockets,
+    own: str | None,
+    server: str | None,
+    said: str,
+) -> None:
+    keys = own and load_keys(tmp_path / f"{own}.key_secret", tmp_path / f"{server}.key")
+    with Feed(address, keys or None) as feed:
+        hears(door, feed, lambda heard: heard or feed.link.startswith("turned away"))
+        assert said in feed.link
+        later_s = time.monotonic() + 0.5  # whatever is tried again says the same
+        hears(door, feed, lambda heard: heard or time.monotonic() > later_s)
+        assert said in feed.link
+
+
+def test_who_was_turned_away_is_let_in_when_its_key_is_known(
+    tmp_path: Path, address: str, door: Sockets
+) -> None:
+    clock = Clock()
+    keys = load_keys(tmp_path / "stranger.key_secret", tmp_path / "daemon.key")
+    with Feed(address, keys, clock) as feed:
+        hears(door, feed, lambda _: feed.is_turned_away)
+        (tmp_path / "stranger.key").rename(tmp_path / "clients" / "stranger.key")
+        door.check_keys()
+        for _ in range(6):  # looks, and is not paused
+            clock.now_ns += 900 * MS
+            list(feed.take())
+        hears(door, feed, lambda heard: heard)
+        assert feed.link == "connected"
+
+
+def test_keys_that_are_wrong_are_said(tmp_path: Path) -> None:
+    make(tmp_path, "own")
+    own = tmp_path / "own.key_secret"
+    empty = tmp_path / "empty.key"
+    empty.write_text("")
+    with pytest.raises(KeysError, match=r"no\.key: cannot read the daemon's key"):
+        load_keys(own, tmp_path / "no.key")
+    with pytest.raises(KeysError, match="has no public key"):
+        load_keys(own, empty)
+    own.chmod(0o644)
+    with pytest.raises(KeysError, match="chmod 600"):
+        load_keys(own, tmp_path / "own.key")

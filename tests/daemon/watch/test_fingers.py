@@ -1,0 +1,140 @@
+"""Tactile images: levels below the rest that was learned, marks, and motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.judge.reasons import Decision, GateState
+from daemon.watch.fingers import FingerImage
+from daemon.watch.view import View
+from models.layout import D1
+from models.levels import Rest
+from tests.daemon.watch.watch_fakes import MS, RESTING, a_view, after, status, tactile, verdict
+
+SOUND = np.ones(24, dtype=np.bool_)
+WIDTH = 11
+
+
+def rested(readings: int = 30) -> View:
+    """A view that has seen an open hand at rest."""
+    view = after((b"status.right", status(0)))
+    for seq in range(readings):
+        view.take(b"verdict.right", verdict(seq), 0)
+        view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
+    return view
+
+
+def images(view: View, *counts: list[int], faulty: tuple[int, ...] = ()) -> list[FingerImage]:
+    """The images of one more reading, while the hand closes."""
+    view.take(b"verdict.right", verdict(98, gate=GateState.CLOSING), 0)
+    view.take(b"tactile.right", tactile(99, *counts, faulty=faulty), 0)
+    return view.snapshot(0).fingers
+
+
+@pytest.mark.parametrize(
+    ("fall", "level"), [(0, 0), (16, 10), (400, 50), (1600, 100), (3000, 100), (-400, -50)]
+)
+def test_a_pixel_shows_the_root_of_the_fall_below_the_rest(fall: int, level: int) -> None:
+    """Root of the share of 1600 counts, in %: 16 / 1600 = 0.1 squared."""
+    first, second = images(rested(), [3000 - fall] * 24, RESTING)
+    assert (first.name, first.from_rest, first.deepest) == ("ff", True, fall)
+    assert first.levels == [level] * 132
+    assert second.levels == [0] * 132
+
+
+def test_an_electrode_is_where_the_layout_has_it() -> None:
+    """E7 stands in row 8, column 1 of D1 (the paper's table)."""
+    first, _ = images(rested(), [3000] * 6 + [1400] + [3000] * 17, RESTING)
+    assert (D1.rows[6], D1.columns[6]) == (8, 1)
+    assert first.levels[8 * WIDTH + 1] == 100
+
+
+def test_a_rest_is_learned_only_while_idle_and_tared() -> None:
+    view = rested(24)
+    view.take(b"status.right", status(1, tared=["th"]), 0)
+    for seq in range(50, 80):
+        view.take(b"tactile.right", tactile(seq, RESTING, RESTING), 0)
+    assert [finger.from_rest for finger in view.snapshot(0).fingers] == [False, True]
+    view.take(b"verdict.right", verdict(90, gate=GateState.CLOSING, contact=["th"]), 0)
+    for seq in range(90, 200):
+        view.take(b"tactile.right", tactile(seq, RESTING, [1400] * 24), 0)
+    assert view.snapshot(0).fingers[1].levels == [100] * 132
+
+
+def learned(*counts: float) -> Rest:
+    """The rest after a hundred readings of 3000 and these."""
+    rest = Rest()
+    for count in [3000.0] * 100 + list(counts):
+        rest.learn(np.full(24, count), SOUND)
+    return rest
+
+
+def test_the_rest_follows_a_drift_and_hardly_an_unseen_touch() -> None:
+    drifted = learned(*[3010.0] * 500)  # ten times the fifty readings that a share of 2 % goes back
+    assert drifted.counts == pytest.approx(np.full(24, 3010.0), abs=0.01)
+    touched = learned(*[1400.0] * 3)
+    assert touched.counts == pytest.approx(np.full(24, 2998.8))  # three times 2 % of 20 counts
+
+
+def test_without_a_rest_an_image_shows_how_electrodes_differ() -> None:
+    first, flat = images(a_view(), [3000] * 12 + [2000] * 12, RESTING)
+    # The median is 2500, and 500 counts are one standard deviation, of two and a half.
+    assert not first.from_rest
+    assert (min(first.levels), max(first.levels)) == (-40, 40)
+    assert flat.levels == [0] * 132
+
+
+def test_faulty_and_repaired_electrodes_are_marked_and_no_touch() -> None:
+    view = rested()
+    counts = [3000] * 24
+    counts[6] = 0
+    view.take(b"tactile.right", tactile(99, counts, RESTING, faulty=(6,)), 0)
+    view.take(b"verdict.right", verdict(99, Decision.STABLE, repaired=["ff_1", "th_24"]), 0)
+    first, second = view.snapshot(0).fingers
+    assert first.levels == [0] * 132
+    assert first.marked == [1, 8 * WIDTH + 1]  # E1 stands in row 0, column 1
+    assert second.marked == [5 * WIDTH + 5]  # E24 in row 5, column 5
+    nothing, _ = images(a_view(), [0] * 24, RESTING, faulty=tuple(range(24)))
+    assert (nothing.levels, len(nothing.marked)) == ([0] * 132, 24)
+
+
+@pytest.mark.parametrize("counts", [[], [1] * 23])
+def test_a_reading_of_fewer_electrodes_has_no_image(counts: list[int]) -> None:
+    assert images(a_view(), counts, RESTING) == []
+
+
+def test_images_go_when_readings_no_longer_come() -> None:
+    view = after((b"tactile.right", tactile(0, RESTING, RESTING)))
+    view.take(b"verdict.right", verdict(0), 1001 * MS)
+    assert view.snapshot(1001 * MS).fingers == []
+
+
+MOVES: dict[str, Any] = {"still_ms": 130.0, "motion": {"ff": 1.2, "th": None}}
+LIMITS: dict[str, Any] = {"motion_limits": {"ff": 1.5, "th": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("told", "motions"),
+    [
+        (MOVES | LIMITS, {"ff": (1.2, 1.5), "th": (None, 1.0)}),
+        ({"motion": {"ff": 0.0}} | LIMITS, {"ff": (0.0, 1.5), "th": (None, 1.0)}),
+        (MOVES, {"ff": (None, 0.0), "th": (None, 0.0)}),
+        ({"motion": {"ff": 1.0}, "motion_limits": {"ff": 0.0}}, {"ff": (None, 0.0)}),
+        ({}, {"ff": None, "th": None}),
+    ],
+    ids=["all", "one", "no limits", "no limit", "nothing"],
+)
+def test_unknown_motion_of_a_finger_is_not_zero(
+    told: dict[str, Any], motions: dict[str, tuple[float | None, float] | None]
+) -> None:
+    view = after(
+        (b"tactile.right", tactile(0, RESTING, RESTING)), (b"verdict.right", verdict(0, **told))
+    )
+    shown = {
+        finger.name: None if finger.motion is None else (finger.motion.now, finger.motion.limit)
+        for finger in view.snapshot(0).fingers
+    }
+    assert motions.items() <= shown.items()

@@ -1,0 +1,170 @@
+"""The table in a terminal: all words at 60 columns, verdict first, several hands."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import time
+from typing import Any
+
+import pytest
+from msgspec import structs
+from rich.console import Console
+
+from daemon.judge.reasons import ADVICE, Decision, Reason
+from daemon.watch.fingers import FingerMotion
+from daemon.watch.snapshot import Snapshot, Tone
+from daemon.watch.terminal import STYLES, draw
+from tests.daemon.watch.watch_fakes import (
+    ENDPOINT,
+    MS,
+    RESTING,
+    a_view,
+    after,
+    status,
+    tactile,
+    text_of,
+    verdict,
+)
+
+FIVE = ["ff", "mf", "rf", "lf", "th"]
+
+
+def a_full_hand(decision: Decision = Decision.SLIP, hand: str = "right") -> Snapshot:
+    """Five fingers that all move and touch, and a reason longer than a line."""
+    view = a_view(hand)
+    message = json.loads(tactile(0, RESTING, RESTING))
+    message |= {"fingers": FIVE, "counts": [RESTING] * 5, "faults": [[0] * 24] * 5}
+    motion = dict.fromkeys(FIVE, 1.2)
+    limits = dict.fromkeys(FIVE, 1.5)
+    more: dict[str, Any] = {"contact": FIVE, "motion": motion, "motion_limits": limits}
+    reasons = [] if decision is not Decision.UNKNOWN else [Reason.STALE]
+    view.take(f"status.{hand}".encode(), status(0), 0)
+    view.take(f"tactile.{hand}".encode(), json.dumps(message).encode(), 0)
+    said = verdict(0, decision, still_ms=131.0, reasons=reasons, **more)
+    view.take(f"verdict.{hand}".encode(), said, 0)
+    return view.snapshot(0)
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+@pytest.mark.parametrize("decision", Decision)
+def test_all_words_fit_a_terminal_of_sixty_columns(decision: Decision, width: int) -> None:
+    seen = a_full_hand(decision)
+    lines = text_of(seen, width)
+    assert len(lines) <= 40
+    assert max(map(len, lines)) <= width
+    assert f" {decision.value.upper()} " in lines[0]
+    text = " ".join("\n".join(lines).split())
+    assert "\u2026" not in text
+    for words in (
+        "q ends",
+        "touches ff mf rf lf th, still 131 ms, may slide",
+        "th ########--|---------- moves 1.2 of 1.5",
+        "FFJ3 28.6°",  # 0.5 rad
+        "small-session 0123456789ab",
+        "latency p50, p99 250 us, 500 us; longest latency 750 us",
+        "session 12 grasps, not yet calibrated",
+        f"endpoint {ENDPOINT} connecting",
+        f"health ff_7 electrode-dead: {ADVICE[Reason.ELECTRODE_DEAD]}",
+        *(line.advice for line in seen.why),
+    ):
+        assert words in text
+    if decision is not Decision.UNKNOWN:
+        assert f"last grasps 7 {decision.value}" in text
+
+
+@pytest.mark.parametrize("tone", Tone)
+def test_only_the_verdict_has_the_colour_of_its_tone(tone: Tone) -> None:
+    seen = structs.replace(a_full_hand(), tone=tone, headline="word")
+    file = io.StringIO()
+    Console(file=file, width=80, force_terminal=True, color_system="truecolor").print(
+        draw([seen], 80)
+    )
+    background = "48;2;" in file.getvalue()
+    assert background == (tone is not Tone.LEANS)  # hollow
+    coloured = re.findall(r"\x1b\[[0-9;]*38;2;[0-9;]*m([^\x1b]*)", file.getvalue())
+    assert coloured == [" WORD "]
+    assert STYLES.keys() == set(Tone)
+
+
+@pytest.mark.parametrize(
+    ("now", "bar"),
+    [
+        (0.0, "----------|----------"),
+        (0.3, "##--------|----------"),
+        (1.5, "##########|----------"),
+        (1.51, "##########|#---------"),
+        (2.0, "##########|####------"),
+        (3.0, "##########|##########"),
+        (1e308, "##########|##########"),
+        (None, "motion not known"),
+    ],
+)
+def test_a_bar_of_motion_has_the_limit_in_its_middle(now: float | None, bar: str) -> None:
+    """It ends at twice the limit, so ten characters are the limit, here 1.5."""
+    seen = a_full_hand()
+    first = structs.replace(seen.fingers[0], motion=FingerMotion(now=now, limit=1.5))
+    (row,) = [
+        line for line in text_of(structs.replace(seen, fingers=[first])) if line.startswith("ff ")
+    ]
+    assert row.split(maxsplit=1)[1].startswith(bar)
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+def test_the_figures_of_a_dead_daemon_have_their_time_and_are_dim(width: int) -> None:
+    view = after((b"status.right", status(0)), (b"verdict.right", verdict(0, Decision.STABLE)))
+    alive, dead = view.snapshot(0), view.snapshot(12_000 * MS)
+    assert (alive.last_t, dead.last_t) == (1790000000.0, 1789999988.0)  # 12 s before the wall clock
+    then = time.strftime("%H:%M:%S", time.localtime(1789999988))
+    last = f"last message  {then}, 12 s ago; figures of then"
+    assert last in "\n".join(text_of(dead, width))
+    assert last not in "\n".join(text_of(alive, width))
+    for seen, dims in ((alive, False), (dead, True)):
+        file = io.StringIO()
+        console = Console(file=file, width=width, force_terminal=True, color_system="truecolor")
+        console.print(draw([seen], width))
+        styles = re.search(r"(\x1b\[[0-9;]*m)readings 100 /s", file.getvalue())
+        assert bool(styles and styles[1] == "\x1b[2;3m") is dims  # dim and italic (ECMA-48)
+
+
+def test_the_header_has_the_wall_clock_of_the_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "CET-1")
+    time.tzset()
+    header = text_of(a_full_hand())[1]
+    monkeypatch.undo()
+    time.tzset()
+    assert header.startswith(
+        "graspd 15:13:20 (q ends)  running"
+    )  # date -u -d @1790000000: 14:13:20
+
+
+@pytest.mark.parametrize("width", [1, 10, 40])
+def test_a_terminal_that_is_too_small_is_no_error(width: int) -> None:
+    assert text_of(a_full_hand(), width)
+
+
+def test_names_that_come_in_messages_cannot_move_the_cursor() -> None:
+    evil = "\x1b[2J\x1b]0;owned\x07"
+    view = after(
+        (b"verdict.right", verdict(0, Decision.SLIP, model=evil, repaired=[evil])),
+        (b"status.right", status(0, health={evil: Reason.HELD}, drivers={evil: {evil: 1}})),
+    )
+    text = "\n".join(text_of(view.snapshot(0), 120))
+    assert "\x1b" not in text
+    assert "\x07" not in text
+    assert r"\x1b[2J" in text
+
+
+def test_several_hands_all_show_their_verdicts() -> None:
+    hands = [a_full_hand(Decision.STABLE, "left"), a_full_hand(Decision.SLIP, "right")]
+    beside = text_of(hands, 200)
+    assert re.fullmatch(
+        r"left  STABLE  .*25 %, lift +right  SLIP  .*75 %, do not lift *", beside[0]
+    )
+    first = text_of(hands, 100)
+    assert first[0].startswith("right  SLIP  slip probability 75 %, do not lift")
+    assert first[1].startswith("left  STABLE  slip probability 25 %, lift")
+    assert "tab shows the next hand" in first[2]
+    second = text_of(hands, 100, chosen=1)
+    assert [line.split()[0] for line in second[:2]] == ["left", "right"]

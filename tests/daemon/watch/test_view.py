@@ -1,0 +1,400 @@
+"""The state of a hand: by its messages, by their absence, and by what its verdicts rest on."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import pytest
+from msgspec import structs
+
+from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
+from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
+from daemon.trust.lift_book import OutcomeStatus
+from daemon.trust.risk import RiskReport
+from daemon.watch.evidence import SUPERVISED
+from daemon.watch.history import History
+from daemon.watch.snapshot import Line, Snapshot, Tone
+from tests.daemon.watch.watch_fakes import BOOT, MS, RISK, a_view, after, status, text_of, verdict
+
+GOLDEN = sorted((Path(__file__).parents[1] / "publish" / "golden").glob("*.json"))
+ODD: tuple[object, ...] = (
+    *(0, -1, 2**63, 1e308, 1e-320, "", "x" * 5000, "\x1b[2J"),
+    *([], [[]], {}, {"": 0}, None, True),
+)
+"""Values in places where others belong."""
+NOTHING_TOLD = structs.replace(RISK, lifts=0, slips=0)
+
+
+def risk(**other: Any) -> RiskReport:  # noqa: ANN401
+    return structs.replace(RISK, **other)
+
+
+def seen_after(decision: Decision = Decision.UNKNOWN, **other: Any) -> Snapshot:  # noqa: ANN401
+    return after((b"verdict.right", verdict(0, decision, **other))).snapshot(0)
+
+
+def figures(lines: list[Line]) -> dict[str, str]:
+    return {line.what: line.advice for line in lines}
+
+
+def test_before_the_first_message_it_is_unknown_and_says_why() -> None:
+    seen = a_view().snapshot(0)
+    assert (seen.tone, seen.verdict) == (Tone.SILENT, "unknown")
+    assert "is graspd running" in seen.why[0].advice
+    assert seen.why[1] == Line("link", "connecting")
+
+
+@pytest.mark.parametrize(
+    ("outcome", "tone", "p_slip"),
+    [(Decision.STABLE, Tone.STABLE, 0.25), (Decision.SLIP, Tone.SLIP, 0.75)],
+)
+def test_a_verdict_stands_until_the_silence_is_longer_than_it_says(
+    outcome: Decision, tone: Tone, p_slip: float
+) -> None:
+    view = after((b"verdict.right", verdict(0, outcome)))
+    seen = view.snapshot(100 * MS)
+    assert (seen.tone, seen.verdict, seen.p_slip) == (tone, outcome.value, p_slip)
+    seen = view.snapshot(101 * MS)
+    assert (seen.tone, seen.verdict, seen.p_slip) == (Tone.SILENT, "unknown", None)
+    assert seen.why[0] == Line("silent", "no message for 101 ms")
+    assert (seen.gate, seen.contact, seen.fingers, seen.state) == (None, None, [], None)
+    assert [(last.verdict, last.held) for last in seen.grasps] == [(outcome.value, False)]
+    assert view.snapshot(124_385 * MS).why[0].advice == "no message for 124 s"
+
+
+def test_a_repeated_message_is_no_sign_of_life() -> None:
+    view = after((b"verdict.right", verdict(5, Decision.STABLE)))
+    view.take(b"verdict.right", verdict(5, Decision.STABLE), 90 * MS)
+    assert view.snapshot(101 * MS).tone is Tone.SILENT
+
+
+def test_gaps_are_counted_as_lost_but_not_over_a_restart() -> None:
+    view = after(*[(b"verdict.right", verdict(seq)) for seq in (3, 4, 9)])
+    assert figures(view.snapshot(0).timing)["lost here"] == "4 messages"
+    view.take(b"verdict.right", verdict(0, Decision.SLIP, boot_id="another"), 0)
+    seen = view.snapshot(0)
+    assert (figures(seen.timing)["lost here"], seen.verdict) == ("4 messages", "slip")
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"{", b"\xff\xfe", b"[]", verdict(1, Decision.STABLE).replace(b'"v":1', b'"v":2')],
+)
+def test_a_malformed_message_is_counted_and_is_no_sign_of_life(payload: bytes) -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE)))
+    view.take(b"verdict.right", payload, 90 * MS)
+    seen = view.snapshot(101 * MS)
+    assert figures(seen.timing)["not understood"] == "1 messages"
+    assert seen.tone is Tone.SILENT
+
+
+def test_other_hands_and_other_topics_are_ignored() -> None:
+    view = a_view("right")
+    for topic in (b"verdict.right2", b"verdict.left", b"verdict", b"other.right", b"\xff"):
+        view.take(topic, verdict(0, Decision.STABLE), 0)
+    seen = view.snapshot(0)
+    assert (seen.verdict, figures(seen.timing)["not understood"]) == ("unknown", "0 messages")
+
+
+@pytest.mark.parametrize(
+    ("reasons", "tone"),
+    [
+        ([Reason.NO_CONTACT], Tone.WAITING),
+        ([Reason.MOVING, Reason.SETTLING], Tone.WAITING),
+        ([Reason.NEVER_SEEN], Tone.TROUBLE),
+        ([Reason.MOVING, Reason.STALE], Tone.TROUBLE),
+    ],
+)
+def test_unknown_shows_whether_something_is_wrong(reasons: list[Reason], tone: Tone) -> None:
+    seen = seen_after(reasons=reasons)
+    assert seen.tone is tone
+    assert seen.why == [Line(reason.value, ADVICE[reason]) for reason in reasons]
+
+
+def test_a_verdict_without_a_calibrated_session_is_less_sure() -> None:
+    why = seen_after(Decision.STABLE, session_calibrated=False).why
+    assert [line.what for line in why] == ["lift", "less sure"]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"p_slip": 0.251}, "a slip is too likely for a promise"),
+        ({"risk": None, "outcomes": 0}, "no outcome told yet"),
+        ({"risk": NOTHING_TOLD, "outcomes": 0}, "no outcome told yet"),
+        ({"risk": NOTHING_TOLD}, "too few `stable` lifts"),
+        ({"risk": risk(lifts=9, slips=0)}, "too few `stable` lifts"),
+        ({"risk": risk(target=None, bound=None)}, "no target is set"),
+        ({"risk": risk(slips=5)}, "more `stable` lifts slipped"),
+        ({"early": True}, "judged early"),
+    ],
+)
+def test_a_stable_without_evidence_only_leans_to_it(change: dict[str, Any], why: str) -> None:
+    """A target of 10 % needs ten lifts, of which one may slip."""
+    assert seen_after(Decision.STABLE).tone is Tone.STABLE
+    assert seen_after(Decision.STABLE, risk=risk(lifts=10, slips=1)).tone is Tone.STABLE
+    seen = seen_after(Decision.STABLE, **change)
+    assert (seen.tone, seen.verdict, seen.headline) == (Tone.LEANS, "stable", "leans to stable")
+    assert seen.why[0].advice.startswith(why)
+    assert "lift" not in [line.what for line in seen.why]
+
+
+@pytest.mark.parametrize(
+    ("still_ms", "words"),
+    [
+        (None, "-"),
+        (0.0, "0 ms"),
+        (100.0, "100 ms, may slide"),
+        (239.999999, "239 ms, may slide"),
+        (240.0, "240 ms"),
+        (9999.9, "9999 ms"),
+        (75_600.0, "75 s"),
+    ],
+)
+def test_stillness_is_told_in_words(still_ms: float | None, words: str) -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE, still_ms=still_ms)))
+    assert view.snapshot(0).still == words
+    assert view.snapshot(101 * MS).still == "-"  # silent
+
+
+@pytest.mark.parametrize(
+    ("change", "evidence"),
+    [
+        ({}, "network 30 %, rests on 57 lifts; of 41 `stable` ones 2 slipped, target 10 %"),
+        (
+            {"outcomes": 1, "risk": risk(lifts=0, slips=0, target=0.05)},
+            "network 30 %, rests on 1 lift; no `stable` one told yet, target 5 %",
+        ),
+        (
+            {"risk": risk(target=None)},
+            "network 30 %, rests on 57 lifts; of 41 `stable` ones 2 slipped",
+        ),
+        ({"risk": NOTHING_TOLD, "outcomes": 0}, "network 30 %, no outcome told yet"),
+        ({"risk": None, "outcomes": 0, "p_slip_model": None}, "no outcome told yet"),
+    ],
+)
+def test_a_verdict_says_what_it_rests_on(change: dict[str, Any], evidence: str) -> None:
+    assert seen_after(Decision.STABLE, **change).evidence == evidence
+
+
+@pytest.mark.parametrize(
+    ("decision", "reasons", "tone"),
+    [
+        (Decision.UNKNOWN, [Reason.UNPROVEN], Tone.LEARNING),
+        (Decision.UNKNOWN, [Reason.LOW_CONFIDENCE], Tone.LEARNING),
+        (Decision.UNKNOWN, [Reason.UNPROVEN, Reason.STALE], Tone.TROUBLE),
+        (Decision.UNKNOWN, [Reason.MOVING], Tone.WAITING),
+        (Decision.SLIP, [], Tone.SLIP),
+        (Decision.STABLE, [], Tone.LEANS),
+    ],
+)
+def test_a_supervised_lift_is_told_apart(
+    decision: Decision, reasons: list[Reason], tone: Tone
+) -> None:
+    seen = seen_after(decision, reasons=reasons, supervised=True)
+    is_wanted = tone not in {Tone.TROUBLE, Tone.WAITING}
+    assert (seen.tone, SUPERVISED in seen.why) == (tone, is_wanted)
+    assert "lift" not in [line.what for line in seen.why]
+
+
+def test_learning_shows_untold_lifts_first() -> None:
+    lifts = Lifts(reported=41, outstanding=1, unreported=3)
+    told = {OutcomeStatus.TAKEN: 57, OutcomeStatus.CONTRADICTS: 1}
+    learner = LearnerHealth(enabled=True, outcomes=57, told=told, uncertainty=0.41)
+    seen = after(
+        (b"status.right", status(0, lifts=lifts, learner=learner)),
+        (b"verdict.right", verdict(0, Decision.STABLE)),
+    ).snapshot(0)
+    assert seen.learning == [
+        Line("never told", "3 lifts"),
+        Line("warm-up left", "0 outcomes"),
+        Line("still out", "1 lift"),
+        Line("learner", "on"),
+        Line("learned from", "57 outcomes"),
+        Line("uncertainty", "41 %"),
+        Line("slips of `stable`", "2 of 41 lifts, at most 9.5"),
+        Line("outcomes taken", "57"),
+        Line("outcomes contradicts", "1"),
+    ]
+
+
+def test_figures_are_told_with_their_units_or_as_unknown() -> None:
+    seen = after((b"status.right", status(0)), (b"verdict.right", verdict(0))).snapshot(0)
+    assert figures(seen.timing) == {
+        "readings": "100 /s",
+        "verdicts": "0 /s",
+        "age": "0.5 ms",
+        "latency p50, p99": "250 us, 500 us",
+        "longest latency": "750 us",
+        "jitter p99": "-",
+        "late": "0 readings",
+        "worst age": "0 ms",
+        "lost here": "0 messages",
+        "not understood": "0 messages",
+    }
+    assert figures(seen.session) == {
+        "session": "12 grasps, not yet calibrated",
+        "repaired now": "nothing",
+    }
+    assert figures(seen.drivers) == {"replay readings": "3", "graspd": "0.1.0"}
+    assert figures(a_view().snapshot(0).timing)["readings"] == "-"
+
+
+@pytest.mark.parametrize("overloaded", [False, True])
+def test_an_overloaded_daemon_is_not_well(overloaded: bool) -> None:
+    view = after(
+        (b"status.right", status(0, overloaded=overloaded)), (b"verdict.right", verdict(0))
+    )
+    assert ("overloaded" in figures(view.snapshot(0).health)) is overloaded
+
+
+def outcome(grasp: int, ended: Literal["stable", "slip"], judged_by: str | None = None) -> bytes:
+    told = OutcomeMessage(
+        boot_id=BOOT, seq=0, t=0.0, t_mono_ns=0, grasp=grasp, outcome=ended, grasp_boot_id=judged_by
+    )
+    return encode(told)
+
+
+def test_the_last_grasps_stay_with_how_their_lifts_ended() -> None:
+    view = a_view()
+    for grasp in range(1, 12):
+        seq = 100 + 2 * grasp
+        watched = grasp == 10
+        decision = Decision.UNKNOWN if watched else Decision.SLIP if grasp == 9 else Decision.STABLE
+        reasons = [Reason.UNPROVEN] if watched else []
+        message = verdict(
+            seq, decision, grasp=grasp, judged=True, supervised=watched, reasons=reasons
+        )
+        for _ in range(2):  # a judgement that is repeated is listed once
+            view.take(b"verdict.right", message, grasp * 1000 * MS)
+        view.take(b"verdict.right", verdict(seq + 1, grasp=grasp), grasp * 1000 * MS)
+    view.take(b"outcome.right", outcome(1, "slip"), 0)
+    view.take(b"outcome.right", outcome(8, "stable"), 0)
+    view.take(b"outcome.right", outcome(9, "slip", "another"), 0)
+    view.take(b"outcome.right", outcome(10, "slip", BOOT), 0)
+    seen = view.snapshot(11_000 * MS)
+    assert [(last.grasp, last.verdict, last.ended) for last in seen.grasps] == [
+        *((11, "stable", None), (10, "unknown", "slip"), (9, "slip", None)),
+        *((8, "stable", "stable"), (7, "stable", None), (6, "stable", None)),
+        *((5, "stable", None), (4, "stable", None)),
+    ]
+    assert [last.ago_s for last in seen.grasps[:3]] == [0.0, 1.0, 2.0]
+    lifts = [last.lift for last in seen.grasps[:4]]
+    assert lifts == ["not told", "slipped", "-", "held"]
+
+
+def test_a_grasp_whose_verdict_turns_is_listed_with_the_last_one() -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
+    turned = verdict(1, Decision.SLIP, grasp=41, judged=False, gate=GateState.JUDGED)
+    view.take(b"verdict.right", turned, 0)
+    assert [(last.grasp, last.verdict) for last in view.snapshot(0).grasps] == [(41, "slip")]
+
+
+@pytest.mark.parametrize(("gate", "held"), [(GateState.JUDGED, True), (GateState.RELEASED, False)])
+def test_a_judged_grasp_is_past_once_it_is_released(gate: GateState, held: bool) -> None:
+    view = after((b"verdict.right", verdict(0, Decision.STABLE, grasp=41)))
+    view.take(b"verdict.right", verdict(1, grasp=41, gate=gate), 0)
+    (last,) = view.snapshot(0).grasps
+    assert (last.verdict, last.held) == ("stable", held)
+
+
+def test_grasps_are_counted_once_by_their_last_verdict() -> None:
+    view = a_view()
+    seq = 0
+    # As the gate numbers them: 1 slips, 2 turns from stable to slip, 3 is let go unjudged, 4 holds.
+    said = {1: [Decision.SLIP], 2: [Decision.STABLE, Decision.SLIP], 3: [], 4: [Decision.STABLE]}
+    for grasp, decisions in said.items():
+        steps = [(GateState.CLOSING, Decision.UNKNOWN)] * 9
+        steps += [(GateState.JUDGED, decision) for decision in decisions for _ in range(20)]
+        steps += [(GateState.RELEASED, Decision.UNKNOWN), (GateState.IDLE, Decision.UNKNOWN)] * 5
+        for gate, decision in steps:
+            view.take(b"verdict.right", verdict(seq, decision, grasp=grasp, gate=gate), 0)
+            seq += 1
+        if grasp == 3:
+            assert view.snapshot(0).counts == {"stable": 0, "slip": 2, "unknown": 1}
+    seen = view.snapshot(0)
+    assert seen.counts == {"stable": 1, "slip": 2, "unknown": 1}
+    view.take(b"verdict.right", verdict(seq, grasp=5, gate=GateState.CLOSING), 0)
+    assert view.snapshot(0).counts == seen.counts  # not known yet
+    restarted = verdict(0, Decision.STABLE, grasp=1, boot_id="another")
+    view.take(b"verdict.right", restarted, 0)
+    assert view.snapshot(0).counts == {"stable": 2, "slip": 2, "unknown": 2}
+
+
+def test_a_grasp_that_was_over_before_watching_is_not_counted() -> None:
+    seen = seen_after(grasp=41, gate=GateState.IDLE)
+    assert seen.counts == {"stable": 0, "slip": 0, "unknown": 0}
+
+
+def test_rates_are_of_the_last_second_with_messages() -> None:
+    view = a_view()
+    for moment in range(40):  # ten seconds of 20 verdicts each
+        now_ns = moment * 250 * MS
+        for part in range(5):
+            view.take(b"verdict.right", verdict(moment * 5 + part, Decision.STABLE), now_ns)
+        seen = view.snapshot(now_ns)
+    assert figures(seen.timing)["verdicts"] == "20 /s"
+    silent = view.snapshot(now_ns + 60_000 * MS)
+    assert (silent.tone, figures(silent.timing)["verdicts"]) == (Tone.SILENT, "20 /s")
+    assert (seen.history, seen.history_p) == (["s"] * 10, [25] * 10)
+
+
+@pytest.mark.parametrize(
+    ("moments", "seconds"),
+    [
+        ([(0, Tone.STABLE, 0.1), (900, Tone.STABLE, 0.2)], [("s", 20)]),
+        ([(0, Tone.SLIP, 0.9), (999, Tone.STABLE, 0.1)], [("xs", 90)]),
+        ([(999, Tone.STABLE, 0.1), (1000, Tone.WAITING, None)], [("s", 10), ("w", -1)]),
+        ([(0, Tone.STABLE, 0.1), (3000, Tone.SLIP, 0.8)], [("s", 10), *[(".", -1)] * 2, ("x", 80)]),
+        ([(0, Tone.WAITING, None), (3_600_000, Tone.STABLE, 0.0)], [(".", -1)] * 299 + [("s", 0)]),
+    ],
+    ids=["one", "both", "next", "gap", "hour"],
+)
+def test_a_second_keeps_all_its_tones_and_a_missed_one_is_silent(
+    moments: list[tuple[int, Tone, float | None]], seconds: list[tuple[str, int]]
+) -> None:
+    history = History()
+    for at_ms, tone, p_slip in moments:
+        history.add(at_ms * MS, tone, p_slip)
+    assert history.seconds() == seconds
+
+
+def mutated(rng: random.Random, golden: dict[str, object]) -> bytes:
+    """A message with odd values, odd bytes, or cut off."""
+    content = dict(golden)
+    for key in rng.sample(sorted(content), rng.randrange(3)):
+        if isinstance(content[key], list | dict) and rng.random() < 0.5:
+            content[key] = [rng.choice(ODD) for _ in range(rng.choice((1, 2, 24, 1000)))]
+        else:
+            content[key] = rng.choice(ODD)
+    payload = bytearray(json.dumps(content).encode())
+    if rng.random() < 0.2:
+        payload[rng.randrange(len(payload))] = rng.randrange(256)
+    if rng.random() < 0.1:
+        del payload[rng.randrange(len(payload)) :]
+    return bytes(payload)
+
+
+def test_malformed_messages_stop_neither_the_view_nor_the_terminal() -> None:
+    seed = 20261121
+    rng = random.Random(seed)
+    goldens = [(path.stem.split("_")[0], json.loads(path.read_text())) for path in GOLDEN]
+    view = a_view()
+    for number in range(4000):
+        kind, golden = rng.choice(goldens)
+        payload = mutated(rng, golden)
+        try:
+            view.take(f"{kind}.right".encode(), payload, number * MS)
+            if number % 10 == 0:
+                seen = view.snapshot(number * MS)
+                json.loads(msgspec.json.encode(seen))
+                assert max(map(len, text_of(seen))) <= 80
+        except Exception as error:
+            error.add_note(f"seed {seed}, message {number}: {payload[:500]!r}")
+            raise
+    unreadable = int(figures(seen.timing)["not understood"].split()[0])
+    assert 400 < unreadable < 3600
