@@ -33,7 +33,7 @@ COMMANDS = {
     ),
     "twin": ("daemon.commands.twin", "stand in for a bridge, a CAN board or a palm"),
     "data": ("daemon.commands.data", "get the real grasp recordings"),
-    "schema": ("daemon.commands.schema", "print the JSON Schema of the messages"),
+    "schema": ("daemon.commands.texts", "print the JSON Schema of the messages"),
     "models": ("daemon.commands.models", "list the models and show their cards"),
     "session": ("daemon.commands.session", "show, reset or seed what is known of the sensors"),
     "export-grasps": (
@@ -50,8 +50,8 @@ COMMANDS = {
         "daemon.commands.report",
         "measure error, time and exactness of the models (extras: train, report)",
     ),
-    "completion": ("daemon.commands.completion", "print what makes a shell complete commands"),
-    "manual": ("daemon.commands.manual", "print the manual page: graspd manual | man -l -"),
+    "completion": ("daemon.commands.texts", "print what makes a shell complete commands"),
+    "manual": ("daemon.commands.texts", "print the manual page: graspd manual | man -l -"),
 }
 """Name: module with `add_arguments(parser)` and `run(args) -> int`, one line of help."""
 EXTRAS = {
@@ -107,7 +107,6 @@ def _parser(is_wanted: Callable[[str], bool]) -> Parser:
         description="Says before a Shadow Dexterous Hand lifts whether the grasp will hold.",
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="tell versions and leave")
-    parser.set_defaults(whole_parser=whole_parser)
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, help="what to do; each has its own --help"
     )

@@ -230,7 +230,7 @@ each_file() {
     "$1" sysusers.d/graspd.conf /usr/local/lib/sysusers.d/graspd.conf
     "$1" tmpfiles.d/graspd.conf /usr/local/lib/tmpfiles.d/graspd.conf
     "$1" udev/70-graspd.rules /usr/local/lib/udev/rules.d/70-graspd.rules
-    "$1" man/graspd.1 /usr/local/share/man/man1/graspd.1
+    "$1" shell/graspd.1 /usr/local/share/man/man1/graspd.1
 }
 
 did() {

@@ -35,7 +35,7 @@ BEGUN_FIRST = (
     "bench/test_mutants.py",
     "bench/test_fuzz.py",
     "stability/test_models.py",
-    "daemon/measure/test_report.py",
+    "daemon/measure/test_error_vs_time.py",
     "daemon/doctor/test_healthy.py",
     "daemon/judge/test_only_stable_if.py",
     "daemon/judge/test_grasps_to_the_lift.py",

@@ -24,7 +24,7 @@ from models.runtime import TactileModel
 
 if TYPE_CHECKING:
     from daemon.judge.decision import GateLimits, HandLimits
-    from daemon.measure.cost.tables import Footprint
+    from daemon.measure.cost import Footprint
 
 TACTILE_SECTIONS = get_args(get_args(scene_drivers.Tactile)[0])
 """Of each tactile driver, as a scene may name it."""
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     found = [(path, _check(path, args)) for path in args.scene]
     costs = [(path, checked.cost) for path, checked in found if checked.cost is not None]
     if len(found) > 1 and costs and not args.json:
-        from daemon.measure.cost.tables import markdown
+        from daemon.measure.cost import markdown
 
         sys.stdout.writelines(f"{line}\n" for line in markdown(costs))
     return max(checked.code for _, checked in found)
@@ -82,7 +82,7 @@ def _check(path: Path, args: argparse.Namespace) -> _Checked:
         return _Checked(WRONG)
     cost = None
     if args.cost:
-        from daemon.measure.cost.tables import CostError, measure
+        from daemon.measure.cost import CostError, measure
 
         try:
             progress(f"measuring what {path} costs, some seconds")
@@ -126,11 +126,7 @@ def _write_json(path: Path, parts: Mapping[str, object], cost: Footprint | None)
     if cost is not None:
         import msgspec
 
-        content["cost"] = {
-            **msgspec.to_builtins(cost),
-            "packages": cost.packages,
-            "start": {"wall_ms": cost.start_wall_ms, "cpu_ms": cost.start_cpu_ms},
-        }
+        content["cost"] = msgspec.to_builtins(cost)
     sys.stdout.write(json.dumps(content) + "\n")
 
 
@@ -141,7 +137,7 @@ def _write(path: Path, parts: dict[str, dict[str, str]], cost: Footprint | None)
         for key, value in entries.items():
             sys.stdout.write(f"  {key:9} {printable(value)}\n")
     if cost is not None:
-        from daemon.measure.cost.tables import lines
+        from daemon.measure.cost import lines
 
         sys.stdout.writelines(f"{line}\n" for line in lines(cost))
 

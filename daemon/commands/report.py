@@ -53,7 +53,6 @@ def _stability(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--quick", action="store_true", help="10^4 outcomes instead of 10^6")
     parser.add_argument("--json", action="store_true", help="one JSON object on stdout")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables here too")
 
 
 def _worth(parser: argparse.ArgumentParser) -> None:
@@ -65,7 +64,7 @@ def _worth(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=Path("runs/worth"),
         metavar="DIR",
-        help="folder for the picture and the table, and for what networks said (runs/worth)",
+        help="folder for the picture and the table (runs/worth)",
     )
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help="of the object folds")
     parser.add_argument("--quick", action="store_true", help="few grasps, one epoch: does it run?")
@@ -73,7 +72,7 @@ def _worth(parser: argparse.ArgumentParser) -> None:
 
 REPORTS = {
     "error-vs-time": (
-        "daemon.measure.error_vs_time.report",
+        "daemon.measure.error_vs_time",
         "how wrong each model is against how long it takes",
         _error_vs_time,
     ),
@@ -83,7 +82,7 @@ REPORTS = {
         _stability,
     ),
     "worth": (
-        "daemon.measure.worth.report",
+        "daemon.measure.worth",
         "what `stable` is worth on another day, by how many outcomes were told",
         _worth,
     ),

@@ -1,6 +1,6 @@
 """Streams of another day through a session network, the learner and the risk: what they are worth.
 
-`python -m tests.bench.trust DIR --cache FOLDER` prints the tables; DIR is the folder that holds
+`python -m tests.bench.trust DIR` prints the tables; DIR is the folder that holds
 `bts3/`. The streams are those of `graspd report worth`.
 """
 
@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.measure.worth.lives import Life, live
-from daemon.measure.worth.streams import ORDERS, Plan, Stream, streams
+from daemon.measure.streams import ORDERS, Life, Plan, Stream, live, streams
 from daemon.trust.learner import Learner
 from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import read_all
@@ -143,10 +142,9 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.trust", description=__doc__)
     parser.add_argument("data", type=Path, metavar="DIR")
-    parser.add_argument("--cache", type=Path, required=True, help="folder for what is scored")
     parser.add_argument("--quick", action="store_true", help="one seed, three epochs")
     options = parser.parse_args()
-    plan = Plan(1 if options.quick else 2, epochs=3 if options.quick else None, cache=options.cache)
+    plan = Plan(1 if options.quick else 2, epochs=3 if options.quick else None)
     found = list(streams(read_all(options.data / "bts3"), plan))
     for line in itertools.chain(learning_lines(found), risk_lines(found)):
         print(line, flush=True)  # noqa: T201

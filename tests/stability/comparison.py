@@ -14,8 +14,6 @@ from daemon.judge.decision import HELD, Limits, decide
 from daemon.judge.network import Examined, Network
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, Reason
-from daemon.measure.reference.reference import Reference
-from daemon.measure.stability import INPUT_RELATIVE_MAX, P_SLIP_ERROR_MAX
 from drivers.base import TactileReading
 from models import zoo
 from models.contract import ModelContract, SessionInput
@@ -26,7 +24,12 @@ from models.session_statistics import HORIZON_GRASPS, SessionState
 from models.tactile_image import SPREAD_FLOOR_COUNTS
 from tests.stability.exact import Exact, exact_input, exact_softening, exact_standard
 from tests.stability.readings import Counts, Raw
+from tests.stability.reference import Reference
 
+INPUT_RELATIVE_MAX = 1e-5
+"""Largest error of a reading's input over the largest magnitude in that input."""
+P_SLIP_ERROR_MAX = 1e-4
+"""Largest error of a probability. A verdict further from its threshold must not flip."""
 THRESHOLD = 0.5
 LIMITS = Limits(max_age_ns=100_000_000)
 """The daemon's own threshold, and an age that these readings do not have."""

@@ -1,4 +1,4 @@
-"""Joint velocity, calibration tables and the gate under extreme times and slopes."""
+"""Calibration tables and the gate under extreme slopes and times."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from math import pi
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from daemon.judge.decision import HandLimits, JointLimits
+from daemon.judge.decision import HandLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
-from daemon.judge.joint_motion import JointMotion
 from daemon.judge.reasons import Reason
-from drivers.base import JointReading, TactileReading
+from drivers.base import TactileReading
 from drivers.palm.calibration import parse_calibration
 from drivers.palm.hall import CoupledTable, Table
 from models.contract import Finger
@@ -30,35 +28,6 @@ ANGLE_ERROR_MAX_RAD = 1e-9
 REST_COUNTS, TOUCH_COUNTS, NOISE_COUNTS = 2600, 2200, 3.5
 """Untouched and touched electrodes, and the noise measured on untouched sensors."""
 TARE_SWEEPS = 150
-
-
-def angle(t_ns: int, angle_rad: float) -> JointReading:
-    return JointReading(t_ns, 0, ("FFJ3",), np.array([angle_rad]))
-
-
-@pytest.mark.parametrize("step_ns", [0, 1, 1_000, MS])
-def test_a_jump_is_motion_however_small_the_time_difference(note: Note, step_ns: int) -> None:
-    motion = JointMotion(JointLimits())
-    with np.errstate(all="raise"):
-        motion.observe(angle(0, 0.0), 0)
-        motion.observe(angle(step_ns, 0.5), step_ns)
-        found = motion.objection(step_ns)
-    step = f"joint velocity, 0.5 rad within {step_ns} ns"
-    note(step=step, expected="moving", found=str(found))
-    assert found is Reason.MOVING
-
-
-@pytest.mark.parametrize(("share", "wanted"), [(0.999, None), (1.001, Reason.MOVING)])
-def test_the_speed_limit_is_exact_at_10_khz(
-    note: Note, share: float, wanted: Reason | None
-) -> None:
-    motion, rate, now_ns = JointMotion(JointLimits()), share * JointLimits().rad_per_s, 0
-    for now_ns in range(0, S, S // 10_000):
-        motion.observe(angle(now_ns, rate * now_ns / S), now_ns)
-    found = motion.objection(now_ns)
-    step = f"joint velocity of {rate:.4f} rad/s at 10 kHz"
-    note(step=step, expected=str(wanted or "still"), found=str(found or "still"))
-    assert found is wanted
 
 
 def test_the_steepest_table_is_exact(note: Note) -> None:

@@ -21,13 +21,13 @@ from torch import nn
 
 from daemon.judge.decision import HELD, Limits, decide
 from daemon.judge.reasons import Decision
-from daemon.measure.stability import P_SLIP_ERROR_MAX
 from models import zoo
 from models.contract import METADATA_KEY, ModelContract, VectorInput
 from models.inputs import builder
 from models.runtime import TactileModel
 from models.training.estimators.graphs import IR_VERSION, MARGIN_NAME, OPSET, with_probability
 from models.training.estimators.networks import IMAGE_SHAPE, NetworkConfig, build, for_inference
+from tests.stability.comparison import P_SLIP_ERROR_MAX
 
 Note = Callable[..., None]
 VARIANCES = torch.tensor((0.0, 1e-38, 1e-12, 1.0, 1e12, 1e38))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,12 +15,9 @@ import zmq
 
 from daemon.cli import COMMANDS, LIBRARIES, whole_parser
 from daemon.commands.arguments import Parser
-from daemon.commands.manual import page
 from drivers.recordings.csv_player import DEMO_RECORDING
-from models import zoo
 from tests.daemon.processes import GRASPD, graspd
 
-MANUAL = Path(__file__).parents[3] / "deploy/man/graspd.1"
 EXTRAS = (
     "torch", "sklearn", "scipy", "joblib", "threadpoolctl", "onnx", "onnxscript", "skl2onnx",
     "rich", "distributed", "matplotlib", "keras", "mcap", "lz4", "zstandard", "foxglove",
@@ -141,75 +136,6 @@ def test_the_version_tells_what_graspd_stands_on() -> None:
     assert told.pop("Python") == ".".join(map(str, sys.version_info[:3]))
     assert told.pop("libzmq") == zmq.zmq_version()
     assert told == {name: version(name) for name in LIBRARIES}
-
-
-LINES = {
-    "graspd re": {"replay", "report"},
-    "graspd twin ": {"spi", "can", "palm", "joints"},
-    "graspd twin spi --st": {"--stuck-clock"},
-    "graspd replay --gate ": {"settled", "every"},
-    "graspd replay --model ": set(zoo.names()),
-    "graspd train cnn1-rank-8": {"cnn1-rank-8"},
-    "graspd run --p": {"--print"},
-}
-"""What is typed, and what is offered for its last word."""
-BASH = """
-eval "$1"; shift
-COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))
-_graspd; printf '%s\\n' "${COMPREPLY[@]}"
-"""
-
-
-@pytest.mark.parametrize("line", LINES)
-def test_bash_completes(line: str) -> None:
-    script = graspd("completion", "bash").stdout
-    command = ["bash", "--norc", "-euc", BASH, "bash", script, *line.split(" ")]
-    environment = {**os.environ, "ZSH_VERSION": ""}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert set(done.stdout.split()) == LINES[line]
-    assert done.stderr == ""
-
-
-@pytest.mark.parametrize("line", LINES)
-def test_fish_completes(line: str) -> None:
-    fish = shutil.which("fish")
-    if fish is None:
-        pytest.skip("no fish: apt install fish")
-    script = graspd("completion", "fish").stdout + f"\ncomplete -C '{line}'\n"
-    done = subprocess.run(
-        [fish, "--no-config"], input=script, capture_output=True, text=True, check=True
-    )
-    assert {row.split("\t")[0] for row in done.stdout.splitlines()} == LINES[line]
-
-
-def test_zsh_takes_what_bash_does() -> None:
-    zsh = shutil.which("zsh")
-    if zsh is None:
-        pytest.skip("no zsh: apt install zsh")
-    script = graspd("completion", "zsh").stdout
-    code = 'autoload -U compinit && compinit -D -u; eval "$1"; print ${_comps[graspd]}'
-    done = subprocess.run(
-        [zsh, "-f", "-c", code, "zsh", script], capture_output=True, text=True, check=True
-    )
-    assert "_graspd" in done.stdout
-
-
-def test_the_manual_page_in_deploy_is_that_of_these_commands() -> None:
-    assert MANUAL.read_text() == page(whole_parser()), (
-        "run: python -m daemon manual > deploy/man/graspd.1"
-    )
-
-
-def test_the_manual_page_is_shown_without_a_warning() -> None:
-    man = shutil.which("man")
-    if man is None:
-        pytest.skip("no man: apt install man-db")
-    command = [man, "--local-file", "--warnings", str(MANUAL)]
-    environment = {**os.environ, "MANWIDTH": "80", "LC_ALL": "C.UTF-8"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert done.stderr == ""
-    shown = " ".join(re.sub(r"\x1b\[[0-9;]*m|.\x08", "", done.stdout).split())
-    assert "graspd export-grasps Make a grasp table of what was recorded" in shown
 
 
 def on_a_terminal(setting: dict[str, str], *arguments: str) -> bytes:

@@ -16,14 +16,12 @@ pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
 from daemon.commands.report import add_arguments
-from daemon.measure.worth import report
-from daemon.measure.worth import streams as module
-from daemon.measure.worth.lives import live
-from daemon.measure.worth.report import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, draw, measured
-from daemon.measure.worth.streams import ORDERS, Plan, Stream, streams
+from daemon.measure import streams as module
+from daemon.measure import worth
+from daemon.measure.streams import ORDERS, Plan, Stream, live, streams
+from daemon.measure.worth import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, draw, measured
 from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import Grasps, read_all
-from models.training.data.protocols import DAYS
 from models.training.systems.system import System
 
 GRASPS = 300
@@ -71,7 +69,7 @@ def test_what_is_said_of_a_grasp_does_not_know_its_outcome() -> None:
 
 
 def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
-    bts3_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bts3_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grasps = read_all(bts3_dir)
     grasps = grasps.rows(np.arange(0, len(grasps), 12))
@@ -80,13 +78,11 @@ def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
         one.tobytes(): kind
         for one, kind in zip(grasps.counts, zip(grasps.objects, tables, strict=True), strict=True)
     }
-    judged, trainings = module.judged, 0
+    judged = module.judged
 
     def watched(
         system: System, seen: Grasps, several: Sequence[NDArray[np.uint16]], seed: int
-    ) -> list[module.Said]:
-        nonlocal trainings
-        trainings += 1
+    ) -> list[tuple[NDArray[np.float64], NDArray[np.float32]]]:
         for counts in several:
             objects, poses = zip(*(of[reading.tobytes()] for reading in counts), strict=True)
             assert set(objects).isdisjoint(seen.objects)
@@ -94,9 +90,8 @@ def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
         return judged(system, seen, several, seed)
 
     monkeypatch.setattr(module, "judged", watched)
-    plan = Plan(seeds=1, epochs=1, cache=tmp_path)
+    plan = Plan(seeds=1, folds=2, epochs=1)
     found = list(streams(grasps, plan))
-    assert trainings == 2 * 4 * len(DAYS)
     assert {(one.protocol, one.table, one.order) for one in found} == {
         *(("A", "palm_45", order) for order in ORDERS),
         *(
@@ -106,11 +101,6 @@ def test_streams_are_of_objects_and_poses_that_their_networks_did_not_see(
             for order in ORDERS
         ),
     }
-    again = list(streams(grasps, plan))
-    assert trainings == 2 * 4 * len(DAYS)  # the rest is from the cache
-    for one, other in zip(found, again, strict=True):
-        for name in ("margins", "features", "published", "slipped"):
-            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +124,7 @@ def test_the_picture_has_every_method_and_is_drawn_the_same_again(
 def folder(bts3_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of the report, made in this process: it starts slowly."""
     out = tmp_path_factory.mktemp("worth")
-    assert report.run(options("--data", str(bts3_dir), "--out", str(out), "--quick")) == 0
+    assert worth.run(options("--data", str(bts3_dir), "--out", str(out), "--quick")) == 0
     return out
 
 
@@ -154,5 +144,5 @@ def test_from_tables_to_picture(folder: Path) -> None:
 def test_a_folder_without_tables_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert report.run(options("--data", str(tmp_path))) == 2
+    assert worth.run(options("--data", str(tmp_path))) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1

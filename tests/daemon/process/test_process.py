@@ -222,10 +222,10 @@ def test_closed_errors_do_not_change_the_exit_code() -> None:
 
 def test_only_an_output_that_nobody_reads_may_break_quietly() -> None:
     code = """
-import daemon.commands.schema
+import daemon.commands.texts
 def run(args):
     raise BrokenPipeError(32, "the serial line broke")
-daemon.commands.schema.run = run
+daemon.commands.texts.run = run
 """
     result = python(code, "schema")
     assert result.returncode == 1

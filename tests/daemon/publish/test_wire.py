@@ -12,7 +12,7 @@ import jsonschema
 import msgspec
 import pytest
 
-from daemon.commands.schema import schema_text
+from daemon.commands.texts import schema_text
 from daemon.judge.reasons import ADVICE, Decision, GateCause, GateState, Reason
 from daemon.publish.messages import (
     GateMessage,

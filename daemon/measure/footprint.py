@@ -1,8 +1,7 @@
 """What a scene costs, measured from within a process of its own that runs nothing else.
 
-`daemon.measure.cost.tables` starts it. It takes up the parts one by one, in the order of
-`graspd run`, and notes after each what the process has become. Imports stand where they are
-measured, and what parts share is counted with the first of them.
+`daemon.measure.cost` starts it. It takes up the parts one by one, in the order of `graspd run`, and
+notes after each what the process has become. Imports stand where they are measured.
 """
 
 from __future__ import annotations
@@ -17,16 +16,12 @@ if TYPE_CHECKING:
     from contextlib import ExitStack
     from pathlib import Path
 
-    import numpy as np
-    from numpy.typing import NDArray
-
     from daemon.assembly.parts import Parts
     from daemon.judge.pipeline import Pipeline
     from daemon.publish.outbox import Outbox
     from daemon.scene import Scene
     from drivers.base import Driver, Reading
-    from models.contract import ModelContract
-    from models.runtime import TactileModel
+    from models.contract import SeenCounts
 
 CORE = (
     ("numpy", ("numpy",)),
@@ -36,19 +31,6 @@ CORE = (
     ("graspd", ("daemon.commands.run",)),
 )
 """Part and modules: what every scene imports."""
-ELSEWHERE = (
-    ("driver replay", ("drivers.recordings.csv_player",)),
-    ("driver spi", ("drivers.spi.driver",)),
-    ("driver can", ("drivers.can.driver",)),
-    ("driver palm", ("drivers.palm.driver",)),
-    ("joints", ("daemon.judge.joint_motion", "drivers.joints.driver", "drivers.palm.calibration")),
-    ("gate", ("daemon.judge.hand",)),
-    ("session", ("daemon.judge.calibration",)),
-    ("session file", ("daemon.session.keeper",)),
-    ("questions", ("daemon.publish.questions",)),
-    ("keys", ("daemon.publish.keys", "zmq.auth.thread")),
-)
-"""Part and modules: what only some scenes import."""
 READINGS = 300
 """Readings that are timed: three grasps."""
 SILENCE_NS = 100_000_000
@@ -62,32 +44,27 @@ class Meter:
 
     def __init__(self, started_ns: int) -> None:
         """Begin with the interpreter, started at monotonic `started_ns`."""
-        self.parts: list[dict[str, object]] = []
-        self._last = {"modules": 0, "rss_kib": 0, "threads": 0, "descriptors": 0}
-        self._wall_ns, self._cpu_ns = started_ns, 0
+        self.parts: list[dict[str, float | str]] = []
+        self._first = dict.fromkeys(_now(), 0) | {"wall_ms": started_ns / 1e6}
+        self._last = self._first
         self.take("interpreter")
 
     def take(self, name: str) -> None:
         """Count all that was added since the last call for the part `name`."""
-        wall_ns, cpu_ns = time.monotonic_ns(), time.process_time_ns()
         now = _now()
-        added: dict[str, object] = {key: now[key] - self._last[key] for key in now}
-        added["wall_ms"] = (wall_ns - self._wall_ns) / 1e6
-        added["cpu_ms"] = (cpu_ns - self._cpu_ns) / 1e6
-        self.parts.append({"name": name, **added})
-        self.skip()
+        self.parts.append(_added(name, self._last, now))
+        self._last = now
 
-    def skip(self) -> None:
-        """Count what was added since the last call for no part."""
-        self._last = _now()
-        self._wall_ns, self._cpu_ns = time.monotonic_ns(), time.process_time_ns()
+    def whole(self, name: str) -> dict[str, float | str]:
+        """Return all that was added until the last call of `take`."""
+        return _added(name, self._first, self._last)
 
 
 def main(arguments: list[str]) -> int:
     """Measure; `arguments` are the scene, a folder for sockets, and the monotonic ns of the start.
 
-    One JSON object on stdout, as `tables.Footprint` reads it. 2 and a line on stderr if the
-    scene, its model or its files are wrong.
+    Writes one JSON object to stdout, as `cost.Footprint` reads it. Returns 2, with a line on
+    stderr, if the scene, its model or its files are wrong.
     """
     path, folder, started_ns = arguments
     meter = Meter(int(started_ns))
@@ -112,14 +89,13 @@ def main(arguments: list[str]) -> int:
     from drivers.base import DriverError
     from models.contract import ModelError
 
-    meter.skip()
     try:
         with ExitStack() as stack:
-            found = _measure(meter, Path(path), Path(folder), stack)
+            cost = _measure(meter, Path(path), Path(folder), stack)
     except (SceneError, ModelError, DriverError, PublishError) as error:
         complain(error)
         return WRONG
-    sys.stdout.write(json.dumps(found) + "\n")
+    sys.stdout.write(json.dumps(cost) + "\n")
     return 0
 
 
@@ -132,27 +108,27 @@ def _measure(meter: Meter, path: Path, folder: Path, stack: ExitStack) -> dict[s
     meter.take("scene")
     model = assembly.load_model(wanted)
     meter.take("model")
-    drivers = _drivers(wanted, meter, stack)
-    pipeline = _pipeline(wanted, model, meter)
+    drivers = _drivers(wanted, stack)
+    meter.take(f"driver {wanted.tactile.driver}")
+    pipeline = assembly.build_pipeline(wanted, model, learns=wanted.session.learn)
+    meter.take("judge")
     outbox = _around(Parts(wanted, model, pipeline, drivers), meter, stack)
-    feed = _feed(wanted, drivers[0], model.contract)
-    meter.skip()
-    _judge(next(feed), pipeline, outbox)
+    readings = _readings(wanted, drivers[0], model.contract.seen)
+    _judge(next(readings), pipeline, outbox)
     meter.take("first reading")
-    timed = _timed(feed, pipeline, outbox)
-    meter.take("readings")
-    whole, modules = _now(), sorted(sys.modules)
+    start = meter.whole("all")
+    timed = _timed(readings, pipeline, outbox)
     return {
         "parts": meter.parts,
-        "whole": whole | {"peak_kib": _status("VmHWM")},
-        "modules": modules,
+        "start": start,
+        "peak_kib": _status("VmHWM"),
+        "modules": sorted(sys.modules),
         "timed": timed,
-        "left_out": _left_out(),
     }
 
 
 def _apart(wanted: Scene, folder: Path) -> Scene:
-    """The scene with its sockets and its session in `folder`, playing recordings at once."""
+    """Return the scene with its sockets and session in `folder`, playing recordings at once."""
     from daemon.scene.drivers import ReplayTactile
     from daemon.scene.scene import Ask
 
@@ -168,44 +144,24 @@ def _apart(wanted: Scene, folder: Path) -> Scene:
     return wanted.model_copy(update={"ask": ask, "tactile": tactile, **places})
 
 
-def _drivers(wanted: Scene, meter: Meter, stack: ExitStack) -> list[Driver]:
-    """The drivers, constructed; one that plays recordings is open as well."""
+def _drivers(wanted: Scene, stack: ExitStack) -> list[Driver]:
+    """Construct the drivers, and open one that plays recordings."""
     from daemon.assembly import assembly
     from daemon.scene.drivers import PalmJoints, ReplayTactile
 
-    drivers = assembly.build_drivers(wanted.model_copy(update={"joints": None}))
+    drivers = assembly.build_drivers(wanted)
     if isinstance(wanted.tactile, ReplayTactile):
         stack.callback(drivers[0].close)
         assembly.open_driver(drivers[0])
-    meter.take(f"driver {wanted.tactile.driver}")
-    if wanted.joints is not None:
-        drivers += assembly.build_drivers(wanted)[1:]
-        if isinstance(wanted.joints, PalmJoints):
-            from drivers.palm.calibration import load_calibration
+    if isinstance(wanted.joints, PalmJoints):
+        from drivers.palm.calibration import load_calibration
 
-            load_calibration(wanted.joints.calibration)
-    gated = assembly.gate_mode(wanted) != "every"
-    if (gated and assembly.joint_limits(wanted) is not None) or wanted.joints is not None:
-        meter.take("joints")
+        load_calibration(wanted.joints.calibration)
     return drivers
 
 
-def _pipeline(wanted: Scene, model: TactileModel, meter: Meter) -> Pipeline:
-    from daemon.assembly import assembly
-
-    every = wanted.gate.model_copy(update={"mode": "every", "sweeps": None})
-    learns = wanted.session.learn
-    simple = wanted.model_copy(update={"gate": every})
-    pipeline = assembly.build_pipeline(simple, model, learns=learns)
-    meter.take("judge" if pipeline.session is None else "judge, session")
-    if assembly.gate_mode(wanted) != "every":
-        pipeline = assembly.build_pipeline(wanted, model, learns=learns)
-        meter.take("gate")
-    return pipeline
-
-
 def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
-    """What `graspd run` puts around the judge."""
+    """Build what `graspd run` puts around the judge."""
     from daemon.assembly.parts import Assembly
     from daemon.publish.sockets import Sockets
 
@@ -227,45 +183,33 @@ def _around(parts: Parts, meter: Meter, stack: ExitStack) -> Outbox:
     return outbox
 
 
-def _feed(wanted: Scene, driver: Driver, contract: ModelContract) -> Iterator[Reading]:
-    """Readings to judge: those of the scene's own recordings, else synthetic grasps."""
+def _readings(wanted: Scene, driver: Driver, seen: SeenCounts) -> Iterator[Reading]:
+    """Yield the readings of the scene's own recordings, else synthetic grasps made now."""
     from daemon.scene.drivers import ReplayTactile
 
     if isinstance(wanted.tactile, ReplayTactile):
-        return _played(driver)
-    joints = wanted.joints is not None
-    from daemon.run.rehearsal import grasps
-
-    counts = list(grasps(contract.seen, READINGS))
-    return _synthetic(counts, joints=joints)
-
-
-def _played(driver: Driver) -> Iterator[Reading]:
-    while not driver.exhausted:
-        yield from driver.read_ready()
-
-
-def _synthetic(counts: list[NDArray[np.uint16]], *, joints: bool) -> Iterator[Reading]:
-    """Readings of these counts made now, and with `joints` angles that waver before each."""
+        while not driver.exhausted:
+            yield from driver.read_ready()
+        return
     import numpy as np
 
-    from daemon.run.rehearsal import PERIOD_NS
+    from daemon.run.rehearsal import PERIOD_NS, grasps
     from drivers.base import JointReading, TactileReading
 
-    sound = np.zeros(counts[0].shape, dtype=np.uint8)
-    hall_rad = 0.0006
-    for number, values in enumerate(counts):
+    hall_rad = 0.0006  # a count of a Hall sensor: frozen angles would not be believed
+    for number, counts in enumerate(grasps(seen, READINGS)):
         now_ns, made_ns = time.monotonic_ns(), number * PERIOD_NS
-        if joints:
+        if wanted.joints is not None:
             angles = np.array([0.2, 0.2 + hall_rad * (number % 2)])
             yield JointReading(now_ns, number, ("FFJ3", "MFJ3"), angles, made_ns)
-        yield TactileReading(now_ns, number, values, sound, recorded_ns=made_ns)
+        sound = np.zeros(counts.shape, dtype=np.uint8)
+        yield TactileReading(now_ns, number, counts, sound, recorded_ns=made_ns)
 
 
 def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, int, bool] | None:
-    """CPU time, ns, of judging and of reporting, and whether the network ran; None for joints.
+    """Return the CPU time of judging and reporting, ns, and True if the network ran.
 
-    What else runs on the machine counts for nothing.
+    None for joints.
     """
     from drivers.base import JointReading
 
@@ -281,26 +225,24 @@ def _judge(reading: Reading, pipeline: Pipeline, outbox: Outbox) -> tuple[int, i
 
 
 def _timed(
-    feed: Iterator[Reading], pipeline: Pipeline, outbox: Outbox
+    readings: Iterator[Reading], pipeline: Pipeline, outbox: Outbox
 ) -> dict[str, dict[str, float]]:
-    """CPU time of the readings, us: all of them, those that were judged, and reporting them."""
-    judge: list[int] = []
-    network: list[int] = []
-    report: list[int] = []
-    for reading in feed:
-        if pipeline.on_request and len(judge) % ASK_EVERY == 0:
+    """Return quantiles of CPU time: of all readings, those judged, and reporting."""
+    times_ns: dict[str, list[int]] = {"reading": [], "judged": [], "report": []}
+    for reading in readings:
+        if pipeline.on_request and len(times_ns["reading"]) % ASK_EVERY == 0:
             pipeline.ask()
-        times = _judge(reading, pipeline, outbox)
-        if times is None:
+        took = _judge(reading, pipeline, outbox)
+        if took is None:
             continue
-        judge.append(times[0])
-        report.append(times[1])
-        if times[2]:
-            network.append(times[0])
-        if len(judge) == READINGS:
+        judge_ns, report_ns, ran = took
+        times_ns["reading"].append(judge_ns)
+        times_ns["report"].append(report_ns)
+        if ran:
+            times_ns["judged"].append(judge_ns)
+        if len(times_ns["reading"]) == READINGS:
             break
-    found = {"reading": judge, "judged": network, "report": report}
-    return {name: _quantiles(times_ns) for name, times_ns in found.items() if times_ns}
+    return {name: _quantiles(values) for name, values in times_ns.items() if values}
 
 
 def _quantiles(times_ns: list[int]) -> dict[str, float]:
@@ -312,32 +254,26 @@ def _quantiles(times_ns: list[int]) -> dict[str, float]:
     }
 
 
-def _left_out() -> list[dict[str, object]]:
-    """What the parts that the scene does not import would add, by their code alone."""
-    import importlib
-
-    meter = Meter(time.monotonic_ns())
-    for name, modules in ELSEWHERE:
-        missing = [module for module in modules if module not in sys.modules]
-        meter.skip()
-        for module in missing:
-            importlib.import_module(module)
-        if modules[0] in missing:
-            meter.take(name)
-    return meter.parts[1:]
-
-
-def _now() -> dict[str, int]:
+def _now() -> dict[str, float]:
     return {
         "modules": len(sys.modules),
         "rss_kib": _status("VmRSS"),
         "threads": _status("Threads"),
         "descriptors": len(os.listdir("/proc/self/fd")) - 1,  # without that of the listing
+        "wall_ms": time.monotonic_ns() / 1e6,
+        "cpu_ms": time.process_time_ns() / 1e6,
     }
 
 
+def _added(name: str, before: dict[str, float], after: dict[str, float]) -> dict[str, float | str]:
+    added: dict[str, float | str] = {"name": name}
+    for key, value in after.items():
+        added[key] = value - before[key]
+    return added
+
+
 def _status(key: str) -> int:
-    """A number of /proc/self/status (proc(5)); memory is in KiB."""
+    """Return a number of /proc/self/status (proc(5)); memory is in KiB."""
     with open("/proc/self/status", encoding="ascii", errors="replace") as lines:
         return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:"))
 

@@ -19,8 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from daemon.measure.worth.lives import live
-from daemon.measure.worth.streams import RANDOM, Plan, Stream, streams
+from daemon.measure.streams import RANDOM, Plan, Stream, live, streams
 from daemon.process.text import complain, markdown_table, progress
 from daemon.trust.risk import RiskLimits
 from models.training.data.datasets import DatasetError, read_all
@@ -57,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Measure, draw, print; 2 if data or folder are wrong."""
     try:
         grasps = read_all(args.data)
-        plan = Plan(args.seeds, cache=args.out / "networks")
+        plan = Plan(args.seeds)
         if args.quick:
             plan = Plan(seeds=1, folds=1, epochs=1)
             chosen = np.linspace(0, len(grasps) - 1, min(QUICK_GRASPS, len(grasps)))

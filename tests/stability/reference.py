@@ -14,50 +14,32 @@ from numpy.typing import NDArray
 from onnx import numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from models.contract import OUTPUT_NAME, ModelError
+from models.contract import OUTPUT_NAME
 
 CHUNK = 128
-"""Readings at a time: the products of a convolution of so many take 30 MB."""
+"""Readings at a time: the products of a convolution of these take 30 MB."""
 NARROW = (onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16)
-OPSET_MIN = 19
-"""First version whose integer operators the evaluator has; to those of 18 it only adds types."""
-STEPPED = frozenset(
-    {
-        "TreeEnsembleClassifier",
-        "TreeEnsembleRegressor",
-        "QuantizeLinear",
-        "DynamicQuantizeLinear",
-    }
-)
+STEPPED = frozenset({"TreeEnsembleClassifier", "TreeEnsembleRegressor"})
 """Operators that jump: the least change of an input may change the answer by a whole step."""
-QUANTISED = frozenset({"QuantizeLinear", "DynamicQuantizeLinear", "MatMulInteger", "ConvInteger"})
 
 
 class Reference:
     """One model file, evaluated in float64: constants are widened, casts to less are left out."""
 
     def __init__(self, path: Path) -> None:
-        """Raises `ModelError` for a file with an operator of which there is no reference."""
         model = onnx.load(path)
         operators = frozenset(node.op_type for node in model.graph.node)
         self.is_stepped = bool(operators & STEPPED)
-        """Whether the answer jumps, so that only the same input can give the same answer."""
-        self.is_quantised = bool(operators & QUANTISED)
-        """Whether anything is computed in integers."""
-        # A range that is taken per run is that of one reading in the daemon.
-        self._chunk = 1 if "DynamicQuantizeLinear" in operators else CHUNK
+        """True if the answer jumps, so that only the same input can give the same answer."""
         self._input_name = model.graph.input[0].name
         _widen(model)
-        try:
-            self._evaluator = ReferenceEvaluator(model)
-        except RuntimeError as error:
-            raise ModelError(f"{path}: has no float64 reference: {error}") from error
+        self._evaluator = ReferenceEvaluator(model)
 
     def probabilities(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
         """Probabilities (N, 2), stable and slip, of inputs (N, *shape) of any float type."""
         wide = inputs.astype(np.float64)
-        starts = range(0, len(wide), self._chunk)
-        parts = [self._run(wide[start : start + self._chunk]) for start in starts]
+        starts = range(0, len(wide), CHUNK)
+        parts = [self._run(wide[start : start + CHUNK]) for start in starts]
         return np.concatenate([np.empty((0, 2)), *parts])
 
     def _run(self, inputs: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -67,9 +49,6 @@ class Reference:
 
 def _widen(model: onnx.ModelProto) -> None:
     """Turn all that is a narrower float into float64, in place."""
-    for opset in model.opset_import:
-        if not opset.domain:
-            opset.version = max(opset.version, OPSET_MIN)
     tensors = list(model.graph.initializer)
     for node in model.graph.node:
         for attribute in node.attribute:

@@ -16,8 +16,10 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Bbox
 
-Found = dict[str, Any]
+Report = dict[str, Any]
+"""Figures as `error-vs-time.json` has them."""
 Row = dict[str, Any]
+"""One candidate of a report: `name`, `kind` (`model` or `peer`), `fingers`, `error`, `time`."""
 
 DEFAULT = "small-session"
 PANELS = (
@@ -25,9 +27,9 @@ PANELS = (
     (("objects", "objects-whole"), "other objects"),
     (("session",), "another day"),
 )
-"""Protocols, of which a model has one at most, and what they ask.
+"""Protocols, of which a model has one at most, and their question.
 
-What lacks the first of them was measured on two palm poses only, and is drawn hollow."""
+A model without the first of them was measured on two palm poses only, and is drawn hollow."""
 COLOURS = {"model": "#1f6f8b", "peer": "#c65d21"}
 MARKERS = {"model": "o", "peer": "s"}
 SIZE_IN = (9.5, 9.6)
@@ -64,12 +66,12 @@ class Point:
 
 
 def error_of(row: Row, protocols: Sequence[str]) -> dict[str, float]:
-    """Figures of the first of these protocols that a row has; empty if it has none."""
+    """Return the figures of the first of these protocols that a row has; empty: none."""
     return next((row["error"][name] for name in protocols if name in row["error"]), {})
 
 
 def points(rows: Sequence[Row], protocols: Sequence[str]) -> Iterator[Point]:
-    """Candidates for the whole hand that have figures of one of these protocols."""
+    """Yield the candidates for the whole hand that have figures of one of these protocols."""
     most = max(len(row["fingers"]) for row in rows)
     for row in rows:
         error = error_of(row, protocols)
@@ -85,37 +87,28 @@ def points(rows: Sequence[Row], protocols: Sequence[str]) -> Iterator[Point]:
 
 
 def front(several: Sequence[Point]) -> list[Point]:
-    """Models that none is both faster and more exact than, the fastest first."""
-    found: list[Point] = []
+    """Return the models without another that is both faster and more exact, fastest first."""
+    best: list[Point] = []
     for point in sorted(several, key=lambda point: (point.us, point.error)):
-        if point.kind == "model" and (not found or point.error < found[-1].error):
-            found.append(point)
-    return found
+        if point.kind == "model" and (not best or point.error < best[-1].error):
+            best.append(point)
+    return best
 
 
-def draw(found: Found) -> str:
-    """The picture, as SVG."""
+def draw(report: Report) -> str:
+    """Return the picture, as SVG."""
     mpl.rcParams["svg.hashsalt"] = "graspd"
     figure = Figure(figsize=SIZE_IN, dpi=72, layout="constrained")
     panels = figure.subplots(len(PANELS), 1, sharex=True)
-    drawn = [list(points(found["rows"], protocols)) for protocols, _ in PANELS]
+    drawn = [list(points(report["rows"], protocols)) for protocols, _ in PANELS]
     times = [point.us for point in itertools.chain(*drawn)]
-    times += [row["time"]["paced_p50_us"] for row in _floors(found)]
     panels[-1].set_xscale("log")
     panels[-1].set_xlim(min(times) / 1.5, max(times) * 1.5)
     for axes, several, (_, asked) in zip(panels, drawn, PANELS, strict=True):
         _draw_panel(axes, several, asked)
-        for row in _floors(found):
-            axes.axvline(row["time"]["paced_p50_us"], color="#888", ls=":", lw=1)
-    for row in _floors(found):
-        x = row["time"]["paced_p50_us"]
-        panels[0].text(
-            x, 0.98, f" {row['name']}", fontsize=FONT_PT, va="top", color="#666",
-            transform=panels[0].get_xaxis_transform(),
-        )  # fmt: skip
     panels[-1].set_xlabel("time of a reading, input and network, paced at 100 Hz, p50, us")
-    figure.suptitle(_title(found), fontsize=11)
-    figure.draw_without_rendering()  # now it is known where everything is
+    figure.suptitle(_title(report), fontsize=11)
+    figure.draw_without_rendering()  # so that all have a place
     for axes, several in zip(panels, drawn, strict=True):
         name_points(axes, several)
     text = io.StringIO()
@@ -123,13 +116,9 @@ def draw(found: Found) -> str:
     return text.getvalue()
 
 
-def _floors(found: Found) -> list[Row]:
-    return [row for row in found["rows"] if row["kind"] == "floor"]
-
-
-def _title(found: Found) -> str:
-    said = f"Error against run time, on {found['machine']['processor']}"
-    few = " - from few readings (--quick): the times are rough" if found["quick"] else ""
+def _title(report: Report) -> str:
+    said = f"Error against run time, on {report['machine']['processor']}"
+    few = " - from few readings (--quick): the times are rough" if report["quick"] else ""
     key = (
         "circles: graspd's models, squares: peers, line: the front, bars: 95 %, "
         "hollow: two palm poses only"

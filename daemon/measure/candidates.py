@@ -1,0 +1,159 @@
+"""Candidates of the report: graspd's models, and the published code around the network `cnn1`.
+
+That network is not trained here: its time does not depend on its weights.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from daemon.measure.timing import Step
+from models.bts3 import FINGERS
+from models.contract import Finger, ModelError
+from models.layout import D1
+from models.runtime import TactileModel
+from models.training.data.datasets import Grasps
+from models.training.estimators.networks import CNN1
+
+CONFIDENCE = 0.95
+Errors = dict[str, dict[str, float]]
+"""By protocol: `f1` with `low` and `high` (95 %), accuracy, brier, ece; all in 0..1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A model or a peer that can be timed."""
+
+    name: str
+    kind: str
+    """`model` or `peer`."""
+    fingers: tuple[Finger, ...]
+    error: Errors
+    step: Step
+
+
+def candidates(folders: Sequence[Path], grasps: Grasps) -> list[Candidate]:
+    """Return the models of these folders, and the published code if Keras is installed.
+
+    `grasps` are what is read. Raises `ModelError` for a file that is no model or has no
+    card.
+    """
+    paths = [path for folder in folders for path in sorted(folder.glob("*.onnx"))]
+    models = [_model(path, grasps) for path in paths]
+    if find_spec("keras") is None:
+        return models
+    published = Candidate(
+        "published: loops, Keras predict",
+        "peer",
+        FINGERS,
+        next((model.error for model in models if model.name == "cnn1"), {}),
+        _published(grasps.counts),
+    )
+    return [*models, published]
+
+
+def _model(path: Path, grasps: Grasps) -> Candidate:
+    model, card_path = TactileModel(path), path.with_suffix(".json")
+    contract = model.contract
+    try:
+        card: dict[str, Any] = json.loads(card_path.read_bytes())
+        error = {name: errors(figures) for name, figures in card["protocols"].items()}
+    except (OSError, ValueError, KeyError) as problem:
+        raise ModelError(f"{card_path}: cannot read the card: {problem}") from problem
+    return Candidate(contract.name, "model", contract.fingers, error, model_step(model, grasps))
+
+
+def model_step(model: TactileModel, grasps: Grasps) -> Step:
+    """Return what graspd does with a reading. Raises `ModelError` if the grasps lack a finger."""
+    try:
+        counts = grasps.of_fingers(model.contract.fingers).counts
+    except ValueError as error:
+        raise ModelError(f"{model.path}: {error}") from error
+
+    def step(index: int) -> None:
+        model.inputs.build(counts[index % len(counts)], model.input)
+        model.run()
+
+    return step
+
+
+def errors(figures: dict[str, Any]) -> dict[str, float]:
+    """Return the figures of a protocol; F1's interval is Nadeau and Bengio's corrected t-test."""
+    spreads, folds = figures["spreads"], figures["folds"]
+    f1 = spreads["f1"]
+    share = figures["test_grasps"] / figures["train_grasps"]
+    error = f1["std"] * math.sqrt(1.0 / folds + share)
+    reach = error * float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, folds - 1))
+    return {
+        "f1": f1["mean"],
+        "low": max(f1["mean"] - reach, 0.0),
+        "high": min(f1["mean"] + reach, 1.0),
+        **{name: spreads[name]["mean"] for name in ("accuracy", "brier", "ece")},
+    }
+
+
+def loop_image(counts: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Return the image (12, 11, fingers) of counts (fingers, 24) as the authors' notebooks do.
+
+    It is the same as `TactileImager`'s, pixel by pixel and so slower.
+    """
+    height, width = D1.shape
+    images = []
+    for finger in counts:
+        image = np.zeros((height, width))
+        filled = np.zeros((height, width), dtype=bool)
+        for electrode in range(len(finger)):
+            image[D1.rows[electrode], D1.columns[electrode]] = finger[electrode]
+            filled[D1.rows[electrode], D1.columns[electrode]] = True
+        while not filled.all():
+            before, known = image.copy(), filled.copy()
+            for row in range(height):
+                for column in range(width):
+                    if known[row, column]:
+                        continue
+                    around = [
+                        before[y, x]
+                        for y in range(max(row - 1, 0), min(row + 2, height))
+                        for x in range(max(column - 1, 0), min(column + 2, width))
+                        if known[y, x]
+                    ]
+                    if around:
+                        image[row, column] = sum(around) / len(around)
+                        filled[row, column] = True
+        images.append((image - image.mean()) / image.std())
+    return np.stack(images, axis=-1).astype(np.float32)
+
+
+def _published(counts: NDArray[np.uint16]) -> Step:
+    # Keras reads it once, when it is imported.
+    os.environ.setdefault("KERAS_BACKEND", "torch")
+    import keras
+
+    layers = keras.layers
+    model = keras.Sequential(
+        [
+            keras.Input((*D1.shape, counts.shape[1])),
+            layers.Conv2D(CNN1.filters, 3, use_bias=False),
+            layers.BatchNormalization(),
+            layers.ReLU(),
+            layers.Flatten(),
+            layers.Dense(CNN1.hidden),
+            layers.BatchNormalization(),
+            layers.ReLU(),
+            layers.Dense(2, activation="softmax"),
+        ]
+    )
+    return lambda index: model.predict(
+        loop_image(counts[index % len(counts)])[np.newaxis], verbose=0
+    )

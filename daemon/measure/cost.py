@@ -1,0 +1,135 @@
+"""What scenes cost: starts `footprint` for each, and puts its figures into tables."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+
+from daemon.process.text import markdown_table, printable
+
+TIMEOUT_S = 120.0
+"""A scene takes a second; on a very busy machine a few."""
+MESSAGE_MAX = 320
+"""Characters of an error that are shown."""
+KIB_PER_MIB = 1024
+
+
+class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one part of a scene adds to the process."""
+
+    name: str
+    modules: int
+    rss_kib: int
+    """Resident memory, KiB."""
+    threads: int
+    descriptors: int
+    wall_ms: float
+    cpu_ms: float
+
+
+class Quantiles(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """CPU time of one thing done `number` times, us."""
+
+    number: int
+    p50_us: float
+    p99_us: float
+
+
+class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What one scene costs. Drivers of hardware are constructed and not opened."""
+
+    parts: tuple[Part, ...]
+    """In the order in which they come; what parts share is counted with the first of them."""
+    start: Part
+    """From the start of the process to the first reading judged and reported."""
+    peak_kib: int
+    """Largest resident memory, KiB."""
+    modules: tuple[str, ...]
+    """Names of all that are imported."""
+    timed: dict[str, Quantiles]
+    """CPU time of a `reading`, of one that is `judged` by the network, and of its `report`."""
+
+
+class CostError(Exception):
+    """The scene could not be measured; the message says why."""
+
+
+def measure(scene: Path) -> Footprint:
+    """Run the scene's parts in a process of their own. Raises `CostError`.
+
+    Takes about a second. Nothing is published, and no device or kept session is touched.
+    """
+    with tempfile.TemporaryDirectory(prefix="graspd-") as folder:
+        # -P, so that the files in the folder at hand are not taken for modules.
+        command = [sys.executable, "-P", "-m", "daemon.measure.footprint", str(scene), folder]
+        try:
+            result = subprocess.run(
+                [*command, str(time.monotonic_ns())],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                timeout=TIMEOUT_S,
+                check=False,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise CostError(f"{scene}: cannot be measured: {error}") from error
+    if result.returncode != 0:
+        why = result.stderr.strip().removeprefix("graspd: ")[-MESSAGE_MAX:]
+        raise CostError(f"{scene}: cannot be measured: {why or result.returncode}")
+    return msgspec.json.decode(result.stdout, type=Footprint)
+
+
+def lines(cost: Footprint) -> Iterator[str]:
+    """Yield the cost of one scene, part by part, for people."""
+    heads = ("modules", "MiB", "threads", "descr.", "wall ms", "CPU ms")
+    yield f"  {'cost':16}" + "".join(f"{head:>9}" for head in heads)
+    for part in (*cost.parts, cost.start):
+        yield (
+            f"  {part.name:16}{part.modules:9}{part.rss_kib / KIB_PER_MIB:9.1f}{part.threads:9}"
+            f"{part.descriptors:9}{part.wall_ms:9.1f}{part.cpu_ms:9.1f}"
+        )
+    yield f"  at most {cost.peak_kib / KIB_PER_MIB:.1f} MiB"
+    for name, times in cost.timed.items():
+        yield (
+            f"  {name}: p50 {times.p50_us:.0f} us, p99 {times.p99_us:.0f} us of CPU time "
+            f"({times.number})"
+        )
+
+
+TITLES = (
+    "Scene",
+    "Modules",
+    "Memory, MiB (over Python's own)",
+    "Threads",
+    "Descriptors",
+    "Start, ms (CPU)",
+    "Per reading, us p50 / p99",
+    "Judged, us p50",
+)
+
+
+def markdown(costs: Sequence[tuple[Path, Footprint]]) -> Iterator[str]:
+    """Return the lines of a table with a row for each scene."""
+    rows = [_cells(printable(path.stem), cost) for path, cost in costs]
+    return markdown_table(TITLES, rows, right=TITLES[1:])
+
+
+def _cells(name: str, cost: Footprint) -> Sequence[str]:
+    start, reading, judged = cost.start, cost.timed.get("reading"), cost.timed.get("judged")
+    over_kib = start.rss_kib - cost.parts[0].rss_kib
+    return (
+        name,
+        str(start.modules),
+        f"{start.rss_kib / KIB_PER_MIB:.1f} ({over_kib / KIB_PER_MIB:.1f})",
+        str(start.threads),
+        str(start.descriptors),
+        f"{start.wall_ms:.0f} ({start.cpu_ms:.0f})",
+        "-" if reading is None else f"{reading.p50_us:.0f} / {reading.p99_us:.0f}",
+        "-" if judged is None else f"{judged.p50_us:.0f}",
+    )

@@ -1,0 +1,98 @@
+"""Make the manual page and what completes commands, of the parsers of the command line.
+
+`python -m tests.daemon.commands.shell_files` writes them to `deploy/shell`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import shtab
+from argparse_manpage.manpage import Manpage
+
+from daemon.cli import whole_parser
+from daemon.commands.arguments import Parser
+from daemon.commands.texts import SHELLS
+from models import zoo
+
+FOLDER: Final = Path(__file__).parents[3] / "deploy" / "shell"
+SECTIONS: Final = {
+    "exit status": """.TP
+.B 0
+Done.
+.TP
+.B 1
+Something failed while running, or doctor has found something.
+.TP
+.B 2
+The command line, a scene, a recording or a model is wrong.
+.TP
+.B 130, 143
+Stopped by SIGINT or SIGTERM before the work was done.
+""",
+    "environment": """.TP
+.B NO_COLOR
+If it is not empty, nothing is coloured on a terminal.
+.TP
+.B TERM
+If it is dumb, neither.
+""",
+    "files": """.TP
+.B /etc/graspd/*.toml
+Scenes of the service graspd@.service, one per hand.
+.TP
+.B /run/graspd
+Sockets of the service.
+.TP
+.B /var/lib/graspd
+What each hand has learned, and recordings.
+""",
+}
+
+
+def parsers(parser: Parser) -> Iterator[Parser]:
+    """Yield the parser and those of all its commands."""
+    yield parser
+    for command in parser.subparsers.values():
+        yield from parsers(command)
+
+
+def manual() -> str:
+    """Return the manual page. It has no date and no version: it is kept in a file."""
+    page = Manpage(whole_parser())
+    page.date, page.manual = "", "User Commands"
+    page.description = "says before a Shadow Dexterous Hand lifts whether the grasp will hold"
+    for heading, text in SECTIONS.items():
+        page.add_section(heading, "=", text)
+    return str(page)
+
+
+def completion(shell: str) -> str:
+    """Return the script for a shell; values without choices are completed as file names."""
+    whole = whole_parser()
+    for parser in parsers(whole):
+        for action in parser.actions:
+            if action.choices is not None or action.nargs == 0:
+                continue
+            if action.dest == "model":
+                action.choices = zoo.names()
+            else:
+                action.complete = shtab.FILE  # type: ignore[attr-defined]
+    script: str = shtab.complete(whole, shell, root_prefix="graspd")
+    return script
+
+
+def files() -> Iterator[tuple[Path, str]]:
+    """Yield each file of the folder and what should be in it."""
+    yield FOLDER / "graspd.1", manual()
+    for shell in SHELLS:
+        yield FOLDER / f"graspd.{shell}", completion(shell)
+
+
+if __name__ == "__main__":
+    os.environ["COLUMNS"] = "80"
+    for path, text in files():
+        path.write_text(text)
