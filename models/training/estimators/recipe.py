@@ -13,7 +13,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from models.training.arrays import Bools, Floats, Floats32
 from models.training.estimators.day_shift import DayShift, on_another_day
-from models.training.estimators.networks import AnyNetwork, build
+from models.training.estimators.networks import NetworkConfig, build
 
 THREADS = 1
 """Threads of a training. Fixed, because sums over more threads round differently; one, because two
@@ -99,13 +99,17 @@ def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
 
 
 def train_network(
-    config: AnyNetwork, inputs: Floats32, slipped: Bools | Floats, recipe: AnyRecipe, *, seed: int
+    config: NetworkConfig,
+    inputs: Floats32,
+    slipped: Bools | Floats,
+    recipe: AnyRecipe,
+    *,
+    seed: int,
 ) -> nn.Sequential:
-    """Train a network on inputs (N, *shape); returns it in evaluation mode.
+    """Train a network on inputs (N, *shape) and labels (N,). It is returned in evaluation mode.
 
-    `slipped` (N,) are labels or probabilities of slip. The same arguments give the same weights on
-    the same machine. Each epoch sees the grasps once, shuffled. Raises `ValueError` for less than
-    two grasps.
+    The same arguments give the same weights on the same machine. Each epoch sees the grasps once,
+    shuffled. Raises `ValueError` for less than two grasps.
     """
     if len(inputs) < 2:
         raise ValueError(f"cannot train on {len(inputs)} grasps")

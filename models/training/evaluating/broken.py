@@ -11,7 +11,7 @@ from sklearn.metrics import f1_score
 from models.electrodes import Electrodes
 from models.training.arrays import Bools, Numbers
 from models.training.data.datasets import COUNT_MAX, Grasps
-from models.training.data.folds import fold_seed, folds_of
+from models.training.data.protocols import fold_seed, folds_of
 from models.training.fitting.trained import Trained, train
 from models.training.systems.system import System
 

@@ -20,7 +20,7 @@ from models.training.data.datasets import Grasps
 from models.training.data.protocols import PROTOCOLS, EvalProtocol
 from models.training.evaluating.day_figures import DayFigures, day_figures
 from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.metrics import (
     METRICS,
     CurvePoint,
@@ -36,7 +36,7 @@ from models.training.evaluating.metrics import (
     wilson,
 )
 from models.training.fitting.calibration import cross_fitted_p_slip, fit_temperature, p_slip
-from models.training.systems.system import System, digest
+from models.training.systems.system import digest
 
 FORMAT = 1
 HEADLINE = "n50"
@@ -136,16 +136,24 @@ Results = Mapping[int, Sequence[JobResult]]
 """By seed: the results of all folds."""
 
 
-def summarise(system: System, protocol: EvalProtocol, results: Results, grasps: Grasps) -> Summary:
-    """The figures of a system in a protocol; `results` hold every fold of every seed."""
-    flat = [result for folds in results.values() for result in folds]
+def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> Summary:
+    """Return the figures of a system in a protocol.
+
+    `found` has its jobs, all folds of every seed in their order, and their results.
+    """
+    flat = list(found.values())
     names = list(flat[0].margins)
+    job = next(iter(found))
+    system = job.system
+    results: dict[int, list[JobResult]] = {}
+    for each, result in found.items():
+        results.setdefault(each.seed, []).append(result)
     return Summary(
         format=FORMAT,
         system=system.name,
         description=system.description,
         digest=digest(system),
-        protocol=protocol,
+        protocol=job.protocol,
         data=grasps.digest(),
         files=grasps.files,
         seeds=tuple(results),

@@ -8,8 +8,7 @@ from models.contract import SeenCounts
 from models.inputs import builder, raw_features
 from models.training.arrays import Floats, Floats32, Ints, Numbers
 from models.training.data.datasets import Grasps
-from models.training.fitting.fit import fit
-from models.training.fitting.fitted import Fitted
+from models.training.fitting.fit import Fitted, fit
 from models.training.fitting.novelty import seen_counts
 from models.training.fitting.sensor_mapping import SensorMapping
 from models.training.fitting.standards import TrainingStandards

@@ -59,10 +59,14 @@ def make_model(
     cannot be written.
     """
     wanted = plan.jobs(grasps)
-    found = run_jobs(
-        wanted, grasps, results, processes=plan.processes, on_result=lambda *_: on_done()
-    )
-    summaries = _summaries(plan, grasps, found)
+    found = {}
+    for job, result in run_jobs(wanted, grasps, results, processes=plan.processes):
+        found[job] = result
+        on_done()
+    summaries = [
+        summarise({job: found[job] for job in wanted if job.protocol == protocol}, grasps)
+        for protocol in plan.protocols(grasps)
+    ]
     again = jobs.run(wanted[0], grasps)
     on_done()
     system = plan.system
@@ -87,7 +91,7 @@ def make_model(
         calibrated_by=calibrator.protocol,
         broken=None if plan.only else broken_study(system, trained.grasps, plan.seed),
         never_seen=_never_seen(trained, contract, plan.seed),
-        same_seed_same_margins=_same(found[0], again),
+        same_seed_same_margins=_same(found[wanted[0]], again),
         command=plan.command,
         made_with=made_with(LIBRARIES) | {"machine": platform.machine()},
         weak_points=weak_points(summaries, trained.grasps),
@@ -99,19 +103,6 @@ def make_model(
 def _calibrator(summaries: list[Summary]) -> Summary:
     """What probabilities are calibrated by: new objects, where they were measured."""
     return summaries[min(1, len(summaries) - 1)]
-
-
-def _summaries(plan: TrainingPlan, grasps: Grasps, found: list[JobResult]) -> list[Summary]:
-    results = list(zip(plan.jobs(grasps), found, strict=True))
-    return [
-        summarise(
-            plan.system,
-            protocol,
-            {plan.seed: [result for job, result in results if job.protocol == protocol]},
-            grasps,
-        )
-        for protocol in plan.protocols(grasps)
-    ]
 
 
 def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) -> ModelContract:

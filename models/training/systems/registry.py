@@ -13,7 +13,6 @@ from models.tactile_image import Composition, Fill, Normalisation
 from models.training.data.augmentation import Augmentation
 from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig
 from models.training.estimators.classical import SvmConfig as Svm
-from models.training.estimators.compression import Compression, HalfWeights, Integers, LowRank
 from models.training.estimators.networks import (
     CNN0,
     CNN1,
@@ -25,7 +24,6 @@ from models.training.estimators.networks import (
 from models.training.estimators.recipe import PublishedRecipe, Recipe, SessionRecipe
 from models.training.systems.system import (
     BlendConfig,
-    DistilConfig,
     Member,
     Published,
     SessionFeatures,
@@ -49,17 +47,11 @@ IMAGE = image()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
-RANKS = (8, 16, 32, 64, 128, 256)
-NARROW = ((4, 32), (8, 64), (16, 64))
-"""Filters and hidden units."""
 SHARP_SVM = Svm(c=5.0, gamma=0.02)
 SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
 SESSION_RECIPE = SessionRecipe()
 SESSION_SVM = Svm(c=3.0, gamma=0.003)
 SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
-SESSION_BLEND = BlendConfig(
-    (Member(SESSION_SVM), Member(SESSION_BOOSTING), Member(SMALL_SESSION, SESSION_RECIPE, copies=2))
-)
 
 
 def cnn(
@@ -180,31 +172,6 @@ _COMPOSITIONS = tuple(
 )
 """CNN0 on the images of the paper's table II, beside `cnn0` itself."""
 
-_FORMS: dict[str, tuple[str, Compression]] = {
-    "f16": ("with weights of 16 bits", HalfWeights()),
-    "int8": ("with weights and inputs of layers of 8 bits", Integers(static=False)),
-    "int8-static": ("the same, with ranges taken from the training", Integers(static=True)),
-    **{
-        f"rank-{rank}": (f"its large layer factored to rank {rank}", LowRank(rank))
-        for rank in RANKS
-    },
-}
-_SMALLER = (
-    *(
-        replace(cnn(f"cnn1-{name}", f"CNN1 {text}.", CNN1), compression=how)
-        for name, (text, how) in _FORMS.items()
-    ),
-    *(
-        cnn(
-            f"narrow-{filters}x{hidden}",
-            f"Conv{filters} - FC{hidden} on the same image as CNN1.",
-            NetworkConfig(filters=filters, hidden=hidden),
-        )
-        for filters, hidden in NARROW
-    ),
-)
-"""CNN1 in smaller forms, and narrower networks: what is error worth in run time?"""
-
 _ELECTRODES = (
     System(
         "svm-electrodes",
@@ -267,20 +234,6 @@ _SESSION = (
         SESSION_RECIPE,
         tables=EVERY_TABLE,
     ),
-    System(
-        "blend-session",
-        "Mean of a support vector machine, gradient boosting and two small networks, "
-        "session-calibrated.",
-        SESSION,
-        SESSION_BLEND,
-    ),
-    System(
-        "distilled-session",
-        "Conv16 - FC64 that has learned from the blend, session-calibrated.",
-        SESSION,
-        DistilConfig(SESSION_BLEND, SMALL_SESSION, inner_folds=3),
-        SESSION_RECIPE,
-    ),
 )
 
 
@@ -303,7 +256,6 @@ SYSTEMS = {
         *_PAPER,
         *_LAYOUTS,
         *_COMPOSITIONS,
-        *_SMALLER,
         *_ELECTRODES,
         *_SESSION,
         *_fewer_fingers(),

@@ -149,7 +149,7 @@ LINES = {
     "graspd twin spi --st": {"--stuck-clock"},
     "graspd replay --gate ": {"settled", "every"},
     "graspd replay --model ": set(zoo.names()),
-    "graspd train cnn1-rank-8": {"cnn1-rank-8"},
+    "graspd train cnn1-faith": {"cnn1-faithful"},
     "graspd run --p": {"--print"},
 }
 """What is typed, and what is offered for its last word."""

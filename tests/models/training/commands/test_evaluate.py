@@ -18,9 +18,9 @@ pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 pytest.importorskip("rich", reason="the train extra is not installed")
 
 from models.training.commands import evaluate, evaluation
-from models.training.estimators.classical import SvmConfig
-from models.training.evaluating import jobs
-from models.training.evaluating.grid import grid_of
+from models.training.commands.evaluation import grid_of
+from models.training.estimators.classical import GRIDS, ForestConfig, SvmConfig
+from models.training.evaluating import jobs, run_jobs
 from models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import write_sessions
 
@@ -110,8 +110,7 @@ def test_a_grid_names_the_best_of_all_its_points(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    points = [SvmConfig(cost, gamma) for cost in (0.01, 3.0) for gamma in (1e-4, 0.01)]
-    monkeypatch.setattr(SvmConfig, "grid", staticmethod(lambda: points))
+    monkeypatch.setitem(GRIDS, SvmConfig, [{"c": (0.01, 3.0), "gamma": (1e-4, 0.01)}])
     options = ["--grid", "--protocol", "cv", "--quick", "--data", str(data)]
     assert graspd_evaluate("svm", "cnn1", *options, "--out", str(tmp_path)) == 0
     report = json.loads((tmp_path / "svm.cv.grid.json").read_text())
@@ -123,13 +122,19 @@ def test_a_grid_names_the_best_of_all_its_points(
 
 
 def test_grids_are_the_papers() -> None:
-    machines = [system.estimator for system in grid_of(SYSTEMS["svm"])]
-    costs = [machine.c for machine in machines if isinstance(machine, SvmConfig)]
+    points = grid_of(SYSTEMS["svm"])
+    machines = [point.estimator for point in points if isinstance(point.estimator, SvmConfig)]
+    costs, gammas = {one.c for one in machines}, {one.gamma for one in machines}
     assert (min(costs), max(costs)) == (0.01, 5000.0)
-    names = [system.name for system in grid_of(SYSTEMS["svm"])]
-    assert len(set(names)) == len(names) == len(machines)
+    assert {"auto", 1e-4, 0.1} < gammas
+    forests = [point.estimator for point in grid_of(SYSTEMS["rf"])]
+    depths = {forest.depth for forest in forests if isinstance(forest, ForestConfig)}
+    assert {None, 5, 30} < depths
+    names = {point.name for point in points}
+    assert len(names) == len(points) == 8 * 7
+    assert "svm-c=3.0-gamma=0.1" in names
     assert not any("/" in name or " " in name for name in names)
-    assert grid_of(SYSTEMS["cnn1"]) == []
+    assert grid_of(SYSTEMS["cnn1"]) == grid_of(SYSTEMS["blend-electrodes"]) == []
 
 
 @pytest.mark.parametrize(
@@ -193,8 +198,8 @@ def test_a_value_out_of_range_is_exit_code_2(
 def test_no_cluster_is_exit_code_1_and_says_so(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cluster = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 1)
+    pytest.importorskip("distributed", reason="no extra: cluster")
+    monkeypatch.setattr(run_jobs, "CONNECT_TIMEOUT_S", 1)
     options = ["--data", str(data), "--out", str(tmp_path), "--dask", "tcp://127.0.0.1:9"]
     assert graspd_evaluate("svm", "--quick", *options) == 1
     last = capsys.readouterr().err.splitlines()[-1]

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
-from models.training.data.folds import TooFewGraspsError, folds_of
+from models.training.data.protocols import TooFewGraspsError, folds_of
 
 
 def test_folds_are_stratified_and_leave_each_grasp_out_once() -> None:

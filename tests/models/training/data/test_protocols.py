@@ -12,12 +12,14 @@ import pytest
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.training.data.datasets import Grasps, concatenate, read_all
-from models.training.data.folds import TooFewGraspsError, fold_seed, object_folds
 from models.training.data.protocols import (
     ABOUT,
     PROTOCOLS,
     UNKNOWN_OBJECTS,
     EvalProtocol,
+    TooFewGraspsError,
+    fold_seed,
+    object_folds,
     splits,
 )
 from tests.models.training.evaluation_samples import OBJECTS, sessions, table

@@ -143,7 +143,7 @@ def test_a_stored_result_is_found_and_a_broken_one_is_not(
     judged: JobResult, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     assert jobs.load(tmp_path, SESSION_JOB, "data") is None
-    jobs.save(tmp_path, SESSION_JOB, "data", judged.to_bytes())
+    jobs.save(tmp_path, SESSION_JOB, "data", judged)
     found = jobs.load(tmp_path, SESSION_JOB, "data")
     assert found is not None
     assert np.array_equal(found.test, judged.test)

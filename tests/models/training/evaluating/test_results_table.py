@@ -14,7 +14,7 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 
 from models.training.data.protocols import EvalProtocol, splits
-from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
 from models.training.evaluating.summaries import (
     Summary,
@@ -45,11 +45,12 @@ def summary_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) 
         ages = {"running": np.arange(len(test))} if protocol == "session" else {}
         return JobResult(test, variants, train, 2.0, 1000, ages)
 
-    results = {
-        seed: [result(split.test, len(split.train)) for split in splits(protocol, GRASPS, seed, 4)]
+    found = {
+        Job(SYSTEMS[name], protocol, seed, fold, 4): result(split.test, len(split.train))
         for seed in range(seeds)
+        for fold, split in enumerate(splits(protocol, GRASPS, seed, 4))
     }
-    return summarise(SYSTEMS[name], protocol, results, GRASPS)
+    return summarise(found, GRASPS)
 
 
 def test_a_summary_counts_every_grasp() -> None:

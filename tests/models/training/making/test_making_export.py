@@ -35,10 +35,9 @@ from models.inputs import builder, raw_features
 from models.runtime import TactileModel
 from models.training.data.datasets import read_whole
 from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
-from models.training.estimators.networks import DenseConfig, NetworkConfig, SecondConvolution
+from models.training.estimators.networks import NetworkConfig, SecondConvolution
 from models.training.estimators.recipe import Recipe
-from models.training.fitting.fit import fit
-from models.training.fitting.fitted import Fitted
+from models.training.fitting.fit import Fitted, fit
 from models.training.fitting.standards import Standards
 from models.training.making.export import ExportError, export
 from models.training.systems.registry import SESSION, SYSTEMS
@@ -87,7 +86,6 @@ CASES = {
         IMAGE, replace(TINY, pool=True, second=SecondConvolution(5), dropout=0.3), QUICK
     ),
     "session network": Case(STATISTICS, replace(TINY, dropout=0.3), QUICK),
-    "dense network": Case(VECTOR, DenseConfig((8,)), QUICK),
     "svm": Case(VECTOR, SvmConfig(3.0, 0.1)),
     "hard svm": Case(STATISTICS, SvmConfig(5000.0, "auto")),
     "mlp": Case(VECTOR, MlpConfig((8, 8), epochs=30)),

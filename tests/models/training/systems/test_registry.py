@@ -18,7 +18,6 @@ from models.training.systems.names import SYSTEM_NAMES
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import (
     BlendConfig,
-    DistilConfig,
     Member,
     Published,
     SessionFeatures,
@@ -64,18 +63,6 @@ DIGESTS = {
     "cnn0-d3-least-contact": "de2b6399d0e374a8",
     "cnn0-horizontal": "67c4b936b6a0c533",
     "cnn0-vertical": "0ed7d70f45f76289",
-    "cnn1-f16": "a0fda49cb89a400d",
-    "cnn1-int8": "7b8e85f90d18aeb7",
-    "cnn1-int8-static": "5979621fd7593bbf",
-    "cnn1-rank-8": "388474a4a1160213",
-    "cnn1-rank-16": "81990778239f10c2",
-    "cnn1-rank-32": "7b70a7b23630c13a",
-    "cnn1-rank-64": "15a17cc30be8f195",
-    "cnn1-rank-128": "47a524947e5b5630",
-    "cnn1-rank-256": "cc563a5b887ca41b",
-    "narrow-4x32": "93a587daf72167dd",
-    "narrow-8x64": "098053519dd33f54",
-    "narrow-16x64": "350f27915f9647ab",
     "svm-electrodes": "51f1f8c6b94928e5",
     "blend-electrodes": "34c960d716e9e91f",
     "cnn0-electrodes": "eb858d8898f13d04",
@@ -84,8 +71,6 @@ DIGESTS = {
     "hgb-session": "55e8da68027a2237",
     "cnn1-session": "1c1bf2e2aff948d1",
     "small-session": "0c08d8572eacdc69",
-    "blend-session": "8f94a987c3c2f29c",
-    "distilled-session": "52e0f227795e8e62",
     "small-session-ff": "51c0c46eb213b6ac",
     "small-session-mf": "3b561ff9c79aabc2",
     "small-session-th": "5acaf16e51f45eb7",
@@ -185,11 +170,13 @@ def test_no_two_systems_are_the_same() -> None:
 
 
 def test_all_recipes_of_a_system_can_be_changed_at_once() -> None:
-    changed = with_recipes(SYSTEMS["distilled-session"], epochs=2, threads=3)
+    small, blend = SYSTEMS["small-session"], SYSTEMS["blend-electrodes"]
+    changed = with_recipes(small, epochs=2, threads=3)
     assert isinstance(changed.recipe, Recipe)
     assert (changed.recipe.epochs, changed.recipe.threads) == (2, 3)
-    assert isinstance(changed.estimator, DistilConfig)
-    recipes = [member.recipe for member in changed.estimator.teacher.members if member.recipe]
+    estimator = with_recipes(blend, epochs=2, threads=3).estimator
+    assert isinstance(estimator, BlendConfig)
+    recipes = [member.recipe for member in estimator.members if member.recipe]
     assert recipes
     assert all((recipe.epochs, recipe.threads) == (2, 3) for recipe in recipes)
     assert with_recipes(SYSTEMS["svm"], epochs=2) == SYSTEMS["svm"]
