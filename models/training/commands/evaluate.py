@@ -50,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dask",
         metavar="ADDRESS",
-        help="scheduler of a Dask cluster, tcp://HOST:PORT, to run on instead, if it has two threads or more (extra: cluster); "
+        help="scheduler of a Dask cluster of two threads or more, tcp://HOST:PORT, to run on "
+        "instead (extra: cluster); "
         "it runs what it is sent: only in a network that you trust",
     )
     parser.add_argument(
