@@ -29,13 +29,15 @@ from models.training.evaluating.metrics import (
     Spread,
     accuracy_at,
     coverage_curve,
+    cross_fitted_p_slip,
+    fit_temperature,
     over_seeds,
+    p_slip,
     reject_threshold,
     reliability_bins,
     score,
     wilson,
 )
-from models.training.fitting.calibration import cross_fitted_p_slip, fit_temperature, p_slip
 from models.training.systems.system import digest
 
 FORMAT = 1

@@ -14,9 +14,9 @@ from torch import nn
 from models.inputs import VectorBuilder
 from models.tactile_image import TactileImager
 from models.training.estimators import recipe as recipes
-from models.training.estimators.day_shift import DayShift
 from models.training.estimators.networks import NetworkConfig, build
 from models.training.estimators.recipe import (
+    DayShift,
     PublishedRecipe,
     Recipe,
     SessionRecipe,
@@ -134,12 +134,6 @@ def test_the_published_recipe_updates_as_keras_does(
             weights[place] = weights[place] - step * first[place] / (np.sqrt(second[place]) + 1e-8)
     for tensor, expected in zip(network.parameters(), weights, strict=True):
         assert tensor.detach().numpy() == pytest.approx(expected, abs=2e-4)
-
-
-def test_the_published_recipe_is_the_published_one() -> None:
-    recipe = PublishedRecipe()
-    assert (recipe.epochs, recipe.batch) == (300, 32)
-    assert (recipe.learning_rate, recipe.decay, recipe.l2) == (1e-4, 0.005, 0.01)
 
 
 @pytest.mark.parametrize(

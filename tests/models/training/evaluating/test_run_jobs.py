@@ -24,10 +24,12 @@ from joblib.externals.loky import get_reusable_executor
 from models.contract import VectorInput
 from models.training.data.datasets import Grasps
 from models.training.estimators.classical import ForestConfig
+from models.training.estimators.networks import NetworkConfig
+from models.training.estimators.recipe import Recipe
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.run_jobs import ClusterError, run_jobs
-from models.training.systems.system import System
+from models.training.systems.system import SessionFeatures, System
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(120)
@@ -64,7 +66,9 @@ def assert_same(ours: dict[Job, JobResult], theirs: dict[Job, JobResult]) -> Non
 
 
 def test_two_processes_give_what_one_gives_bit_for_bit(tmp_path: Path) -> None:
-    wanted = some_jobs(6)
+    network = NetworkConfig(filters=4, hidden=8)
+    small = System("small", "A network.", SessionFeatures(), network, Recipe(epochs=2))
+    wanted = [*some_jobs(3), *(Job(small, "objects", 2, fold, 4) for fold in range(3))]
     alone = dict(run_jobs(wanted, GRASPS, tmp_path / "one"))
     both = dict(run_jobs(wanted, GRASPS, tmp_path / "two", processes=2))
     assert_same(both, alone)
