@@ -27,7 +27,7 @@ from models.training.evaluating.jobs import Job, JobResult, jobs_of
 from models.training.evaluating.results_table import Made, results_table
 from models.training.evaluating.run_jobs import run_jobs
 from models.training.evaluating.summaries import (
-    Summary,
+    SystemSummary,
     made_with,
     read_summaries,
     summarise,
@@ -110,7 +110,7 @@ def _quick(system: System) -> System:
 
 def _summaries(
     systems: Sequence[System], grasps: Grasps, args: argparse.Namespace
-) -> list[Summary]:
+) -> list[SystemSummary]:
     """Run all jobs. Each summary is stored and printed as soon as its jobs are done."""
     seeds = range(args.seeds or (1 if args.quick else SEEDS))
     folds = QUICK_FOLDS if args.quick else FOLDS
@@ -121,7 +121,7 @@ def _summaries(
     }
     wanted = [job for group in groups.values() for job in group]
     found: dict[Job, JobResult] = {}
-    made: dict[tuple[str, str], Summary] = {}
+    made: dict[tuple[str, str], SystemSummary] = {}
     with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
         results = run_jobs(wanted, grasps, args.out / "jobs", processes=args.jobs, dask=args.dask)
         for job, result in results:
@@ -134,7 +134,7 @@ def _summaries(
     return [made[key] for key in groups]
 
 
-def _show(summary: Summary, args: argparse.Namespace) -> None:
+def _show(summary: SystemSummary, args: argparse.Namespace) -> None:
     if args.grid:
         return
     write_summary(summary, args.out)
@@ -143,7 +143,7 @@ def _show(summary: Summary, args: argparse.Namespace) -> None:
         sys.stdout.flush()
 
 
-def _line(summary: Summary) -> str:
+def _line(summary: SystemSummary) -> str:
     f1, accuracy = (summary.main.spreads[name] for name in ("f1", "accuracy"))
     error = "" if f1.error is None else f", s.e. {100 * f1.error:.2f} over {f1.seeds} seeds"
     return (
@@ -189,7 +189,7 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
 
 
 def _report_grids(
-    systems: Sequence[System], summaries: Sequence[Summary], args: argparse.Namespace
+    systems: Sequence[System], summaries: Sequence[SystemSummary], args: argparse.Namespace
 ) -> None:
     """Write all points of each grid, the best F1 first, and name the best."""
     for system in systems:

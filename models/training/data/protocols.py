@@ -154,7 +154,7 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
 
 
 def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """The same groups of objects leave all days: so many splits of each of `DAYS`."""
+    """Leave the same groups of objects out of all days: a split for each fold of each of `DAYS`."""
     folds = min(folds, DAYS_FOLDS)
     every = _rows(grasps, *WHOLE, NEW_SESSION)
     fold_of = np.full(len(grasps), -1)

@@ -184,7 +184,7 @@ def paired_difference(
 
 
 def wilson(accuracy: float, grasps: int) -> Fraction:
-    """A share of right verdicts among so many grasps, with its interval."""
+    """Return the share of right verdicts among `grasps` grasps, with its interval."""
     spread = Z_95**2 / grasps
     centre = (accuracy + spread / 2.0) / (1.0 + spread)
     half = math.sqrt(accuracy * (1.0 - accuracy) * spread + spread**2 / 4.0) / (1.0 + spread)

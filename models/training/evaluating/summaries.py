@@ -102,7 +102,7 @@ class Variant:
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class SystemSummary:
     """All that is known of a system in one protocol."""
 
     format: int
@@ -138,7 +138,7 @@ Results = Mapping[int, Sequence[JobResult]]
 """By seed: the results of all folds."""
 
 
-def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> Summary:
+def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> SystemSummary:
     """Return the figures of a system in a protocol.
 
     `found` has its jobs, all folds of every seed in their order, and their results.
@@ -150,7 +150,7 @@ def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> Summary:
     results: dict[int, list[JobResult]] = {}
     for each, result in found.items():
         results.setdefault(each.seed, []).append(result)
-    return Summary(
+    return SystemSummary(
         format=FORMAT,
         system=system.name,
         description=system.description,
@@ -177,20 +177,20 @@ def made_with(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
     return {"machine": machine, "python": platform.python_version(), **versions}
 
 
-def write_summary(summary: Summary, folder: Path) -> None:
+def write_summary(summary: SystemSummary, folder: Path) -> None:
     """Store a summary as `SYSTEM.PROTOCOL.json` in the folder. Raises `OSError`."""
     write_whole(folder / f"{summary.system}.{summary.protocol}.json", to_json(summary))
 
 
-def read_summary(path: Path) -> Summary:
-    """Read a summary. Raises `OSError`, or `ValueError` if it is none of this format."""
-    summary = msgspec.json.decode(path.read_bytes(), type=Summary)
+def read_summary(path: Path) -> SystemSummary:
+    """Read a summary. Raises `OSError`, or `ValueError` if it has another format."""
+    summary = msgspec.json.decode(path.read_bytes(), type=SystemSummary)
     if summary.format != FORMAT:
         raise ValueError(f"{path}: format {summary.format}, not {FORMAT}")
     return summary
 
 
-def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[Summary]:
+def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[SystemSummary]:
     """The summaries in a folder that are of this data and of these systems.
 
     `data` is the digest of the grasps, `digests` are those of the systems by name. In the order of

@@ -26,7 +26,7 @@ from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import FEWEST_JUDGED
 from models.training.evaluating.run_jobs import run_jobs
-from models.training.evaluating.summaries import Summary, made_with, summarise
+from models.training.evaluating.summaries import SystemSummary, made_with, summarise
 from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
 from models.training.fitting.standards import PRIOR_GRASPS, RUNNING
 from models.training.fitting.trained import Trained, train
@@ -34,8 +34,8 @@ from models.training.making.card import (
     LIBRARIES,
     Card,
     Data,
+    ExportedFile,
     Measured,
-    ModelFile,
     NeverSeen,
     weak_points,
 )
@@ -82,7 +82,7 @@ def make_model(
     card = Card(
         what=system.description,
         contract=contract,
-        file=ModelFile.of(path, parity),
+        file=ExportedFile.of(path, parity),
         parameters=trained.fitted.parameters,
         data=Data.of(grasps.files),
         system=configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
@@ -100,12 +100,14 @@ def make_model(
     return card
 
 
-def _calibrator(summaries: list[Summary]) -> Summary:
+def _calibrator(summaries: list[SystemSummary]) -> SystemSummary:
     """What probabilities are calibrated by: new objects, where they were measured."""
     return summaries[min(1, len(summaries) - 1)]
 
 
-def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) -> ModelContract:
+def _contract(
+    plan: TrainingPlan, trained: Trained, summaries: list[SystemSummary]
+) -> ModelContract:
     return ModelContract(
         version=2,
         name=plan.model,
@@ -120,7 +122,7 @@ def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) ->
     )
 
 
-def _confidence(summary: Summary) -> tuple[ConfidenceStep, ...]:
+def _confidence(summary: SystemSummary) -> tuple[ConfidenceStep, ...]:
     """Of few grasps the surest are too few to say how often they are right."""
     judged = summary.folds * summary.test_grasps
     return tuple(
@@ -130,14 +132,14 @@ def _confidence(summary: Summary) -> tuple[ConfidenceStep, ...]:
     )
 
 
-def _measured(summary: Summary) -> MeasuredError:
+def _measured(summary: SystemSummary) -> MeasuredError:
     f1, accuracy = summary.main.spreads["f1"], summary.main.spreads["accuracy"]
     return MeasuredError(
         summary.protocol, summary.folds, f1.mean, f1.std, accuracy.mean, accuracy.std
     )
 
 
-def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
+def _input(system: System, trained: Trained, summaries: list[SystemSummary]) -> Input:
     if not isinstance(system.input, SessionFeatures):
         return system.input
     if trained.standards is None:
@@ -153,7 +155,7 @@ def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
     )
 
 
-def _sharpness(summaries: list[Summary]) -> tuple[Sharpness, ...]:
+def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
     """How much less sure a young session is than the calibrated model, never more sure."""
     base = _calibrator(summaries).main.temperature
     later = next((s for s in summaries if s.protocol == "days"), None)

@@ -37,7 +37,7 @@ class Member:
     recipe: AnyRecipe | None = None
     """Of a network."""
     copies: int = 1
-    """So many, each from another seed."""
+    """How many of it are trained, each from another seed."""
     weight: float = 1.0
     """Of all copies together."""
 
@@ -54,7 +54,7 @@ Estimator = NetworkConfig | ClassicalConfig | BlendConfig
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class PaperFigure:
     """A figure of the paper, %, slip positive: mean and standard deviation."""
 
     protocol: EvalProtocol
@@ -81,7 +81,7 @@ class System:
     """Those that it judges by."""
     tables: tuple[str, ...] = WHOLE
     """What the model that is kept is trained on; protocols say for themselves."""
-    published: tuple[Published, ...] = ()
+    published: tuple[PaperFigure, ...] = ()
 
 
 def digest(system: System) -> str:

@@ -17,7 +17,7 @@ from models.training.data.protocols import EvalProtocol, splits
 from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.results_table import ONE_ROW, Made, difference, results_table
 from models.training.evaluating.summaries import (
-    Summary,
+    SystemSummary,
     read_summaries,
     read_summary,
     summarise,
@@ -33,7 +33,7 @@ MADE = Made("graspd evaluate --data DIR", 90.0, {"machine": "a desk", "numpy": "
 TRUTH = np.where(GRASPS.slipped, 2.0, -2.0)
 
 
-def summary_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> Summary:
+def summary_of(name: str, protocol: EvalProtocol, wrong: float, seeds: int = 2) -> SystemSummary:
     """A system that is wrong on this share of the grasps, at random."""
     flip = np.random.default_rng(len(name)).random(len(GRASPS)) < wrong
     margins = np.where(flip, -TRUTH, TRUTH)
