@@ -72,7 +72,7 @@ class SeenCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distance_max: Annotated[float, msgspec.Meta(gt=0.0)]
     """A reading with a larger root-mean-square whitened deviation was never seen."""
     distance_min: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
-    """One with a smaller one neither: it is nobody's grasp, it is the mean of them all."""
+    """A reading with a smaller one was never seen either: it is the mean of all, not a grasp."""
 
     def whitening_matrix(self) -> NDArray[np.float64]:
         """L of `whitening`, shape (electrodes, electrodes), lower triangular, 1/counts.
@@ -107,7 +107,7 @@ class Sharpness(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How far a verdict may be trusted while a session is young."""
 
     grasps: Annotated[float, msgspec.Meta(ge=0.0)]
-    """From so many grasps' worth of statistics on."""
+    """Weight of the session's statistics from which on this holds, grasps."""
     temperature: Annotated[float, msgspec.Meta(ge=1.0)]
     """The margin (log-odds of slip) is divided by this; as measured on a session left out."""
 
@@ -144,13 +144,13 @@ class ConfidenceStep(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     confidence: Fraction
     """Judging only where max(p_slip, 1 - p_slip) reaches this ..."""
     accuracy: Fraction
-    """... so many verdicts were right ..."""
+    """... this share of the verdicts was right ..."""
     coverage: Fraction
-    """... and so many grasps were judged."""
+    """... and this share of the grasps was judged."""
 
 
 class ModelContract(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Everything that must agree between a model and whoever feeds it."""
+    """Everything that must agree between a model and the program that feeds it."""
 
     version: Literal[2]
     name: str

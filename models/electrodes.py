@@ -199,7 +199,7 @@ class NoveltyCheck:
         return square <= LEARNED_DISTANCES**2 * self._square_max
 
     def square(self, values: NDArray[np.float64], repaired: int = 0) -> float:
-        """Mean square whitened deviation of counts (fingers, 24) with so many `repaired`."""
+        """Mean square whitened deviation of counts (fingers, 24); `repaired` of them count as 0."""
         deviations = (values.ravel() - self._centre) @ self._whitening
         return float(deviations @ deviations) / (self._electrodes - repaired)
 

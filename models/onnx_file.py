@@ -17,7 +17,7 @@ VARINT_BYTES_MAX = 10
 """Of 64 bits, seven in each byte."""
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-"""Kinds of fields; the other two, groups, nobody writes any more."""
+"""Kinds of fields. The other two, groups, are out of use."""
 
 _OF_ONNX = """
     Abs Add And ArgMax ArgMin AveragePool BatchNormalization Cast CastLike Ceil Celu Clip Concat

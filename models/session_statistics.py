@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 HORIZON_GRASPS = 300.0
-"""Older grasps fade once so many have been seen. Without it, 400 grasps of one object would bias
+"""Grasps after which older ones fade. Without it, 400 grasps of one object would bias
 the next thousand; with it the session forgets them, and a fresh sensor's slow drift is followed."""
 REPEAT_DISTANCE, REPEAT_IN_PRIOR = 0.05, 0.15
 """A reading that is nearer to the last one than this (root mean square, in the session's spreads or

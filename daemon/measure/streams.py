@@ -22,8 +22,7 @@ from daemon.trust.risk import Permission, RiskLimits
 from daemon.trust.trust import Trust
 from models.inputs import SessionBuilder, builder, raw_features
 from models.training.data.datasets import Grasps
-from models.training.data.folds import fold_seed, object_folds
-from models.training.data.protocols import DAYS, DAYS_FOLDS
+from models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, object_folds
 from models.training.fitting.trained import train
 from models.training.systems.registry import SYSTEMS
 from models.training.systems.system import SessionFeatures, System, with_recipes

@@ -122,14 +122,14 @@ _shtab_graspd_evaluate_options=(
   "--out[folder for results\; what is there already is not run again (default\: runs\/evaluate)]:DIR:_files"
   "--seeds[split seeds (default\: 3)]:N:_files"
   "--jobs[processes on this machine (default\: 1)]:N:_files"
-  "--dask[scheduler of a Dask cluster, tcp\:\/\/HOST\:PORT, to run on instead (extra\: cluster)\; it runs what it is sent\: only in a network that you trust]:ADDRESS:_files"
+  "--dask[scheduler of a Dask cluster of two threads or more, tcp\:\/\/HOST\:PORT, to run on instead (extra\: cluster)\; it runs what it is sent\: only in a network that you trust]:ADDRESS:_files"
   "--quick[few grasps, folds and epochs\: does it run\?]"
   "--grid[try the grids of classical systems and name the best]"
   "--table[write the table of all results in --out]:FILE:_files"
   "--plots[draw them into this folder]:DIR:_files"
   "--json[print the summaries as JSON]"
   "--quiet[show no progress bar]"
-  "(*)::systems (default\: all)\: cnn0, cnn1, cnn2, cnn3, cnn3-3x3, cnn1-faithful, cnn1-augmented, cnn1-dropout, cnn1-plain, svm, mlp, rf, cnn0-d1-least-contact, cnn0-d2a-least-contact, cnn0-d2b-least-contact, cnn0-d3-least-contact, cnn0-horizontal, cnn0-vertical, cnn1-f16, cnn1-int8, cnn1-int8-static, cnn1-rank-8, cnn1-rank-16, cnn1-rank-32, cnn1-rank-64, cnn1-rank-128, cnn1-rank-256, narrow-4x32, narrow-8x64, narrow-16x64, svm-electrodes, blend-electrodes, cnn0-electrodes, small-electrodes, svm-session, hgb-session, cnn1-session, small-session, blend-session, distilled-session, small-session-ff, small-session-mf, small-session-th, small-session-ff-mf, small-session-ff-th, small-session-mf-th:_files"
+  "(*)::systems (default\: all)\: cnn0, cnn1, cnn2, cnn3, cnn3-3x3, cnn1-faithful, cnn1-augmented, cnn1-dropout, cnn1-plain, svm, mlp, rf, cnn0-d1-least-contact, cnn0-d2a-least-contact, cnn0-d2b-least-contact, cnn0-d3-least-contact, cnn0-horizontal, cnn0-vertical, svm-electrodes, blend-electrodes, cnn0-electrodes, small-electrodes, svm-session, hgb-session, cnn1-session, small-session, small-session-ff, small-session-mf, small-session-th, small-session-ff-mf, small-session-ff-th, small-session-mf-th:_files"
 )
 
 # guard to ensure default positional specs are added only once per session
@@ -330,7 +330,7 @@ _shtab_graspd_train_options=(
   "--only[measure by this one protocol (cv\: known objects\; objects\: others, which cannot be measured of a single one) and leave the other studies out\: for a model that is compared and not used]:PROTOCOL:(cv objects objects-whole)"
   "--jobs[trainings at once (default\: 1)]:N:_files"
   "--quiet[show no progress bar]"
-  ":one of cnn0, cnn1, cnn2, cnn3, cnn3-3x3, cnn1-faithful, cnn1-augmented, cnn1-dropout, cnn1-plain, svm, mlp, rf, cnn0-d1-least-contact, cnn0-d2a-least-contact, cnn0-d2b-least-contact, cnn0-d3-least-contact, cnn0-horizontal, cnn0-vertical, cnn1-f16, cnn1-int8, cnn1-int8-static, cnn1-rank-8, cnn1-rank-16, cnn1-rank-32, cnn1-rank-64, cnn1-rank-128, cnn1-rank-256, narrow-4x32, narrow-8x64, narrow-16x64, svm-electrodes, blend-electrodes, cnn0-electrodes, small-electrodes, svm-session, hgb-session, cnn1-session, small-session, blend-session, distilled-session, small-session-ff, small-session-mf, small-session-th, small-session-ff-mf, small-session-ff-th, small-session-mf-th:(blend-electrodes blend-session cnn0 cnn0-d1-least-contact cnn0-d2a-least-contact cnn0-d2b-least-contact cnn0-d3-least-contact cnn0-electrodes cnn0-horizontal cnn0-vertical cnn1 cnn1-augmented cnn1-dropout cnn1-f16 cnn1-faithful cnn1-int8 cnn1-int8-static cnn1-plain cnn1-rank-128 cnn1-rank-16 cnn1-rank-256 cnn1-rank-32 cnn1-rank-64 cnn1-rank-8 cnn1-session cnn2 cnn3 cnn3-3x3 distilled-session hgb-session mlp narrow-16x64 narrow-4x32 narrow-8x64 rf small-electrodes small-session small-session-ff small-session-ff-mf small-session-ff-th small-session-mf small-session-mf-th small-session-th svm svm-electrodes svm-session)"
+  ":one of cnn0, cnn1, cnn2, cnn3, cnn3-3x3, cnn1-faithful, cnn1-augmented, cnn1-dropout, cnn1-plain, svm, mlp, rf, cnn0-d1-least-contact, cnn0-d2a-least-contact, cnn0-d2b-least-contact, cnn0-d3-least-contact, cnn0-horizontal, cnn0-vertical, svm-electrodes, blend-electrodes, cnn0-electrodes, small-electrodes, svm-session, hgb-session, cnn1-session, small-session, small-session-ff, small-session-mf, small-session-th, small-session-ff-mf, small-session-ff-th, small-session-mf-th:(blend-electrodes cnn0 cnn0-d1-least-contact cnn0-d2a-least-contact cnn0-d2b-least-contact cnn0-d3-least-contact cnn0-electrodes cnn0-horizontal cnn0-vertical cnn1 cnn1-augmented cnn1-dropout cnn1-faithful cnn1-plain cnn1-session cnn2 cnn3 cnn3-3x3 hgb-session mlp rf small-electrodes small-session small-session-ff small-session-ff-mf small-session-ff-th small-session-mf small-session-mf-th small-session-th svm svm-electrodes svm-session)"
 )
 
 # guard to ensure default positional specs are added only once per session

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from daemon.trust.learner import Learner
 from models.training.arrays import Bools, Ints
 from models.training.data.datasets import COUNT_MAX, Grasps, read_all
-from models.training.data.folds import fold_seed
-from models.training.data.protocols import DAYS, DAYS_FOLDS, splits
+from models.training.data.protocols import DAYS, DAYS_FOLDS, fold_seed, splits
 from models.training.evaluating.days import CALIBRATED_FROM, SessionDay
 from models.training.fitting.trained import Trained, train
 from models.training.systems.registry import SYSTEMS

@@ -134,16 +134,6 @@ def test_no_sequence_of_grasps_takes_the_spread_away(rows: list[list[float]]) ->
     assert (session.spread >= 2.0 * np.sqrt(1.0 / (len(rows) + 1)) - 1e-9).all()
 
 
-def test_an_electrode_that_never_moves_leaves_numbers_that_can_be_divided_by() -> None:
-    session = statistics()
-    row = np.full(WIDTH, 2000.0)
-    for index in range(5000):
-        row[0] = index % 7
-        session.observe(row)
-    assert (session.spread > 0.05).all()
-    assert np.isfinite(session.mean).all()
-
-
 def test_the_same_grasp_again_and_again_counts_once_however_little_the_session_varies() -> None:
     session = SessionStatistics(np.full(WIDTH, 500.0), np.full(WIDTH, 30.0))
     random = np.random.default_rng(2)
@@ -161,10 +151,9 @@ def halves(slips: int) -> tuple[SessionStatistics, float]:
     return session, 600.0
 
 
-@pytest.mark.parametrize("slips", [300, 900])
-def test_slips_alone_hardly_move_a_session(slips: int) -> None:
+def test_slips_alone_hardly_move_a_session() -> None:
     before, _ = halves(0)
-    after, reading = halves(slips)
+    after, reading = halves(900)
     np.testing.assert_allclose(before.mean, 500.0, atol=10.0)
     assert (after.mean < 530.0).all()
     assert (after.mean < reading - 2.0 * 30.0).all()

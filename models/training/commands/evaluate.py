@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from models.training.commands.arguments import SEEDS, exit_code, whole
+from models.training.commands.common import exit_code, whole
 from models.training.data.protocols import ABOUT, PROTOCOLS
 from models.training.systems.names import SYSTEM_NAMES
 
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder for results; what is there already is not run again (default: runs/evaluate)",
     )
     parser.add_argument(
-        "--seeds", type=whole(1, 1000), metavar="N", help=f"split seeds (default: {SEEDS})"
+        "--seeds", type=whole(1, 1000), metavar="N", help="split seeds (default: 3)"
     )
     parser.add_argument(
         "--jobs",
@@ -50,7 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dask",
         metavar="ADDRESS",
-        help="scheduler of a Dask cluster, tcp://HOST:PORT, to run on instead (extra: cluster); "
+        help="scheduler of a Dask cluster of two threads or more, tcp://HOST:PORT, to run on "
+        "instead (extra: cluster); "
         "it runs what it is sent: only in a network that you trust",
     )
     parser.add_argument(
@@ -73,6 +74,6 @@ def run(args: argparse.Namespace) -> int:
     Whatever was finished by then is kept and not run again.
     """
     from models.training.commands.evaluation import evaluate
-    from models.training.evaluating.jobs import ClusterError
+    from models.training.evaluating.run_jobs import ClusterError
 
     return exit_code("evaluate", args.out, lambda: evaluate(args), ClusterError)

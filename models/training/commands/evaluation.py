@@ -3,84 +3,83 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import difflib
 import sys
 import time
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from itertools import product
 
-from models.training.commands.arguments import (
-    SEEDS,
+import numpy as np
+from sklearn.model_selection import ParameterGrid
+
+from models.training.commands.common import (
     WrongInputError,
+    progress_bar,
     warn_of_unpublished,
 )
-from models.training.commands.progress import progress_bar
-from models.training.data.datasets import read_all, unpublished
-from models.training.data.protocols import STANDARD, EvalProtocol
-from models.training.evaluating.campaign import Campaign, campaign, quickened
+from models.training.data.datasets import Grasps, read_all, unpublished
+from models.training.data.protocols import FOLDS, STANDARD
+from models.training.estimators.classical import GRIDS
+from models.training.estimators.networks import NetworkConfig
 from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.grid import best_of_grid, grid_of
+from models.training.evaluating.jobs import Job, JobResult, jobs_of
 from models.training.evaluating.results_table import Made, results_table
-from models.training.evaluating.summaries import Summary, made_with, read_summaries
+from models.training.evaluating.run_jobs import run_jobs
+from models.training.evaluating.summaries import (
+    SystemSummary,
+    made_with,
+    read_summaries,
+    summarise,
+    write_summary,
+)
 from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import System, digest
+from models.training.systems.system import BlendConfig, System, digest, with_recipes
+
+SEEDS = 3
+"""Split seeds of an evaluation unless `--seeds` says otherwise."""
+QUICK_GRASPS, QUICK_FOLDS, QUICK_EPOCHS = 400, 2, 1
+"""Of `--quick`: enough to see that everything runs. The figures mean nothing."""
 
 
 def evaluate(args: argparse.Namespace) -> None:
-    """Evaluate; raises what `exit_code` knows."""
+    """Evaluate what the command line asks for. Raises what `exit_code` knows."""
     started_s = time.monotonic()
-    systems = _systems(args.names, args.grid)
+    systems = _systems(args.names, grid=args.grid)
     _check_extras(args)
-    protocols = list(dict.fromkeys(args.protocol or STANDARD))
     grasps = read_all(args.data)
     warn_of_unpublished("evaluate", unpublished(grasps.files))
-    wanted = campaign(
-        [variant for system in systems for variant in grid_of(system)] if args.grid else systems,
-        protocols,
-        grasps,
-        seeds=args.seeds or (1 if args.quick else SEEDS),
-        quick=args.quick,
-    )
-    summaries = _evaluate(wanted, args)
+    if args.quick:
+        systems = [_quick(system) for system in systems]
+        chosen = np.random.default_rng(0).permutation(len(grasps))[:QUICK_GRASPS]
+        grasps = grasps.rows(np.sort(chosen).astype(np.int64))
+    tried = [point for system in systems for point in grid_of(system)] if args.grid else systems
+    summaries = _summaries(tried, grasps, args)
     if args.json:
         sys.stdout.buffer.write(to_json(summaries))
     if args.grid:
-        _report_grid(systems, protocols, summaries, args)
+        _report_grids(systems, summaries, args)
     if args.table or args.plots:
-        _report(wanted.data, args, time.monotonic() - started_s)
+        _report(grasps.digest(), args, time.monotonic() - started_s)
 
 
-def _evaluate(wanted: Campaign, args: argparse.Namespace) -> list[Summary]:
-    shown = not (args.json or args.grid)
-
-    def on_summary(summary: Summary) -> None:
-        if shown:
-            sys.stdout.write(_line(summary))
-            sys.stdout.flush()
-
-    with progress_bar("starting", len(wanted.jobs), hidden=args.quiet) as on_job:
-        return wanted.run(
-            args.out,
-            processes=args.jobs,
-            dask=args.dask,
-            on_job=on_job,
-            on_summary=on_summary,
-            keep=not args.grid,
-        )
+def grid_of(system: System) -> list[System]:
+    """Return a system for each configuration of a classical estimator's grid, else nothing."""
+    estimator = system.estimator
+    if isinstance(estimator, NetworkConfig | BlendConfig):
+        return []
+    points = []
+    for values in ParameterGrid(GRIDS[type(estimator)]):
+        config = dataclasses.replace(estimator, **values)
+        fields = dataclasses.asdict(config).items()
+        # A file may have this name: svm-c=3.0-gamma=0.01.
+        words = [f"{name}={value}".replace(" ", "") for name, value in fields]
+        name = "-".join((system.name, *words))
+        points.append(dataclasses.replace(system, name=name, estimator=config))
+    return points
 
 
-def _line(summary: Summary) -> str:
-    f1, accuracy = (summary.main.spreads[name] for name in ("f1", "accuracy"))
-    error = "" if f1.error is None else f", s.e. {100 * f1.error:.2f} over {f1.seeds} seeds"
-    return (
-        f"{summary.system} {summary.protocol} ({summary.headline}): "
-        f"F1 {100 * f1.mean:.1f} +- {100 * f1.std:.1f} %{error}; "
-        f"accuracy {100 * accuracy.mean:.1f} %, {summary.seconds:.0f} s\n"
-    )
-
-
-def _systems(names: Sequence[str], grid: bool) -> list[System]:
+def _systems(names: Sequence[str], *, grid: bool) -> list[System]:
     unknown = [name for name in names if name not in SYSTEMS]
     if unknown:
         near = difflib.get_close_matches(unknown[0], SYSTEMS, n=1)
@@ -97,19 +96,67 @@ def _systems(names: Sequence[str], grid: bool) -> list[System]:
 
 def _check_extras(args: argparse.Namespace) -> None:
     """Now, not after hours of training."""
-    for wanted, package, extra in (
+    for option, package, extra in (
         (args.dask, "distributed", "cluster"),
         (args.plots, "matplotlib", "report"),
     ):
-        if wanted and find_spec(package) is None:
+        if option and find_spec(package) is None:
             raise WrongInputError(f"needs the package '{package}': pip install '.[{extra}]'")
 
 
+def _quick(system: System) -> System:
+    return with_recipes(system, epochs=QUICK_EPOCHS)
+
+
+def _summaries(
+    systems: Sequence[System], grasps: Grasps, args: argparse.Namespace
+) -> list[SystemSummary]:
+    """Run all jobs. Each summary is stored and printed as soon as its jobs are done."""
+    seeds = range(args.seeds or (1 if args.quick else SEEDS))
+    folds = QUICK_FOLDS if args.quick else FOLDS
+    groups = {
+        (system.name, protocol): jobs_of(system, protocol, grasps, seeds, folds)
+        for system in systems
+        for protocol in dict.fromkeys(args.protocol or STANDARD)
+    }
+    wanted = [job for group in groups.values() for job in group]
+    found: dict[Job, JobResult] = {}
+    made: dict[tuple[str, str], SystemSummary] = {}
+    with progress_bar("starting", len(wanted), hidden=args.quiet) as on_job:
+        results = run_jobs(wanted, grasps, args.out / "jobs", processes=args.jobs, dask=args.dask)
+        for job, result in results:
+            found[job] = result
+            on_job(f"{job.system.name} {job.protocol}")
+            key = (job.system.name, job.protocol)
+            if all(each in found for each in groups[key]):
+                made[key] = summarise({each: found.pop(each) for each in groups[key]}, grasps)
+                _show(made[key], args)
+    return [made[key] for key in groups]
+
+
+def _show(summary: SystemSummary, args: argparse.Namespace) -> None:
+    if args.grid:
+        return
+    write_summary(summary, args.out)
+    if not args.json:
+        sys.stdout.write(_line(summary))
+        sys.stdout.flush()
+
+
+def _line(summary: SystemSummary) -> str:
+    f1, accuracy = (summary.main.spreads[name] for name in ("f1", "accuracy"))
+    error = "" if f1.error is None else f", s.e. {100 * f1.error:.2f} over {f1.seeds} seeds"
+    return (
+        f"{summary.system} {summary.protocol} ({summary.headline}): "
+        f"F1 {100 * f1.mean:.1f} +- {100 * f1.std:.1f} %{error}; "
+        f"accuracy {100 * accuracy.mean:.1f} %, {summary.seconds:.0f} s\n"
+    )
+
+
 def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
-    """Table and plots of all that is in the folder of this data (a digest)."""
+    """Write table and plots of all summaries in the folder that are of this data (a digest)."""
     digests = {
-        name: digest(quickened(system) if args.quick else system)
-        for name, system in SYSTEMS.items()
+        name: digest(_quick(system) if args.quick else system) for name, system in SYSTEMS.items()
     }
     summaries = read_summaries(args.out, data, digests)
     if args.table:
@@ -124,7 +171,7 @@ def _report(data: str, args: argparse.Namespace, seconds: float) -> None:
 
 
 def _command(args: argparse.Namespace) -> Iterator[str]:
-    """The command line without the folders of this machine."""
+    """Yield the words of the command line, without the folders of this machine."""
     yield "evaluate"
     yield from args.names
     for protocol in args.protocol or ():
@@ -141,18 +188,27 @@ def _command(args: argparse.Namespace) -> Iterator[str]:
     yield "--table FILE"
 
 
-def _report_grid(
-    systems: Sequence[System],
-    protocols: Sequence[EvalProtocol],
-    summaries: Sequence[Summary],
-    args: argparse.Namespace,
+def _report_grids(
+    systems: Sequence[System], summaries: Sequence[SystemSummary], args: argparse.Namespace
 ) -> None:
-    for system, protocol in product(systems, protocols):
-        report = best_of_grid(system, protocol, summaries)
-        write_whole(args.out / f"{system.name}.{protocol}.grid.json", to_json(report))
-        if not args.json:
-            best = report[0]
-            sys.stdout.write(
-                f"{best.name} {protocol}: best of {len(report)}, F1 {100 * best.f1.mean:.2f} "
-                f"+- {100 * best.f1.std:.1f} %\n"
-            )
+    """Write all points of each grid, the best F1 first, and name the best."""
+    for system in systems:
+        names = {point.name for point in grid_of(system)}
+        for protocol in dict.fromkeys(summary.protocol for summary in summaries):
+            points = [one for one in summaries if one.system in names and one.protocol == protocol]
+            points.sort(key=lambda one: -one.main.spreads["f1"].mean)
+            report = [
+                {
+                    "name": point.system,
+                    "f1": point.main.spreads["f1"],
+                    "accuracy": point.main.spreads["accuracy"],
+                }
+                for point in points
+            ]
+            write_whole(args.out / f"{system.name}.{protocol}.grid.json", to_json(report))
+            if not args.json:
+                f1 = points[0].main.spreads["f1"]
+                sys.stdout.write(
+                    f"{points[0].system} {protocol}: best of {len(points)}, "
+                    f"F1 {100 * f1.mean:.2f} +- {100 * f1.std:.1f} %\n"
+                )

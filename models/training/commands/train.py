@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from models import own, zoo
-from models.training.commands.arguments import (
+from models.training.commands.common import (
     EXIT_INPUT,
     WrongInputError,
     exit_code,
@@ -20,8 +20,8 @@ from models.training.commands.arguments import (
     whole,
 )
 from models.training.data.datasets import DatasetError, Grasps, lab_table_names, unpublished
-from models.training.data.folds import TooFewGraspsError
 from models.training.data.lab_tables import FEWEST_GRASPS, read_with_lab_tables
+from models.training.data.protocols import TooFewGraspsError
 from models.training.systems.names import SYSTEM_NAMES
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train(args: argparse.Namespace, out: Path) -> None:
-    from models.training.commands.progress import progress_bar
+    from models.training.commands.common import progress_bar
     from models.training.making.make_model import EXTRA_TRAININGS, make_model
     from models.training.making.preflight import limits, preflight
 

@@ -63,7 +63,7 @@ class Grasps:
         return np.repeat(np.arange(len(self.files)), [file.rows for file in self.files])
 
     def rows(self, indices: Ints) -> Grasps:
-        """Only these grasps, indices ascending; `files` keep digests and count their rows anew."""
+        """Return only these grasps, indices ascending. `files` keep digests and count these."""
         kept = np.bincount(self.table_of[indices], minlength=len(self.files))
         return Grasps(
             self.counts[indices],

@@ -6,16 +6,15 @@ data without any published table, these alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
 
 from models.bts3 import NEW_SESSION, WHOLE
-from models.training.arrays import Ints
+from models.training.arrays import Bools, Ints
 from models.training.data.datasets import Grasps, lab_table_names
-from models.training.data.folds import TooFewGraspsError, folds_of, object_folds
 
 EvalProtocol = Literal[
     "cv", "unknown", "objects", "objects-whole", "session", "days", "cv-palm-down", "cv-palm-side"
@@ -51,6 +50,10 @@ DAYS_FOLDS = 4
 to say what a session is worth that runs for hundreds of grasps."""
 
 
+class TooFewGraspsError(ValueError):
+    """The data cannot be cut into that many folds: take fewer folds or more data."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
     """One training and the grasps that it is judged by: row indices of `Grasps`, ascending."""
@@ -69,6 +72,43 @@ def splits(protocol: EvalProtocol, grasps: Grasps, seed: int, folds: int = FOLDS
     Raises `TooFewGraspsError` if the data lack a table, objects or grasps that the protocol needs.
     """
     return _MAKERS[protocol](grasps, seed, folds)
+
+
+def folds_of(slipped: Bools, folds: int, seed: int) -> Ints:
+    """Return the fold of each grasp, shape (N,): stratified, shuffled with the seed.
+
+    Raises `TooFewGraspsError` if a class has fewer grasps than there are folds.
+    """
+    from sklearn.model_selection import StratifiedKFold
+
+    fewest = min(int(slipped.sum()), int((~slipped).sum()))
+    if fewest < folds:
+        raise TooFewGraspsError(
+            f"{folds} folds need {folds} grasps of each class, one has {fewest}"
+        )
+    split = StratifiedKFold(folds, shuffle=True, random_state=seed)
+    fold_of = np.empty(len(slipped), dtype=np.int64)
+    for fold, (_, test) in enumerate(split.split(np.zeros((len(slipped), 1)), slipped)):
+        fold_of[test] = fold
+    return fold_of
+
+
+def fold_seed(seed: int, fold: int) -> int:
+    """Return the seed of the training of a fold: another one for each fold and split seed."""
+    return int(np.random.SeedSequence([seed, fold]).generate_state(1)[0])
+
+
+def object_folds(objects: Sequence[str], folds: int, seed: int) -> Ints:
+    """Return the fold of each grasp, shape (N,): all grasps of an object are in one fold.
+
+    Raises `TooFewGraspsError` if there are fewer objects than folds.
+    """
+    names = sorted(set(objects))
+    if len(names) < folds:
+        raise TooFewGraspsError(f"{folds} folds need {folds} objects, there are {len(names)}")
+    dealt = np.random.default_rng(seed).permutation(len(names)) % folds
+    fold_of_object = dict(zip(names, dealt.tolist(), strict=True))
+    return np.array([fold_of_object[name] for name in objects], dtype=np.int64)
 
 
 _Maker = Callable[[Grasps, int, int], list[Split]]
@@ -114,7 +154,7 @@ def _session(grasps: Grasps, seed: int, folds: int) -> list[Split]:
 
 
 def _days(grasps: Grasps, seed: int, folds: int) -> list[Split]:
-    """The same groups of objects leave all days: so many splits of each of `DAYS`."""
+    """Leave the same groups of objects out of all days: a split for each fold of each of `DAYS`."""
     folds = min(folds, DAYS_FOLDS)
     every = _rows(grasps, *WHOLE, NEW_SESSION)
     fold_of = np.full(len(grasps), -1)

@@ -1,12 +1,11 @@
-"""Classifiers of scikit-learn on vectors and features, with the grids they were chosen from."""
+"""Classifiers of scikit-learn on vectors and features, and the grids to choose from."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import product
 from typing import Literal, Protocol
 
 import numpy as np
@@ -21,6 +20,10 @@ from models.training.arrays import Bools, Floats, Floats32
 
 PROBABILITY_FLOOR = 1e-3
 """A forest's probability is kept this far from 0 and 1, where its log-odds are infinite."""
+
+
+INTERRUPTED = "Training interrupted"
+"""How scikit-learn's warning begins that Ctrl-C has ended the training of a perceptron."""
 
 
 class Boosting(HistGradientBoostingClassifier):  # type: ignore[misc]  # scikit-learn has no types
@@ -45,13 +48,6 @@ class SvmConfig:
     gamma: float | Literal["auto"]
     """Of the kernel exp(-gamma * distance**2); auto: one over the number of features."""
 
-    @staticmethod
-    def grid() -> list[SvmConfig]:
-        """The paper's: C in 0.01..5000, gamma auto or in 1e-4..0.1."""
-        costs = (0.01, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0, 5000.0)
-        gammas: tuple[float | Literal["auto"], ...] = ("auto", 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
-        return [SvmConfig(c, gamma) for c, gamma in product(costs, gammas)]
-
 
 @dataclass(frozen=True, slots=True)
 class ForestConfig:
@@ -60,14 +56,6 @@ class ForestConfig:
     trees: int
     depth: int | None
     """Largest depth of a tree; None: until its leaves are pure."""
-
-    @staticmethod
-    def grid() -> list[ForestConfig]:
-        """The paper's: 10..200 trees, depth none or 5..30. Odd numbers of trees cannot tie."""
-        return [
-            ForestConfig(trees, depth)
-            for trees, depth in product((11, 25, 51, 101, 199), (None, 5, 10, 15, 20, 30))
-        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +68,6 @@ class MlpConfig:
     """L2 term."""
     learning_rate: float = 1e-3
     epochs: int = 100
-
-    @staticmethod
-    def grid() -> list[MlpConfig]:
-        """One or two hidden layers around the width of the input; the paper gives no grid."""
-        hidden = ((32,), (100,), (300,), (64, 32), (100, 100))
-        return [MlpConfig(units, alpha) for units, alpha in product(hidden, (1e-4, 0.1, 1.0))]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,18 +84,29 @@ class BoostingConfig:
     features: float = 1.0
     """Fraction of the features that a split may choose from."""
 
-    @staticmethod
-    def grid() -> list[BoostingConfig]:
-        """Our own: the paper has no boosting."""
-        return [
-            BoostingConfig(iterations, rate, leaves, features=features)
-            for (iterations, rate), leaves, features in product(
-                ((150, 0.1), (400, 0.05)), (8, 15, 31), (0.3, 1.0)
-            )
-        ]
-
 
 ClassicalConfig = SvmConfig | ForestConfig | MlpConfig | BoostingConfig
+
+_TREES: dict[str, Sequence[object]] = {"leaves": (8, 15, 31), "features": (0.3, 1.0)}
+GRIDS: dict[type[ClassicalConfig], Sequence[Mapping[str, Sequence[object]]]] = {
+    SvmConfig: [
+        {
+            "c": (0.01, 0.1, 1.0, 3.0, 10.0, 100.0, 1000.0, 5000.0),
+            "gamma": ("auto", 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1),
+        }
+    ],
+    # Odd numbers of trees cannot tie.
+    ForestConfig: [{"trees": (11, 25, 51, 101, 199), "depth": (None, 5, 10, 15, 20, 30)}],
+    MlpConfig: [
+        {"hidden": ((32,), (100,), (300,), (64, 32), (100, 100)), "alpha": (1e-4, 0.1, 1.0)}
+    ],
+    BoostingConfig: [
+        {"iterations": (150,), "learning_rate": (0.1,), **_TREES},
+        {"iterations": (400,), "learning_rate": (0.05,), **_TREES},
+    ],
+}
+"""What a grid search tries, as scikit-learn's `ParameterGrid` takes it. The paper gives the grids
+of the first two; it gives none for perceptrons, and has no boosting."""
 
 
 class ClassicalModel(Protocol):
@@ -223,4 +216,11 @@ def _one_thread() -> Iterator[None]:
     with threadpool_limits(1), warnings.catch_warnings():
         # A perceptron's number of epochs is a setting here, not a failure to converge.
         warnings.filterwarnings("ignore", category=ConvergenceWarning)
-        yield
+        # A perceptron takes Ctrl-C for the end of its training, and only warns.
+        warnings.filterwarnings("error", message=INTERRUPTED, category=UserWarning)
+        try:
+            yield
+        except UserWarning as warning:
+            if str(warning).startswith(INTERRUPTED):
+                raise KeyboardInterrupt from warning
+            raise

@@ -102,21 +102,6 @@ def with_probability(margin: onnx.ModelProto, temperature: float) -> onnx.ModelP
     return _model(nodes, constants, margin.graph.input[0], OUTPUT_NAME, 2)
 
 
-def renamed(model: onnx.ModelProto, input_name: str) -> onnx.ModelProto:
-    """A copy whose input has this name."""
-    other = copied(model)
-    _feed(other.graph, other.graph.input[0].name, input_name)
-    other.graph.input[0].name = input_name
-    return other
-
-
-def copied(model: onnx.ModelProto) -> onnx.ModelProto:
-    """A copy that may be changed."""
-    other = onnx.ModelProto()
-    other.CopyFrom(model)
-    return other
-
-
 def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onnx.ModelProto:
     """The graph, changed in place, with `(input - mean) * scale` before it.
 
@@ -129,33 +114,11 @@ def standardised(model: onnx.ModelProto, mean: Floats32, scale: Floats32) -> onn
         ("Sub", (given, "input_mean"), "centred", {}),
         ("Mul", ("centred", "input_scale"), "standardised", {}),
     )
-    set_nodes(graph, [*_nodes(steps), *graph.node])
-    graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
-    return model
-
-
-def set_nodes(graph: onnx.GraphProto, nodes: Sequence[onnx.NodeProto]) -> None:
-    """Let the graph consist of these nodes, in the order in which they run."""
+    nodes = [*_nodes(steps), *graph.node]
     del graph.node[:]
     graph.node.extend(nodes)
-
-
-@contextmanager
-def quiet(name: str | None) -> Iterator[None]:
-    """Hold back what a logger (None: the root) says below an error, and what will be deprecated.
-
-    Exporter and quantiser talk of their own insides: nothing that a user could act on.
-    """
-    logger = logging.getLogger(name)
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=FutureWarning)
-            warnings.filterwarnings("ignore", category=DeprecationWarning)
-            yield
-    finally:
-        logger.setLevel(level)
+    graph.initializer.extend((_constant("input_mean", mean), _constant("input_scale", scale)))
+    return model
 
 
 def _feed(graph: onnx.GraphProto, former: str, name: str) -> None:
@@ -290,7 +253,7 @@ def _from_torch(
 ) -> onnx.ModelProto:
     # Two inputs, because one would let the exporter take the batch for a constant.
     example = torch.zeros(2, *shape)
-    with quiet("torch.onnx"):
+    with _quiet("torch.onnx"):
         program = torch.onnx.export(
             network,
             (example,),
@@ -307,6 +270,24 @@ def _from_torch(
     model: onnx.ModelProto = program.model_proto
     _strip(model)
     return model
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Hold back what a logger says below an error, and what will be deprecated.
+
+    The exporter talks of its own insides: nothing that a user could act on.
+    """
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", category=FutureWarning)
+            warnings.filterwarnings("ignore", category=DeprecationWarning)
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _strip(model: onnx.ModelProto) -> None:

@@ -54,19 +54,6 @@ class NetworkConfig:
     """After each convolution and after the hidden layer; a convolution then needs no bias."""
 
 
-@dataclass(frozen=True, slots=True)
-class DenseConfig:
-    """A network of dense layers only, on a vector or on features."""
-
-    hidden: tuple[int, ...]
-    """Units of each hidden layer."""
-    dropout: float = 0.0
-    """Fraction of values left out in training, after each hidden layer."""
-    batch_norm: bool = True
-
-
-AnyNetwork = NetworkConfig | DenseConfig
-
 CNN0 = NetworkConfig(filters=32, hidden=128)
 CNN1 = NetworkConfig(filters=32, hidden=1024)
 """The best network of the paper: Conv32 - FC1024."""
@@ -113,26 +100,17 @@ class Beside(nn.Module):
         return torch.cat((seen, features[:, self.first :]), dim=1)
 
 
-def build(config: AnyNetwork, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Sequential:
+def build(config: NetworkConfig, shape: Sequence[int] = IMAGE_SHAPE) -> nn.Sequential:
     """A network with fresh weights from torch's global random state.
 
     Takes float32 inputs (N, *shape), images or features, returns logits (N, 2) in the order
     (stable, slip). Weights are Glorot-uniform and biases zero, as Keras starts them. Raises
     `ValueError` if the network does not fit the shape.
     """
-    match config:
-        case NetworkConfig():
-            look, width = _look(config, tuple(shape))
-            layers = [*look, *_drop(config), *_dense(width, config.hidden, config.batch_norm)]
-            layers += _drop(config)
-            width = config.hidden
-        case DenseConfig():
-            (width,) = shape
-            layers = []
-            for units in config.hidden:
-                layers += [*_dense(width, units, config.batch_norm), *_drop(config)]
-                width = units
-    network = nn.Sequential(*layers, nn.Linear(width, 2))
+    look, width = _look(config, tuple(shape))
+    dense = _dense(width, config.hidden, config.batch_norm)
+    last = nn.Linear(config.hidden, 2)
+    network = nn.Sequential(*look, *_drop(config), *dense, *_drop(config), last)
     for layer in network.modules():
         if isinstance(layer, nn.Conv2d | nn.Linear):
             nn.init.xavier_uniform_(layer.weight)
@@ -218,7 +196,7 @@ def _dense(inputs: int, units: int, batch_norm: bool) -> list[nn.Module]:
     return [nn.Linear(inputs, units), *norm, nn.ReLU()]
 
 
-def _drop(config: AnyNetwork) -> list[nn.Module]:
+def _drop(config: NetworkConfig) -> list[nn.Module]:
     return [nn.Dropout(config.dropout)] if config.dropout > 0.0 else []
 
 

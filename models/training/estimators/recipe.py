@@ -11,18 +11,37 @@ import torch
 from torch import nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from models.contract import FEATURES_PER_FINGER
+from models.layout import ELECTRODES
 from models.training.arrays import Bools, Floats, Floats32
-from models.training.estimators.day_shift import DayShift, on_another_day
-from models.training.estimators.networks import AnyNetwork, build
+from models.training.estimators.networks import NetworkConfig, build
 
 THREADS = 1
 """Threads of a training. Fixed, because sums over more threads round differently; one, because two
 that share busy cores wait for each other, and many trainings at once use a machine better."""
 INFERENCE_BATCH = 512
 """Inputs per forward pass: bounds memory, changes nothing else."""
-DAY_SHIFT = DayShift()
 KERAS_ADAM_EPSILON = 1e-8
 """Of Keras 2.0.8, with which the published networks were trained."""
+
+
+@dataclass(frozen=True, slots=True)
+class DayShift:
+    """How far the features of one day differ from those of another, beyond their standardising.
+
+    Measured by what helped networks on days that they were not trained on; twice as much helps
+    networks of a single training day more, and costs the others.
+    """
+
+    gain: float = 0.3
+    """Each feature is multiplied by `exp(gain * e)`, e standard normal."""
+    finger_gain: float = 0.3
+    """All 24 z-values of a finger are multiplied by the same `exp(finger_gain * e)`."""
+    offset: float = 0.7
+    """Standard deviation of what is added to each finger's mean and to its spread."""
+
+
+DAY_SHIFT = DayShift()
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,13 +118,17 @@ def reproducible(seed: int, threads: int = THREADS) -> Iterator[None]:
 
 
 def train_network(
-    config: AnyNetwork, inputs: Floats32, slipped: Bools | Floats, recipe: AnyRecipe, *, seed: int
+    config: NetworkConfig,
+    inputs: Floats32,
+    slipped: Bools | Floats,
+    recipe: AnyRecipe,
+    *,
+    seed: int,
 ) -> nn.Sequential:
-    """Train a network on inputs (N, *shape); returns it in evaluation mode.
+    """Train a network on inputs (N, *shape) and labels (N,). It is returned in evaluation mode.
 
-    `slipped` (N,) are labels or probabilities of slip. The same arguments give the same weights on
-    the same machine. Each epoch sees the grasps once, shuffled. Raises `ValueError` for less than
-    two grasps.
+    The same arguments give the same weights on the same machine. Each epoch sees the grasps once,
+    shuffled. Raises `ValueError` for less than two grasps.
     """
     if len(inputs) < 2:
         raise ValueError(f"cannot train on {len(inputs)} grasps")
@@ -125,6 +148,27 @@ def logits(network: nn.Module, inputs: Floats32, threads: int = THREADS) -> Floa
     batches = torch.split(torch.from_numpy(inputs), INFERENCE_BATCH)
     with reproducible(0, threads), torch.no_grad():
         return torch.cat([network(batch) for batch in batches]).double().numpy()
+
+
+def on_another_day(features: torch.Tensor, shift: DayShift) -> torch.Tensor:
+    """Shift standardised session features (N, fingers * 26), each grasp by a draw of its own.
+
+    They become as they might have been on another day: other sensors, another palm pose.
+
+    Draws from torch's global random state; the features themselves are not changed. Raises
+    `ValueError` if these are no session features.
+    """
+    if features.ndim != 2 or features.shape[1] % FEATURES_PER_FINGER:
+        raise ValueError(f"inputs {tuple(features.shape[1:])} are no session features")
+    grasps, width = features.shape
+    fingers = width // FEATURES_PER_FINGER
+    electrodes = fingers * ELECTRODES
+    exponent = shift.gain * torch.randn(grasps, width)
+    of_finger = shift.finger_gain * torch.randn(grasps, fingers)
+    exponent[:, :electrodes] += of_finger.repeat_interleave(ELECTRODES, dim=1)
+    shifted = features * exponent.exp()
+    shifted[:, electrodes:] += shift.offset * torch.randn(grasps, width - electrodes)
+    return shifted
 
 
 def _fit(

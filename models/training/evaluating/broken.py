@@ -1,4 +1,4 @@
-"""The study of broken electrodes: what they cost if nobody notices, and after their repair."""
+"""The study of broken electrodes: what they cost unnoticed, and after their repair."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sklearn.metrics import f1_score
 from models.electrodes import Electrodes
 from models.training.arrays import Bools, Numbers
 from models.training.data.datasets import COUNT_MAX, Grasps
-from models.training.data.folds import fold_seed, folds_of
+from models.training.data.protocols import fold_seed, folds_of
 from models.training.fitting.trained import Trained, train
 from models.training.systems.system import System
 
@@ -20,7 +20,7 @@ FOLDS, JUDGED_FOLDS = 10, 3
 NUMBERS = (1, 2, 4, 8, 12)
 LOOKED_FOR_MAX = 13
 """Broken electrodes of a reading that are looked for at most: one more than the daemon repairs in a
-hand (`BROKEN_MAX` of `daemon.judge.health`, 12), for with so many it refuses the reading."""
+hand (`BROKEN_MAX` of `daemon.judge.health`, 12). A reading with 13 is refused."""
 
 Breakage = Callable[[Numbers, np.random.Generator], Numbers]
 KINDS: dict[str, Breakage] = {
@@ -144,7 +144,7 @@ def _break(folds: list[_Fold], number: int, reads: str, random: np.random.Genera
 
 
 def _places(shape: tuple[int, ...], number: int, random: np.random.Generator) -> Bools:
-    """So many places in each reading, any of them: shape (N, fingers, 24)."""
+    """Draw `number` places in each reading: True there, shape (N, fingers, 24)."""
     order = random.random((shape[0], shape[1] * shape[2])).argsort(axis=1)
     places: Bools = (order < number).reshape(shape)
     return places

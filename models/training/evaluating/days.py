@@ -1,4 +1,4 @@
-"""Grasps of another day, judged one after the other as the daemon does, none of them labelled."""
+"""Grasps of another day, judged one after the other as the daemon does, without labels."""
 
 from __future__ import annotations
 

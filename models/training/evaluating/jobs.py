@@ -8,10 +8,8 @@ import json
 import logging
 import threading
 import time
-import warnings
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -20,25 +18,20 @@ import joblib
 import numpy as np
 from numpy.typing import NDArray
 
-from models.inputs import builder, raw_features
+from models.inputs import raw_features
 from models.training.arrays import Bools, Floats, Ints, Numbers
 from models.training.data.datasets import Grasps
-from models.training.data.folds import fold_seed
-from models.training.data.protocols import FOLDS, EvalProtocol, Split, splits
+from models.training.data.protocols import FOLDS, EvalProtocol, Split, fold_seed, splits
 from models.training.evaluating.days import judged_days
 from models.training.evaluating.files import write_whole
-from models.training.fitting.fit import fit
-from models.training.fitting.fitted import Fitted
 from models.training.fitting.standards import NONE, TRAINING, TrainingStandards, later_session
-from models.training.fitting.trained import train
+from models.training.fitting.trained import Trained, train
 from models.training.systems.system import SessionFeatures, System, digest, with_recipes
 
 FORMAT = 1
 """Goes up when a job gives another result for the same configuration, or is written otherwise."""
 MAX_FILE_BYTES = 64 * 2**20
 """A larger file is no result: 4682 grasps in 8 variants take 0.4 MB."""
-_META, _TEST, _MARGINS, _AGES, _REFUSED = "meta", "test", "margins.", "ages.", "refused."
-_INTERRUPTED = "Training interrupted"
 _ONE_AT_A_TIME = threading.Lock()
 """torch's random state and its number of threads belong to the process."""
 
@@ -49,14 +42,6 @@ Number = TypeVar("Number", np.float64, np.int64, np.bool_)
 
 class BrokenResultError(Exception):
     """A stored result is not what it claims to be: run the job again."""
-
-
-class ClusterError(Exception):
-    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
-
-
-Outcomes = Iterator[tuple[int, bytes]]
-"""Of jobs in the order in which they finish: index of the job, `JobResult.to_bytes`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +67,20 @@ class Job:
         return f"{readable}.{self.key(data)[:16]}.npz"
 
 
+def jobs_of(
+    system: System, protocol: EvalProtocol, grasps: Grasps, seeds: Sequence[int], folds: int
+) -> list[Job]:
+    """Return the jobs of a system in a protocol: all folds of the first seed, then of the next.
+
+    Raises `TooFewGraspsError` if the grasps do not have the splits.
+    """
+    return [
+        Job(system, protocol, seed, fold, folds)
+        for seed in seeds
+        for fold in range(len(splits(protocol, grasps, seed, folds)))
+    ]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class JobResult:
     """How a trained system judges the test grasps of a job."""
@@ -101,30 +100,36 @@ class JobResult:
     """In `days`, by variant: which grasps (n,) the daemon would hold for never seen."""
 
     def to_bytes(self) -> bytes:
-        """A .npz file without pickled objects."""
+        """Return a .npz file without pickled objects."""
         meta = {
             "format": FORMAT,
             "train_grasps": self.train_grasps,
             "seconds": self.seconds,
             "parameters": self.parameters,
         }
-        arrays = {_TEST: self.test, _META: np.frombuffer(json.dumps(meta).encode(), np.uint8)}
-        arrays |= {_MARGINS + variant: values for variant, values in self.margins.items()}
-        arrays |= {_AGES + variant: values for variant, values in self.ages.items()}
-        arrays |= {_REFUSED + variant: values for variant, values in self.refused.items()}
+        arrays: dict[str, Numbers] = {
+            "test": self.test,
+            "meta": np.frombuffer(json.dumps(meta).encode(), np.uint8),
+        }
+        parts: dict[str, Mapping[str, Numbers]] = {
+            "margins": self.margins,
+            "ages": self.ages,
+            "refused": self.refused,
+        }
+        for part, by_variant in parts.items():
+            arrays |= {f"{part}.{variant}": values for variant, values in by_variant.items()}
         file = io.BytesIO()
-        np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez(file, allow_pickle=False, **arrays)
         return file.getvalue()
 
     @classmethod
     def from_bytes(cls, data: bytes) -> JobResult:
-        """The inverse of `to_bytes`. Raises `BrokenResultError`."""
+        """Read what `to_bytes` returned. Raises `BrokenResultError`."""
         try:
             with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                result = _result({name: arrays[name] for name in arrays.files})
+                return _result({name: arrays[name] for name in arrays.files})
         except (OSError, EOFError, ValueError, TypeError, KeyError, zipfile.BadZipFile) as error:
             raise BrokenResultError(f"is no result of a job: {error}") from error
-        return result
 
 
 def run(job: Job, grasps: Grasps) -> JobResult:
@@ -136,32 +141,31 @@ def run(job: Job, grasps: Grasps) -> JobResult:
     split = splits(job.protocol, grasps, job.seed, job.folds)[job.fold]
     system, seed = _alone(job.system), fold_seed(job.seed, job.fold)
     grasps = grasps.of_fingers(system.fingers)
+    counts, table_of = grasps.counts[split.test], grasps.table_of[split.test]
+    ages: dict[str, Ints] = {}
+    refused: dict[str, Bools] = {}
     # A forest would otherwise send its trees back to the cluster that this job came from.
-    with _ONE_AT_A_TIME, joblib.parallel_config("sequential"), _interruptible():
+    with _ONE_AT_A_TIME, joblib.parallel_config("sequential"):
         started_s = time.perf_counter()
-        refused: dict[str, Bools] = {}
+        trained = train(system, grasps.rows(split.train), seed)
         if job.protocol == "days":
-            trained = train(system, grasps.rows(split.train), seed)
-            fitted = trained.fitted
             margins, refused, ages = judged_days(trained, grasps, split.test, seed)
-        elif isinstance(system.input, SessionFeatures):
-            fitted, margins, ages = _run_session(system, system.input, grasps, split, seed)
+        elif trained.standards is None:
+            margins = {NONE: trained.margins(counts, table_of)}
+        elif split.calibration is None:
+            margins = {TRAINING: trained.margins(counts, table_of)}
         else:
-            inputs = builder(system.input, len(system.fingers)).build_batch(grasps.counts)[0]
-            fitted = fit(system, inputs[split.train], grasps.slipped[split.train], seed=seed)
-            margins, ages = {NONE: fitted.margins(inputs[split.test])}, {}
+            margins, ages = _later_margins(trained, trained.standards, grasps, split, seed)
         seconds = time.perf_counter() - started_s
-    numbers = len(split.train), seconds, fitted.parameters
+    numbers = len(split.train), seconds, trained.fitted.parameters
     return JobResult(split.test, margins, *numbers, ages, refused)
 
 
-def run_numbered(index: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
-    """`run` as a process of its own is asked and answers: an item of `Outcomes`."""
-    return index, run(job, grasps).to_bytes()
-
-
 def load(folder: Path, job: Job, data: str) -> JobResult | None:
-    """The stored result of a job on data with this digest; None, if broken with a warning."""
+    """Read the stored result of a job on data of this digest.
+
+    None: nothing is stored, or what is stored is broken, which is logged.
+    """
     path = folder / job.file_name(data)
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
@@ -174,42 +178,24 @@ def load(folder: Path, job: Job, data: str) -> JobResult | None:
         return None
 
 
-def save(folder: Path, job: Job, data: str, content: bytes) -> None:
-    """Store the bytes of a result, for `load`. Raises `OSError`."""
-    write_whole(folder / job.file_name(data), content)
+def save(folder: Path, job: Job, data: str, result: JobResult) -> None:
+    """Store a result for `load`. Raises `OSError`."""
+    write_whole(folder / job.file_name(data), result.to_bytes())
 
 
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    """A perceptron of scikit-learn takes Ctrl-C for the end of its training, and only warns."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message=_INTERRUPTED, category=UserWarning)
-        try:
-            yield
-        except UserWarning as warning:
-            if str(warning).startswith(_INTERRUPTED):
-                raise KeyboardInterrupt from warning
-            raise
-
-
-def _run_session(
-    system: System, wanted: SessionFeatures, grasps: Grasps, split: Split, seed: int
-) -> tuple[Fitted, dict[str, Floats], dict[str, Ints]]:
-    """Each table is a session, standardised by its own training grasps."""
-    features, table_of = raw_features(grasps.counts), grasps.table_of
-    train, test = split.train, split.test
-    standards = TrainingStandards.of(features[train], table_of[train])
-    inputs = standards.apply(features[train], table_of[train], wanted.clip)
-    fitted = fit(system, inputs, grasps.slipped[train], seed=seed)
-    if split.calibration is None:
-        known = standards.apply(features[test], table_of[test], wanted.clip)
-        return fitted, {TRAINING: fitted.margins(known)}, {}
-    session = later_session(features, test, split.calibration, standards, seed)
+def _later_margins(
+    trained: Trained, standards: TrainingStandards, grasps: Grasps, split: Split, seed: int
+) -> tuple[dict[str, Floats], dict[str, Ints]]:
+    """By variant: margins of the test grasps of a later session, and ages of the session."""
+    if not isinstance(trained.system.input, SessionFeatures) or split.calibration is None:
+        raise ValueError(f"{trained.system.name} is not calibrated by a session")
+    features, clip = raw_features(grasps.counts), trained.system.input.clip
+    session = later_session(features, split.test, split.calibration, standards, seed)
     margins = {
-        variant: fitted.margins(by.apply(features[test], wanted.clip))
+        variant: trained.fitted.margins(by.apply(features[split.test], clip))
         for variant, by in session.standards.items()
     }
-    return fitted, margins, session.ages
+    return margins, session.ages
 
 
 def _alone(system: System) -> System:
@@ -217,16 +203,16 @@ def _alone(system: System) -> System:
 
 
 def _result(arrays: dict[str, Numbers]) -> JobResult:
-    """Raises `KeyError`, `TypeError` or `ValueError` for what is no result."""
-    meta = json.loads(arrays[_META].tobytes())
+    """Raise `KeyError`, `TypeError` or `ValueError` for what is no result."""
+    meta = json.loads(arrays["meta"].tobytes())
     if meta["format"] != FORMAT:
         raise ValueError(f"format {meta['format']}, not {FORMAT}")
-    test = arrays[_TEST].astype(np.int64)
-    margins = _named(arrays, _MARGINS, np.float64)
-    ages = _named(arrays, _AGES, np.int64)
+    test = arrays["test"].astype(np.int64)
+    margins = _by_variant(arrays, "margins.", np.float64)
+    ages = _by_variant(arrays, "ages.", np.int64)
+    refused = _by_variant(arrays, "refused.", np.bool_)
     if test.ndim != 1 or not margins:
         raise ValueError("has no margins")
-    refused = _named(arrays, _REFUSED, np.bool_)
     columns = (*margins.values(), *ages.values(), *refused.values())
     if any(values.shape != test.shape for values in columns):
         raise ValueError("has margins or ages of another number of grasps")
@@ -236,7 +222,7 @@ def _result(arrays: dict[str, Numbers]) -> JobResult:
     return JobResult(test, margins, *numbers, ages, refused)
 
 
-def _named(
+def _by_variant(
     arrays: dict[str, Numbers], prefix: str, kind: type[Number]
 ) -> dict[str, NDArray[Number]]:
     return {

@@ -1,22 +1,25 @@
-"""Figures of verdicts: of one test set, over folds and seeds, and between two systems."""
+"""Figures of verdicts: of one test set, over folds and seeds, and between two systems.
+
+Probabilities are calibrated by one temperature (Guo et al. 2017, arXiv:1706.04599).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from sklearn.metrics import accuracy_score, precision_recall_fscore_support, roc_auc_score
 
-from models.training.arrays import Bools, Floats
-from models.training.fitting.calibration import (
-    ECE_BINS,
-    Reliability,
-    p_slip,
-    reliability,
-)
+from models.training.arrays import Bools, Floats, Ints
 
+TEMPERATURE_RANGE = (0.05, 20.0)
+"""Where a temperature is looked for; perfectly separated labels end at the low end."""
+ECE_BINS = 15
+"""Bins of equal width, as in Guo et al."""
+HALVINGS = 60
+"""Steps of the bisection: enough for every bit of a double."""
 METRICS = ("accuracy", "precision", "recall", "f1", "auc", "brier", "ece", "log_loss")
 """Names of the figures of `Scores`."""
 Z_95 = 1.959963984540054
@@ -28,9 +31,15 @@ FEWEST_JUDGED = 50
 
 
 @dataclass(frozen=True, slots=True)
-class Scores(Reliability):
+class Scores:
     """Figures of one test set as fractions, slip positive."""
 
+    ece: float
+    """Expected calibration error of the verdict's probability; 0 is perfect."""
+    brier: float
+    """Mean squared error of the slip probability."""
+    log_loss: float
+    """Mean negative log-likelihood, nats: what the temperature is fitted to."""
     grasps: int
     accuracy: float
     precision: float
@@ -95,9 +104,13 @@ def score(margins: Floats, slipped: Bools, probability: Floats | None = None) ->
         slipped, verdict, average="binary", zero_division=0.0
     )
     both = len(np.unique(slipped)) == 2
-    reliable = reliability(p_slip(margins) if probability is None else probability, slipped)
+    if probability is None:
+        probability = p_slip(margins)
+    of_truth = np.where(slipped, probability, 1.0 - probability)
     return Scores(
-        **asdict(reliable),
+        ece=_ece(probability, slipped),
+        brier=float(np.mean((probability - slipped) ** 2)),
+        log_loss=float(-np.mean(np.log(np.maximum(of_truth, np.finfo(np.float64).tiny)))),
         grasps=len(slipped),
         accuracy=float(accuracy_score(slipped, verdict)),
         precision=float(precision),
@@ -105,6 +118,39 @@ def score(margins: Floats, slipped: Bools, probability: Floats | None = None) ->
         f1=float(f1),
         auc=float(roc_auc_score(slipped, margins)) if both else math.nan,
     )
+
+
+def fit_temperature(margins: Floats, slipped: Bools) -> float:
+    """Return the T that makes sigmoid(margin / T) most likely, of margins (N,) and labels (N,).
+
+    The grasps must not have been trained on.
+    """
+    low, high = np.log(TEMPERATURE_RANGE)
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2.0
+        # The likelihood is concave in 1/T; its slope there says on which side of T the peak is.
+        slope = np.mean((slipped - p_slip(margins, np.exp(middle))) * margins)
+        low, high = (low, middle) if slope > 0.0 else (middle, high)
+    return float(np.exp((low + high) / 2.0))
+
+
+def p_slip(margins: Floats, temperature: float = 1.0) -> Floats:
+    """Return the slip probability (N,) of margins (N,): sigmoid(margin / temperature)."""
+    value = margins / temperature
+    # exp() of a negative number only: never overflows.
+    small = np.exp(-np.abs(value))
+    probability: Floats = np.where(value >= 0.0, 1.0, small) / (1.0 + small)
+    return probability
+
+
+def cross_fitted_p_slip(margins: Floats, slipped: Bools, fold_of: Ints) -> Floats:
+    """Return the slip probability (N,), each fold's by the temperature of the other folds."""
+    probability = np.empty(len(margins))
+    for fold in np.unique(fold_of):
+        inside = fold_of == fold
+        temperature = fit_temperature(margins[~inside], slipped[~inside])
+        probability[inside] = p_slip(margins[inside], temperature)
+    return probability
 
 
 def over_seeds(figures: Sequence[Sequence[float]]) -> Spread:
@@ -138,7 +184,7 @@ def paired_difference(
 
 
 def wilson(accuracy: float, grasps: int) -> Fraction:
-    """A share of right verdicts among so many grasps, with its interval."""
+    """Return the share of right verdicts among `grasps` grasps, with its interval."""
     spread = Z_95**2 / grasps
     centre = (accuracy + spread / 2.0) / (1.0 + spread)
     half = math.sqrt(accuracy * (1.0 - accuracy) * spread + spread**2 / 4.0) / (1.0 + spread)
@@ -190,6 +236,15 @@ def reliability_bins(probability: Floats, slipped: Bools) -> list[tuple[float, f
         for b, number in enumerate(np.bincount(bins, minlength=ECE_BINS))
         if number
     ]
+
+
+def _ece(probability: Floats, slipped: Bools) -> float:
+    """Expected calibration error of slip probabilities (N,)."""
+    confidence = np.maximum(probability, 1.0 - probability)
+    correct = (probability > 0.5) == slipped
+    bins = np.minimum((confidence * ECE_BINS).astype(np.int64), ECE_BINS - 1)
+    gaps = np.bincount(bins, weights=correct - confidence, minlength=ECE_BINS)
+    return float(np.abs(gaps).sum() / len(probability))
 
 
 def _points(probability: Floats, slipped: Bools) -> list[CurvePoint]:

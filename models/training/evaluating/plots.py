@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from models.training.data.protocols import PROTOCOLS
-from models.training.evaluating.summaries import Summary
+from models.training.evaluating.summaries import SystemSummary
 from models.training.fitting.standards import SESSION_VARIANTS
 
 FORMATS = ("png", "svg")
@@ -20,7 +20,7 @@ MOST_CURVES = 8
 SLIP, STABLE, LINE, GREY = "#b5402a", "#2a6f97", "#1d3557", "#999999"
 
 
-def draw(summaries: Sequence[Summary], folder: Path) -> list[Path]:
+def draw(summaries: Sequence[SystemSummary], folder: Path) -> list[Path]:
     """Write the pictures into the folder and return their paths.
 
     One of each system in each protocol; one per protocol that compares the best of them; one of
@@ -50,7 +50,7 @@ def _save(figure: Figure, stem: Path) -> list[Path]:
     return paths
 
 
-def _report(summary: Summary) -> Figure:
+def _report(summary: SystemSummary) -> Figure:
     figure = Figure(figsize=(13.0, 9.5), layout="constrained")
     f1 = summary.main.spreads["f1"]
     figure.suptitle(
@@ -59,14 +59,18 @@ def _report(summary: Summary) -> Figure:
         fontsize=13,
     )
     grid = figure.add_gridspec(3, 2, width_ratios=(1.0, 1.15))
-    panels: tuple[Callable[[Axes, Summary], None], ...] = (_reliability, _coverage, _confusion)
+    panels: tuple[Callable[[Axes, SystemSummary], None], ...] = (
+        _reliability,
+        _coverage,
+        _confusion,
+    )
     for row, panel in enumerate(panels):
         panel(figure.add_subplot(grid[row, 0]), summary)
     _objects(figure.add_subplot(grid[:, 1]), summary)
     return figure
 
 
-def _reliability(axes: Axes, summary: Summary) -> None:
+def _reliability(axes: Axes, summary: SystemSummary) -> None:
     bins = summary.main.bins
     total = sum(number for _, _, number in bins)
     axes.plot((0.0, 1.0), (0.0, 1.0), color=GREY, linewidth=1.0, linestyle="--")
@@ -79,7 +83,7 @@ def _reliability(axes: Axes, summary: Summary) -> None:
     axes.set(xlabel="predicted slip probability (size: grasps)", ylabel="share that slipped")
 
 
-def _coverage(axes: Axes, summary: Summary) -> None:
+def _coverage(axes: Axes, summary: SystemSummary) -> None:
     axes.plot(*_curve(summary), color=LINE)
     for wanted, threshold in summary.main.thresholds.items():
         if threshold is not None:
@@ -100,13 +104,13 @@ def _coverage(axes: Axes, summary: Summary) -> None:
     axes.grid(alpha=0.3)
 
 
-def _curve(summary: Summary) -> tuple[list[float], list[float]]:
+def _curve(summary: SystemSummary) -> tuple[list[float], list[float]]:
     """Coverage and accuracy, %."""
     curve = summary.main.curve
     return [100.0 * point.coverage for point in curve], [100.0 * point.accuracy for point in curve]
 
 
-def _confusion(axes: Axes, summary: Summary) -> None:
+def _confusion(axes: Axes, summary: SystemSummary) -> None:
     rows = summary.main.confusion
     shares = [[number / max(1, sum(row)) for number in row] for row in rows]
     axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
@@ -125,7 +129,7 @@ def _confusion(axes: Axes, summary: Summary) -> None:
     axes.set_title("Confusion (grasps of all seeds)", fontsize=10)
 
 
-def _objects(axes: Axes, summary: Summary) -> None:
+def _objects(axes: Axes, summary: SystemSummary) -> None:
     """F1 as bars, accuracy with its interval as points: the worst object on top."""
     ranked = sorted(summary.main.objects.items(), key=lambda item: -item[1].f1)
     places = range(len(ranked))
@@ -151,7 +155,7 @@ def _objects(axes: Axes, summary: Summary) -> None:
     axes.grid(axis="x", alpha=0.3)
 
 
-def _comparison(summaries: Sequence[Summary]) -> Figure:
+def _comparison(summaries: Sequence[SystemSummary]) -> Figure:
     """Accuracy-coverage curves of the best systems of a protocol."""
     ranked = sorted(summaries, key=lambda one: -one.main.coverages["0.8"])[:MOST_CURVES]
     figure = Figure(figsize=(8.0, 5.5), layout="constrained")
@@ -167,7 +171,7 @@ def _comparison(summaries: Sequence[Summary]) -> Figure:
     return figure
 
 
-def _calibration(summaries: Sequence[Summary]) -> Figure:
+def _calibration(summaries: Sequence[SystemSummary]) -> Figure:
     """F1 in a later session by the number of unlabelled grasps, and of a running session."""
     figure = Figure(figsize=(8.0, 5.0), layout="constrained")
     axes = figure.subplots()

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from models.training.data.protocols import ABOUT, PROTOCOLS, STANDARD, EvalProtocol
 from models.training.evaluating.day_figures import GROUPS, DayFigures
 from models.training.evaluating.metrics import Difference, Spread, paired_difference
-from models.training.evaluating.summaries import HEADLINE, Summary, Variant
+from models.training.evaluating.summaries import HEADLINE, SystemSummary, Variant
 from models.training.fitting.standards import RUNNING, RUNNING_SORTED, SESSION_VARIANTS
 from models.training.systems.registry import SYSTEMS
-from models.training.systems.system import Published, SessionFeatures, System
+from models.training.systems.system import PaperFigure, SessionFeatures, System
 
 NOT_RUN = "-"
 REFERENCE = "cnn1"
@@ -36,26 +36,26 @@ class Made:
 
 
 Row = Sequence[str]
-Found = dict[tuple[str, EvalProtocol], Summary]
+ByGroup = dict[tuple[str, EvalProtocol], SystemSummary]
 
 
-def results_table(summaries: Sequence[Summary], made: Made) -> str:
-    """The whole document as Markdown; what was not run is `-`."""
-    found: Found = {(summary.system, summary.protocol): summary for summary in summaries}
+def results_table(summaries: Sequence[SystemSummary], made: Made) -> str:
+    """Return the whole document as Markdown; what was not run is `-`."""
+    by_group: ByGroup = {(summary.system, summary.protocol): summary for summary in summaries}
     sections = (
         _head(summaries, made),
-        _paper(found),
-        _systems(found),
-        _sessions(found),
-        _days(found),
-        _differences(found),
+        _paper(by_group),
+        _systems(by_group),
+        _sessions(by_group),
+        _days(by_group),
+        _differences(by_group),
         _everything(summaries),
         _how(summaries, made),
     )
     return "\n\n".join(paragraph for section in sections for paragraph in section) + "\n"
 
 
-def _head(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
+def _head(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
     yield "# Results"
     yield (
         "F1 in % with slip as the positive class, unless a column says otherwise. `+-` is the "
@@ -69,7 +69,7 @@ def _head(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
     yield "\n".join(f"- `{name}`: {ABOUT[name]}" for name in PROTOCOLS if name in shown)
 
 
-def _paper(found: Found) -> Iterator[str]:
+def _paper(by_group: ByGroup) -> Iterator[str]:
     yield "## 1. The paper's systems"
     yield _table(
         ("system", "protocol", "figure", "paper", "ours", "s.e.", "seeds", "difference"),
@@ -78,15 +78,15 @@ def _paper(found: Found) -> Iterator[str]:
             for system in SYSTEMS.values()
             if not isinstance(system.input, SessionFeatures)
             for published in system.published or (None,)
-            for row in _published(system, published, found)
+            for row in _published(system, published, by_group)
         ),
     )
 
 
-def _published(system: System, published: Published | None, found: Found) -> Iterator[Row]:
+def _published(system: System, published: PaperFigure | None, by_group: ByGroup) -> Iterator[Row]:
     """A row for each figure that the paper gives; for F1 alone where it gives none."""
     protocol: EvalProtocol = published.protocol if published else "cv"
-    summary = found.get((system.name, protocol))
+    summary = by_group.get((system.name, protocol))
     for figure in FIGURES:
         paper = getattr(published, figure) if published else None
         if paper is None and (published or figure != "f1"):
@@ -104,7 +104,7 @@ def _published(system: System, published: Published | None, found: Found) -> Ite
         )
 
 
-def _systems(found: Found) -> Iterator[str]:
+def _systems(by_group: ByGroup) -> Iterator[str]:
     yield "## 2. All systems, all protocols"
     yield (
         f"In `session`, systems with session calibration have seen {HEADLINE[1:]} unlabelled "
@@ -114,14 +114,14 @@ def _systems(found: Found) -> Iterator[str]:
     )
     rows = []
     for name in SYSTEMS:
-        row = [found.get((name, protocol)) for protocol in STANDARD]
+        row = [by_group.get((name, protocol)) for protocol in STANDARD]
         if any(row):
             size = max(summary.parameters for summary in row if summary)
             rows.append((f"`{name}`", f"{size:,}", *(_with_error(summary) for summary in row)))
     yield _table(("system", "parameters", *(f"`{protocol}`" for protocol in STANDARD)), rows)
 
 
-def _sessions(found: Found) -> Iterator[str]:
+def _sessions(by_group: ByGroup) -> Iterator[str]:
     yield "## 3. Session calibration"
     yield (
         "Protocol `session`, by what the session has shown before: nothing; 5 to 50 unlabelled "
@@ -132,7 +132,11 @@ def _sessions(found: Found) -> Iterator[str]:
         variant[1:] if variant[1:].isdigit() else variant.replace("-", ", ")
         for variant in SESSION_VARIANTS
     ]
-    here = {name: found[name, "session"].variants for name in SYSTEMS if (name, "session") in found}
+    here = {
+        name: by_group[name, "session"].variants
+        for name in SYSTEMS
+        if (name, "session") in by_group
+    }
     yield _table(
         ("system", *columns),
         (
@@ -152,9 +156,9 @@ def _sessions(found: Found) -> Iterator[str]:
         yield _table(("system", *map(str, bounds)), rows)
 
 
-def _days(found: Found) -> Iterator[str]:
+def _days(by_group: ByGroup) -> Iterator[str]:
     yield "## 4. Other days"
-    here = [found[name, "days"] for name in SYSTEMS if (name, "days") in found]
+    here = [by_group[name, "days"] for name in SYSTEMS if (name, "days") in by_group]
     trainings = ", ".join(f"`{one.system}` {len(one.seeds)} x {one.folds}" for one in here)
     yield (
         "Protocol `days`: each table is a session from nothing, its grasps judged one after the "
@@ -183,19 +187,22 @@ def _days(found: Found) -> Iterator[str]:
     yield _table(("system", "order", *head, *judged), more)
 
 
-def _day_row(figures: DayFigures) -> Iterator[str]:
+def _day_row(figures: DayFigures) -> list[str]:
     every, judged = figures.every, figures.judged
-    yield from map(
-        _percent,
-        (
-            *(every.f1, every.slips_among_stable, every.slips_called_stable),
-            *(every.stable_called_slip, figures.coverage),
-            *(judged.f1, judged.slips_among_stable, figures.refused_slipped),
-        ),
+    fractions = (
+        every.f1,
+        every.slips_among_stable,
+        every.slips_called_stable,
+        every.stable_called_slip,
+        figures.coverage,
+        judged.f1,
+        judged.slips_among_stable,
+        figures.refused_slipped,
     )
+    return [_percent(fraction) for fraction in fractions]
 
 
-def _differences(found: Found) -> Iterator[str]:
+def _differences(by_group: ByGroup) -> Iterator[str]:
     yield "## 5. Differences on the same splits"
     yield (
         f"F1 of the system less that of `{REFERENCE}`, and less that of the protocol's best, in "
@@ -205,21 +212,21 @@ def _differences(found: Found) -> Iterator[str]:
     )
     rows = []
     for protocol in PROTOCOLS:
-        here = [found[name, protocol] for name in SYSTEMS if (name, protocol) in found]
+        here = [by_group[name, protocol] for name in SYSTEMS if (name, protocol) in by_group]
         if len(here) < 2:
             continue
         best = max(here, key=lambda summary: summary.main.spreads["f1"].mean)
-        reference = found.get((REFERENCE, protocol))
+        reference = by_group.get((REFERENCE, protocol))
         for summary in here:
             to_others = (_difference(summary, other) for other in (reference, best))
             rows.append((f"`{summary.system}`", f"`{protocol}`", *to_others, f"`{best.system}`"))
     yield _table(("system", "protocol", f"to `{REFERENCE}`", "to the best", "best"), rows)
 
 
-def difference(ours: Summary, theirs: Summary, figure: str = "f1") -> Difference | None:
-    """Our mean figure less theirs on the splits that both have judged; None if there are none.
+def difference(ours: SystemSummary, theirs: SystemSummary, figure: str = "f1") -> Difference | None:
+    """Return our mean figure less theirs on the splits that both have judged.
 
-    Of other data or another number of folds no split is the same.
+    None: no split is the same, for other data or another number of folds, say.
     """
     seeds = [seed for seed in ours.seeds if seed in theirs.seeds]
     if not seeds or ours.folds != theirs.folds or ours.data != theirs.data:
@@ -236,11 +243,11 @@ def difference(ours: Summary, theirs: Summary, figure: str = "f1") -> Difference
     return paired_difference([one for one, _ in pairs], [other for _, other in pairs], overlap)
 
 
-def _of(summary: Summary, figure: str, seed: int) -> list[float | None]:
+def _of(summary: SystemSummary, figure: str, seed: int) -> list[float | None]:
     return summary.main.figures[figure][summary.seeds.index(seed)]
 
 
-def _everything(summaries: Sequence[Summary]) -> Iterator[str]:
+def _everything(summaries: Sequence[SystemSummary]) -> Iterator[str]:
     yield "## 6. Every figure"
     yield (
         "Accuracy, precision, recall and F1 in %; AUC, Brier score and expected calibration error "
@@ -268,7 +275,7 @@ def _everything(summaries: Sequence[Summary]) -> Iterator[str]:
     )
 
 
-def _how(summaries: Sequence[Summary], made: Made) -> Iterator[str]:
+def _how(summaries: Sequence[SystemSummary], made: Made) -> Iterator[str]:
     yield "## How this was made"
     yield f"    {made.command}"
     yield ONE_ROW
@@ -295,7 +302,7 @@ def _table(header: Row, rows: Iterable[Row]) -> str:
     return "\n".join((f"| {lines[0]} |", rule, *(f"| {line} |" for line in lines[1:])))
 
 
-def _trainings(summary: Summary) -> int:
+def _trainings(summary: SystemSummary) -> int:
     return len(summary.seeds) * summary.folds
 
 
@@ -318,7 +325,7 @@ def _error(error: float | None) -> str:
     return NOT_RUN if error is None else f"{100 * error:.2f}"
 
 
-def _with_error(summary: Summary | None) -> str:
+def _with_error(summary: SystemSummary | None) -> str:
     if summary is None:
         return NOT_RUN
     spread = summary.main.spreads["f1"]
@@ -326,14 +333,14 @@ def _with_error(summary: Summary | None) -> str:
     return _value(spread) + error
 
 
-def _difference(ours: Summary, theirs: Summary | None) -> str:
+def _difference(ours: SystemSummary, theirs: SystemSummary | None) -> str:
     if theirs is None or ours is theirs:
         return NOT_RUN
-    found = difference(ours, theirs)
-    if found is None:
+    gap = difference(ours, theirs)
+    if gap is None:
         return NOT_RUN
-    error = "" if found.error is None else f" +- {100 * found.error:.1f}"
-    return f"{100 * found.mean:+.1f}{error}"
+    error = "" if gap.error is None else f" +- {100 * gap.error:.1f}"
+    return f"{100 * gap.mean:+.1f}{error}"
 
 
 def _duration(seconds: float) -> str:

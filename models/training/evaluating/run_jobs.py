@@ -1,10 +1,13 @@
-"""Many jobs at once, on this machine or on a Dask cluster; what is finished is never run again."""
+"""Many jobs by joblib: here, in several processes, or on a Dask cluster (extra: cluster)."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import joblib
@@ -12,10 +15,15 @@ from joblib.externals.loky import get_reusable_executor
 
 from models.training.data.datasets import Grasps
 from models.training.evaluating import jobs
-from models.training.evaluating.jobs import Job, JobResult, Outcomes
+from models.training.evaluating.jobs import Job, JobResult
 
-OnResult = Callable[[int, JobResult], None]
-"""Called with the index of each job and its result, as they come."""
+CONNECT_TIMEOUT_S = 10
+WORKERS_TIMEOUT_S = 60
+"""How long a cluster may take to show its first worker."""
+
+
+class ClusterError(Exception):
+    """The cluster is not there, or lost a job too often. What is finished is kept: try again."""
 
 
 def run_jobs(
@@ -25,72 +33,95 @@ def run_jobs(
     *,
     processes: int = 1,
     dask: str | None = None,
-    on_result: OnResult | None = None,
-) -> list[JobResult]:
-    """Results of all jobs in their order: read from `folder` where it has them, else run now.
+) -> Iterator[tuple[Job, JobResult]]:
+    """Yield each job with its result: first those that `folder` has, then the others as they end.
 
-    Each result is in the folder as soon as it is known, so an interrupted call goes on where it
-    was. Runs `processes` jobs at a time, or on the Dask cluster whose scheduler has the address
-    `dask`; its workers need graspd with the extras `train` and `cluster`, but no folder and no
-    data. A job whose worker is lost runs again. `on_result` is called for stored results, too.
+    Each result is in the folder before it is yielded, so an interrupted run goes on where it was.
+    `processes` jobs run at a time, or those that the Dask cluster takes whose scheduler has the
+    address `dask`: its workers need graspd with the extras `train` and `cluster`, no folder, no
+    data. A job whose worker is lost runs again.
 
     Raises what `jobs.run` raises, `ClusterError`, and `OSError` if the folder cannot be used.
     """
     folder.mkdir(parents=True, exist_ok=True)
     data = grasps.digest()
-    results: dict[int, JobResult] = {}
-
-    def done(index: int, result: JobResult) -> None:
-        results[index] = result
-        if on_result is not None:
-            on_result(index, result)
-
-    for index, job in enumerate(wanted):
+    missing = []
+    for job in wanted:
         stored = jobs.load(folder, job, data)
-        if stored is not None:
-            done(index, stored)
-    missing = [index for index in range(len(wanted)) if index not in results]
-    with _outcomes([wanted[index] for index in missing], grasps, processes, dask) as outcomes:
-        for place, content in outcomes:
-            index = missing[place]
-            result = JobResult.from_bytes(content)
-            jobs.save(folder, wanted[index], data, content)
-            done(index, result)
-    return [results[index] for index in range(len(wanted))]
-
-
-def _outcomes(
-    missing: Sequence[Job], grasps: Grasps, processes: int, dask: str | None
-) -> AbstractContextManager[Outcomes]:
+        if stored is None:
+            missing.append(job)
+        else:
+            yield job, stored
     if not missing:
-        return nullcontext(iter(()))
-    if dask is not None:
-        from models.training.evaluating.cluster import on_cluster
+        return
+    run = _run if dask or processes == 1 else _run_in_process
+    with _on_cluster(dask, grasps) if dask else _on_this_machine(processes) as parallel:
+        outcomes = parallel(joblib.delayed(run)(job, grasps) for job in missing)
+        with closing(outcomes):  # stops what still runs
+            for outcome in outcomes:
+                if not isinstance(outcome, tuple):  # what joblib makes of a cancelled task
+                    raise ClusterError(f"the cluster lost a job: {outcome!r}")
+                job, result = outcome
+                jobs.save(folder, job, data, result)
+                yield job, result
 
-        return on_cluster(missing, grasps, dask)
-    if processes == 1:
-        return nullcontext(
-            jobs.run_numbered(place, job, grasps) for place, job in enumerate(missing)
-        )
-    return _in_processes(missing, grasps, processes)
+
+def _run(job: Job, grasps: Grasps) -> tuple[Job, JobResult]:
+    return job, jobs.run(job, grasps)
+
+
+def _run_in_process(job: Job, grasps: Grasps) -> tuple[Job, JobResult]:
+    # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return _run(job, grasps)
 
 
 @contextmanager
-def _in_processes(missing: Sequence[Job], grasps: Grasps, processes: int) -> Iterator[Outcomes]:
-    parallel = joblib.Parallel(
-        n_jobs=processes, backend="loky", batch_size=1, return_as="generator_unordered"
-    )
-    outcomes = parallel(
-        joblib.delayed(_in_worker)(place, job, grasps) for place, job in enumerate(missing)
-    )
+def _on_this_machine(processes: int) -> Iterator[joblib.Parallel]:
     try:
-        yield outcomes
+        yield _parallel("loky", n_jobs=processes)
     finally:
-        outcomes.close()  # stops what still runs
-        get_reusable_executor().shutdown(wait=True, kill_workers=True)
+        if processes > 1:
+            get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
-def _in_worker(place: int, job: Job, grasps: Grasps) -> tuple[int, bytes]:
-    # A terminal sends Ctrl-C to the workers, too; it is the first process that ends them.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return jobs.run_numbered(place, job, grasps)
+@contextmanager
+def _on_cluster(address: str, grasps: Grasps) -> Iterator[joblib.Parallel]:
+    from distributed import Client, KilledWorker
+
+    # What it has to say, with a traceback, also comes as an exception.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    try:
+        asyncio.run(_knock(address))
+        client = Client(  # type: ignore[no-untyped-call]
+            address, timeout=CONNECT_TIMEOUT_S, set_as_default=False
+        )
+    except (OSError, ValueError) as error:
+        raise ClusterError(f"no Dask scheduler at {address}: {_line(error)}") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
+            # Every worker gets the grasps once, not with each job.
+            yield _parallel("dask", client=client, scatter=[grasps], pure=False)
+        except KilledWorker as error:
+            raise ClusterError(f"a job lost one worker after the other: {_line(error)}") from error
+        except (TimeoutError, CancelledError) as error:
+            raise ClusterError(f"the cluster does not answer: {_line(error)}") from error
+
+
+async def _knock(address: str) -> None:
+    """Connect once: a client that finds no scheduler would leave its thread running."""
+    from distributed.comm.core import connect
+
+    comm = await connect(address, timeout=CONNECT_TIMEOUT_S)  # type: ignore[no-untyped-call]
+    comm.abort()
+
+
+def _parallel(backend: str, **options: object) -> joblib.Parallel:
+    with joblib.parallel_config(backend, **options):
+        # All at once, so that workers that join later get their share.
+        return joblib.Parallel(batch_size=1, pre_dispatch="all", return_as="generator_unordered")
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())

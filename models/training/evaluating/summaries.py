@@ -20,7 +20,7 @@ from models.training.data.datasets import Grasps
 from models.training.data.protocols import PROTOCOLS, EvalProtocol
 from models.training.evaluating.day_figures import DayFigures, day_figures
 from models.training.evaluating.files import to_json, write_whole
-from models.training.evaluating.jobs import JobResult
+from models.training.evaluating.jobs import Job, JobResult
 from models.training.evaluating.metrics import (
     METRICS,
     CurvePoint,
@@ -29,14 +29,16 @@ from models.training.evaluating.metrics import (
     Spread,
     accuracy_at,
     coverage_curve,
+    cross_fitted_p_slip,
+    fit_temperature,
     over_seeds,
+    p_slip,
     reject_threshold,
     reliability_bins,
     score,
     wilson,
 )
-from models.training.fitting.calibration import cross_fitted_p_slip, fit_temperature, p_slip
-from models.training.systems.system import System, digest
+from models.training.systems.system import digest
 
 FORMAT = 1
 HEADLINE = "n50"
@@ -100,7 +102,7 @@ class Variant:
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class SystemSummary:
     """All that is known of a system in one protocol."""
 
     format: int
@@ -136,16 +138,24 @@ Results = Mapping[int, Sequence[JobResult]]
 """By seed: the results of all folds."""
 
 
-def summarise(system: System, protocol: EvalProtocol, results: Results, grasps: Grasps) -> Summary:
-    """The figures of a system in a protocol; `results` hold every fold of every seed."""
-    flat = [result for folds in results.values() for result in folds]
+def summarise(found: Mapping[Job, JobResult], grasps: Grasps) -> SystemSummary:
+    """Return the figures of a system in a protocol.
+
+    `found` has its jobs, all folds of every seed in their order, and their results.
+    """
+    flat = list(found.values())
     names = list(flat[0].margins)
-    return Summary(
+    job = next(iter(found))
+    system = job.system
+    results: dict[int, list[JobResult]] = {}
+    for each, result in found.items():
+        results.setdefault(each.seed, []).append(result)
+    return SystemSummary(
         format=FORMAT,
         system=system.name,
         description=system.description,
         digest=digest(system),
-        protocol=protocol,
+        protocol=job.protocol,
         data=grasps.digest(),
         files=grasps.files,
         seeds=tuple(results),
@@ -167,20 +177,20 @@ def made_with(libraries: Sequence[str] = LIBRARIES) -> dict[str, str]:
     return {"machine": machine, "python": platform.python_version(), **versions}
 
 
-def write_summary(summary: Summary, folder: Path) -> None:
+def write_summary(summary: SystemSummary, folder: Path) -> None:
     """Store a summary as `SYSTEM.PROTOCOL.json` in the folder. Raises `OSError`."""
     write_whole(folder / f"{summary.system}.{summary.protocol}.json", to_json(summary))
 
 
-def read_summary(path: Path) -> Summary:
-    """Read a summary. Raises `OSError`, or `ValueError` if it is none of this format."""
-    summary = msgspec.json.decode(path.read_bytes(), type=Summary)
+def read_summary(path: Path) -> SystemSummary:
+    """Read a summary. Raises `OSError`, or `ValueError` if it has another format."""
+    summary = msgspec.json.decode(path.read_bytes(), type=SystemSummary)
     if summary.format != FORMAT:
         raise ValueError(f"{path}: format {summary.format}, not {FORMAT}")
     return summary
 
 
-def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[Summary]:
+def read_summaries(folder: Path, data: str, digests: Mapping[str, str]) -> list[SystemSummary]:
     """The summaries in a folder that are of this data and of these systems.
 
     `data` is the digest of the grasps, `digests` are those of the systems by name. In the order of

@@ -1,30 +1,46 @@
-"""From a system and its training rows to a trained system: one function for every kind."""
+"""Training a system of any kind, and what comes of it: margins, and the graph that gives them."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
-from sklearn.model_selection import StratifiedKFold
+import onnx
+from torch import nn
 
 from models.training.arrays import Bools, Floats, Floats32
 from models.training.data.augmentation import augment
-from models.training.estimators.classical import ClassicalConfig, fit_classical
-from models.training.estimators.compression import compressed
-from models.training.estimators.networks import AnyNetwork, DenseConfig, NetworkConfig
-from models.training.estimators.recipe import AnyRecipe, train_network
-from models.training.fitting.calibration import fit_temperature
-from models.training.fitting.fitted import (
-    Fitted,
-    FittedBlend,
-    FittedClassical,
-    FittedCompressed,
-    FittedNetwork,
-    FittedStandardised,
+from models.training.estimators import graphs
+from models.training.estimators.classical import (
+    ClassicalConfig,
+    ClassicalModel,
+    classical_margins,
+    classical_size,
+    fit_classical,
 )
-from models.training.systems.system import BlendConfig, DistilConfig, System, digest
+from models.training.estimators.networks import NetworkConfig, parameter_count
+from models.training.estimators.recipe import AnyRecipe, logits, train_network
+from models.training.systems.system import BlendConfig, System
+
+
+class Fitted(Protocol):
+    """A trained system of any kind."""
+
+    @property
+    def parameters(self) -> int:
+        """How many numbers it consists of."""
+
+    def margins(self, inputs: Floats32) -> Floats:
+        """Return the log-odds of slip (N,), uncalibrated, of inputs (N, *shape)."""
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        """Return the graph from inputs (N, *shape) to `margin` (N, 1)."""
+
+    def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+        """Return the graph from inputs to `probability` (N, 2): sigmoid(margin / temperature)."""
+        return graphs.with_probability(self.margin_graph(input_name), temperature)
 
 
 def fit(system: System, inputs: Floats32, slipped: Bools, *, seed: int) -> Fitted:
@@ -33,97 +49,144 @@ def fit(system: System, inputs: Floats32, slipped: Bools, *, seed: int) -> Fitte
     The same arguments give the same result on the same machine. Raises `ValueError` if the inputs
     do not fit the estimator, or are too few.
     """
-    if system.compression is not None:
-        whole = _fit_once(replace(system, compression=None), inputs, slipped, seed)
-        return FittedCompressed(compressed(whole.margin_graph("given"), system.compression, inputs))
     if system.standardise:
-        mean, spread = inputs.mean(axis=0, dtype=np.float64), inputs.std(axis=0, dtype=np.float64)
-        # A value that never changes tells nothing: it becomes zero.
-        scale = np.divide(1.0, spread, where=spread > 0.0, out=np.zeros_like(spread))
-        mean, scale = mean.astype(np.float32), scale.astype(np.float32)
-        plain = replace(system, standardise=False)
-        return FittedStandardised(
-            fit(plain, (inputs - mean) * scale, slipped, seed=seed), mean, scale
-        )
+        return _fit_standardised(system, inputs, slipped, seed)
     if system.augmentation is not None:
         inputs, slipped = augment(inputs, slipped, system.augmentation, seed)
-    match system.estimator:
-        case BlendConfig() as blend:
-            return _fit_blend(blend, inputs, slipped, seed)
-        case DistilConfig() as distil:
-            targets = _targets(distil, inputs, slipped, seed)
-            return _fit_network(distil.student, system.recipe, inputs, targets, seed)
-        case single:
-            return _fit_single(single, system.recipe, inputs, slipped, seed)
+    if isinstance(system.estimator, BlendConfig):
+        return _fit_blend(system.estimator, inputs, slipped, seed)
+    return _fit_single(system.estimator, system.recipe, inputs, slipped, seed)
 
 
-_last: list[tuple[str, Fitted]] = []
-"""The last system that was fitted to be compressed, by a digest of all that it was made from: the
-forms of one network follow each other."""
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedNetwork(Fitted):
+    """A trained network; `parameters` are its weights and biases."""
+
+    network: nn.Sequential
+    shape: tuple[int, ...]
+    threads: int
+
+    @property
+    def parameters(self) -> int:
+        return parameter_count(self.network)
+
+    def margins(self, inputs: Floats32) -> Floats:
+        if not len(inputs):
+            return np.empty(0)
+        values = logits(self.network, inputs, self.threads)
+        margins: Floats = values[:, 1] - values[:, 0]
+        return margins
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        return graphs.network_margin(self.network, self.shape, input_name)
+
+    def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+        return graphs.network_probability(self.network, self.shape, temperature, input_name)
 
 
-def _fit_once(system: System, inputs: Floats32, slipped: Bools, seed: int) -> Fitted:
-    parts = hashlib.sha256(f"{digest(system)} {seed}".encode())
-    parts.update(np.ascontiguousarray(inputs).data)
-    parts.update(np.ascontiguousarray(slipped).data)
-    key = parts.hexdigest()
-    if not _last or _last[0][0] != key:
-        _last[:] = [(key, fit(system, inputs, slipped, seed=seed))]
-    return _last[0][1]
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedClassical(Fitted):
+    """A fitted classifier; `parameters` are weights, support vectors' values or tree nodes."""
+
+    model: ClassicalModel
+
+    @property
+    def parameters(self) -> int:
+        return classical_size(self.model)
+
+    def margins(self, inputs: Floats32) -> Floats:
+        return classical_margins(self.model, inputs)
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        return graphs.classical_margin(self.model, input_name)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedBlend(Fitted):
+    """Weighted sum of the margins of trained members."""
+
+    members: tuple[FittedNetwork | FittedClassical, ...]
+    factors: tuple[float, ...]
+    """What each member's margin is multiplied by."""
+
+    @property
+    def parameters(self) -> int:
+        return sum(member.parameters for member in self.members)
+
+    def margins(self, inputs: Floats32) -> Floats:
+        total = np.zeros(len(inputs))
+        for member, factor in zip(self.members, self.factors, strict=True):
+            total += factor * member.margins(inputs)
+        return total
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        parts = [member.margin_graph(input_name) for member in self.members]
+        return graphs.weighted_sum(parts, self.factors)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedStandardised(Fitted):
+    """A trained system whose inputs are standardised first."""
+
+    inner: Fitted
+    mean: Floats32
+    """Of the training, in the shape of an input."""
+    scale: Floats32
+    """One over the spread in the training, in the shape of an input; 0 where nothing varied."""
+
+    @property
+    def parameters(self) -> int:
+        return self.inner.parameters + self.mean.size + self.scale.size
+
+    def margins(self, inputs: Floats32) -> Floats:
+        return self.inner.margins((inputs - self.mean) * self.scale)
+
+    def margin_graph(self, input_name: str) -> onnx.ModelProto:
+        return graphs.standardised(self.inner.margin_graph(input_name), self.mean, self.scale)
+
+    def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
+        graph = self.inner.to_onnx(temperature, input_name)
+        return graphs.standardised(graph, self.mean, self.scale)
+
+
+def _fit_standardised(
+    system: System, inputs: Floats32, slipped: Bools, seed: int
+) -> FittedStandardised:
+    spread = inputs.std(axis=0, dtype=np.float64)
+    # A value that never changes tells nothing: it becomes zero.
+    scale = np.divide(1.0, spread, where=spread > 0.0, out=np.zeros_like(spread))
+    mean = inputs.mean(axis=0, dtype=np.float64).astype(np.float32)
+    scale = scale.astype(np.float32)
+    plain = replace(system, standardise=False)
+    inner = fit(plain, (inputs - mean) * scale, slipped, seed=seed)
+    return FittedStandardised(inner, mean, scale)
 
 
 def _fit_single(
-    estimator: AnyNetwork | ClassicalConfig,
+    estimator: NetworkConfig | ClassicalConfig,
     recipe: AnyRecipe | None,
     inputs: Floats32,
     slipped: Bools,
     seed: int,
 ) -> FittedNetwork | FittedClassical:
-    if isinstance(estimator, NetworkConfig | DenseConfig):
-        return _fit_network(estimator, recipe, inputs, slipped, seed)
-    return FittedClassical(fit_classical(estimator, inputs, slipped, seed))
-
-
-def _fit_network(
-    config: AnyNetwork,
-    recipe: AnyRecipe | None,
-    inputs: Floats32,
-    slipped: Bools | Floats,
-    seed: int,
-) -> FittedNetwork:
+    if not isinstance(estimator, NetworkConfig):
+        return FittedClassical(fit_classical(estimator, inputs, slipped, seed))
     if recipe is None:
         raise ValueError("a network needs a recipe")
-    network = train_network(config, inputs, slipped, recipe, seed=seed)
+    network = train_network(estimator, inputs, slipped, recipe, seed=seed)
     return FittedNetwork(network, inputs.shape[1:], recipe.threads)
 
 
 def _fit_blend(blend: BlendConfig, inputs: Floats32, slipped: Bools, seed: int) -> FittedBlend:
     copies = [member for member in blend.members for _ in range(member.copies)]
+    seeds: Sequence[int] = np.random.SeedSequence(seed).generate_state(len(copies)).tolist()
     total = sum(member.weight for member in blend.members)
-    fitted, factors = [], []
-    for member, member_seed in zip(copies, _seeds(seed, len(copies)), strict=True):
-        judge = _fit_single(member.estimator, member.recipe, inputs, slipped, member_seed)
-        spread = float(judge.margins(inputs).std())
-        fitted.append(judge)
+    members, factors = [], []
+    for member, member_seed in zip(copies, seeds, strict=True):
+        fitted = _fit_single(member.estimator, member.recipe, inputs, slipped, member_seed)
+        spread = float(fitted.margins(inputs).std())
+        members.append(fitted)
         # A member that judges all grasps alike has learnt nothing and has no say.
         share = member.weight / (member.copies * total)
         factors.append(share / spread if spread > 0.0 else 0.0)
-    return FittedBlend(tuple(fitted), tuple(factors))
-
-
-def _targets(distil: DistilConfig, inputs: Floats32, slipped: Bools, seed: int) -> Floats:
-    """Probabilities of slip (N,): the labels mixed with what the teacher says out of fold."""
-    margins = np.empty(len(inputs))
-    split = StratifiedKFold(distil.inner_folds, shuffle=True, random_state=seed)
-    seeds = _seeds(seed, distil.inner_folds)
-    for fold_seed, (rest, fold) in zip(seeds, split.split(inputs, slipped), strict=True):
-        teacher = _fit_blend(distil.teacher, inputs[rest], slipped[rest], fold_seed)
-        margins[fold] = teacher.margins(inputs[fold])
-    temperature = fit_temperature(margins, slipped)
-    soft = 1.0 / (1.0 + np.exp(-margins / temperature))
-    targets: Floats = distil.hard * slipped + (1.0 - distil.hard) * soft
-    return targets
-
-
-def _seeds(seed: int, number: int) -> Sequence[int]:
-    return [int(value) for value in np.random.SeedSequence(seed).generate_state(number)]
+    return FittedBlend(tuple(members), tuple(factors))

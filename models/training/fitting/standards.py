@@ -16,7 +16,7 @@ NONE, TRAINING, ALL = "none", "training", "all"
 RUNNING, RUNNING_SORTED = "running", "running-sorted"
 """Variants: each grasp by what came before it, from nothing; objects mixed, or one by one."""
 DRAWS = (5, 10, 20, 50)
-"""Variants `n5` ...: by so many grasps of the pool, drawn at random."""
+"""Variants `n5` ...: calibrated by 5 ... grasps of the pool, drawn at random."""
 SESSION_VARIANTS = (NONE, *(f"n{number}" for number in DRAWS), ALL, RUNNING, RUNNING_SORTED)
 
 

@@ -17,7 +17,7 @@ from models.training.estimators.graphs import OPSET
 from models.training.evaluating.broken import Study
 from models.training.evaluating.day_figures import DayFigures
 from models.training.evaluating.metrics import CurvePoint, Fraction, Spread
-from models.training.evaluating.summaries import ObjectFigures, Summary, Variant
+from models.training.evaluating.summaries import ObjectFigures, SystemSummary, Variant
 from models.training.making.export import Parity
 
 LIBRARIES = ("numpy", "onnx", "onnxruntime", "onnxscript", "scikit-learn", "skl2onnx", "torch")
@@ -33,7 +33,7 @@ OWN_LICENCE = "whatever the owner of the tables says"
 """Of data without a published table."""
 
 
-class ModelFile(msgspec.Struct, frozen=True):
+class ExportedFile(msgspec.Struct, frozen=True):
     """The ONNX file that the card is about."""
 
     sha256: str
@@ -42,7 +42,7 @@ class ModelFile(msgspec.Struct, frozen=True):
     parity: Parity
 
     @classmethod
-    def of(cls, path: Path, parity: Parity) -> ModelFile:
+    def of(cls, path: Path, parity: Parity) -> ExportedFile:
         """Of a file that was just exported."""
         data = path.read_bytes()
         return cls(hashlib.sha256(data).hexdigest(), len(data), OPSET, parity)
@@ -88,7 +88,7 @@ class Measured(msgspec.Struct, frozen=True):
     """Of the protocol `days`, by group of streams."""
 
     @classmethod
-    def of(cls, summary: Summary) -> Measured:
+    def of(cls, summary: SystemSummary) -> Measured:
         """The figures of a summary that a user of the model needs."""
         main: Variant = summary.main
         several = summary.variants if len(summary.variants) > 1 else {}
@@ -123,7 +123,7 @@ class Card(msgspec.Struct, frozen=True):
     what: str
     contract: ModelContract
     """Word for word what stands in the file."""
-    file: ModelFile
+    file: ExportedFile
     parameters: int
     """How many numbers the model consists of."""
     data: Data
@@ -145,7 +145,7 @@ class Card(msgspec.Struct, frozen=True):
     weak_points: tuple[str, ...]
 
 
-def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]:
+def weak_points(summaries: Sequence[SystemSummary], grasps: Grasps) -> tuple[str, ...]:
     """Sentences on what the model cannot do, with measured figures; `grasps` are trained on."""
     texts = []
     for summary in summaries:
@@ -182,7 +182,9 @@ def weak_points(summaries: Sequence[Summary], grasps: Grasps) -> tuple[str, ...]
     return (*texts, *(_own_data(grasps, own, summaries) if own else [PUBLISHED_DATA]), *WEAK_POINTS)
 
 
-def _own_data(grasps: Grasps, own: Sequence[str], summaries: Sequence[Summary]) -> Iterator[str]:
+def _own_data(
+    grasps: Grasps, own: Sequence[str], summaries: Sequence[SystemSummary]
+) -> Iterator[str]:
     objects, tables = len(set(grasps.objects)), sum(file.rows > 0 for file in grasps.files)
     yield (
         f"The data is of {objects} {'object' if objects == 1 else 'objects'} in {tables} "

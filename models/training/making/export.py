@@ -13,7 +13,7 @@ from models.contract import METADATA_KEY, ModelContract
 from models.inputs import SessionBuilder, builder
 from models.runtime import TactileModel
 from models.training.evaluating.files import replacing
-from models.training.fitting.fitted import Fitted
+from models.training.fitting.fit import Fitted
 from models.training.fitting.standards import Standards
 
 TOLERANCE = 1e-5

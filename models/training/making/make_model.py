@@ -26,7 +26,7 @@ from models.training.evaluating.files import to_json, write_whole
 from models.training.evaluating.jobs import JobResult
 from models.training.evaluating.metrics import FEWEST_JUDGED
 from models.training.evaluating.run_jobs import run_jobs
-from models.training.evaluating.summaries import Summary, made_with, summarise
+from models.training.evaluating.summaries import SystemSummary, made_with, summarise
 from models.training.fitting.novelty import held_out_never_seen, made_up_never_seen
 from models.training.fitting.standards import PRIOR_GRASPS, RUNNING
 from models.training.fitting.trained import Trained, train
@@ -34,8 +34,8 @@ from models.training.making.card import (
     LIBRARIES,
     Card,
     Data,
+    ExportedFile,
     Measured,
-    ModelFile,
     NeverSeen,
     weak_points,
 )
@@ -59,10 +59,14 @@ def make_model(
     cannot be written.
     """
     wanted = plan.jobs(grasps)
-    found = run_jobs(
-        wanted, grasps, results, processes=plan.processes, on_result=lambda *_: on_done()
-    )
-    summaries = _summaries(plan, grasps, found)
+    found = {}
+    for job, result in run_jobs(wanted, grasps, results, processes=plan.processes):
+        found[job] = result
+        on_done()
+    summaries = [
+        summarise({job: found[job] for job in wanted if job.protocol == protocol}, grasps)
+        for protocol in plan.protocols(grasps)
+    ]
     again = jobs.run(wanted[0], grasps)
     on_done()
     system = plan.system
@@ -78,7 +82,7 @@ def make_model(
     card = Card(
         what=system.description,
         contract=contract,
-        file=ModelFile.of(path, parity),
+        file=ExportedFile.of(path, parity),
         parameters=trained.fitted.parameters,
         data=Data.of(grasps.files),
         system=configuration(system, "input", "estimator", "recipe", "augmentation", "tables"),
@@ -87,7 +91,7 @@ def make_model(
         calibrated_by=calibrator.protocol,
         broken=None if plan.only else broken_study(system, trained.grasps, plan.seed),
         never_seen=_never_seen(trained, contract, plan.seed),
-        same_seed_same_margins=_same(found[0], again),
+        same_seed_same_margins=_same(found[wanted[0]], again),
         command=plan.command,
         made_with=made_with(LIBRARIES) | {"machine": platform.machine()},
         weak_points=weak_points(summaries, trained.grasps),
@@ -96,25 +100,14 @@ def make_model(
     return card
 
 
-def _calibrator(summaries: list[Summary]) -> Summary:
+def _calibrator(summaries: list[SystemSummary]) -> SystemSummary:
     """What probabilities are calibrated by: new objects, where they were measured."""
     return summaries[min(1, len(summaries) - 1)]
 
 
-def _summaries(plan: TrainingPlan, grasps: Grasps, found: list[JobResult]) -> list[Summary]:
-    results = list(zip(plan.jobs(grasps), found, strict=True))
-    return [
-        summarise(
-            plan.system,
-            protocol,
-            {plan.seed: [result for job, result in results if job.protocol == protocol]},
-            grasps,
-        )
-        for protocol in plan.protocols(grasps)
-    ]
-
-
-def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) -> ModelContract:
+def _contract(
+    plan: TrainingPlan, trained: Trained, summaries: list[SystemSummary]
+) -> ModelContract:
     return ModelContract(
         version=2,
         name=plan.model,
@@ -129,7 +122,7 @@ def _contract(plan: TrainingPlan, trained: Trained, summaries: list[Summary]) ->
     )
 
 
-def _confidence(summary: Summary) -> tuple[ConfidenceStep, ...]:
+def _confidence(summary: SystemSummary) -> tuple[ConfidenceStep, ...]:
     """Of few grasps the surest are too few to say how often they are right."""
     judged = summary.folds * summary.test_grasps
     return tuple(
@@ -139,14 +132,14 @@ def _confidence(summary: Summary) -> tuple[ConfidenceStep, ...]:
     )
 
 
-def _measured(summary: Summary) -> MeasuredError:
+def _measured(summary: SystemSummary) -> MeasuredError:
     f1, accuracy = summary.main.spreads["f1"], summary.main.spreads["accuracy"]
     return MeasuredError(
         summary.protocol, summary.folds, f1.mean, f1.std, accuracy.mean, accuracy.std
     )
 
 
-def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
+def _input(system: System, trained: Trained, summaries: list[SystemSummary]) -> Input:
     if not isinstance(system.input, SessionFeatures):
         return system.input
     if trained.standards is None:
@@ -162,7 +155,7 @@ def _input(system: System, trained: Trained, summaries: list[Summary]) -> Input:
     )
 
 
-def _sharpness(summaries: list[Summary]) -> tuple[Sharpness, ...]:
+def _sharpness(summaries: list[SystemSummary]) -> tuple[Sharpness, ...]:
     """How much less sure a young session is than the calibrated model, never more sure."""
     base = _calibrator(summaries).main.temperature
     later = next((s for s in summaries if s.protocol == "days"), None)

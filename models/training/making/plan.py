@@ -10,8 +10,8 @@ from pathlib import Path
 from models.bts3 import NEW_SESSION, TABLES, WHOLE
 from models.own import NAME_MAX
 from models.training.data.datasets import Grasps
-from models.training.data.protocols import EvalProtocol, splits
-from models.training.evaluating.jobs import Job
+from models.training.data.protocols import EvalProtocol
+from models.training.evaluating.jobs import Job, jobs_of
 from models.training.systems.system import System
 
 
@@ -54,9 +54,9 @@ class TrainingPlan:
     def jobs(self, grasps: Grasps) -> list[Job]:
         """Every training that is judged: the folds of each protocol, in the order of both."""
         return [
-            Job(self.system, protocol, self.seed, fold, self.folds)
+            job
             for protocol in self.protocols(grasps)
-            for fold in range(len(splits(protocol, grasps, self.seed, self.folds)))
+            for job in jobs_of(self.system, protocol, grasps, (self.seed,), self.folds)
         ]
 
     def chosen(self, grasps: Grasps) -> Grasps:

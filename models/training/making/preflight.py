@@ -10,12 +10,11 @@ import numpy as np
 
 from models.training.arrays import Ints
 from models.training.data.datasets import Grasps, lab_table_names
-from models.training.data.folds import TooFewGraspsError
 from models.training.data.lab_tables import ENOUGH_GRASPS
-from models.training.data.protocols import splits
+from models.training.data.protocols import TooFewGraspsError, splits
 from models.training.evaluating.broken import left_out
 from models.training.making.plan import TrainingPlan
-from models.training.systems.system import DistilConfig, SessionFeatures
+from models.training.systems.system import SessionFeatures
 
 FEWEST_FOLDS = 2
 FEW_OBJECTS = 10
@@ -31,16 +30,12 @@ def preflight(plan: TrainingPlan, grasps: Grasps) -> None:
 
     A training of a session model also needs `FEWEST_STANDARD` of each table that it is judged by.
     """
-    estimator = plan.system.estimator
-    least = estimator.inner_folds if isinstance(estimator, DistilConfig) else 1
     session = isinstance(plan.system.input, SessionFeatures)
     for where, of, train, test in _trainings(plan, grasps):
         slips = int(of.slipped[train].sum())
         for kind, number in (("slipped", slips), ("stayed", len(train) - slips)):
-            if number < least:
-                raise TooFewGraspsError(
-                    f"{where} has {number} grasps that {kind} to train on, not {least}"
-                )
+            if not number:
+                raise TooFewGraspsError(f"{where} has 0 grasps that {kind} to train on, not 1")
         trained = np.bincount(of.table_of[train], minlength=len(of.files))
         for table in np.unique(of.table_of[test]) if session else ():
             if trained[table] < FEWEST_STANDARD:

@@ -13,7 +13,6 @@ from models.tactile_image import Composition, Fill, Normalisation
 from models.training.data.augmentation import Augmentation
 from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig
 from models.training.estimators.classical import SvmConfig as Svm
-from models.training.estimators.compression import Compression, HalfWeights, Integers, LowRank
 from models.training.estimators.networks import (
     CNN0,
     CNN1,
@@ -25,9 +24,8 @@ from models.training.estimators.networks import (
 from models.training.estimators.recipe import PublishedRecipe, Recipe, SessionRecipe
 from models.training.systems.system import (
     BlendConfig,
-    DistilConfig,
     Member,
-    Published,
+    PaperFigure,
     SessionFeatures,
     System,
 )
@@ -49,24 +47,18 @@ IMAGE = image()
 SESSION = SessionFeatures()
 
 CNN_RECIPE = Recipe()
-RANKS = (8, 16, 32, 64, 128, 256)
-NARROW = ((4, 32), (8, 64), (16, 64))
-"""Filters and hidden units."""
 SHARP_SVM = Svm(c=5.0, gamma=0.02)
 SMALL_SESSION = NetworkConfig(filters=16, hidden=64, dropout=0.3)
 SESSION_RECIPE = SessionRecipe()
 SESSION_SVM = Svm(c=3.0, gamma=0.003)
 SESSION_BOOSTING = BoostingConfig(iterations=400, learning_rate=0.05, leaves=15, features=0.3)
-SESSION_BLEND = BlendConfig(
-    (Member(SESSION_SVM), Member(SESSION_BOOSTING), Member(SMALL_SESSION, SESSION_RECIPE, copies=2))
-)
 
 
 def cnn(
     name: str,
     description: str,
     network: NetworkConfig,
-    *published: Published,
+    *published: PaperFigure,
     recipe: Recipe | PublishedRecipe = CNN_RECIPE,
     augmentation: Augmentation | None = None,
     takes: ImageInput = IMAGE,
@@ -75,15 +67,15 @@ def cnn(
     return System(name, description, takes, network, recipe, augmentation, published=published)
 
 
-_CNN1_FIGURES = (Published("cv", (94.2, 0.8)), Published("unknown", (87.7, 0.4)))
-_CNN3_FIGURES = Published("cv", (92.2, 2.0))
+_CNN1_FIGURES = (PaperFigure("cv", (94.2, 0.8)), PaperFigure("unknown", (87.7, 0.4)))
+_CNN3_FIGURES = PaperFigure("cv", (92.2, 2.0))
 
 _PAPER = (
     cnn(
         "cnn0",
         "Conv32 - FC128 on the D1 image, neighbour mean, fingers as channels.",
         CNN0,
-        Published("cv", (92.6, 1.7)),
+        PaperFigure("cv", (92.6, 1.7)),
     ),
     cnn(
         "cnn1",
@@ -91,7 +83,7 @@ _PAPER = (
         CNN1,
         *_CNN1_FIGURES,
     ),
-    cnn("cnn2", "Conv32 - MaxPool2 - FC1024.", CNN2, Published("cv", (92.0, 2.0))),
+    cnn("cnn2", "Conv32 - MaxPool2 - FC1024.", CNN2, PaperFigure("cv", (92.0, 2.0))),
     cnn(
         "cnn3",
         "Conv32 - MaxPool2 - Conv64 (1 x 1, as in the notebooks) - FC1024.",
@@ -115,7 +107,7 @@ _PAPER = (
         "cnn1-augmented",
         "CNN1 for new objects as published: flips and rotations, dropout, 30 epochs.",
         replace(CNN1, dropout=0.25),
-        Published("unknown", (90.1, 0.4)),
+        PaperFigure("unknown", (90.1, 0.4)),
         recipe=PublishedRecipe(epochs=30, l2=0.015),
         augmentation=Augmentation(),
     ),
@@ -135,7 +127,7 @@ _PAPER = (
         "Support vector machine on the 72 z-scored counts.",
         VECTOR,
         Svm(c=3.0, gamma=0.1),
-        published=(Published("cv", (88.0, 2.9)),),
+        published=(PaperFigure("cv", (88.0, 2.9)),),
     ),
     System("mlp", "Multi-layer perceptron on the 72 z-scored counts.", VECTOR, MlpConfig((300,))),
     System(
@@ -143,11 +135,11 @@ _PAPER = (
         "Random forest on the 72 z-scored counts.",
         VECTOR,
         ForestConfig(101, None),
-        published=(Published("cv", (92.6, 1.5)), Published("unknown", (90.2, 0.5))),
+        published=(PaperFigure("cv", (92.6, 1.5)), PaperFigure("unknown", (90.2, 0.5))),
     ),
 )
 
-_D2_FIGURES = Published("cv", (89.7, 1.5), (89.6, 1.7))
+_D2_FIGURES = PaperFigure("cv", (89.7, 1.5), (89.6, 1.7))
 _LAYOUTS = tuple(
     cnn(
         f"cnn0-{layout.name.lower()}-{Fill.LEAST_CONTACT.value}",
@@ -157,10 +149,10 @@ _LAYOUTS = tuple(
         takes=image(layout.name, Fill.LEAST_CONTACT),
     )
     for layout, published in (
-        (D1, Published("cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4))),
+        (D1, PaperFigure("cv", (91.0, 1.4), (90.9, 1.5), (90.4, 2.4), (91.6, 2.4))),
         (D2A, _D2_FIGURES),
         (D2B, _D2_FIGURES),
-        (D3, Published("cv", (89.7, 1.4), (89.7, 1.3))),
+        (D3, PaperFigure("cv", (89.7, 1.4), (89.7, 1.3))),
     )
 )
 """CNN0 on the images of the paper's table I."""
@@ -170,7 +162,7 @@ _COMPOSITIONS = tuple(
         f"cnn0-{composition.value}",
         f"CNN0 on one image with the fingers {where}.",
         CNN0,
-        Published("cv", f1),
+        PaperFigure("cv", f1),
         takes=image(composition=composition),
     )
     for composition, where, f1 in (
@@ -179,31 +171,6 @@ _COMPOSITIONS = tuple(
     )
 )
 """CNN0 on the images of the paper's table II, beside `cnn0` itself."""
-
-_FORMS: dict[str, tuple[str, Compression]] = {
-    "f16": ("with weights of 16 bits", HalfWeights()),
-    "int8": ("with weights and inputs of layers of 8 bits", Integers(static=False)),
-    "int8-static": ("the same, with ranges taken from the training", Integers(static=True)),
-    **{
-        f"rank-{rank}": (f"its large layer factored to rank {rank}", LowRank(rank))
-        for rank in RANKS
-    },
-}
-_SMALLER = (
-    *(
-        replace(cnn(f"cnn1-{name}", f"CNN1 {text}.", CNN1), compression=how)
-        for name, (text, how) in _FORMS.items()
-    ),
-    *(
-        cnn(
-            f"narrow-{filters}x{hidden}",
-            f"Conv{filters} - FC{hidden} on the same image as CNN1.",
-            NetworkConfig(filters=filters, hidden=hidden),
-        )
-        for filters, hidden in NARROW
-    ),
-)
-"""CNN1 in smaller forms, and narrower networks: what is error worth in run time?"""
 
 _ELECTRODES = (
     System(
@@ -267,20 +234,6 @@ _SESSION = (
         SESSION_RECIPE,
         tables=EVERY_TABLE,
     ),
-    System(
-        "blend-session",
-        "Mean of a support vector machine, gradient boosting and two small networks, "
-        "session-calibrated.",
-        SESSION,
-        SESSION_BLEND,
-    ),
-    System(
-        "distilled-session",
-        "Conv16 - FC64 that has learned from the blend, session-calibrated.",
-        SESSION,
-        DistilConfig(SESSION_BLEND, SMALL_SESSION, inner_folds=3),
-        SESSION_RECIPE,
-    ),
 )
 
 
@@ -303,7 +256,6 @@ SYSTEMS = {
         *_PAPER,
         *_LAYOUTS,
         *_COMPOSITIONS,
-        *_SMALLER,
         *_ELECTRODES,
         *_SESSION,
         *_fewer_fingers(),

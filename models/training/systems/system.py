@@ -15,8 +15,7 @@ from models.contract import CountsInput, Finger, ImageInput, VectorInput
 from models.training.data.augmentation import Augmentation
 from models.training.data.protocols import EvalProtocol
 from models.training.estimators.classical import ClassicalConfig
-from models.training.estimators.compression import Compression
-from models.training.estimators.networks import AnyNetwork
+from models.training.estimators.networks import NetworkConfig
 from models.training.estimators.recipe import AnyRecipe, PublishedRecipe, Recipe
 
 CLIP = 3.0
@@ -34,11 +33,11 @@ class SessionFeatures:
 class Member:
     """One of the estimators that a blend asks."""
 
-    estimator: AnyNetwork | ClassicalConfig
+    estimator: NetworkConfig | ClassicalConfig
     recipe: AnyRecipe | None = None
     """Of a network."""
     copies: int = 1
-    """So many, each from another seed."""
+    """How many of it are trained, each from another seed."""
     weight: float = 1.0
     """Of all copies together."""
 
@@ -50,24 +49,12 @@ class BlendConfig:
     members: tuple[Member, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class DistilConfig:
-    """A small network that learns what a blend says of grasps that the blend has not seen."""
-
-    teacher: BlendConfig
-    student: AnyNetwork
-    hard: float = 0.5
-    """Weight of the labels in the student's targets; the rest is the teacher's probability."""
-    inner_folds: int = 5
-    """The teacher judges each grasp after training on the other folds."""
-
-
 SystemInput = ImageInput | VectorInput | CountsInput | SessionFeatures
-Estimator = AnyNetwork | ClassicalConfig | BlendConfig | DistilConfig
+Estimator = NetworkConfig | ClassicalConfig | BlendConfig
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class PaperFigure:
     """A figure of the paper, %, slip positive: mean and standard deviation."""
 
     protocol: EvalProtocol
@@ -86,17 +73,15 @@ class System:
     input: SystemInput
     estimator: Estimator
     recipe: AnyRecipe | None = None
-    """Of the network that `estimator` is or, distilled, ends in; None for others."""
+    """Of the network that `estimator` is; None for others."""
     augmentation: Augmentation | None = None
     standardise: bool = False
     """Each value of an input by its own mean and spread in the training, within the model."""
-    compression: Compression | None = None
-    """What is done to the trained network before it judges."""
     fingers: tuple[Finger, ...] = FINGERS
     """Those that it judges by."""
     tables: tuple[str, ...] = WHOLE
     """What the model that is kept is trained on; protocols say for themselves."""
-    published: tuple[Published, ...] = ()
+    published: tuple[PaperFigure, ...] = ()
 
 
 def digest(system: System) -> str:
@@ -107,9 +92,8 @@ def digest(system: System) -> str:
 
 
 def configuration(system: System, *fields: str) -> dict[str, Any]:
-    """These fields of a system, JSON-ready, and its compression and fingers if they are special."""
-    special = {"compression": system.compression is not None, "fingers": system.fingers != FINGERS}
-    names = (*fields, *(name for name, is_special in special.items() if is_special))
+    """Return these fields of a system, JSON-ready, and its fingers if they are not all three."""
+    names = fields if system.fingers == FINGERS else (*fields, "fingers")
     return {name: _plain(getattr(system, name)) for name in names}
 
 

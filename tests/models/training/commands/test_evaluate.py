@@ -18,9 +18,9 @@ pytest.importorskip("skl2onnx", reason="the train extra is not installed")
 pytest.importorskip("rich", reason="the train extra is not installed")
 
 from models.training.commands import evaluate, evaluation
-from models.training.estimators.classical import SvmConfig
-from models.training.evaluating import jobs
-from models.training.evaluating.grid import grid_of
+from models.training.commands.evaluation import grid_of
+from models.training.estimators.classical import GRIDS, ForestConfig, SvmConfig
+from models.training.evaluating import jobs, run_jobs
 from models.training.systems.registry import SYSTEMS
 from tests.models.training.evaluation_samples import write_sessions
 
@@ -45,35 +45,23 @@ def test_a_quick_run_writes_summaries_and_table(
 ) -> None:
     out, table = tmp_path / "out", tmp_path / "tables" / "RESULTS.md"
     options = ["--data", str(data), "--out", str(out), "--table", str(table), "--quick"]
-    assert graspd_evaluate("svm", "svm-session", *options) == 0
+    assert graspd_evaluate("svm-session", *options) == 0
     protocols = ("cv", "unknown", "objects", "objects-whole", "session", "days")
     assert {path.name for path in out.glob("*.json")} == {
-        f"{name}.{protocol}.json" for name in ("svm", "svm-session") for protocol in protocols
+        f"svm-session.{protocol}.json" for protocol in protocols
     }
     # Unknown has one split, days have two of each of four.
-    assert len(list((out / "jobs").iterdir())) == 2 * (4 * 2 + 1 + 8)
+    assert len(list((out / "jobs").iterdir())) == 4 * 2 + 1 + 8
     text = table.read_text()
-    assert "graspd evaluate svm svm-session --data DIR --out DIR --quick --table FILE" in text
+    assert "graspd evaluate svm-session --data DIR --out DIR --quick --table FILE" in text
     assert "mean nothing" in text
     assert str(tmp_path) not in text
     printed = capsys.readouterr()
     assert [line.split()[:2] for line in printed.out.splitlines()] == [
-        [name, protocol] for name in ("svm", "svm-session") for protocol in protocols
+        ["svm-session", protocol] for protocol in protocols
     ]
     assert "svm-session session (n50): F1 " in printed.out
     assert "palm_45.csv is not the published table" in printed.err
-
-
-def test_a_quick_run_on_the_real_grasps_says_what_it_is(bts3_dir: Path, tmp_path: Path) -> None:
-    table = tmp_path / "RESULTS.md"
-    options = ["--data", str(bts3_dir), "--out", str(tmp_path / "out"), "--table", str(table)]
-    systems = ("cnn0", "rf", "svm", "svm-session")
-    protocols = ("--protocol", "cv", "--protocol", "session")
-    assert graspd_evaluate(*systems, *protocols, *options, "--quick", "--quiet") == 0
-    text = table.read_text()
-    assert "mean nothing" in text
-    for name in systems:
-        assert f"`{name}`" in text
 
 
 def test_what_is_finished_is_not_run_again(
@@ -96,22 +84,13 @@ def test_what_is_finished_is_not_run_again(
     assert json.loads((tmp_path / "svm.cv.json").read_text()) == summary
 
 
-def test_seeds_add_to_what_is_there(data: Path, tmp_path: Path) -> None:
-    options = ["svm", "--protocol", "cv", "--data", str(data), "--out", str(tmp_path)]
-    assert graspd_evaluate(*options, "--seeds", "1") == 0
-    assert len(list((tmp_path / "jobs").iterdir())) == 10
-    assert graspd_evaluate(*options, "--seeds", "2") == 0
-    assert len(list((tmp_path / "jobs").iterdir())) == 20
-
-
 def test_a_grid_names_the_best_of_all_its_points(
     data: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    points = [SvmConfig(cost, gamma) for cost in (0.01, 3.0) for gamma in (1e-4, 0.01)]
-    monkeypatch.setattr(SvmConfig, "grid", staticmethod(lambda: points))
+    monkeypatch.setitem(GRIDS, SvmConfig, [{"c": (0.01, 3.0), "gamma": (1e-4, 0.01)}])
     options = ["--grid", "--protocol", "cv", "--quick", "--data", str(data)]
     assert graspd_evaluate("svm", "cnn1", *options, "--out", str(tmp_path)) == 0
     report = json.loads((tmp_path / "svm.cv.grid.json").read_text())
@@ -123,13 +102,19 @@ def test_a_grid_names_the_best_of_all_its_points(
 
 
 def test_grids_are_the_papers() -> None:
-    machines = [system.estimator for system in grid_of(SYSTEMS["svm"])]
-    costs = [machine.c for machine in machines if isinstance(machine, SvmConfig)]
+    points = grid_of(SYSTEMS["svm"])
+    machines = [point.estimator for point in points if isinstance(point.estimator, SvmConfig)]
+    costs, gammas = {one.c for one in machines}, {one.gamma for one in machines}
     assert (min(costs), max(costs)) == (0.01, 5000.0)
-    names = [system.name for system in grid_of(SYSTEMS["svm"])]
-    assert len(set(names)) == len(names) == len(machines)
+    assert {"auto", 1e-4, 0.1} < gammas
+    forests = [point.estimator for point in grid_of(SYSTEMS["rf"])]
+    depths = {forest.depth for forest in forests if isinstance(forest, ForestConfig)}
+    assert {None, 5, 30} < depths
+    names = {point.name for point in points}
+    assert len(names) == len(points) == 8 * 7
+    assert "svm-c=3.0-gamma=0.1" in names
     assert not any("/" in name or " " in name for name in names)
-    assert grid_of(SYSTEMS["cnn1"]) == []
+    assert grid_of(SYSTEMS["cnn1"]) == grid_of(SYSTEMS["blend-electrodes"]) == []
 
 
 @pytest.mark.parametrize(
@@ -193,8 +178,8 @@ def test_a_value_out_of_range_is_exit_code_2(
 def test_no_cluster_is_exit_code_1_and_says_so(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cluster = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
-    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 1)
+    pytest.importorskip("distributed", reason="no extra: cluster")
+    monkeypatch.setattr(run_jobs, "CONNECT_TIMEOUT_S", 1)
     options = ["--data", str(data), "--out", str(tmp_path), "--dask", "tcp://127.0.0.1:9"]
     assert graspd_evaluate("svm", "--quick", *options) == 1
     last = capsys.readouterr().err.splitlines()[-1]
@@ -214,12 +199,9 @@ def test_what_is_not_installed_is_said_before_any_training(
     ]
 
 
-@pytest.mark.parametrize("processes", ["1", "2"])
-def test_ctrl_c_ends_with_130_and_leaves_a_folder_to_go_on_from(
-    data: Path, tmp_path: Path, processes: str
-) -> None:
+def test_ctrl_c_ends_with_130_and_leaves_a_folder_to_go_on_from(data: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "daemon", "evaluate", "mlp", "--protocol", "cv"]
-    options = ["--data", str(data), "--out", str(tmp_path), "--jobs", processes, "--seeds", "30"]
+    options = ["--data", str(data), "--out", str(tmp_path), "--jobs", "2", "--seeds", "30"]
     process = subprocess.Popen(
         [*command, *options],
         cwd=ROOT,

@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from models.contract import Dataset, SessionInput
 from models.runtime import TactileModel
 from models.training.commands import train
 from models.training.data.datasets import Grasps
-from models.training.evaluating import jobs
 from models.training.making import make_model
 from models.training.making.export import ExportError
 from tests.models.training.evaluation_samples import OBJECTS, table, write, write_sessions
@@ -108,30 +106,6 @@ def test_the_contract_holds_the_statistics_that_the_session_starts_from(
     sharpness = [step.temperature for step in session.sharpness]
     assert sharpness == sorted(sharpness, reverse=True)
     assert sharpness[-1] >= 1.0
-
-
-def test_an_interrupted_training_goes_on_where_it_was(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "2", "--quiet"]
-    ran: list[jobs.Job] = []
-    run, most = jobs.run, [4]
-
-    def counted(job: jobs.Job, grasps: Grasps) -> jobs.JobResult:
-        if len(ran) == most[0]:
-            raise KeyboardInterrupt
-        ran.append(job)
-        return run(job, grasps)
-
-    monkeypatch.setattr(jobs, "run", counted)
-    assert graspd_train(*options) == 130
-    assert not (tmp_path / "out" / f"{SYSTEM}.onnx").exists()
-    done, ran[:] = len(ran), []
-    assert done == 4
-    most[0] = 100
-    assert graspd_train(*options) == 0
-    # Six folds and two of each of four days, less those kept, and one again: is it the same?
-    assert len(ran) == 6 + 8 - 4 + 1
 
 
 def test_the_same_seed_makes_the_same_file(data: Path, tmp_path: Path) -> None:
@@ -227,60 +201,6 @@ def test_the_smallest_table_of_ones_own_makes_a_model_that_says_what_it_is_of(
     ]
     assert card["weak_points"][3].startswith("20 grasps, 10 of which slipped, are few: the daemon")
     assert capsys.readouterr().err.startswith("graspd train: warning: 20 grasps are few")
-
-
-@pytest.mark.parametrize(
-    ("name", "rows", "problem"),
-    [
-        ("palm_45", range(80), "has the name of a published table: rename it, or use --data"),
-        ("la\nb", range(80), "has a name that cannot be printed"),
-        ("lab", range(19), "has 19 grasps, 20 are the fewest"),
-        ("lab", range(0, 80, 2), "has no grasp that slipped, a session needs both kinds"),
-        ("lab", range(1, 80, 2), "has no grasp that stayed, a session needs both kinds"),
-        ("lab", (*range(80), 7), "has counts twice: the same grasp counts once"),
-    ],
-)
-def test_a_table_of_ones_own_that_would_mislead_is_one_line_and_exit_code_2(
-    name: str,
-    rows: Sequence[int],
-    problem: str,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    counts, slipped = separable_counts(GRASPS)
-    path = tmp_path / f"{name}.csv"
-    write_table(path, counts[list(rows)], slipped[list(rows)])
-    assert graspd_train("--own", str(path), "--out", str(tmp_path / "out")) == 2
-    assert capsys.readouterr().err == f"graspd train: {path}: {problem}\n"
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("beside", ["palm_45", "monday"])
-def test_a_grasp_that_is_in_two_tables_is_refused(
-    beside: str, data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monday, both = tmp_path / "monday.csv", tmp_path / "both.csv"
-    write(monday, table("monday", 40, 3))
-    first = monday if beside == "monday" else data / "palm_45.csv"
-    both.write_bytes(first.read_bytes())
-    options = ["--data", str(data), "--own", str(monday), "--own", str(both)]
-    assert graspd_train(*options, "--out", str(tmp_path / "out")) == 2
-    assert capsys.readouterr().err == (
-        f"graspd train: {both}: has counts that are in {beside}, too: the same grasp counts once\n"
-    )
-
-
-def test_two_tables_of_ones_own_have_two_names(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    paths = [tmp_path / day / "lab.csv" for day in ("monday", "friday")]
-    for seed, path in enumerate(paths):
-        path.parent.mkdir()
-        write(path, table("lab", 40, seed))
-    assert graspd_train("--own", str(paths[0]), "--own", str(paths[1])) == 2
-    assert capsys.readouterr().err == (
-        f"graspd train: {paths[1]}: has the same name as {paths[0]}: rename one\n"
-    )
 
 
 def test_grasps_of_one_object_measure_known_objects_alone(
@@ -423,15 +343,6 @@ def test_a_name_that_a_scene_could_not_use_is_refused(
 def test_without_any_data_there_is_nothing_to_train_on(capsys: pytest.CaptureFixture[str]) -> None:
     assert graspd_train() == 2
     assert capsys.readouterr().err == "graspd train: needs --data DIR, --own FILE, or both\n"
-
-
-def test_too_few_grasps_for_the_folds_are_exit_code_2(
-    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    options = ["--data", str(data), "--out", str(tmp_path / "out"), "--folds", "25"]
-    assert graspd_train(*options) == 2
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last == ("graspd train: 25 folds need 25 objects, there are 20 (see --folds and --only)")
 
 
 def test_an_output_folder_that_is_a_file_is_exit_code_2(

@@ -177,12 +177,6 @@ def test_all_tables_know_which_grasp_is_theirs(bts3_dir: Path) -> None:
     assert [file.name for file in grasps.files] == ["palm_down", "palm_side", "palm_45"]
 
 
-def test_without_a_later_session_all_is_whole(tmp_path: Path) -> None:
-    for name in ("palm_down", "palm_side"):
-        write_table(tmp_path / f"{name}.csv", *separable_counts(6))
-    assert len(read_all(tmp_path)) == 12
-
-
 def test_some_rows_keep_counts_labels_objects_and_tables_together(tmp_path: Path) -> None:
     for seed, name in enumerate(("palm_down", "palm_side")):
         write_table(tmp_path / f"{name}.csv", *separable_counts(6, seed))

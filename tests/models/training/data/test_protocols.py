@@ -12,12 +12,15 @@ import pytest
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.training.data.datasets import Grasps, concatenate, read_all
-from models.training.data.folds import TooFewGraspsError, fold_seed, object_folds
 from models.training.data.protocols import (
     ABOUT,
     PROTOCOLS,
     UNKNOWN_OBJECTS,
     EvalProtocol,
+    TooFewGraspsError,
+    fold_seed,
+    folds_of,
+    object_folds,
     splits,
 )
 from tests.models.training.evaluation_samples import OBJECTS, sessions, table
@@ -189,3 +192,19 @@ def test_each_fold_of_each_seed_trains_from_another_start() -> None:
 
 def test_every_protocol_is_explained() -> None:
     assert set(ABOUT) == set(get_args(EvalProtocol)) == set(PROTOCOLS)
+
+
+def test_folds_are_stratified_and_leave_each_grasp_out_once() -> None:
+    slipped = np.arange(200) % 4 == 0
+    fold_of = folds_of(slipped, 10, seed=0)
+    for fold in range(10):
+        inside = fold_of == fold
+        assert (int(inside.sum()), int(slipped[inside].sum())) == (20, 5)
+    assert np.array_equal(fold_of, folds_of(slipped, 10, seed=0))
+    assert not np.array_equal(fold_of, folds_of(slipped, 10, seed=1))
+
+
+def test_too_few_grasps_of_one_class_are_refused() -> None:
+    slipped = np.array([True] * 9 + [False] * 30)
+    with pytest.raises(TooFewGraspsError, match="10 folds need 10 grasps of each class, one has 9"):
+        folds_of(slipped, 10, seed=0)

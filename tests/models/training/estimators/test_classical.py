@@ -90,20 +90,6 @@ def test_classes_weigh_the_same_however_many_grasps_each_has() -> None:
     assert weights.max() / weights.min() == pytest.approx(9.0, rel=0.01)
 
 
-def test_grids_cover_what_the_paper_searched() -> None:
-    costs = {config.c for config in SvmConfig.grid()}
-    gammas = {config.gamma for config in SvmConfig.grid()}
-    assert (min(costs), max(costs)) == (0.01, 5000.0)
-    assert "auto" in gammas
-    numbers = [gamma for gamma in gammas if not isinstance(gamma, str)]
-    assert (min(numbers), max(numbers)) == (1e-4, 0.1)
-    depths = {config.depth for config in ForestConfig.grid()}
-    assert {None, 5, 30} <= depths
-    assert all(10 <= config.trees <= 200 for config in ForestConfig.grid())
-    for grid in (SvmConfig.grid(), ForestConfig.grid(), MlpConfig.grid(), BoostingConfig.grid()):
-        assert len(set(grid)) == len(grid) > 5
-
-
 def test_images_and_a_single_class_are_refused() -> None:
     images, slipped = np.zeros((4, 12, 11, 3), np.float32), np.ones(120, np.bool_)
     with pytest.raises(ValueError, match="takes vectors"):

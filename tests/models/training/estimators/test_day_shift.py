@@ -8,7 +8,7 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 
 import torch
 
-from models.training.estimators.day_shift import DayShift, on_another_day
+from models.training.estimators.recipe import DayShift, on_another_day
 
 GRASPS = 4000
 

@@ -19,7 +19,6 @@ from models.training.estimators.networks import (
     CNN2,
     CNN3,
     Beside,
-    DenseConfig,
     NetworkConfig,
     SecondConvolution,
     build,
@@ -43,7 +42,7 @@ def images() -> NDArray[np.float32]:
     return TactileImager(3).build_batch(separable_counts(160)[0])[0]
 
 
-def _unsettled(config: NetworkConfig | DenseConfig, shape: tuple[int, ...]) -> nn.Sequential:
+def _unsettled(config: NetworkConfig, shape: tuple[int, ...]) -> nn.Sequential:
     """A network in evaluation mode, no parameter of which has its neutral value."""
     with reproducible(seed=3):
         network = build(config, shape)
@@ -80,11 +79,10 @@ def _unsettled(config: NetworkConfig | DenseConfig, shape: tuple[int, ...]) -> n
         (NetworkConfig(16, 64), FEATURES, 432 + 32 + (1446 * 64 + 64) + 128 + 130),
         (NetworkConfig(8, 32), VECTOR, 216 + 16 + (720 * 32 + 32) + 64 + 66),
         (NetworkConfig(8, 32, batch_norm=False), IMAGE, 216 + 8 + (720 * 32 + 32) + 66),
-        (DenseConfig((64, 32)), FEATURES, (78 * 64 + 64) + 128 + (64 * 32 + 32) + 64 + 66),
     ],
 )
 def test_a_network_has_the_parameters_of_its_layers(
-    config: NetworkConfig | DenseConfig, shape: tuple[int, ...], parameters: int
+    config: NetworkConfig, shape: tuple[int, ...], parameters: int
 ) -> None:
     network = build(config, shape).eval()
     assert parameter_count(network) == parameters
@@ -222,13 +220,12 @@ def test_features_become_the_filled_image_and_the_rest_stands_beside() -> None:
         (DEEP, IMAGE),
         (PLAIN, IMAGE),
         (NetworkConfig(4, 8, dropout=0.5), FEATURES),
-        (DenseConfig((9, 5), dropout=0.5), VECTOR),
-        (DenseConfig((9,), batch_norm=False), FEATURES),
+        (NetworkConfig(4, 8, batch_norm=False), VECTOR),
     ],
 )
 @pytest.mark.parametrize("temperature", [0.5, 2.5])
 def test_folding_batch_norm_and_temperature_changes_no_probability(
-    config: NetworkConfig | DenseConfig, shape: tuple[int, ...], temperature: float
+    config: NetworkConfig, shape: tuple[int, ...], temperature: float
 ) -> None:
     inputs = np.random.default_rng(6).normal(size=(50, *shape)).astype(np.float32)
     network = _unsettled(config, shape)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -25,10 +24,12 @@ from joblib.externals.loky import get_reusable_executor
 from models.contract import VectorInput
 from models.training.data.datasets import Grasps
 from models.training.estimators.classical import ForestConfig
+from models.training.estimators.networks import NetworkConfig
+from models.training.estimators.recipe import Recipe
 from models.training.evaluating import jobs
-from models.training.evaluating.jobs import ClusterError, Job, JobResult
-from models.training.evaluating.run_jobs import run_jobs
-from models.training.systems.system import System
+from models.training.evaluating.jobs import Job, JobResult
+from models.training.evaluating.run_jobs import ClusterError, run_jobs
+from models.training.systems.system import SessionFeatures, System
 from tests.models.training.evaluation_samples import sessions
 
 GRASPS = sessions(120)
@@ -54,8 +55,10 @@ def some_jobs(number: int, trees: int = 5) -> list[Job]:
     ]
 
 
-def assert_same(ours: list[JobResult], theirs: list[JobResult]) -> None:
-    for one, other in zip(ours, theirs, strict=True):
+def assert_same(ours: dict[Job, JobResult], theirs: dict[Job, JobResult]) -> None:
+    assert ours.keys() == theirs.keys()
+    for job, one in ours.items():
+        other = theirs[job]
         assert np.array_equal(one.test, other.test)
         assert one.margins.keys() == other.margins.keys()
         for variant, margins in one.margins.items():
@@ -63,21 +66,16 @@ def assert_same(ours: list[JobResult], theirs: list[JobResult]) -> None:
 
 
 def test_two_processes_give_what_one_gives_bit_for_bit(tmp_path: Path) -> None:
-    wanted = some_jobs(6)
-    alone = run_jobs(wanted, GRASPS, tmp_path / "one")
-    both = run_jobs(wanted, GRASPS, tmp_path / "two", processes=2)
+    network = NetworkConfig(filters=4, hidden=8)
+    small = System("small", "A network.", SessionFeatures(), network, Recipe(epochs=2))
+    wanted = [*some_jobs(3), *(Job(small, "objects", 2, fold, 4) for fold in range(3))]
+    alone = dict(run_jobs(wanted, GRASPS, tmp_path / "one"))
+    both = dict(run_jobs(wanted, GRASPS, tmp_path / "two", processes=2))
     assert_same(both, alone)
+    assert list(alone) == wanted
     names = {path.name for path in (tmp_path / "one").iterdir()}
     assert names == {path.name for path in (tmp_path / "two").iterdir()}
     assert len(names) == 6
-
-
-def test_results_come_in_the_order_of_the_jobs(tmp_path: Path) -> None:
-    wanted = some_jobs(4)
-    forth = run_jobs(wanted, GRASPS, tmp_path)
-    back = run_jobs(wanted[::-1], GRASPS, tmp_path)
-    assert_same(forth, back[::-1])
-    assert_same(forth, [jobs.run(job, GRASPS) for job in wanted])
 
 
 def test_an_interrupted_sweep_goes_on_and_runs_nothing_twice(
@@ -95,93 +93,41 @@ def test_an_interrupted_sweep_goes_on_and_runs_nothing_twice(
 
     monkeypatch.setattr(jobs, "run", counted)
     with pytest.raises(KeyboardInterrupt):
-        run_jobs(wanted, GRASPS, tmp_path)
+        list(run_jobs(wanted, GRASPS, tmp_path))
     assert len(list(tmp_path.iterdir())) == 3
     stop_after.clear()
-    results = run_jobs(wanted, GRASPS, tmp_path)
+    results = dict(run_jobs(wanted, GRASPS, tmp_path))
     assert ran == wanted
-    assert_same(results, [run(job, GRASPS) for job in wanted])
+    assert_same(results, {job: run(job, GRASPS) for job in wanted})
 
 
-def test_every_job_is_told_once_stored_or_run(tmp_path: Path) -> None:
-    wanted = some_jobs(4)
-    run_jobs(wanted[:2], GRASPS, tmp_path)
-    told: list[int] = []
-    results = run_jobs(wanted, GRASPS, tmp_path, on_result=lambda index, _: told.append(index))
-    assert sorted(told) == [0, 1, 2, 3]
-    assert len(told) == len(results) == 4
-
-
-def test_a_broken_result_is_run_again_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    wanted = some_jobs(2)
-    first = run_jobs(wanted, GRASPS, tmp_path)
-    path = tmp_path / wanted[1].file_name(GRASPS.digest())
-    path.write_bytes(path.read_bytes()[:-100])
-    with caplog.at_level(logging.WARNING):
-        assert_same(run_jobs(wanted, GRASPS, tmp_path), first)
-    assert [record.getMessage().endswith("it is run again") for record in caplog.records] == [True]
-    caplog.clear()
-    run_jobs(wanted, GRASPS, tmp_path)
-    assert not caplog.records
-
-
-def test_a_cluster_that_is_not_there_is_said_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ours = pytest.importorskip("models.training.evaluating.cluster", reason="no extra: cluster")
-    monkeypatch.setattr(ours, "CONNECT_TIMEOUT_S", 1)
-    with pytest.raises(ClusterError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
-        run_jobs(some_jobs(1), GRASPS, tmp_path, dask="tcp://127.0.0.1:9")
-
-
-def test_a_cluster_that_loses_a_worker_loses_no_result(tmp_path: Path) -> None:
+def test_a_cluster_may_lose_a_worker_and_then_its_scheduler(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="no extra: cluster")
-    wanted = some_jobs(12, trees=40)
-    alone = run_jobs(wanted, GRASPS, tmp_path / "alone")
-    killed: list[int] = []
-    with cluster(tmp_path, workers=2) as (address, _, workers):
-
-        def kill_one(index: int, _result: JobResult) -> None:
-            if not killed:
+    wanted, more = some_jobs(8, trees=40), some_jobs(8, trees=30)
+    found: dict[Job, JobResult] = {}
+    with cluster(tmp_path) as (address, scheduler, workers):
+        for job, result in run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address):
+            if not found:
                 workers[0].kill()
-                killed.append(index)
-
-        ours = run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_one)
+            found[job] = result
         assert workers[0].wait(START_S) == -signal.SIGKILL
-        assert workers[1].poll() is None
-    assert len(killed) == 1
-    assert_same(ours, alone)
-    stored = [jobs.load(tmp_path / "ours", job, GRASPS.digest()) for job in wanted]
-    assert_same([result for result in stored if result is not None], alone)
-
-
-def test_a_cluster_that_dies_leaves_what_was_finished(tmp_path: Path) -> None:
-    pytest.importorskip("distributed", reason="no extra: cluster")
-    wanted = some_jobs(12, trees=30)
-    told: list[int] = []
-    with cluster(tmp_path, workers=1) as (address, scheduler, _):
-
-        def kill_scheduler(index: int, _result: JobResult) -> None:
-            told.append(index)
-            if len(told) == 3:
-                scheduler.kill()
-
+        assert workers[1].poll() is workers[2].poll() is None
+        results = run_jobs(more, GRASPS, tmp_path / "more", dask=address)
+        next(results)
+        scheduler.kill()
         with pytest.raises(ClusterError, match="the cluster does not answer"):
-            run_jobs(wanted, GRASPS, tmp_path / "ours", dask=address, on_result=kill_scheduler)
-    stored = len(list((tmp_path / "ours").iterdir()))
-    assert 3 <= stored == len(told) < 12
-    finished = run_jobs(wanted, GRASPS, tmp_path / "ours")
-    assert_same(finished, [jobs.run(job, GRASPS) for job in wanted])
+            list(results)
+    assert_same(found, {job: jobs.run(job, GRASPS) for job in wanted})
+    assert_same(dict(run_jobs(wanted, GRASPS, tmp_path / "ours")), found)
+    assert 1 <= len(list((tmp_path / "more").iterdir())) < 8
 
 
 Process = subprocess.Popen[bytes]
 
 
 @contextlib.contextmanager
-def cluster(folder: Path, workers: int) -> Iterator[tuple[str, Process, list[Process]]]:
-    """Address, scheduler and workers, each a process of its own, on loopback."""
+def cluster(folder: Path) -> Iterator[tuple[str, Process, list[Process]]]:
+    """Address, scheduler and three workers, each a process of its own, on loopback."""
     import distributed
 
     place = folder / "scheduler.json"
@@ -204,12 +150,12 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, Process, list[Pro
         )
         running = [
             stack.enter_context(started("dask_worker", address, *options, folder=folder))
-            for _ in range(workers)
+            for _ in range(3)
         ]
         with distributed.Client(  # type: ignore[no-untyped-call]
             address, timeout=START_S, set_as_default=False
         ) as client:
-            client.wait_for_workers(workers, timeout=START_S)
+            client.wait_for_workers(3, timeout=START_S)
         yield address, scheduler, running
 
 

@@ -33,15 +33,13 @@ from models.contract import (
 )
 from models.inputs import builder, raw_features
 from models.runtime import TactileModel
-from models.training.data.datasets import read_whole
 from models.training.estimators.classical import BoostingConfig, ForestConfig, MlpConfig, SvmConfig
-from models.training.estimators.networks import DenseConfig, NetworkConfig, SecondConvolution
+from models.training.estimators.networks import NetworkConfig, SecondConvolution
 from models.training.estimators.recipe import Recipe
-from models.training.fitting.fit import fit
-from models.training.fitting.fitted import Fitted
+from models.training.fitting.fit import Fitted, fit
 from models.training.fitting.standards import Standards
 from models.training.making.export import ExportError, export
-from models.training.systems.registry import SESSION, SYSTEMS
+from models.training.systems.registry import SESSION
 from models.training.systems.system import BlendConfig, Estimator, Member, System
 from tests.models.training.training_samples import separable_counts
 
@@ -87,7 +85,6 @@ CASES = {
         IMAGE, replace(TINY, pool=True, second=SecondConvolution(5), dropout=0.3), QUICK
     ),
     "session network": Case(STATISTICS, replace(TINY, dropout=0.3), QUICK),
-    "dense network": Case(VECTOR, DenseConfig((8,)), QUICK),
     "svm": Case(VECTOR, SvmConfig(3.0, 0.1)),
     "hard svm": Case(STATISTICS, SvmConfig(5000.0, "auto")),
     "mlp": Case(VECTOR, MlpConfig((8, 8), epochs=30)),
@@ -207,20 +204,6 @@ def test_the_same_training_makes_the_same_bytes_and_tells_nothing_of_the_machine
     assert not re.search(r"/(tmp|home|usr|work|root)/", text)
 
 
-@pytest.mark.parametrize("name", ["image network", "svm", "forest"])
-@pytest.mark.parametrize("temperature", [0.2, 5.0])
-def test_temperature_divides_the_margin(
-    name: str, temperature: float, fitted: Callable[[str], Fitted]
-) -> None:
-    inputs = builder(CASES[name].input, 3)
-    readings = inputs.build_batch(OTHER_COUNTS)[0]
-    model = fitted(name).to_onnx(temperature, inputs.name)
-    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    (probability,) = session.run(None, {inputs.name: readings})
-    odds = np.exp(fitted(name).margins(readings) / temperature)
-    assert probability[:, 1] == pytest.approx(odds / (1.0 + odds), abs=1e-5)
-
-
 def test_a_session_model_is_checked_by_the_statistics_given(
     fitted: Callable[[str], Fitted], tmp_path: Path
 ) -> None:
@@ -252,45 +235,24 @@ def test_a_session_model_is_checked_by_the_statistics_given(
     assert seen[0] == pytest.approx(expected, abs=1e-5)
 
 
-@pytest.mark.parametrize("name", ["image network", "svm"])
 def test_a_file_that_judges_otherwise_is_not_written(
-    name: str, fitted: Callable[[str], Fitted], tmp_path: Path
+    fitted: Callable[[str], Fitted], tmp_path: Path
 ) -> None:
     class Warmer:
         parameters = 0
 
         def margins(self, inputs: NDArray[np.float32]) -> NDArray[np.float64]:
-            return fitted(name).margins(inputs)
+            return fitted("svm").margins(inputs)
 
         def to_onnx(self, temperature: float, input_name: str) -> onnx.ModelProto:
-            return fitted(name).to_onnx(temperature * 1.01, input_name)
+            return fitted("svm").to_onnx(temperature * 1.01, input_name)
 
         def margin_graph(self, input_name: str) -> onnx.ModelProto:
-            return fitted(name).margin_graph(input_name)
+            return fitted("svm").margin_graph(input_name)
 
     path = tmp_path / "made.onnx"
     path.write_bytes(b"the file before")
     with pytest.raises(ExportError, match="differs from the system"):
-        export(Warmer(), 1.0, _contract(CASES[name].input), COUNTS, path)
+        export(Warmer(), 1.0, _contract(CASES["svm"].input), COUNTS, path)
     assert [entry.name for entry in tmp_path.iterdir()] == ["made.onnx"]
     assert path.read_bytes() == b"the file before"
-
-
-@pytest.mark.parametrize("name", ["svm", "mlp", "rf"])
-def test_the_vector_systems_of_the_paper_judge_real_grasps_as_trained(
-    name: str, bts3_dir: Path, tmp_path: Path
-) -> None:
-    """Trained on every second grasp, compared on all of them."""
-    grasps = read_whole(bts3_dir)
-    estimator = SYSTEMS[name].estimator
-    if isinstance(estimator, MlpConfig):
-        estimator = replace(estimator, epochs=20)
-    case = Case(VECTOR, estimator)
-    trained = _fit(case, grasps.counts[::2], grasps.slipped[::2])
-    parity = export(trained, 0.4, _contract(VECTOR), grasps.counts, tmp_path / "made.onnx")
-    assert parity.grasps == 2549
-    assert parity.largest_difference < 1e-5
-    assert parity.verdicts_flipped == 0
-    inputs = builder(VECTOR, 3).build_batch(grasps.counts[1::2])[0]
-    verdicts = trained.margins(inputs) > 0.0
-    assert (verdicts == grasps.slipped[1::2]).mean() > 0.85

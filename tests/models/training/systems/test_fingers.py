@@ -11,10 +11,9 @@ import pytest
 pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("onnx", reason="the train extra is not installed")
 
-from daemon.assembly.assembly import build_pipeline, load_model, model_path
+from daemon.assembly.assembly import build_pipeline, load_model
 from daemon.scene import parse
 from drivers.base import TactileReading
-from models.contract import ModelError
 from models.training.evaluating import jobs
 from models.training.evaluating.jobs import Job
 from models.training.making.make_model import make_model
@@ -92,13 +91,3 @@ def test_a_model_of_two_fingers_judges_a_hand_of_two(tmp_path: Path) -> None:
     counts = grasps.counts[:1, [0, 2]][0]
     judgement = pipeline.judge(TactileReading(10**9, 0, counts, np.zeros((2, 24), dtype=np.uint8)))
     assert judgement.moment.grasp == 1
-
-
-def test_a_hand_of_fingers_that_were_never_recorded_is_told_so(tmp_path: Path) -> None:
-    scene = parse(
-        {"hand": {"fingers": ["ff", "rf"]}, "tactile": {"driver": "spi", "port": "/nowhere"}},
-        tmp_path / "scene.toml",
-    )
-    assert model_path(scene).name == "small-session.onnx"
-    with pytest.raises(ModelError, match=r"judges the fingers ff, mf, th .* no model for these"):
-        build_pipeline(scene, load_model(scene))

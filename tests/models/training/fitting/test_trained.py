@@ -9,7 +9,7 @@ pytest.importorskip("torch", reason="the train extra is not installed")
 pytest.importorskip("sklearn", reason="the train extra is not installed")
 
 from models.training.fitting.novelty import MARGIN_COUNTS, SESSION_MARGIN_COUNTS
-from models.training.fitting.sensor_mapping import SensorMapping
+from models.training.fitting.trained import SensorMapping
 from tests.models.training.evaluation_samples import sessions
 
 

@@ -1,18 +1,17 @@
-"""What the commands of the training half share: arguments, messages, exit codes."""
+"""What the commands of the training half share: arguments, messages, progress, exit codes."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from models.training.data.datasets import DatasetError
-from models.training.data.folds import TooFewGraspsError
+from models.training.data.protocols import TooFewGraspsError
 
 EXIT_OK, EXIT_FAILED, EXIT_INPUT, EXIT_INTERRUPTED = 0, 1, 2, 130
-SEEDS = 3
-"""Of the splits, that an evaluation takes by default."""
 
 
 class WrongInputError(Exception):
@@ -20,7 +19,7 @@ class WrongInputError(Exception):
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """For `argparse`: takes whole numbers from `low` to `high`, ten digits at most."""
+    """Return a type for `argparse`: whole numbers from `low` to `high`, at most ten digits."""
 
     def parse(text: str) -> int:
         if text.isascii() and text.isdigit() and len(text) <= 10 and low <= int(text) <= high:
@@ -55,14 +54,42 @@ def exit_code(
 
 
 def warn_of_unpublished(command: str, names: Iterable[str]) -> None:
-    """Say which tables are not, byte for byte, the published ones."""
+    """Warn of tables that are not, byte for byte, the published ones."""
     for name in names:
-        say(
-            command,
-            f"warning: {name}.csv is not the published table; the figures are of this data only",
-        )
+        text = f"{name}.csv is not the published table; the figures are of this data only"
+        say(command, f"warning: {text}")
 
 
 def say(command: str, text: str) -> None:
-    """One line on standard error."""
+    """Write one line to standard error."""
     sys.stderr.write(f"graspd {command}: {text}\n")
+
+
+@contextmanager
+def progress_bar(first: str, total: int, *, hidden: bool) -> Iterator[Callable[[str], None]]:
+    """Show on standard error, if that is a terminal, how many of `total` trainings are done.
+
+    Call what it yields after each training, with the text to show before the bar. Until then the
+    text is `first`.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("trainings, left"),
+        TimeRemainingColumn(),
+    )
+    hidden = hidden or not console.is_terminal
+    with Progress(*columns, console=console, disable=hidden, transient=True) as bar:
+        task = bar.add_task(first, total=total)
+        yield lambda name: bar.update(task, advance=1, description=name)
