@@ -19,8 +19,7 @@ from daemon.publish.outbox import Outbox
 from daemon.publish.sockets import Sockets
 from daemon.scene import Scene, parse
 from drivers.base import TactileReading
-from drivers.recordings.csv_columns import electrode_columns
-from drivers.recordings.csv_rows import Recording
+from drivers.recordings.csv_rows import Recording, electrode_columns
 from models.electrodes import Electrodes
 from models.runtime import TactileModel
 

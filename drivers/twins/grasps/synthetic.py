@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
-from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
 from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
-from drivers.recordings.csv_rows import read_rows
+from drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns, read_rows
 
 FINGERS = ("ff", "mf", "th")
 COUNTS = len(FINGERS) * ELECTRODES
