@@ -266,15 +266,11 @@ def _palm(
             heed_finger_bits=heed,
             clock=clock,
         )
-    from drivers.recordings.palm_file import PalmFileDriver
+    from drivers.recordings.link_log_player import LinkLogDriver
+    from drivers.recordings.palm_file import PalmFile
 
-    return PalmFileDriver(
-        Path(options.source),
-        fingers,
-        calibration=calibration,
-        heed_finger_bits=heed,
-        clock=clock,
-    )
+    log = PalmFile(fingers, calibration=calibration, heed_finger_bits=heed)
+    return LinkLogDriver([Path(options.source)], log, speed=1.0, clock=clock)
 
 
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
