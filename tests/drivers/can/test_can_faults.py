@@ -257,13 +257,3 @@ def test_sweeps_that_nobody_sent_in_between_are_missed(frame_format: str) -> Non
     missed = 3 if frame_format == "syntouch" else 0  # sweep frames say that none was made
     assert counters.missed_readings == missed
     assert link.readings[-1].seq == 20 + missed
-
-
-def test_sweep_frames_that_start_anew_are_followed() -> None:
-    link = TwinLink("sweep_fd")
-    with link.driver:
-        link.send(contact(20))
-        link.sweeps_sent = 5_000
-        link.send(contact(3))
-    assert len(link.readings) == 23
-    assert link.driver.counters.restarts == 1

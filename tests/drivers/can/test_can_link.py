@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import logging
 import struct
-import time
 
 import can
 import pytest
@@ -131,12 +130,6 @@ def test_whatever_opening_raises_is_tried_again(
         assert driver.counters.link_losses == 0
 
 
-def test_a_keyboard_interrupt_is_no_link_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in(monkeypatch, lambda: ScriptedBus([KeyboardInterrupt()]))
-    with CanBridgeDriver("pcan", "x") as driver, pytest.raises(KeyboardInterrupt):
-        driver.read_ready()
-
-
 def test_one_call_takes_a_bounded_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     bus = ScriptedBus([message(b"\0", 0x7FF)] * (2 * FRAMES_PER_DRAIN + 5))
@@ -199,13 +192,6 @@ def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
     assert seen["rx_queue_size"] == 16384
     assert seen["bitrate"] == 500_000
     assert seen["ignore_config"] is True
-
-
-def test_a_bus_that_was_never_opened_drains_nothing() -> None:
-    bus = CanBus("virtual", "x", {}, time.monotonic_ns, time.time_ns)
-    assert bus.drain() == []
-    assert bus.fileno() is None
-    bus.close()
 
 
 def test_a_board_that_falls_silent_is_not_up_and_comes_back_by_itself() -> None:
