@@ -36,7 +36,7 @@ from drivers.can.frames import (
 )
 from tests.conftest import ROOT
 from tests.drivers.can.can_fuzz import fuzz
-from tests.drivers.can.can_words import pack_frame, word
+from tests.drivers.can.can_words import word
 
 E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
 """Electrode 1 of three sensors: 2602, 2713, 2391."""
@@ -194,18 +194,6 @@ def test_the_kernels_structs_are_read(raw: str, frame: CanFrame) -> None:
 )
 def test_what_is_no_struct_of_the_kernel_is_no_frame(raw: bytes) -> None:
     assert unpack_frame(raw) is None
-
-
-@given(
-    st.integers(0, 0x1FFFFFFF),
-    st.binary(max_size=64),
-    st.sampled_from([0, 1, 4, 8, 9]),
-)
-def test_frames_come_back_as_they_went(identifier: int, data: bytes, flags: int) -> None:
-    identifier &= 0x1FFFFFFF if flags & (EXTENDED | ERROR) else 0x7FF
-    data = data if flags & FD else data[:8]
-    frame = CanFrame(identifier, data, flags)
-    assert unpack_frame(pack_frame(frame)) == frame
 
 
 def test_error_frames_say_what_happened() -> None:

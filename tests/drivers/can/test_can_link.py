@@ -170,19 +170,6 @@ def test_frames_per_second_are_told_until_there_are_none() -> None:
         assert driver.frames_per_s == 0.0
 
 
-def test_frames_are_counted_over_a_full_second() -> None:
-    clock, where = Clock(), channel()
-    with (
-        bridge(where, clock=clock) as driver,
-        can.Bus(interface="virtual", channel=where, ignore_config=True) as bus,
-    ):
-        for passed_ns, told in ((1_000 * MS - 1, 0.0), (1, 2.0), (1_000 * MS, 1.0)):
-            bus.send(message(b"\0", 0x7FF))
-            clock.now_ns += passed_ns
-            driver.read_ready()
-            assert driver.frames_per_s == told
-
-
 def test_a_bit_rate_reaches_python_can_with_a_queue_that_has_a_bound(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -181,18 +181,6 @@ def test_a_sweep_cut_by_silence_is_not_filled_up_later(known: bool) -> None:
     assert counters.lost_frames == 24
 
 
-def test_frames_that_come_in_bursts_make_the_same_readings() -> None:
-    sweeps, counters = assembler("interleaved")
-    stream = concatenated([samples(n, "interleaved") for n in range(40)])
-    bursts = [stream[at : at + 7] for at in range(0, len(stream), 7)]
-    stream = [(channel, words, burst[-1][2]) for burst in bursts for channel, words, _ in burst]
-    readings = feed(sweeps, stream)
-    assert [reading.seq for reading in readings] == list(range(40))
-    for sweep, reading in enumerate(readings):
-        assert_true(reading, sweep)
-    assert counters.faulty_readings == counters.missed_readings == 0
-
-
 @pytest.mark.parametrize(
     ("spoiled", "fault", "counter"),
     [

@@ -152,13 +152,6 @@ def test_a_lag_is_counted_and_nothing_is_skipped(tmp_path: Path) -> None:
             assert driver.counters.late == late
 
 
-def test_fast_is_never_waiting_and_never_late(tmp_path: Path) -> None:
-    clock = Clock()
-    driver = ReplayDriver([write(tmp_path, table(50))], speed=None, clock=clock)
-    assert times_ms(play(driver)) == [0] * 50
-    assert driver.counters.late == 0
-
-
 def test_several_files_play_in_a_row_on_one_time_axis(tmp_path: Path) -> None:
     clock = Clock()
     paths = [
@@ -306,12 +299,6 @@ def test_an_argument_out_of_range_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=message):
         build(Path("grasps.csv"))
-
-
-def test_fingers_come_in_the_order_asked_for(tmp_path: Path) -> None:
-    path = write(tmp_path, table(1))
-    (reading,) = tactile(play(ReplayDriver([path], ("th", "mf"), speed=None)))
-    assert reading.counts[:, 0].tolist() == [count(0, 48), count(0, 24)]
 
 
 def peak_bytes(path: Path, rows: int) -> int:

@@ -89,17 +89,3 @@ def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None
         player(path, Clock())[1].open()
     with pytest.raises(RecordingError, match="is a directory"):
         player(tmp_path, Clock())[1].open()
-
-
-def test_a_file_that_is_read_late_has_lost_no_packet(tmp_path: Path) -> None:
-    clock = Clock()
-    path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(datagrams(40)))
-    readings = []
-    log, driver = player(path, clock)
-    with driver:
-        while not driver.exhausted:
-            readings += tactile(driver.read_ready())
-            clock.now_ns += 500 * MS
-        assert log.stream.counters.lost_packets == 0
-    assert np.array_equal([reading.counts for reading in readings], rows(40))

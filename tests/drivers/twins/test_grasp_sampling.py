@@ -36,16 +36,6 @@ def untouched(sampling: Sampling) -> NDArray[np.float64]:
     return counts_of(list(itertools.islice(grasps, 6000)))
 
 
-def test_held_pairs_repeat_in_two_of_seven_rows_on_all_fingers_together() -> None:
-    repeats = np.diff(untouched(Sampling.HELD), axis=0) == 0.0
-    for pair in PAIRS:
-        together = repeats[:, :, pair].all(axis=(1, 2))
-        assert together.mean() == pytest.approx(0.2857, abs=0.001)
-        gaps = np.diff(np.flatnonzero(together))
-        # Three values that are new and all the same by chance: 0.08 to the third.
-        assert np.isin(gaps, (3, 4)).mean() > 0.995
-
-
 def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_palm() -> None:
     numbers = np.broadcast_to(np.arange(1000.0)[:, np.newaxis, np.newaxis], (1000, 3, 24))
     for seed in range(20):
