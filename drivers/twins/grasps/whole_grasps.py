@@ -110,7 +110,7 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points for ever.
+        """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points without end.
 
         `noise` is made of the number of fingers and a source of chance, `MeasuredNoise` unless
         given. Raises `ValueError` for a rate that is not positive or, held, not 100 Hz.

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import random
-import struct
 from collections.abc import Sequence
-from typing import Any
 
-import can
 import msgspec
 import numpy as np
 import pytest
@@ -22,10 +18,8 @@ from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_fuzz import decoder
 from tests.drivers.can.can_standin import (
-    FailingBus,
     TwinLink,
     contact,
-    tactile,
 )
 from tests.drivers.can.can_words import truth, word
 
@@ -67,51 +61,6 @@ def test_link_faults_are_counted_one_by_one_and_invent_nothing(
     assert counters.faulty_readings == sum(bool(r.faults.any()) for r in link.readings)
     assert injected.total() > 10
     assert_same_tail(link.readings, after)
-
-
-FAILURES = [OSError(errno.ENODEV, "No such device"), struct.error("unpack requires a buffer")]
-
-
-@pytest.mark.parametrize("frame_format", FORMATS)
-@pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
-def test_a_driver_that_loses_its_bus_again_and_again_invents_nothing(
-    monkeypatch: pytest.MonkeyPatch, frame_format: str, failure: Exception
-) -> None:
-    """The bus breaks in the middle of every tenth sweep; what is sent until it is back is lost."""
-    real, opened = can.Bus, []
-    link = TwinLink(frame_format)
-
-    def open_bus(**options: Any) -> object:  # noqa: ANN401
-        if options.get("preserve_timestamps"):
-            return real(**options)  # the twin's
-        opened.append(FailingBus(real(**options)))
-        return opened[-1]
-
-    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
-    sent, losses = contact(120), 0
-    with link.driver:
-        for sweep, counts in enumerate(sent):
-            if sweep % 10 == 9:
-                losses += 1
-                half = link.half(counts)
-                opened[-1].failure = failure
-                link.readings += tactile(link.driver.read_ready())
-                assert half > 0
-                assert link.driver.link_state is LinkState.WAITING
-                link.clock.now_ns += 10 * MS
-            else:
-                link.send([counts])
-        counters = link.driver.counters
-    assert (counters.bus_faults, counters.link_losses, counters.interrupted_sweeps) == (
-        losses,
-        losses,
-        losses,
-    )
-    assert losses == 12
-    for reading in link.readings:
-        sound = reading.faults == 0
-        assert any((reading.counts[sound] == counts[sound]).all() for counts in sent)
-    assert counters.faulty_readings == counters.lost_frames == 0
 
 
 def truth_frames(sweep: int) -> list[CanFrame]:
