@@ -31,7 +31,7 @@ from models.contract import ModelError, SessionInput
 from models.runtime import TactileModel
 
 if TYPE_CHECKING:
-    from drivers.recordings.csv_columns import Columns
+    from drivers.recordings.csv_rows import Columns
 
 DEFAULT_MODEL = "small-session"
 MCAP = ".mcap"
@@ -132,7 +132,7 @@ def gate_mode(scene: Scene) -> GateMode:
         return scene.gate.mode
     if not isinstance(scene.tactile, ReplayTactile) or is_mcap(scene.tactile):
         return "settled"
-    streams = {columns.time is not None for columns in _columns(scene, scene.tactile)}
+    streams = {columns.is_stream for columns in _columns(scene, scene.tactile)}
     if len(streams) > 1:
         raise SceneError("tactile.recordings: both grasp tables and streams; say gate.mode")
     return "settled" if True in streams else "every"
@@ -263,28 +263,23 @@ def _palm(
             heed_finger_bits=heed,
             clock=clock,
         )
-    from drivers.recordings.palm_file import PalmFileDriver
+    from drivers.recordings.link_log_player import LinkLogDriver
+    from drivers.recordings.palm_file import PalmFile
 
-    return PalmFileDriver(
-        Path(options.source),
-        fingers,
-        calibration=calibration,
-        heed_finger_bits=heed,
-        clock=clock,
-    )
+    log = PalmFile(fingers, calibration=calibration, heed_finger_bits=heed)
+    return LinkLogDriver([Path(options.source)], log, speed=1.0, clock=clock)
 
 
 def _replay(scene: Scene, options: ReplayTactile, clock: Clock) -> Driver:
     if is_mcap(options):
         return _replay_mcap(scene, options, clock)
-    from drivers.recordings.csv_player import Pace, ReplayDriver
+    from drivers.recordings.csv_player import ReplayDriver
     from drivers.recordings.faults import ReplayFaults
 
     return ReplayDriver(
         options.recordings,
         scene.hand.fingers,
-        pace=Pace(options.pace),
-        speed=options.speed,
+        speed=options.speed if options.pace == "realtime" else None,
         rate_hz=options.rate_hz,
         loop=options.loop,
         strict=options.strict,

@@ -32,9 +32,8 @@ from daemon.scene.endpoints import check_endpoint, is_private
 from daemon.scene.scene import Hand
 from daemon.session.file import SessionFileError, load, statistics_of
 from drivers.base import DriverError, RecordingError
-from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_DAY
-from drivers.recordings.csv_rows import columns_of
+from drivers.recordings.csv_rows import SLIPPED, columns_of
 from models import zoo
 from models.bts3 import FINGERS, TABLES
 from models.contract import ModelError
@@ -239,7 +238,7 @@ def _choose_demo(args: argparse.Namespace) -> None:
 def _need_labels(args: argparse.Namespace, wanted: Scene) -> None:
     """Raise `SceneError` if outcomes are to be told and a recording has none."""
     for path in args.recordings if args.outcomes else ():
-        if columns_of(path, wanted.hand.fingers).slipped is None:
+        if not columns_of(path, wanted.hand.fingers).has_labels:
             raise SceneError(f"{path}: no column `{SLIPPED}`: there are no outcomes to tell")
 
 

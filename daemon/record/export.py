@@ -16,8 +16,7 @@ from daemon.publish.messages import OutcomeMessage, decode_outcome
 from daemon.record.mcap import McapReader, RecordedMessage
 from daemon.record.topics import Judged, Topic, decode_judged
 from drivers.base import ELECTRODES, RecordingError
-from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
-from drivers.recordings.csv_rows import open_recording
+from drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns, open_recording
 
 GraspId = tuple[str, int]
 """Boot id and number."""

@@ -97,11 +97,11 @@ class CanBus:
         self.failure: LinkError | None = None
         """Why the bus is of no use any more, None while it is."""
         self.more = False
-        """Whether the last drain left frames behind."""
+        """True if the last drain left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
         """Gets what every drain brings, if it brings anything."""
         self.malformed = 0
-        """Records from the socket that are no CAN frames, until somebody resets it."""
+        """Records from the socket that are no CAN frames; its owner resets it."""
         self.kernel_drops = 0
         """Frames dropped by the kernel because its buffer was full, likewise."""
         self._interface = interface
@@ -242,7 +242,7 @@ def _fileno(bus: can.BusABC) -> int | None:
 
 
 def _has_more(descriptor: int | None) -> bool:
-    """Whether a descriptor is readable: slcan takes an adapter's own words for the end."""
+    """Return True if a descriptor is readable: slcan takes an adapter's answer for the end."""
     if descriptor is None:
         return False
     poll = select.poll()

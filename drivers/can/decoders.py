@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import assert_never
 
 import numpy as np
 
 from drivers.base import FINGERS, ElectrodeFault, TactileReading, check_fingers, sensor_rows
 from drivers.biotac import SEQUENCES, decode_words
 from drivers.can.formats import (
+    SWEEP_BASE_ID,
     CanFormat,
     Reject,
     SweepStatus,
@@ -41,7 +41,7 @@ class CanDecoder(ABC):
     """Turns the data frames of one format into readings."""
 
     arbitration_id: int | None
-    """Whose frames are taken, of finger 0 if each has its own; None while any would be."""
+    """Id of the frames that are taken, of finger 0 if each has its own; None: any id."""
 
     def __init__(self, assembler: SampleAssembler | FrameAssembler, counters: CanCounters) -> None:
         self._assembler = assembler
@@ -67,8 +67,10 @@ class CanDecoder(ABC):
         """
 
     def cut(self) -> Sequence[TactileReading]:
-        """Frames were lost here: the readings that end with that. None where frames are numbered:
-        there a loss shows by itself."""
+        """Return the readings that end because frames were lost here.
+
+        There are none where frames are numbered: there a loss shows by itself.
+        """
         return ()
 
     def interrupt(self) -> None:
@@ -94,23 +96,14 @@ def make_decoder(
     check_fingers(fingers)
     if arbitration_id is not None and not 0 <= arbitration_id <= EXTENDED_ID_MAX:
         raise ValueError(f"arbitration_id {arbitration_id} is not in 0..{EXTENDED_ID_MAX:#x}")
-    match frame_format:
-        case CanFormat.SYNTOUCH:
-            return SynTouchDecoder(
-                fingers, sensors, arbitration_id, sequence, data_length, counters
-            )
-        case CanFormat.SWEEP_FD:
-            if sensors is not None:
-                raise ValueError(
-                    "sensors is for the format syntouch; sweep frames say whose they are"
-                )
-            if data_length is not None:
-                raise ValueError(
-                    "data_length is for the format syntouch; sweep frames have 64 bytes"
-                )
-            return SweepFrameDecoder(fingers, arbitration_id, counters)
-        case _:
-            assert_never(frame_format)
+    if frame_format is CanFormat.SYNTOUCH:
+        return SynTouchDecoder(fingers, sensors, arbitration_id, sequence, data_length, counters)
+    if sensors is not None:
+        raise ValueError("sensors is for the format syntouch; sweep frames say whose they are")
+    if data_length is not None:
+        raise ValueError("data_length is for the format syntouch; sweep frames have 64 bytes")
+    base_id = SWEEP_BASE_ID if arbitration_id is None else arbitration_id
+    return SweepFrameDecoder(fingers, base_id, counters)
 
 
 class SynTouchDecoder(CanDecoder):
@@ -188,11 +181,11 @@ class SweepFrameDecoder(CanDecoder):
 
     _assembler: FrameAssembler
 
-    def __init__(self, fingers: Sequence[str], base_id: int | None, counters: CanCounters) -> None:
+    def __init__(self, fingers: Sequence[str], base_id: int, counters: CanCounters) -> None:
         self._rows = {FINGERS.index(finger): row for row, finger in enumerate(fingers)}
-        self.arbitration_id = base_id
-        self._flags = _id_flags(None if base_id is None else base_id + len(FINGERS) - 1)
-        if base_id is not None and _id_flags(base_id) != self._flags:
+        self._base_id = self.arbitration_id = base_id
+        self._flags = _id_flags(base_id + len(FINGERS) - 1)
+        if _id_flags(base_id) != self._flags:
             raise ValueError(f"arbitration_id {base_id:#x}: the fingers' ids are of two kinds")
         self._ticks: dict[int, tuple[int, int]] = {}
         super().__init__(FrameAssembler(len(fingers), counters, list(self._rows)), counters)
@@ -201,30 +194,28 @@ class SweepFrameDecoder(CanDecoder):
         self, frame: CanFrame, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
         """Take a data frame received at `t_ns`; the readings that it completes, oldest first."""
-        base, counters = self.arbitration_id, self._counters
-        expected: int | None = None
-        if base is not None:
-            expected = frame.arbitration_id - base
-            if expected not in self._rows or frame.flags & EXTENDED != self._flags:
-                counters.foreign_frames += 1
-                return ()
+        base, counters = self._base_id, self._counters
+        finger = frame.arbitration_id - base
+        if finger not in self._rows or frame.flags & EXTENDED != self._flags:
+            counters.foreign_frames += 1
+            return ()
         sweep = parse_sweep(frame.data) if frame.flags & FD else Reject.CONTENT
         if isinstance(sweep, Reject):
             _count_reject(counters, sweep, base)
             return ()
-        row = self._rows.get(sweep.finger)
-        if row is None or (expected is not None and sweep.finger != expected):
+        if sweep.finger != finger:
             _count_reject(counters, Reject.CONTENT, base)
             return ()
         counters.accepted_frames += 1
-        stands = self._tick_stands(sweep.finger, sweep.sequence, sweep.tick_us)
+        stands = self._tick_stands(finger, sweep.sequence, sweep.tick_us)
         counters.overruns += bool(sweep.status & _OVERRUN)
         faults = _MISSING if sweep.status & _ABSENT else 0
         faults |= _HELD if stands or sweep.status & _REPEATED else 0
+        row = self._rows[finger]
         return self._assembler.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
 
     def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:
-        """Whether another sweep of a finger has ended at the same time: nothing was sampled."""
+        """Return True if another sweep of a finger ended at the same time: nothing was sampled."""
         before = self._ticks.get(finger)
         stands = before is not None and before[1] == tick_us and before[0] != sequence
         self._counters.stuck_ticks += stands
@@ -233,7 +224,7 @@ class SweepFrameDecoder(CanDecoder):
 
 
 def _is_sound(words: bytes) -> bool:
-    """Whether some word is a count, and every other one that of a sensor that is not there."""
+    """Return True if some word is a count, and every other one that of an absent sensor."""
     _, faults = decode_words(np.frombuffer(words, dtype=">u2"))
     return not (faults & ~np.uint8(_MISSING)).any() and not faults.all()
 
@@ -246,6 +237,6 @@ def _id_flags(identifier: int | None) -> int:
 
 
 def _count_reject(counters: CanCounters, reject: Reject, identifier: int | None) -> None:
-    """Count by kind; without a configured id nobody knows whether the frame was meant for us."""
+    """Count by kind; without a known id the frame may have been meant for others."""
     name = "foreign_frames" if identifier is None else reject.value
     setattr(counters, name, getattr(counters, name) + 1)

@@ -28,8 +28,8 @@ POLL_NS: Final = 1_000_000
 REST_MARGIN_NS: Final = 1_000_000
 REST_MAX_NS: Final = 15_000_000
 """Where a reading takes many frames, waking for each costs more than the frames. The kernel keeps
-them meanwhile: the loop rests until so long before the reading should be complete, and never longer
-than a quarter of what the kernel's usual buffer holds, ns."""
+them meanwhile: the loop rests until this time before the reading should be complete, and at most a
+quarter of what the kernel's usual buffer holds, ns."""
 RATE_WINDOW_NS: Final = 1_000_000_000
 """Frames per second are counted over this time, ns."""
 FD_CLOCK_HZ: Final = 80_000_000
@@ -162,7 +162,7 @@ class CanBridgeDriver(Opened):
         return readings
 
     def _is_open_again(self) -> bool:
-        """Whether the bus is open after a try, if one was due."""
+        """Return True if the bus is open after a try, if one was due."""
         if not self.stream.link.is_due(self._clock()):
             return False
         self._try_to_open()

@@ -91,12 +91,12 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
 
 
 def is_bus_off(frame: CanFrame) -> bool:
-    """Whether an error frame says that the controller has left the bus."""
+    """Return True if an error frame says that the controller has left the bus."""
     return bool(frame.flags & ERROR and frame.arbitration_id & ERROR_BUS_OFF)
 
 
 def is_overflow(frame: CanFrame) -> bool:
-    """Whether an error frame says that the controller's receive buffer ran over."""
+    """Return True if an error frame says that the controller's receive buffer ran over."""
     if not (frame.flags & ERROR and frame.arbitration_id & ERROR_CONTROLLER):
         return False
     return len(frame.data) > 1 and bool(frame.data[1] & CONTROLLER_RX_OVERFLOW)

@@ -17,7 +17,7 @@ PERIODS_KEPT: Final = 15
 PERIODS_NEEDED: Final = 5
 """The period is the median of the last 15 and known after 5."""
 OUTAGE_NS: Final = 2_000_000_000
-"""After this long, ns, nobody knows how many sweeps were made: it counts as one missed."""
+"""A gap of more, ns, counts as one missed reading: the number of sweeps in it is unknown."""
 
 
 @dataclass(slots=True)
@@ -36,8 +36,8 @@ class CanCounters(DriverCounters):
     unsynchronised_frames: int = 0
     """Frames dropped after opening, or after a known loss, until a sweep began."""
     untimed_frames: int = 0
-    """Samples dropped because nobody knows when they came: the loop stalled, and the bus does not
-    stamp them."""
+    """Samples dropped because their time is unknown: the loop stalled, and the bus does not stamp
+    them."""
     unexpected_channels: int = 0
     """Samples of a channel that the configured sequence does not have."""
     interrupted_sweeps: int = 0
@@ -45,7 +45,7 @@ class CanCounters(DriverCounters):
     cut_sweeps: int = 0
     """Sweeps ended in the middle because frames were known to be lost there."""
     restarts: int = 0
-    """Times that the device's sweep counter or clock started anew."""
+    """Restarts of the device's sweep counter or clock."""
     contradicting_frames: int = 0
     """Frames with the number of the sweep at hand and another tick; dropped."""
     parity_words: int = 0
@@ -110,7 +110,7 @@ class ReadingMaker:
         self.period_ns = None
 
     def miss(self, sweeps: int) -> None:
-        """So many sweeps were made and never arrived."""
+        """Count sweeps that were made and never arrived."""
         self.seq += sweeps
         self.counters.missed_readings += sweeps
 

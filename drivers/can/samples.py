@@ -8,7 +8,7 @@ to, only its place in the known order of the sequence and the time between sampl
 - A sample that comes later than its place in the order explains starts a new sweep too: the
   samples of one reading are never further apart than a sweep takes and three quarters of a period.
 - A sweep that is lost as a whole is found by time alone.
-- Where samples are known to be lost, nobody knows how many: the sweep at hand ends there.
+- Where an unknown number of samples is lost, the present sweep ends.
 
 What cannot be told apart: a sample of which the data is damaged so that it names another valid
 channel; a sender that stalls in the middle of a sweep from the loss of whole sweeps' worth of
@@ -29,7 +29,7 @@ from drivers.biotac import E1, E24
 from drivers.can.readings import OUTAGE_NS, CanCounters, ReadingMaker
 
 REORDER_MAX: Final = 3
-"""Samples may come so many electrodes late: adapters with two or three receive buffers swap
+"""Samples may come up to this many electrodes late: adapters with two or three receive buffers swap
 neighbours, a bus does not."""
 NEXT_SWEEP_PERIODS: Final = 0.75
 """A sample this much later than its place explains, in periods, is of another sweep. Samples of
@@ -147,7 +147,7 @@ class SampleAssembler:
         return (*finished, *self._store(place, words, t_ns))
 
     def cut(self) -> Sequence[TactileReading]:
-        """Samples were lost, nobody knows how many: end the sweep at hand, wait for another."""
+        """End the present sweep and wait for another: an unknown number of samples was lost."""
         self._counters.cut_sweeps += not self._finished and self._have != 0
         self._run = 0
         finished = self._finish()
@@ -176,7 +176,7 @@ class SampleAssembler:
         self._finished = False
 
     def _starts(self, place: int) -> bool:
-        """Whether a sweep begins with this sample, the first ones after opening."""
+        """Return True if a sweep begins with this sample, one of the first after opening."""
         self._synchronised = place == 0 or place < self._last
         self._last = -1 if self._synchronised else place
         return self._synchronised
@@ -191,11 +191,11 @@ class SampleAssembler:
         return finished
 
     def _ahead(self, place: int, until_ns: int) -> bool:
-        """Whether a sample is of this sweep and the furthest so far."""
+        """Return True if a sample is of this sweep and the furthest so far."""
         return place > self._last and not self._is_next_sweep(place, until_ns)
 
     def _is_next_sweep(self, place: int, until_ns: int) -> bool:
-        """Whether a sample may have come too late to be of this sweep."""
+        """Return True if a sample may have come too late to be of this sweep."""
         if self._last < 0:
             return False
         period_ns = self._readings.period_ns
@@ -206,7 +206,7 @@ class SampleAssembler:
         return until_ns - due_ns >= self._lateness_ns()
 
     def _is_early(self, place: int, until_ns: int) -> bool:
-        """Whether a sample came too soon to be of this sweep: it is a late one of before."""
+        """Return True if a sample came too soon to be of this sweep: it is of the last one."""
         period_ns = self._readings.period_ns
         if period_ns is None:
             return until_ns - self._t_ns < (place - self._last) * SLOT_MIN_NS
@@ -219,12 +219,14 @@ class SampleAssembler:
         return NEXT_SWEEP_PERIODS * period_ns
 
     def _is_tail_of_previous(self, place: int) -> bool:
-        """Whether one of the last electrodes comes where a sweep has just begun: late, doubled, or
-        after a loss of all between."""
+        """Return True if one of the last electrodes comes where a sweep has just begun.
+
+        It is late, doubled, or came after a loss of all between.
+        """
         return place >= ELECTRODES - REORDER_MAX and 0 <= self._last < REORDER_MAX
 
     def _holds(self, place: int, words: bytes) -> bool:
-        """Whether these words came last for this place."""
+        """Return True if these words came last for this place."""
         start = place * self._width
         return self._buffer[start : start + self._width] == words
 

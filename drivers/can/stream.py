@@ -10,7 +10,7 @@ from typing import Final, TypedDict
 
 from drivers.base import DeviceFault, Fact, LinkCause, LinkError, Reading
 from drivers.can.decoders import make_decoder
-from drivers.can.formats import SWEEP_BASE_ID, CanFormat
+from drivers.can.formats import CanFormat
 from drivers.can.frames import (
     ERROR,
     LOST,
@@ -73,8 +73,6 @@ class CanStream:
         the board pads it.
         """
         frame_format = CanFormat(format)
-        if frame_format is CanFormat.SWEEP_FD and arbitration_id is None:
-            arbitration_id = SWEEP_BASE_ID
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None

@@ -1,7 +1,7 @@
 """Per-finger frames -> one `TactileReading` per sweep; what is missing is flagged.
 
 Frames are of one sweep if number and tick agree and if they come within two periods: a board that
-was reset repeats both, but must be silent for so long.
+was reset repeats both, but must be silent for that time.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
 from drivers.can.readings import CanCounters, ReadingMaker
 
 SEQUENCE_JUMP_MAX: Final = 1000
-"""Sweep counters that jump by more have started anew; 1000 sweeps last ten seconds."""
+"""A jump by more is a restart of the counter; 1000 sweeps last ten seconds."""
 LATE_FRAMES_MAX: Final = 8
 """Sweep counters that fall back by up to this are late frames, by more a new start."""
 PATIENCE_PERIODS: Final = 2
-"""After so many periods a frame is neither late nor of the sweep at hand."""
+"""After this many periods a frame is neither late nor of the present sweep."""
 PATIENCE_NS: Final = 100_000_000
 """The same while the period is not known, ns."""
 _TICKS: Final = 1 << 32
@@ -114,14 +114,14 @@ class FrameAssembler:
         return PATIENCE_NS if period_ns is None else PATIENCE_PERIODS * period_ns
 
     def _is_late(self, sequence: int, tick_us: int, t_ns: int) -> bool:
-        """Whether a frame is of one of the sweeps just before: by number, time and tick."""
+        """Return True if a frame is of a sweep just before, by number, time and tick."""
         if self._current is None or t_ns - self._t_ns > self._patience_ns():
             return False
         back = (self._current - sequence) % (1 << 16)
         return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _HALF
 
     def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
-        """Begin a sweep; count those left out, or a device that started anew."""
+        """Begin a sweep; count those left out, or a restart of the device."""
         if self._current is not None:
             jump = (sequence - self._current) % (1 << 16)
             backwards = (tick_us - self._tick_us) % _TICKS >= _HALF

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.base import JointReading, Reading
 from drivers.palm.packet import SENSORS, Palm, PalmCounters, PalmPacket, PalmParser
-from drivers.palm.rounds import RoundAssembler
+from drivers.palm.rounds import ROUND_NS, RoundAssembler
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,6 +34,9 @@ class PalmStream:
     batches longer than 10 ms, rounds are flagged or counted as missed that were not; where it holds
     packets back for more than 3 ms, the loss of a whole round may not be told.
     """
+
+    period_ns: int | None = ROUND_NS
+    """Time between tactile readings, ns."""
 
     def __init__(
         self,

@@ -1,8 +1,8 @@
-"""Recordings as CSV files, read as a stream: lines of bytes in, rows with counts out.
+"""CSV recordings, read row by row: grasp tables and streams.
 
-Two layouts, told apart by a column `t`: grasp tables (one row per grasp, as in the BioTac SP
-Stability Set) and streams (one row per sweep, `t` in seconds, joint angles if recorded). Memory
-does not grow with the file. Everything but `open_recording` and `read_lines` is pure.
+A grasp table has one row per grasp, as in the BioTac SP Stability Set. A stream has one row per
+sweep with a column `t` in seconds, and joint angles if they were recorded. Memory does not grow
+with the file.
 """
 
 from __future__ import annotations
@@ -12,37 +12,78 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from operator import itemgetter
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, Annotation, ElectrodeFault, RecordingError
-from drivers.recordings.csv_columns import Columns
+from drivers.base import (
+    COUNT_MAX,
+    ELECTRODES,
+    FINGERS,
+    Annotation,
+    ElectrodeFault,
+    RecordingError,
+)
+from drivers.hand import joint_name
 
+TIME = "t"
+"""Column of seconds, with any offset. A file with it is a stream, one without it a grasp table."""
+OBJECT = "object"
+SLIPPED = "slipped"
 LINE_BYTES_MAX = 65_536
-"""A row of five fingers and all joints has about 1,200 bytes. What is far longer is no recording,
-and reading on for a line end could take in a whole disk image."""
+"""A row of five fingers and all joints has about 1,200 bytes. A far longer line is no recording:
+reading on for its end could take in a whole disk image."""
 TIME_MAX_S = 1e11
 """The year 5138. Unix time in ms, us or ns lies above it: the wrong unit, not a time in seconds."""
-NUMBER_LENGTH_MAX = 32
-"""Characters of a number; a double in full needs 24."""
 SHOWN_LENGTH_MAX = 40
 """Characters of a cell that an error message shows."""
 
-_BOM = b"\xef\xbb\xbf"
-_SPACES = " \t"
 _LABELS = {"0": False, "1": True}
 # ASCII digits only: float() alone would take `1_000`, `nan` and digits of other scripts.
-_UNSIGNED = re.compile(r"[0-9]+(\.[0-9]*)?([eE][+-]?[0-9]{1,2})?")
-_SIGNED = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-# The usual way to write each count. Looking a cell up is as fast as int() and far stricter.
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
+# The usual way to write each count: looking it up is ten times as fast as reading a number.
 _COUNT_OF_TEXT = {str(count): count for count in range(COUNT_MAX + 1)}
+
+
+def electrode_columns(finger: str) -> list[str]:
+    """Column names of one finger, E1 first, as the BioTac SP Stability Set writes them."""
+    return [f"{finger}_biotac_{electrode}" for electrode in range(1, ELECTRODES + 1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Columns of a file that are read, by name."""
+
+    electrodes: tuple[str, ...]
+    """Finger by finger as asked for, E1..E24 each."""
+    joints: Mapping[str, str]
+    """Joint without hand prefix by column; empty for a table."""
+    is_stream: bool
+    has_labels: bool
+    ignored: tuple[str, ...]
+    """Columns of unknown names. Those of fingers not asked for are known."""
+
+    @classmethod
+    def of(cls, names: Sequence[str], fingers: Sequence[str]) -> Self:
+        """The columns to read for these fingers, of a header's names."""
+        known = {name for finger in FINGERS for name in electrode_columns(finger)}
+        known |= {TIME, OBJECT, SLIPPED}
+        is_stream = TIME in names
+        joints: dict[str, str] = {}
+        if is_stream:
+            joints = {name: joint for name in names if (joint := joint_name(name))}
+        return cls(
+            electrodes=tuple(name for finger in fingers for name in electrode_columns(finger)),
+            joints=joints,
+            is_stream=is_stream,
+            has_labels=SLIPPED in names,
+            ignored=tuple(name for name in names if name not in known and name not in joints),
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,10 +95,11 @@ class Row:
     faults: NDArray[np.uint8]
     """Shape (fingers, 24), `ElectrodeFault` bits."""
     annotation: Annotation
-    t_s: float | None = None
+    t_s: float | None
     """Streams only; never falls from row to row."""
-    position_rad: NDArray[np.float64] | None = None
-    """Shape (joints,), NaN where there is no angle; None without joint columns."""
+    joint_names: tuple[str, ...]
+    position_rad: NDArray[np.float64]
+    """Shape (joints,), NaN where there is no angle."""
 
 
 class Recording:
@@ -65,13 +107,11 @@ class Recording:
 
     `lines` gives the file's lines with their ends, each at most `LINE_BYTES_MAX` + 1 bytes long
     (as `read_lines` does). The constructor takes the header and the first row's line, so it raises
-    `RecordingError` for whatever is wrong with the header, and for a file without rows. Iterating
-    raises it for a row that is not one. A value that is not a count only makes its electrode
-    faulty, unless `strict`.
+    `RecordingError` for a wrong header and for a file without rows. Iterating raises it for a row
+    that is not one. A value that is not a count only makes its electrode faulty, unless `strict`.
 
-    A count is an integer in 0..4095, in ASCII digits, with spaces around it or not: `2602`,
-    `2602.0` or `2.602e3`, but not `+2602` or `2_602`. A last row without a line end may be cut off
-    in mid value: all its electrodes are faulty and its angles NaN.
+    A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
+    without a line end may be cut off in mid value: all its electrodes are faulty, its angles NaN.
     """
 
     def __init__(
@@ -79,158 +119,146 @@ class Recording:
     ) -> None:
         self._path = path
         self._strict = strict
-        self._ended = True
-        texts = self._texts(lines)
-        header = next(texts, None)
-        if header is None:
-            raise RecordingError(path, "the file is empty")
-        self.columns = Columns.from_header(path, self._line, self._cells(header), fingers)
-        first = next(texts, None)
-        if first is None:
-            raise RecordingError(path, "the file has a header and no rows")
-        self._rest = chain([first], texts)
-        self._pick = itemgetter(*self.columns.electrodes)
+        self._has_end = True
         self._shape = (len(fingers), ELECTRODES)
         self._t_s = -math.inf
+        rows = self._cells(lines)
+        header = next(rows, None)
+        if header is None:
+            raise RecordingError(path, "the file is empty")
+        self._names = [name.strip() for name in header]
+        self.columns = Columns.of(self._names, fingers)
+        self._refuse_header()
+        first = next(rows, None)
+        if first is None:
+            raise RecordingError(path, "the file has a header and no rows")
+        self._rows = chain([first], rows)
 
     def __iter__(self) -> Iterator[Row]:
-        for text in self._rest:
-            yield self._row(text)
+        for cells in self._rows:
+            yield self._row(cells)
 
-    def _texts(self, lines: Iterable[bytes]) -> Iterator[str]:
-        """Lines as text without their ends, blank ones skipped; keeps the line number."""
-        for self._line, raw in enumerate(lines, 1):
-            if len(raw) > LINE_BYTES_MAX:
+    def _cells(self, lines: Iterable[bytes]) -> Iterator[list[str]]:
+        """Cells of each line that is not blank; keeps the line number."""
+        for self._line, line in enumerate(lines, 1):
+            if len(line) > LINE_BYTES_MAX:
                 raise self._error(f"the line is longer than {LINE_BYTES_MAX} bytes")
-            if self._line == 1:
-                raw = raw.removeprefix(_BOM)
-            if b"\0" in raw:
-                raise self._error("a NUL byte: this is a binary file, not CSV")
+            self._has_end = line.endswith(b"\n")
             try:
-                text = raw.decode()
+                text = line.decode("utf-8-sig" if self._line == 1 else "utf-8").rstrip("\r\n")
+                rows = list(csv.reader([text], strict=True)) if text.strip() else []
             except UnicodeDecodeError as error:
                 problem = "not UTF-8: this is a binary file or has another encoding"
                 raise self._error(problem) from error
-            self._ended = text.endswith("\n")
-            text = text.rstrip("\r\n")
-            if "\r" in text:
-                raise self._error("a carriage return inside the line: lines must end in LF or CRLF")
-            if text and not text.isspace():
-                yield text
+            except csv.Error as error:
+                raise self._error(f"this is not CSV: {error}") from error
+            yield from rows
 
-    def _cells(self, text: str) -> list[str]:
-        if '"' not in text:
-            return text.split(",")
-        try:
-            if text.count('"') % 2 == 0:
-                return next(csv.reader([text], strict=True))
-        except csv.Error as error:
-            raise self._error(f"wrong quotes: {error}") from error
-        raise self._error("wrong quotes: they do not pair up")
+    def _refuse_header(self) -> None:
+        """Raise unless each column that is read is there once, and each joint under one name."""
+        missing = [name for name in self.columns.electrodes if name not in self._names]
+        if len(missing) == 1:
+            raise self._error("this column is missing", missing[0])
+        if missing:
+            problem = f"this column is missing, the first of {len(missing)} that are"
+            raise self._error(problem, missing[0])
+        joints = self.columns.joints
+        read = {*self.columns.electrodes, TIME, OBJECT, SLIPPED, *joints}
+        column_of: dict[str, str] = {}
+        for name in self._names:
+            if name not in read:
+                continue
+            meaning = joints.get(name, name)
+            if meaning in column_of:
+                raise self._error(f"this column is there twice, as {column_of[meaning]} too", name)
+            column_of[meaning] = name
 
-    def _row(self, text: str) -> Row:
-        columns = self.columns
-        cells = self._cells(text)
-        if len(cells) != len(columns.names):
-            raise self._error(f"the row has {len(cells)} cells, the header {len(columns.names)}")
-        picked = self._pick(cells)
-        try:
-            flat = np.fromiter(map(_COUNT_OF_TEXT.__getitem__, picked), np.uint16, len(picked))
-            counts = flat.reshape(self._shape)
-            faults = np.zeros(self._shape, dtype=np.uint8)
-        except KeyError:
-            counts, faults = self._careful_counts(picked)
-        if not self._ended:
+    def _row(self, cells: Sequence[str]) -> Row:
+        if len(cells) != len(self._names):
+            raise self._error(f"the row has {len(cells)} cells, the header {len(self._names)}")
+        cell_of = dict(zip(self._names, cells, strict=True))
+        counts, faults = self._counts(cell_of)
+        if not self._has_end:
             if self._strict:
                 raise self._error("the last row has no line end")
             faults |= np.uint8(ElectrodeFault.CUT_OFF)
-        annotation = Annotation(
-            source=self._path,
-            line=self._line,
-            object_name=self._object_name(cells),
-            slipped=self._slipped(cells),
+        return Row(
+            counts=counts,
+            faults=faults,
+            annotation=Annotation(
+                source=self._path,
+                line=self._line,
+                object_name=cell_of.get(OBJECT, "").strip() or None,
+                slipped=self._slipped(cell_of),
+            ),
+            t_s=self._time_s(cell_of),
+            joint_names=tuple(self.columns.joints.values()),
+            position_rad=self._position_rad(cell_of),
         )
-        if columns.time is None:
-            return Row(counts, faults, annotation)
-        t_s = self._time_s(cells[columns.time])
-        return Row(counts, faults, annotation, t_s, self._position_rad(cells))
 
-    def _careful_counts(
-        self, picked: Sequence[str]
-    ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-        """Cell by cell, for rows with a count written in another way or with no count at all."""
-        counts = np.zeros(len(picked), dtype=np.uint16)
-        faults = np.zeros(len(picked), dtype=np.uint8)
-        for index, cell in enumerate(picked):
-            count = count_of(cell)
+    def _counts(self, cell_of: Mapping[str, str]) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+        """Counts and faults, shape (fingers, 24)."""
+        names = self.columns.electrodes
+        counts = [count_of(cell_of[name]) for name in names]
+        faults = np.zeros(self._shape, dtype=np.uint8)
+        for place, count in enumerate(counts):
             if count is not None:
-                counts[index] = count
-            elif self._strict:
-                raise self._error(
-                    f"{shown(cell)} is not a count, an integer in 0..{COUNT_MAX}",
-                    self.columns.electrodes[index],
-                )
-            else:
-                faults[index] = ElectrodeFault.NOT_A_COUNT
-        return counts.reshape(self._shape), faults.reshape(self._shape)
+                continue
+            if self._strict:
+                problem = f"is not a count, an integer in 0..{COUNT_MAX}"
+                raise self._error(f"{_shown(cell_of[names[place]])} {problem}", names[place])
+            faults.flat[place] = ElectrodeFault.NOT_A_COUNT
+            counts[place] = 0
+        return np.array(counts, dtype=np.uint16).reshape(self._shape), faults
 
-    def _object_name(self, cells: Sequence[str]) -> str | None:
-        place = self.columns.object_name
-        return None if place is None else cells[place].strip() or None
-
-    def _slipped(self, cells: Sequence[str]) -> bool | None:
-        place = self.columns.slipped
-        if place is None:
+    def _slipped(self, cell_of: Mapping[str, str]) -> bool | None:
+        if not self.columns.has_labels:
             return None
-        label = _LABELS.get(cells[place].strip(_SPACES))
+        label = _LABELS.get(cell_of[SLIPPED].strip())
         if label is None:
-            raise self._error(
-                f"{shown(cells[place])} is not a label: 0 (stable) or 1 (slip)", place
-            )
+            problem = f"{_shown(cell_of[SLIPPED])} is not a label: 0 (stable) or 1 (slip)"
+            raise self._error(problem, SLIPPED)
         return label
 
-    def _time_s(self, cell: str) -> float:
-        t_s = number_of(cell)
+    def _time_s(self, cell_of: Mapping[str, str]) -> float | None:
+        if not self.columns.is_stream:
+            return None
+        t_s = number_of(cell_of[TIME])
         if t_s is None:
-            raise self._error(f"{shown(cell)} is not a finite number of seconds", self.columns.time)
+            raise self._error(f"{_shown(cell_of[TIME])} is not a finite number of seconds", TIME)
         if abs(t_s) > TIME_MAX_S:
-            raise self._error(
-                f"{shown(cell)} is no time in seconds: another unit?", self.columns.time
-            )
+            problem = f"{_shown(cell_of[TIME])} is no time in seconds: another unit?"
+            raise self._error(problem, TIME)
         if t_s < self._t_s:
-            raise self._error(
-                f"time goes backwards, from {self._t_s} s to {t_s} s", self.columns.time
-            )
+            raise self._error(f"time goes backwards, from {self._t_s} s to {t_s} s", TIME)
         self._t_s = t_s
         return t_s
 
-    def _position_rad(self, cells: Sequence[str]) -> NDArray[np.float64] | None:
-        if not self.columns.joints:
-            return None
-        angles = [number_of(cells[place]) for place in self.columns.joints]
-        if self._strict and None in angles:
-            place = self.columns.joints[angles.index(None)]
-            raise self._error(f"{shown(cells[place])} is not an angle in radians", place)
-        if not self._ended:
-            return np.full(len(angles), math.nan)
-        return np.array([math.nan if angle is None else angle for angle in angles])
+    def _position_rad(self, cell_of: Mapping[str, str]) -> NDArray[np.float64]:
+        position_rad = np.full(len(self.columns.joints), math.nan)
+        for place, name in enumerate(self.columns.joints):
+            angle = number_of(cell_of[name])
+            if angle is None and self._strict:
+                raise self._error(f"{_shown(cell_of[name])} is not an angle in radians", name)
+            if angle is not None and self._has_end:
+                position_rad[place] = angle
+        return position_rad
 
-    def _error(self, problem: str, place: int | None = None) -> RecordingError:
-        """What is wrong with the line at hand; `place` is the index of a cell."""
-        if not self._ended:
+    def _error(self, problem: str, column: str | None = None) -> RecordingError:
+        """What is wrong with the present line."""
+        if not self._has_end:
             problem += "; the file ends here without a line end, so it may be cut off"
-        column = None if place is None else self.columns.names[place]
         return RecordingError(self._path, problem, line=self._line, column=column)
 
 
 def columns_of(path: Path, fingers: Sequence[str]) -> Columns:
-    """What a recording's columns hold. Raises `RecordingError` if it is none of these fingers."""
+    """Return the columns of a file. Raises `RecordingError` if it is no recording of `fingers`."""
     with open_recording(path) as file:
         return Recording(path, read_lines(path, file), fingers).columns
 
 
 def read_rows(path: Path, fingers: Sequence[str], *, strict: bool = False) -> Iterator[Row]:
-    """The rows of a file, as those of a `Recording`. Raises `RecordingError`."""
+    """Yield the rows of a file, as a `Recording` does. Raises `RecordingError`."""
     with open_recording(path) as file:
         yield from Recording(path, read_lines(path, file), fingers, strict=strict)
 
@@ -247,37 +275,36 @@ def open_recording(path: Path) -> BinaryIO:
 
 
 def read_lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
-    """Lines of `stream` with their ends, cut at `LINE_BYTES_MAX` + 1 bytes."""
-    while True:
-        try:
-            line = stream.readline(LINE_BYTES_MAX + 1)
-        except OSError as error:
-            raise RecordingError(path, _reason(error)) from error
-        if not line:
-            return
-        yield line
+    """Yield the lines of `stream` with their ends, cut at `LINE_BYTES_MAX` + 1 bytes."""
+    try:
+        while line := stream.readline(LINE_BYTES_MAX + 1):
+            yield line
+    except OSError as error:
+        raise RecordingError(path, _reason(error)) from error
 
 
 def count_of(cell: str) -> int | None:
-    """The 12-bit count that a cell holds, or None if it holds no such count."""
-    cell = cell.strip(_SPACES)
-    if len(cell) > NUMBER_LENGTH_MAX or _UNSIGNED.fullmatch(cell) is None:
+    """Return the 12-bit count that a cell holds, or None."""
+    count = _COUNT_OF_TEXT.get(cell)
+    if count is not None:
+        return count
+    number = number_of(cell)
+    if number is None or not number.is_integer() or not 0 <= number <= COUNT_MAX:
         return None
-    value = float(cell)
-    return int(value) if value.is_integer() and value <= COUNT_MAX else None
+    return int(number)
 
 
 def number_of(cell: str) -> float | None:
-    """The finite number that a cell holds, or None."""
-    cell = cell.strip(_SPACES)
-    if len(cell) > NUMBER_LENGTH_MAX or _SIGNED.fullmatch(cell) is None:
+    """Return the finite number that a cell holds, or None."""
+    cell = cell.strip()
+    if _NUMBER.fullmatch(cell) is None:
         return None
-    value = float(cell)
-    return value if math.isfinite(value) else None
+    number = float(cell)
+    return number if math.isfinite(number) else None
 
 
-def shown(cell: str) -> str:
-    """A cell as an error message shows it: quoted, escaped and of bounded length."""
+def _shown(cell: str) -> str:
+    """Return a cell as an error message shows it: quoted, escaped and of bounded length."""
     return repr(cell if len(cell) <= SHOWN_LENGTH_MAX else cell[:SHOWN_LENGTH_MAX] + "...")
 
 

@@ -1,4 +1,4 @@
-"""What came over a link, decoded again: candump text and framed serial bytes as a driver.
+"""What came over a link, decoded again: candump text, framed serial bytes or palm packets.
 
 What was logged goes through the very decoders that live bytes and frames go through, at the times
 at which it came.
@@ -16,7 +16,7 @@ from drivers.recordings.csv_rows import open_recording
 from drivers.recordings.player import RecordedDriver, Timeline
 
 CANDUMP, SERIAL = ".log", ".serial"
-"""Endings of the two kinds of files."""
+"""Endings of the two kinds of files that graspd writes."""
 Record = TypeVar("Record")
 
 
@@ -33,7 +33,7 @@ class LinkDecoder(Protocol):
 
 
 class LinkLog(Protocol[Record]):
-    """One kind of file, and the stream that its records go through."""
+    """One kind of file, and the decoder that its records go through."""
 
     @property
     def stream(self) -> LinkDecoder:
@@ -43,7 +43,7 @@ class LinkLog(Protocol[Record]):
         """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
 
     def begin(self) -> None:
-        """Forget all that came."""
+        """Forget all that came. Raises `DriverError`."""
 
     def feed(self, t_ns: int, record: Record) -> Sequence[Reading]:
         """The readings that a record of `t_ns` completes."""
@@ -52,7 +52,7 @@ class LinkLog(Protocol[Record]):
 class LinkLogDriver(RecordedDriver[Record]):
     """Plays link logs in a row, as one run. `recorded_ns` of a reading is its time on their clock.
 
-    Without `speed` as fast as possible. `open` raises `RecordingError`.
+    Without `speed` as fast as possible. `open` raises `DriverError`, `read_ready` `RecordingError`.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class LinkLogDriver(RecordedDriver[Record]):
         speed: float | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Nothing is opened yet. Raises `ValueError` without files or with a speed that is none."""
+        """Nothing is opened yet. Raises `ValueError` without files or for a speed of 0 or less."""
         super().__init__(paths, Timeline(speed, clock))
         self._log = log
 
@@ -84,16 +84,22 @@ class LinkLogDriver(RecordedDriver[Record]):
         for path in self.paths:
             open_recording(path).close()
         self._log.begin()
-        self.timeline.start(self._records())
+        logs = [self._log.records(path) for path in self.paths]
+        self.timeline.start(self._records(logs))
         if self.exhausted:
             raise RecordingError(self.paths[0], "has nothing that came over a link")
 
-    def _records(self) -> Generator[tuple[int, Record], None, None]:
-        for path in self.paths:
-            yield from self._log.records(path)
+    def _records(
+        self, logs: Sequence[Iterator[tuple[int, Record]]]
+    ) -> Generator[tuple[int, Record], None, None]:
+        for path, records in zip(self.paths, logs, strict=True):
+            try:
+                yield from records
+            except OSError as error:
+                raise RecordingError(path, f"cannot be read: {error.strerror}") from error
 
     def read_ready(self) -> Sequence[Reading]:
-        """The readings of the first record that completes any, as far as records are due."""
+        """The readings of the first record that completes any, if enough records are due."""
         while (due := self.timeline.take()) is not None:
             t_ns, record, _ = due
             if readings := self._log.feed(t_ns, record):

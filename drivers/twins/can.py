@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import threading
 import time
 from collections import Counter
@@ -35,6 +34,8 @@ SEND_TIMEOUT_S: Final = 0.1
 reader in the same thread empties."""
 DOWN_S: Final = 0.2
 """How long a broken link stays down, s."""
+ID_BYTES: Final = 4
+"""Bytes of the arbitration id, before the data of a frame that faults may hit."""
 _UNDRIVEN: Final = b"\xff\xff"
 _WORDS: Final = [encode_word(count).to_bytes(2, "big") for count in range(4096)]
 
@@ -73,10 +74,9 @@ class CanTwin(Opened):
             raise ValueError(f"sequence {sequence!r} is none of {sorted(SEQUENCES)}")
         if not 0.0 < rate_hz <= 1000.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be above 0 and at most 1000")
-        if faults.one_byte_at_a_time:
-            raise ValueError("CAN has no single bytes")
-        if not is_sweep and (faults.wrong_version or faults.stuck_clock):
-            raise ValueError("SynTouch's format has neither a version nor a clock")
+        faults.refuse("CAN", "one_byte_at_a_time")
+        if not is_sweep:
+            faults.refuse("SynTouch's format", "wrong_version", "stuck_clock")
         self._fingers = tuple(FINGERS.index(finger) for finger in fingers)
         self._channels = SEQUENCES[sequence]
         default_id = SWEEP_BASE_ID if is_sweep else SAMPLE_ID
@@ -84,8 +84,7 @@ class CanTwin(Opened):
         self._counts = counts
         self._period_ns = round(1e9 / rate_hz)
         self._faults = faults
-        # A burst joins the bytes of frames, which on CAN must stay apart: done here instead.
-        self._injector = LinkFaultInjector(dataclasses.replace(faults, burst_frames=1))
+        self._injector = LinkFaultInjector(faults, spared_bytes=ID_BYTES)
         self._clock = clock
         self._interface, self._channel = interface, channel
         self._options: dict[str, Any] = {}
@@ -95,8 +94,6 @@ class CanTwin(Opened):
             self._options["fd"] = True
         self._send_timeout_s = 0.0 if interface == "virtual" else SEND_TIMEOUT_S
         self._bus: can.BusABC | None = None
-        self._held_id: int | None = None
-        self._burst: list[Outgoing] = []
         self._sweep = first_sweep
         self._stuck_tick_us = self._tick_us()
         self.frames_sent = 0
@@ -128,10 +125,8 @@ class CanTwin(Opened):
         return bool(frames)
 
     def flush(self) -> None:
-        """Send what a burst still holds back."""
-        burst, self._burst = self._burst, []
-        for outgoing in burst:
-            self.put(outgoing)
+        """Send what faults still hold back."""
+        self._put_all(self._injector.flush())
 
     def serve(self, stop: threading.Event) -> None:
         """Send sweeps at their rate, frames evenly spread, until told to stop or counts end.
@@ -208,27 +203,13 @@ class CanTwin(Opened):
         if self._injector.breaks_here():
             self.open()
             return False
-        for outgoing in self._spoiled(frame):
-            if self._faults.burst_frames == 1:
-                self.put(outgoing)
-                continue
-            self._burst.append(outgoing)
-            if len(self._burst) >= self._faults.burst_frames:
-                self.injected["burst"] += 1
-                self.flush()
+        identifier, data = frame
+        self._put_all(self._injector.spoil(identifier.to_bytes(ID_BYTES) + data))
         return True
 
-    def _spoiled(self, frame: Outgoing) -> list[Outgoing]:
-        """Frames to send instead of this one: the injector knows only the data, we keep the ids."""
-        identifier, data = frame
-        reordered = self.injected["reorder"]
-        spoiled = [(identifier, bytes_) for bytes_ in self._injector.spoil(data)]
-        if self._held_id is not None and spoiled:
-            spoiled[-1] = (self._held_id, spoiled[-1][1])
-            self._held_id = None
-        elif self.injected["reorder"] > reordered:
-            self._held_id = identifier
-        return spoiled
+    def _put_all(self, frames: Sequence[bytes]) -> None:
+        for frame in frames:
+            self.put((int.from_bytes(frame[:ID_BYTES]), frame[ID_BYTES:]))
 
     def put(self, outgoing: Outgoing) -> None:
         """Put one frame on the bus; what it does not take is counted in `unsent`."""

@@ -18,7 +18,7 @@ def send_paced(
 ) -> None:
     """Send the datagrams of one cycle after the other until told to stop or they end.
 
-    With `period_ns` None as fast as the kernel takes them. Whether anyone listens is not noticed.
+    With `period_ns` None as fast as the kernel takes them. A missing listener is not noticed.
     """
     with socket.socket(target.family, socket.SOCK_DGRAM) as sender:
         due_ns = time.monotonic_ns()

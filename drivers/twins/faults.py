@@ -27,13 +27,13 @@ class LinkFaults:
     one_byte_at_a_time: bool = False
     """Every byte is written on its own (byte streams only)."""
     burst_frames: int = 1
-    """Frames are held back and written so many at once."""
+    """Frames are held back until there are this many, and sent at once."""
     disconnect_every_frames: int | None = None
     """The link breaks in the middle of every n-th frame."""
     wrong_version: bool = False
     """The twin says that it speaks a later version of the protocol."""
     dead_electrodes: tuple[tuple[int, int], ...] = ()
-    """(finger, electrode) pairs that read 0 for ever."""
+    """(finger, electrode) pairs that always read 0."""
     unplugged_fingers: tuple[int, ...] = ()
     """Fingers whose line nothing drives."""
     stuck_clock: bool = False
@@ -50,12 +50,20 @@ class LinkFaults:
         if self.disconnect_every_frames is not None and self.disconnect_every_frames < 1:
             raise ValueError("disconnect_every_frames must be at least 1")
 
+    def refuse(self, link: str, *names: str) -> None:
+        """Raise `ValueError` if one of these faults is asked for: this link cannot show it."""
+        for name in names:
+            if getattr(self, name) != getattr(LinkFaults(), name):
+                raise ValueError(f"{link} has no fault {name}")
+
 
 class LinkFaultInjector:
     """Spoils a twin's frames; `injected` counts each fault by its name."""
 
-    def __init__(self, faults: LinkFaults) -> None:
+    def __init__(self, faults: LinkFaults, spared_bytes: int = 0) -> None:
+        """`spared_bytes`: bytes at the front of a frame that no bit flip hits."""
         self.faults = faults
+        self._spared_bytes = spared_bytes
         self.injected: Counter[str] = Counter()
         self._random = np.random.default_rng(faults.seed)
         self._held_back: bytes | None = None
@@ -63,7 +71,7 @@ class LinkFaultInjector:
         self._frames = 0
 
     def spoil(self, frame: bytes, *, waits: bool = True) -> list[bytes]:
-        """Frames to put on the wire now, in order, instead of this one; each is one whole write.
+        """Return the frames to send now, in order, instead of this one.
 
         A frame that does not wait is neither reordered nor held back for a burst, and takes
         along what was.
@@ -90,16 +98,18 @@ class LinkFaultInjector:
             return []
         burst, self._burst = self._burst, []
         self.injected["burst"] += 1
-        return [b"".join(burst)]
+        return burst
 
     def flush(self) -> list[bytes]:
-        """Frames that are held back, to be put on the wire now: the link ends or goes on."""
-        held = [*self._burst, *([] if self._held_back is None else [self._held_back])]
+        """Return the frames that are held back, to be sent now."""
+        held = self._burst
+        if self._held_back is not None:
+            held.append(self._held_back)
         self._burst, self._held_back = [], None
         return held
 
     def breaks_here(self) -> bool:
-        """Whether the link is to break in the middle of the next frame; call once per frame."""
+        """Return True if the link breaks in the middle of the next frame; call once per frame."""
         self._frames += 1
         every = self.faults.disconnect_every_frames
         if every is None or self._frames % every:
@@ -114,7 +124,7 @@ class LinkFaultInjector:
         return True
 
     def _flipped(self, frame: bytes) -> bytes:
-        at = int(self._random.integers(len(frame) * 8))
+        at = int(self._random.integers(self._spared_bytes * 8, len(frame) * 8))
         spoiled = bytearray(frame)
         spoiled[at // 8] ^= 1 << at % 8
         return bytes(spoiled)

@@ -1,4 +1,4 @@
-"""A sender of the plain joint stream that is not there: joints that swing slowly."""
+"""Stands in for a sender of the joint stream: joints that swing slowly."""
 
 from __future__ import annotations
 
@@ -34,10 +34,8 @@ class JointTwin:
         """Raises `ValueError` for a rate that is not positive and for a fault that it lacks."""
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
-        if faults.burst_frames != 1 or faults.one_byte_at_a_time:
-            raise ValueError("the joint stream has no bursts and no single bytes")
-        if faults.dead_electrodes or faults.unplugged_fingers:
-            raise ValueError("the joint stream has no electrodes")
+        faults.refuse("the joint stream", "burst_frames", "one_byte_at_a_time")
+        faults.refuse("the joint stream", "dead_electrodes", "unplugged_fingers")
         self._names = tuple(names)
         self._rate_hz = rate_hz
         self._injector = LinkFaultInjector(faults)

@@ -45,14 +45,14 @@ ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
 OUTAGE_CYCLES = 500
 """A link that breaks stays silent for half a second while the palm goes on."""
 LATER_VERSION_BYTES = 4
-"""Packets of a palm that nobody knows yet are longer by so much."""
+"""Packets of a later kind of palm are longer by this much."""
 
 
 class PalmTwin:
     """Plays counts as a palm would send them: one shape (fingers, 24) per round of 14 packets.
 
     `cycles` is deterministic: datagrams by the millisecond, after faults. `serve` sends them.
-    With `stuck_clock` the palm answers the same request for ever. Fingers that are not in
+    With `stuck_clock` the palm always answers the same request. Fingers that are not in
     `fingers` have no sensor, and say so; those unplugged by a fault do not.
     """
 
@@ -71,8 +71,7 @@ class PalmTwin:
 
         Raises `ValueError` for a fault that datagrams cannot have.
         """
-        if faults.one_byte_at_a_time:
-            raise ValueError("datagrams are not sent byte by byte")
+        faults.refuse("the palm", "one_byte_at_a_time")
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
         self._palm = palm
@@ -113,12 +112,7 @@ class PalmTwin:
                 silent = OUTAGE_CYCLES
                 yield [*self._injector.flush(), data[: len(data) // 2]]
                 continue
-            # A burst is many datagrams at once, not a long one.
-            yield [
-                burst[at : at + len(data)]
-                for burst in self._injector.spoil(data)
-                for at in range(0, len(burst), len(data))
-            ]
+            yield self._injector.spoil(data)
         yield self._injector.flush()
 
     def serve(

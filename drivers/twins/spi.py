@@ -180,7 +180,7 @@ class SpiTwin(Opened):
         )
 
     def unplug(self) -> None:
-        """Take the pseudo-terminal away: whoever has it open is told by the system."""
+        """Take the pseudo-terminal away: the system tells the process that has it open."""
         ours = None if self._slave is None else os.ttyname(self._slave)
         if self.path.is_symlink() and str(self.path.readlink()) == ours:
             self.path.unlink()
@@ -215,7 +215,7 @@ class SpiTwin(Opened):
             self.run_once(min(wait_ns, IDLE_NS) / 1e9)
 
     def run_once(self, timeout_s: float = 0.0) -> None:
-        """Wait for the host so long at most, then do what is due."""
+        """Wait up to `timeout_s` for the host, then do what is due."""
         if self._master is None:
             if self._replug_ns is None or self._clock() < self._replug_ns:
                 time.sleep(timeout_s)

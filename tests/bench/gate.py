@@ -22,7 +22,7 @@ from drivers.base import JointReading, TactileReading
 from drivers.twins.grasps.grasp_script import EndPoint, Phase, Timetable
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.whole_grasps import (
-    Moment,
+    GraspRow,
     Sampling,
     WholeGrasps,
     read_end_points,
@@ -129,7 +129,7 @@ class Judge:
         judgement = self._pipeline(None).judge(_tactile(self._now_ns, 0, counts))
         return judgement.decision, judgement.p_slip
 
-    def stream(self, stream: WholeGrasps) -> Iterator[tuple[Moment, Judgement]]:
+    def stream(self, stream: WholeGrasps) -> Iterator[tuple[GraspRow, Judgement]]:
         """Every row of the stream and what is said of it."""
         pipeline = self._pipeline(self._grip)
         for index, moment in enumerate(stream):

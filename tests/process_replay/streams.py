@@ -19,7 +19,7 @@ from drivers.can.stream import CanStream
 from drivers.link import LinkState
 from drivers.palm.stream import PalmStream
 from drivers.recordings.can_log import line_of
-from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from drivers.recordings.serial_log import encode_records
 from drivers.spi.conversation import Conversation
 from drivers.spi.line import LineEvent
@@ -66,7 +66,7 @@ class Clock:
 def recording(path: Path, fingers: Sequence[str] = FINGERS) -> Iterator[Reading]:
     """Play a CSV recording in its own time, with joints if it has them."""
     clock = Clock()
-    with ReplayDriver([path], fingers, pace=Pace.REALTIME, clock=clock) as driver:
+    with ReplayDriver([path], fingers, clock=clock) as driver:
         while not driver.exhausted:
             clock.now_ns = max(clock.now_ns, driver.due_ns() or 0)
             yield from driver.read_ready()

@@ -8,30 +8,11 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES
-
 Range = tuple[float, float]
 """Lower and upper end of a uniform distribution."""
 
-FIRST_REST_S: Range = (1.5, 2.0)
-"""Rest before the first grasp, s: enough sweeps to learn the resting level from."""
-APPROACH_S: Range = (0.4, 0.7)
-"""Joints move and nothing is touched, s."""
-TOUCH_S: Range = (0.03, 0.15)
-"""From the first finger that touches to the last, s: fingers of one command differ by this much."""
-CLOSE_S: Range = (0.25, 0.5)
-"""From the last touch to the end of closing, s."""
-SETTLE_S: Range = (0.6, 1.0)
-"""From the end of closing to the lift, s: five time constants of the creep, and time to judge."""
-LIFT_S: Range = (0.4, 0.6)
-"""From the start of the lift to the release, s."""
-RELEASE_S: Range = (0.2, 0.3)
-"""From the first finger opening to nothing touched, s: faster than closing."""
-REST_S: Range = (0.8, 1.5)
-"""From the release to the next approach, s."""
-
 FINGER_LEAD_S = 0.05
-"""A finger is done closing so much before the last one at most, s."""
+"""A finger is done closing at most this much before the last one, s."""
 CREEP_SHARE: Range = (0.05, 0.07)
 """Share of the deviation that is still missing when closing ends: skin and fluid yield slowly."""
 CREEP_TAU_S: Range = (0.10, 0.14)
@@ -73,14 +54,22 @@ class Phase(StrEnum):
 class Durations:
     """How long the phases last, s: each drawn between two limits."""
 
-    first_rest_s: Range = FIRST_REST_S
-    approach_s: Range = APPROACH_S
-    touch_s: Range = TOUCH_S
-    close_s: Range = CLOSE_S
-    settle_s: Range = SETTLE_S
-    lift_s: Range = LIFT_S
-    release_s: Range = RELEASE_S
-    rest_s: Range = REST_S
+    first_rest_s: Range = (1.5, 2.0)
+    """Rest before the first grasp: enough sweeps to learn the resting level from."""
+    approach_s: Range = (0.4, 0.7)
+    """Joints move and nothing is touched."""
+    touch_s: Range = (0.03, 0.15)
+    """From the first finger that touches to the last: fingers of one command differ by this."""
+    close_s: Range = (0.25, 0.5)
+    """From the last touch to the end of closing."""
+    settle_s: Range = (0.6, 1.0)
+    """From the end of closing to the lift: five time constants of the creep, and time to judge."""
+    lift_s: Range = (0.4, 0.6)
+    """From the start of the lift to the release."""
+    release_s: Range = (0.2, 0.3)
+    """From the first finger opening to nothing touched: faster than closing."""
+    rest_s: Range = (0.8, 1.5)
+    """From the release to the next approach."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,9 +228,3 @@ def _minimum_jerk(share: NDArray[np.float64]) -> NDArray[np.float64]:
     """Way made after this share of the time, 0..1: how arms and hands move (Flash, Hogan 1985)."""
     share = np.minimum(np.maximum(share, 0.0), 1.0)
     return share * share * share * (10.0 + share * (6.0 * share - 15.0))
-
-
-def check_rest(rest: NDArray[np.float64]) -> None:
-    """Raise `ValueError` unless these are counts of fingers, shape (fingers, 24)."""
-    if rest.ndim != 2 or not len(rest) or rest.shape[1] != ELECTRODES:
-        raise ValueError(f"rest has shape {rest.shape}, not (fingers, {ELECTRODES})")

@@ -1,4 +1,4 @@
-"""What a hardware twin's sensors feel: a recording; and the noise that recordings show."""
+"""Counts of a recording, for a twin to play."""
 
 from __future__ import annotations
 
@@ -16,14 +16,6 @@ from drivers.recordings.csv_rows import read_rows
 Counts = NDArray[np.uint16]
 """Shape (fingers, 24), raw counts 0..4095."""
 
-NOISE_COUNTS = 3.5
-"""Standard deviation of an untouched electrode, counts; measured 2.9 to 4.3 (robust)."""
-SPIKE_PROBABILITY = 0.01
-"""Chance per electrode and sweep of a downward spike; measured 0.75 to 1.22 %."""
-SPIKE_COUNTS = (25.0, 150.0)
-"""Depth of a spike, counts; upward spikes were never seen."""
-DRIFT_COUNTS_PER_S = 0.7
-"""Warm-up drift, counts/s; measured 0.56 to 0.84, always upward."""
 TACTILES_COLUMN = "tactiles"
 """Column of a Shadow hand's recording as exported from a ROS bag: its header has 43 columns, its
 rows have 38, and finger i starts at column 8 + 6 i in the order FF MF RF LF TH."""

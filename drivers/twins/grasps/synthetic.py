@@ -1,11 +1,13 @@
 """Synthetic grasps: drawn from a small statistical model of real ones, for demos and tests.
 
 The model describes the BioTac SP Stability Set (palm down and palm side; MIT licence,
-Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by a few parameters per class and holds none
-of its grasps. Each class is a mixture of Gaussians with few axes over the raw counts of ff, mf, th.
+Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by 5763 parameters per class, against some
+92,000 counts of a class in the data set; it holds none of its grasps. Each class is a mixture of
+three Gaussians over the raw counts of ff, mf, th: clusters by k-means, with the 24 largest
+principal axes of each.
 
 `python -m drivers.twins.grasps.synthetic` writes the demo table again, byte for byte, with `--day`
-the demo day, and with `--fit FOLDER` first fits the model again to the tables in that folder.
+the demo day.
 """
 
 from __future__ import annotations
@@ -15,40 +17,28 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
-from drivers.recordings.csv_columns import OBJECT, SLIPPED, electrode_columns
+from drivers.base import COUNT_MAX, ELECTRODES
 from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
-from drivers.recordings.csv_rows import read_rows
+from drivers.recordings.csv_rows import OBJECT, SLIPPED, electrode_columns
 
 FINGERS = ("ff", "mf", "th")
 COUNTS = len(FINGERS) * ELECTRODES
-TABLES = ("palm_down.csv", "palm_side.csv")
 MODEL = Path(__file__).with_name("grasp_classes.json")
-COMPONENTS = 3
-AXES = 24
-"""Mixture components per class, and axes per component: 5763 parameters per class (`parameters`),
-against 92,000 counts or so that a class of the data set has."""
 DEMO_GRASPS = 200
 DAY_GRASPS = 300
 DEMO_SEED = 0
 DRIFT_ENDS = 0.6
-"""Share of a day after which its sensors drift no more."""
+"""Share of a day after which its sensors stop drifting."""
 DRIFT_TO_STABLE = 1.2
-"""By how many times the difference between the classes a drifting hand comes to read firmer."""
+"""Drift of the day, as a multiple of the difference between the classes, toward stable grasps."""
 DRIFT_COUNTS, DRIFT_GAIN = 60.0, 0.1
 """Standard deviation, over the electrodes, of a further offset, and of the logarithm of a gain."""
-FIT_SEED = 0
-KMEANS_PASSES = 50
 OBJECT_PREFIX = "synthetic"
-ABOUT = (
-    "Parameters of a statistical model of the grasps in the BioTac SP Stability Set (MIT licence), "
-    "palm_down and palm_side, raw counts ff 1..24, mf 1..24, th 1..24. Draws from it are synthetic."
-)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,12 +64,6 @@ class GraspClass:
     highest: NDArray[np.float64]
     components: tuple[Component, ...]
 
-    @property
-    def parameters(self) -> int:
-        """How many numbers the class is made of."""
-        per_component = [1 + c.mean.size + c.axes.size + c.spread.size for c in self.components]
-        return self.lowest.size + self.highest.size + sum(per_component)
-
 
 GraspModel = Mapping[bool, GraspClass]
 """By label: False stable, True slip."""
@@ -87,7 +71,7 @@ GraspModel = Mapping[bool, GraspClass]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticGrasps:
-    """What `draw` drew."""
+    """Grasps that `draw` made."""
 
     counts: NDArray[np.uint16]
     """Shape (grasps, 72)."""
@@ -97,18 +81,8 @@ class SyntheticGrasps:
     """Shape (grasps,): the mixture component, from 0; it stands in for the object."""
 
 
-def fit(counts: NDArray[np.uint16], slipped: NDArray[np.bool_]) -> GraspModel:
-    """Fit both classes to real grasps: counts (grasps, 72), labels (grasps,).
-
-    Raises `ValueError` for classes too small to fit.
-    """
-    return {
-        label: _fit_class(counts[slipped == label].astype(np.float64)) for label in (False, True)
-    }
-
-
 def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
-    """Draw so many grasps, half of them slipping, in random order; counts within the real range."""
+    """Draw grasps, half of them slipping, in random order; counts within the real range."""
     slipped = rng.permutation(np.arange(grasps) % 2 == 1)
     counts = np.zeros((grasps, COUNTS), dtype=np.uint16)
     component = np.zeros(grasps, dtype=np.int64)
@@ -119,7 +93,7 @@ def draw(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticG
 
 
 def draw_day(model: GraspModel, rng: np.random.Generator, grasps: int) -> SyntheticGrasps:
-    """As `draw`, but by sensors that drift: slips come to read as stable grasps did in the morning.
+    """Draw grasps of sensors that drift: slips come to read as stable grasps did in the morning.
 
     At first the grasps are those of `draw`. Real sensors drift by hundreds of counts from month to
     month; that it happens within a day, and in the direction that misleads, is made up.
@@ -148,143 +122,44 @@ def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
         file.write(",".join(map(str, cells)) + "\n")
 
 
-def read_tables(paths: Sequence[Path]) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
-    """Counts (grasps, 72) and labels (grasps,) of labelled tables. Raises `RecordingError`."""
-    counts, slipped = [], []
-    for path in paths:
-        for row in read_rows(path, FINGERS, strict=True):
-            if row.annotation.slipped is None:
-                raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
-            counts.append(row.counts.ravel())
-            slipped.append(row.annotation.slipped)
-    return np.array(counts, dtype=np.uint16), np.array(slipped, dtype=np.bool_)
+def read_model() -> GraspModel:
+    """Read the model of real grasps."""
+    document = json.loads(MODEL.read_text(encoding="utf-8"))
+    return {False: _grasp_class(document["stable"]), True: _grasp_class(document["slip"])}
 
 
-def write_model(model: GraspModel, path: Path) -> None:
-    """Write a model as JSON, one vector per line."""
-    classes = {
-        _name(label): {
-            "lowest": grasp_class.lowest.astype(int).tolist(),
-            "highest": grasp_class.highest.astype(int).tolist(),
-            "components": [
-                {
-                    "weight": component.weight,
-                    "mean": component.mean.tolist(),
-                    "spread": component.spread.tolist(),
-                    "axes": component.axes.tolist(),
-                }
-                for component in grasp_class.components
-            ],
-        }
-        for label, grasp_class in model.items()
-    }
-    text = json.dumps({"about": ABOUT, **classes}, separators=(",", ":"))
-    path.write_text(text.replace("],", "],\n") + "\n", encoding="utf-8")
-
-
-def read_model(path: Path = MODEL) -> GraspModel:
-    """Read what `write_model` wrote."""
-    document = json.loads(path.read_text(encoding="utf-8"))
-    return {
-        label: GraspClass(
-            lowest=np.array(document[_name(label)]["lowest"]),
-            highest=np.array(document[_name(label)]["highest"]),
-            components=tuple(
-                Component(
-                    weight=component["weight"],
-                    mean=np.array(component["mean"]),
-                    axes=np.array(component["axes"]),
-                    spread=np.array(component["spread"]),
-                )
-                for component in document[_name(label)]["components"]
-            ),
+def _grasp_class(document: Mapping[str, Any]) -> GraspClass:
+    components = [
+        Component(
+            weight=component["weight"],
+            mean=np.array(component["mean"]),
+            axes=np.array(component["axes"]),
+            spread=np.array(component["spread"]),
         )
-        for label in (False, True)
-    }
+        for component in document["components"]
+    ]
+    return GraspClass(
+        lowest=np.array(document["lowest"]),
+        highest=np.array(document["highest"]),
+        components=tuple(components),
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the demo table, or one of another size, seed or model."""
+    """Write the demo table, or the demo day."""
     parser = argparse.ArgumentParser(
         prog="python -m drivers.twins.grasps.synthetic", description=__doc__
     )
-    parser.add_argument("--fit", type=Path, metavar="FOLDER", help=f"fit to {', '.join(TABLES)}")
-    parser.add_argument("--model", type=Path, default=MODEL, help="JSON file of the model")
     parser.add_argument("--day", action="store_true", help="a day in which the sensors drift")
     parser.add_argument("--out", type=Path, help="CSV file to write (default: the demo's)")
-    parser.add_argument("--grasps", type=int, help=f"(default: {DEMO_GRASPS}, a day {DAY_GRASPS})")
-    parser.add_argument("--seed", type=int, default=DEMO_SEED)
     options = parser.parse_args(arguments)
-    try:
-        if options.fit is not None:
-            tables = [options.fit / table for table in TABLES]
-            write_model(fit(*read_tables(tables)), options.model)
-        rng = np.random.default_rng(options.seed)
-        model = read_model(options.model)
-        if options.day:
-            grasps, out = draw_day(model, rng, options.grasps or DAY_GRASPS), DEMO_DAY
-        else:
-            grasps, out = draw(model, rng, options.grasps or DEMO_GRASPS), DEMO_TABLE
-        with (options.out or out).open("w", encoding="utf-8", newline="") as file:
-            write_table(grasps, file)
-    except (RecordingError, OSError, ValueError) as error:
-        parser.error(str(error))
-
-
-def _name(label: bool) -> str:
-    return "slip" if label else "stable"
-
-
-def _fit_class(counts: NDArray[np.float64]) -> GraspClass:
-    """Cluster the grasps, then take each cluster's largest principal axes. Rounded to 0.1 count."""
-    cluster = _k_means(counts, np.random.default_rng(FIT_SEED))
-    components = []
-    for index in range(COMPONENTS):
-        members = counts[cluster == index]
-        if len(members) <= AXES:
-            raise ValueError(f"{len(members)} grasps in a cluster are too few for {AXES} axes")
-        mean = members.mean(axis=0)
-        axes = _principal_axes(np.cov(members, rowvar=False))
-        left = members.var(axis=0, ddof=1) - np.square(axes).sum(axis=0)
-        components.append(
-            Component(
-                weight=round(len(members) / len(counts), 4),
-                mean=mean.round(1),
-                axes=axes.round(1),
-                spread=np.sqrt(np.maximum(left, 0.0)).round(1),
-            )
-        )
-    components.sort(key=lambda component: -component.weight)
-    return GraspClass(counts.min(axis=0), counts.max(axis=0), tuple(components))
-
-
-def _principal_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The largest axes, shape (AXES, 72), one standard deviation long."""
-    variances, directions = np.linalg.eigh(covariance)
-    largest = np.arange(COUNTS - 1, COUNTS - 1 - AXES, -1)
-    axes = directions[:, largest].T * np.sqrt(variances[largest, np.newaxis])
-    # An axis has no direction of its own; this choice makes a fit repeatable.
-    steepest = np.abs(axes).argmax(axis=1)
-    signed: NDArray[np.float64] = axes * np.sign(axes[np.arange(AXES), steepest])[:, np.newaxis]
-    return signed
-
-
-def _k_means(counts: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Cluster of each grasp, shape (grasps,)."""
-    if len(counts) < COMPONENTS:
-        raise ValueError(f"{len(counts)} grasps are too few for {COMPONENTS} clusters")
-    centres = counts[rng.choice(len(counts), COMPONENTS, replace=False)]
-    nearest = np.zeros(len(counts), dtype=np.int64)
-    for _ in range(KMEANS_PASSES):
-        distances = np.square(counts[:, np.newaxis] - centres).sum(axis=2)
-        nearest = distances.argmin(axis=1)
-        centres = np.array(
-            [
-                counts[nearest == index].mean(axis=0) if (nearest == index).any() else centre
-                for index, centre in enumerate(centres)
-            ]
-        )
-    return nearest
+    rng = np.random.default_rng(DEMO_SEED)
+    if options.day:
+        grasps, out = draw_day(read_model(), rng, DAY_GRASPS), DEMO_DAY
+    else:
+        grasps, out = draw(read_model(), rng, DEMO_GRASPS), DEMO_TABLE
+    with (options.out or out).open("w", encoding="utf-8", newline="") as file:
+        write_table(grasps, file)
 
 
 def _draw_one(grasp_class: GraspClass, rng: np.random.Generator) -> tuple[int, NDArray[np.uint16]]:

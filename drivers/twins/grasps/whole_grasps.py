@@ -20,10 +20,9 @@ from typing import Protocol, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import COUNT_MAX, ELECTRODES, RecordingError
-from drivers.recordings.csv_columns import OBJECT, SLIPPED, TIME, electrode_columns
+from drivers.base import COUNT_MAX, ELECTRODES
 from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.recordings.csv_rows import read_rows
+from drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns, read_rows
 from drivers.twins.grasps import synthetic
 from drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
@@ -32,7 +31,6 @@ from drivers.twins.grasps.grasp_script import (
     GraspScript,
     Phase,
     Timetable,
-    check_rest,
 )
 from drivers.twins.grasps.tactile_noise import MeasuredNoise, TactileNoise
 
@@ -51,7 +49,6 @@ WARM_REST_MAX = COUNT_MAX - 50
 """No electrode drifts above this, counts: one of the synthetic first finger rests at 3975 and would
 drift to the end of a sensor's range in three minutes."""
 DEMO_GRASPS = 12
-DEMO_SEED = 0
 DEMO_DURATIONS = Durations(
     first_rest_s=(1.2, 1.2),
     approach_s=(0.25, 0.35),
@@ -77,7 +74,7 @@ class Sampling(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moment:
+class GraspRow:
     """One row of the stream."""
 
     t_s: float
@@ -113,17 +110,11 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points for ever.
+        """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points without end.
 
         `noise` is made of the number of fingers and a source of chance, `MeasuredNoise` unless
-        given. Raises `ValueError` for shapes that do not fit, for no end points, and for a rate
-        that is not positive or, held, not 100 Hz.
+        given. Raises `ValueError` for a rate that is not positive or, held, not 100 Hz.
         """
-        check_rest(rest)
-        if not end_points:
-            raise ValueError("there are no end points to grasp")
-        if any(end_point.counts.shape != rest.shape for end_point in end_points):
-            raise ValueError(f"an end point has not the shape of the rest, {rest.shape}")
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
         if sampling is Sampling.HELD and rate_hz != RATE_HZ:
@@ -137,7 +128,7 @@ class WholeGrasps:
         self._loop = loop
         self._seed = seed
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[GraspRow]:
         noise_seed, joint_seed = np.random.SeedSequence([self._seed, 0]).spawn(2)
         joint_rng = np.random.default_rng(joint_seed)
         sampler = self._sampler(np.random.default_rng(noise_seed))
@@ -152,7 +143,7 @@ class WholeGrasps:
                 script = following
             jitter = joint_rng.normal(0.0, POSITION_NOISE_RAD, len(JOINT_NAMES))
             counts = sampler.sample(script, t_s)
-            yield _moment(script, t_s, counts, script.position_rad(t_s) + jitter)
+            yield _grasp_row(script, t_s, counts, script.position_rad(t_s) + jitter)
 
     def timetables(self) -> Iterator[Timetable]:
         """The truth about each grasp in turn, before, while or after the stream is played."""
@@ -236,13 +227,9 @@ def rest_above(
     A table does not tell what its fingers rest at. Contact lowers counts, and in many grasps an
     electrode is hardly pressed, so the rest is near the upper end of what an electrode shows. It is
     a quantile and not the largest, which a single odd grasp decides; the few end points above it
-    rise at contact. Raises `ValueError` for no grasps or a shape that does not fit.
+    rise at contact.
     """
-    if end_points.ndim != 3 or not len(end_points):
-        raise ValueError(f"end points have shape {end_points.shape}, not (grasps, fingers, 24)")
-    rest = np.asarray(np.quantile(end_points, quantile, axis=0), dtype=np.float64)
-    check_rest(rest)
-    return rest
+    return np.asarray(np.quantile(end_points, quantile, axis=0), dtype=np.float64)
 
 
 def synthetic_grasps(
@@ -254,7 +241,7 @@ def synthetic_grasps(
     loop: bool = False,
     seed: int = 0,
 ) -> WholeGrasps:
-    """A stream of grasps that nobody ever grasped, half of them slipping.
+    """Return a stream of synthetic grasps, half of them slipping.
 
     End points and rest are drawn from the model of `drivers.twins.grasps.synthetic`. Raises
     `ValueError` as `WholeGrasps` does.
@@ -282,87 +269,46 @@ def synthetic_grasps(
 
 
 def read_end_points(path: Path) -> list[EndPoint]:
-    """The grasps of a labelled table in the order of the file. Raises `RecordingError`."""
-    end_points = []
-    for row in read_rows(path, synthetic.FINGERS, strict=True):
-        note = row.annotation
-        if row.t_s is not None:
-            raise RecordingError(path, "a stream, not a table of grasps", column=TIME)
-        if note.slipped is None:
-            raise RecordingError(path, "the grasps have no labels", column=SLIPPED)
-        end_points.append(EndPoint(row.counts, note.slipped, note.object_name or ""))
-    return end_points
+    """Return the grasps of a labelled table in the order of the file. Raises `RecordingError`."""
+    notes = ((row, row.annotation) for row in read_rows(path, synthetic.FINGERS, strict=True))
+    return [
+        EndPoint(row.counts, note.slipped is True, note.object_name or "") for row, note in notes
+    ]
 
 
-def write_stream(moments: Iterable[Moment], file: TextIO, t_decimals: int) -> None:
-    """Write moments of ff, mf, th as a stream that a replay plays.
+def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
+    """Write rows of ff, mf, th as a stream that a replay plays.
 
     A label column holds 0 or 1, so it is 0 before the first grasp, where the object is empty.
     """
     electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
     file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
-    for moment in moments:
-        cells = [f"{moment.t_s:.{t_decimals}f}", moment.object_name or ""]
-        cells += [str(int(moment.slipped or False)), *map(str, moment.counts.ravel().tolist())]
-        cells += [f"{angle:.4f}" for angle in moment.position_rad.tolist()]
+    for row in rows:
+        cells = [f"{row.t_s:.{t_decimals}f}", row.object_name or ""]
+        cells += [str(int(row.slipped or False)), *map(str, row.counts.ravel().tolist())]
+        cells += [f"{angle:.4f}" for angle in row.position_rad.tolist()]
         file.write(",".join(cells) + "\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write the demo recording, or a stream of other grasps, size, seed or rate."""
+    """Write the demo recording."""
     parser = argparse.ArgumentParser(prog="python -m drivers.twins.grasps.whole_grasps")
     parser.add_argument("--out", type=Path, default=DEMO_RECORDING, help="CSV file to write")
-    parser.add_argument("--table", type=Path, metavar="FILE", help="take end points from a table")
-    parser.add_argument(
-        "--grasps", type=int, help=f"(default: {DEMO_GRASPS}, or all grasps of the table)"
-    )
-    parser.add_argument("--seed", type=int, default=DEMO_SEED)
-    parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="rows/s")
-    parser.add_argument(
-        "--fresh", action="store_true", help="sample at the rate, instead of 71.43 Hz and held"
-    )
     options = parser.parse_args(arguments)
-    try:
-        stream = _stream(options)
-        with options.out.open("w", encoding="utf-8", newline="") as file:
-            # Rows every 10 ms need two decimals, others get microseconds.
-            write_stream(stream, file, 2 if options.rate == RATE_HZ else 6)
-    except (RecordingError, OSError, ValueError) as error:
-        parser.error(str(error))
+    stream = synthetic_grasps(DEMO_GRASPS, sampling=Sampling.HELD, durations=DEMO_DURATIONS)
+    with options.out.open("w", encoding="utf-8", newline="") as file:
+        write_stream(stream, file, t_decimals=2)
 
 
-def _stream(options: argparse.Namespace) -> WholeGrasps:
-    sampling = Sampling.FRESH if options.fresh else Sampling.HELD
-    if options.grasps is not None and options.grasps < 1:
-        raise ValueError(f"--grasps is {options.grasps}, must be positive")
-    if options.table is None:
-        return synthetic_grasps(
-            options.grasps or DEMO_GRASPS,
-            sampling=sampling,
-            rate_hz=options.rate,
-            durations=DEMO_DURATIONS,
-            seed=options.seed,
-        )
-    end_points = read_end_points(options.table)
-    return WholeGrasps(
-        rest_above(np.array([end_point.counts for end_point in end_points])),
-        end_points[: options.grasps],
-        sampling=sampling,
-        rate_hz=options.rate,
-        durations=DEMO_DURATIONS,
-        seed=options.seed,
-    )
-
-
-def _moment(
+def _grasp_row(
     script: GraspScript,
     t_s: float,
     counts: NDArray[np.uint16],
     position_rad: NDArray[np.float64],
-) -> Moment:
+) -> GraspRow:
     timetable = script.timetable
     begun = t_s >= timetable.approach_s
-    return Moment(
+    return GraspRow(
         t_s=t_s,
         counts=counts,
         joint_names=JOINT_NAMES,

@@ -27,7 +27,7 @@ from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import (
     PALM_RATE_HZ,
     RATE_HZ,
-    Moment,
+    GraspRow,
     synthetic_grasps,
     write_stream,
 )
@@ -225,7 +225,7 @@ def ring_over(over: Link, rates_hz: Sequence[float], plan: Plan) -> Outcome:
 
 def recorded(
     ring: int, finger: int | None, rate_hz: float, hold_s: float
-) -> tuple[list[Moment], int]:
+) -> tuple[list[GraspRow], int]:
     """Rows of a recording whose grasp is held so long, and from which on none may be `stable`."""
     durations = Durations(first_rest_s=(1.5, 1.5), settle_s=(hold_s + 2.0, hold_s + 2.0))
     grasps = synthetic_grasps(1, durations=durations, seed=SEED, rate_hz=rate_hz)

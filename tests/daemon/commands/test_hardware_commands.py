@@ -15,7 +15,7 @@ import pytest
 
 from daemon.publish.messages import Tactile, Verdict, decode_tactile, decode_verdict
 from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_TABLE, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_TABLE, ReplayDriver
 from tests.bench.live import Subscriber
 from tests.daemon.processes import SUBSCRIBER, TIMEOUT_S, graspd, start, wait_for
 from tests.ports import free_port
@@ -87,7 +87,7 @@ def test_a_recording_on_the_wire_is_read_as_its_replay_is(tmp_path: Path, kind: 
     sound = [str(reading.counts) for reading in readings]
     assert json.loads(output)["injected"] == {}
     assert len(sound) == WANTED
-    with ReplayDriver([DEMO_TABLE], ("ff", "mf", "th"), pace=Pace.FAST) as replay:
+    with ReplayDriver([DEMO_TABLE], ("ff", "mf", "th"), speed=None) as replay:
         rows: set[str] = set()
         while not replay.exhausted:
             rows |= {

@@ -15,9 +15,8 @@ from daemon.assembly import assembly
 from daemon.session.file import SessionFile, former_of, kept_now, load
 from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust, TrustState, decode
-from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_TABLE
-from drivers.recordings.csv_rows import read_rows
+from drivers.recordings.csv_rows import SLIPPED, read_rows
 from tests.daemon.processes import graspd
 from tests.daemon.record.test_export import Writer
 

@@ -32,17 +32,15 @@ def replayed(**faults: int | float | tuple[int, ...] | tuple[str, ...]) -> Fault
     def spoil(sound: Sequence[Step]) -> list[Step]:
         injector = FaultInjector(wanted, FINGERS, ReplayCounters())
         steps = []
-        for number, step in enumerate(sound):
+        for step in sound:
             reading = step.tactile
             if reading is None:
                 continue
             counts, flags = reading.counts.copy(), reading.faults.copy()
-            injector.observe(number, counts, flags)
-            if number and injector.makes(number) and not injector.loses():
-                injector.spoil(counts, flags)
-                reading = msgspec.structs.replace(reading, counts=counts, faults=flags)
-            elif number:
+            if injector.inject(counts, flags) is None:
                 reading = None
+            else:
+                reading = msgspec.structs.replace(reading, counts=counts, faults=flags)
             now_ns = step.now_ns + round(wanted.delayed_s * 1e9)
             steps.append(dataclasses.replace(step, now_ns=now_ns, tactile=reading))
         return steps[1:]

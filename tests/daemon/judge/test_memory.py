@@ -21,7 +21,7 @@ from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
 from daemon.trust import trust
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
-from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from models.contract import Finger
 from models.runtime import TactileModel
 from models.session_statistics import SessionState
@@ -40,7 +40,7 @@ OLD = 30
 
 @pytest.fixture(scope="module")
 def readings() -> list[Reading]:
-    with ReplayDriver([DEMO_RECORDING], FINGERS, pace=Pace.FAST, clock=lambda: 10**12) as driver:
+    with ReplayDriver([DEMO_RECORDING], FINGERS, speed=None, clock=lambda: 10**12) as driver:
         found: list[Reading] = []
         while not driver.exhausted:
             found += driver.read_ready()

@@ -31,7 +31,7 @@ from daemon.record.mcap import McapWriter, header_of
 from daemon.record.recorder import Recorder
 from daemon.scene.scene import Record
 from drivers.base import TactileReading
-from drivers.recordings.csv_player import DEMO_RECORDING, Pace, ReplayDriver
+from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from tests.daemon.fakes import NO_LIFT
 from tests.daemon.record.recorded import BOOT, HEADER, NO_STATUS, messages, wait_until
 
@@ -168,7 +168,7 @@ class Daemon:
 def sweeps() -> list[TactileReading]:
     """Those of the demo recording, as if they came live, with the pace of it."""
     found = []
-    with ReplayDriver([DEMO_RECORDING], pace=Pace.FAST, clock=lambda: 0) as driver:
+    with ReplayDriver([DEMO_RECORDING], speed=None, clock=lambda: 0) as driver:
         while not driver.exhausted:
             for reading in driver.read_ready():
                 if isinstance(reading, TactileReading):

@@ -83,27 +83,6 @@ class ScriptedBus:
             raise self.shutdown_error
 
 
-class FailingBus:
-    """A bus whose `recv` fails once `failure` is set, as when an adapter is unplugged."""
-
-    def __init__(self, bus: can.BusABC) -> None:
-        self.bus = bus
-        self.failure: BaseException | None = None
-
-    def recv(self, timeout: float | None = None) -> can.Message | None:
-        received = self.bus.recv(timeout)
-        if received is None and self.failure is not None:
-            failure, self.failure = self.failure, None
-            raise failure
-        return received
-
-    def fileno(self) -> int:
-        raise NotImplementedError
-
-    def shutdown(self) -> None:
-        self.bus.shutdown()
-
-
 @contextlib.contextmanager
 def bus_options(**options: object) -> Iterator[None]:
     """Have python-can open its buses with these options too."""
@@ -208,22 +187,3 @@ class TwinLink:
             self.readings += tactile(self.driver.read_ready())
         assert twin.unsent == 0
         return twin
-
-    def half(self, counts: Counts) -> int:
-        """Send the first half of a sweep; its frames."""
-        twin = StampingTwin(
-            "virtual",
-            self.where,
-            iter([counts]),
-            format=self.format,
-            sequence=self.sequence,
-            first_sweep=self.sweeps_sent,
-            clock=self.clock,
-        )
-        self.clock.now_ns += 10 * MS
-        self.sweeps_sent += 1
-        with twin:
-            frames = twin.next_frames()
-            for frame in frames[: len(frames) // 2]:
-                twin.put(frame)
-        return len(frames) // 2

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import errno
-import struct
+import random
 from collections.abc import Sequence
-from typing import Any
 
-import can
 import msgspec
 import numpy as np
 import pytest
@@ -21,10 +18,8 @@ from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts
 from tests.drivers.can.can_fuzz import decoder
 from tests.drivers.can.can_standin import (
-    FailingBus,
     TwinLink,
     contact,
-    tactile,
 )
 from tests.drivers.can.can_words import truth, word
 
@@ -68,56 +63,6 @@ def test_link_faults_are_counted_one_by_one_and_invent_nothing(
     assert_same_tail(link.readings, after)
 
 
-FAILURES = [
-    can.CanOperationError("adapter says no"),
-    OSError(errno.ENODEV, "No such device"),
-    struct.error("unpack requires a buffer of 4 bytes"),
-    IndexError("string index out of range"),
-]
-
-
-@pytest.mark.parametrize("frame_format", FORMATS)
-@pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
-def test_a_driver_that_loses_its_bus_again_and_again_invents_nothing(
-    monkeypatch: pytest.MonkeyPatch, frame_format: str, failure: Exception
-) -> None:
-    """The bus breaks in the middle of every tenth sweep; what is sent until it is back is lost."""
-    real, opened = can.Bus, []
-    link = TwinLink(frame_format)
-
-    def open_bus(**options: Any) -> object:  # noqa: ANN401
-        if options.get("preserve_timestamps"):
-            return real(**options)  # the twin's
-        opened.append(FailingBus(real(**options)))
-        return opened[-1]
-
-    monkeypatch.setattr("drivers.can.bus.can.Bus", open_bus)
-    sent, losses = contact(120), 0
-    with link.driver:
-        for sweep, counts in enumerate(sent):
-            if sweep % 10 == 9:
-                losses += 1
-                half = link.half(counts)
-                opened[-1].failure = failure
-                link.readings += tactile(link.driver.read_ready())
-                assert half > 0
-                assert link.driver.link_state is LinkState.WAITING
-                link.clock.now_ns += 10 * MS
-            else:
-                link.send([counts])
-        counters = link.driver.counters
-    assert (counters.bus_faults, counters.link_losses, counters.interrupted_sweeps) == (
-        losses,
-        losses,
-        losses,
-    )
-    assert losses == 12
-    for reading in link.readings:
-        sound = reading.faults == 0
-        assert any((reading.counts[sound] == counts[sound]).all() for counts in sent)
-    assert counters.faulty_readings == counters.lost_frames == 0
-
-
 def truth_frames(sweep: int) -> list[CanFrame]:
     """Sweep frames of the tagged counts, at 100 Hz by the board's clock."""
     return [
@@ -136,10 +81,10 @@ def truth_frames(sweep: int) -> list[CanFrame]:
 
 
 @pytest.mark.parametrize("spoiled_row", [0, 1, 2])
-def test_every_single_flipped_bit_of_a_sweep_frame_shows_and_invents_nothing(
+def test_a_flipped_bit_of_a_sweep_frame_shows_and_invents_nothing(
     spoiled_row: int,
 ) -> None:
-    for bit in range(512):
+    for bit in random.Random(spoiled_row).sample(range(512), 64):
         made, counters = decoder(CanFormat.SWEEP_FD)
         readings: list[TactileReading] = []
         for sweep in range(100, 130):
@@ -188,22 +133,6 @@ def test_flipped_bits_are_counted_and_never_become_counts() -> None:
     assert counters.lost_frames == counters.unknown_commands
     assert_only_what_was_sent(link.readings, sent)
     assert_same_tail(link.readings, sent[298:])
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_flipped_bits_in_sweep_frames_are_recovered_from(seed: int) -> None:
-    link = TwinLink("sweep_fd")
-    after = contact(20, 5)
-    with link.driver:
-        link.send(contact(2))
-        link.send(contact(200), LinkFaults(bit_flip_probability=0.05, seed=seed))
-        link.clock.now_ns += 3_000 * MS
-        link.send(after)
-    assert_same_tail(link.readings, after[1:])
-    counters = link.driver.counters
-    assert counters.accepted_frames + counters.unknown_versions + counters.malformed_frames == (
-        counters.frames
-    )
 
 
 @pytest.mark.parametrize("frame_format", FORMATS)
@@ -261,13 +190,3 @@ def test_sweeps_that_nobody_sent_in_between_are_missed(frame_format: str) -> Non
     missed = 3 if frame_format == "syntouch" else 0  # sweep frames say that none was made
     assert counters.missed_readings == missed
     assert link.readings[-1].seq == 20 + missed
-
-
-def test_sweep_frames_that_start_anew_are_followed() -> None:
-    link = TwinLink("sweep_fd")
-    with link.driver:
-        link.send(contact(20))
-        link.sweeps_sent = 5_000
-        link.send(contact(3))
-    assert len(link.readings) == 23
-    assert link.driver.counters.restarts == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from pathlib import Path
 
 import cantools.database
 import numpy as np
@@ -12,7 +11,7 @@ from cantools.database.can.database import Database
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.base import FINGERS, TactileReading
+from drivers.base import FINGERS
 from drivers.biotac import decode_words
 from drivers.can.formats import (
     SWEEP_BASE_ID,
@@ -36,14 +35,14 @@ from drivers.can.frames import (
     unpack_frame,
 )
 from tests.conftest import ROOT
-from tests.drivers.can.can_fuzz import SAMPLE_ID, decoder, fuzz
-from tests.drivers.can.can_words import pack_frame, samples, truth, word
+from tests.drivers.can.can_fuzz import fuzz
+from tests.drivers.can.can_words import word
 
 E1_SAMPLE = bytes.fromhex("A2 A251 A8C8 94B9")
 """Electrode 1 of three sensors: 2602, 2713, 2391."""
 SWEEP_EXAMPLE = bytes.fromhex("01 04 3412 40420F00" + "A251" * 24 + "0000 000000000000")
 """The example in deploy/can/PROTOCOL.md."""
-DAMAGED_FRAMES = 100_000
+DAMAGED_FRAMES = 20_000
 
 
 @pytest.fixture(scope="module")
@@ -84,26 +83,11 @@ def test_what_is_no_sample_is_refused(data: str, reject: Reject) -> None:
     assert parse_sample(bytes.fromhex(data), 3, 7) == reject
 
 
-@pytest.mark.parametrize(
-    ("channel", "words"),
-    [(17, b""), (17, b"\xa2"), (17, bytes(8)), (16, bytes(6)), (41, bytes(6)), (-1, bytes(6))],
-)
-def test_samples_that_cannot_be_sent_are_our_mistake(channel: int, words: bytes) -> None:
-    with pytest.raises(ValueError, match=r"sensors|channel"):
-        encode_sample(channel, words)
-
-
 def test_the_protocols_example_of_a_sweep_frame_is_read_and_written() -> None:
     sweep = SweepFrame(4, 0x1234, 1_000_000, bytes.fromhex("A251") * 24)
     assert len(SWEEP_EXAMPLE) == 64
     assert parse_sweep(SWEEP_EXAMPLE) == sweep
     assert sweep.to_bytes() == SWEEP_EXAMPLE
-
-
-def test_the_protocols_example_stands_in_the_protocol() -> None:
-    text = (ROOT / "deploy" / "can" / "PROTOCOL.md").read_text()
-    assert "01 04 3412 40420F00 A251 (24 times) 0000 000000000000" in text
-    assert "`A2 A251 A8C8 94B9`" in text
 
 
 @pytest.mark.parametrize(
@@ -127,23 +111,6 @@ def test_what_is_no_sweep_frame_is_refused(at: int, value: int, reject: Reject) 
 @pytest.mark.parametrize("length", [0, 1, 8, 48, 63])
 def test_a_short_sweep_frame_is_refused(length: int) -> None:
     assert parse_sweep(SWEEP_EXAMPLE[:length]) == Reject.LENGTH
-
-
-@pytest.mark.parametrize(
-    "sweep",
-    [
-        SweepFrame(5, 0, 0, bytes(48)),
-        SweepFrame(-1, 0, 0, bytes(48)),
-        SweepFrame(0, 1 << 16, 0, bytes(48)),
-        SweepFrame(0, -1, 0, bytes(48)),
-        SweepFrame(0, 0, 1 << 32, bytes(48)),
-        SweepFrame(0, 0, 0, bytes(47)),
-        SweepFrame(0, 0, 0, bytes(48), 8),
-    ],
-)
-def test_sweep_frames_that_cannot_be_sent_are_our_mistake(sweep: SweepFrame) -> None:
-    with pytest.raises(ValueError, match=r"finger|sequence|tick_us|words|status"):
-        sweep.to_bytes()
 
 
 @given(
@@ -229,33 +196,6 @@ def test_what_is_no_struct_of_the_kernel_is_no_frame(raw: bytes) -> None:
     assert unpack_frame(raw) is None
 
 
-@pytest.mark.parametrize(
-    "frame",
-    [
-        CanFrame(0x800, b""),
-        CanFrame(-1, b""),
-        CanFrame(1 << 29, b"", EXTENDED),
-        CanFrame(1, bytes(9)),
-        CanFrame(1, bytes(65), FD),
-    ],
-)
-def test_frames_that_no_bus_has_are_our_mistake(frame: CanFrame) -> None:
-    with pytest.raises(ValueError, match=r"out of range|do not fit"):
-        pack_frame(frame)
-
-
-@given(
-    st.integers(0, 0x1FFFFFFF),
-    st.binary(max_size=64),
-    st.sampled_from([0, 1, 4, 8, 9]),
-)
-def test_frames_come_back_as_they_went(identifier: int, data: bytes, flags: int) -> None:
-    identifier &= 0x1FFFFFFF if flags & (EXTENDED | ERROR) else 0x7FF
-    data = data if flags & FD else data[:8]
-    frame = CanFrame(identifier, data, flags)
-    assert unpack_frame(pack_frame(frame)) == frame
-
-
 def test_error_frames_say_what_happened() -> None:
     """Classes and bits of linux/can/error.h."""
     bus_off = CanFrame(0x040, bytes(8), ERROR)
@@ -283,28 +223,3 @@ def test_error_frames_say_what_happened() -> None:
 @pytest.mark.parametrize("frame_format", list(CanFormat))
 def test_damaged_frames_raise_nothing_and_are_recovered_from(frame_format: CanFormat) -> None:
     assert fuzz(frame_format, DAMAGED_FRAMES, random.SystemRandom().randrange(1 << 32)) > 0
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_flipped_bit_in_a_sample_never_becomes_a_count(seed: int) -> None:
-    chance = random.Random(seed)
-    made, counters = decoder(CanFormat.SYNTOUCH)
-    readings: list[TactileReading] = []
-    flips = 0
-    for sweep in range(200):
-        for channel, words, t_ns in samples(sweep):
-            data = bytearray(encode_sample(channel, words))
-            if sweep and chance.random() < 0.05:
-                data[chance.randrange(7)] ^= 1 << chance.randrange(8)
-                flips += 1
-            readings += made.push(CanFrame(SAMPLE_ID, bytes(data)), t_ns)
-    for reading in readings:
-        sound = reading.faults == 0
-        assert (reading.counts[sound] == truth(reading.seq)[sound]).all(), f"seed {seed}"
-    bad_words = counters.parity_words + counters.error_words + counters.unplugged_words
-    assert bad_words + counters.unknown_commands == flips, f"seed {seed}"
-
-
-def test_the_dbc_file_needs_nothing_but_itself() -> None:
-    text = Path(ROOT / "deploy" / "can" / "graspd.dbc").read_text()
-    assert text.isascii()

@@ -28,9 +28,7 @@ from tests.drivers.can.can_standin import (
     sweep_of_frames,
     tactile,
 )
-from tests.drivers.can.can_words import SLOT_NS, Clock, pack_frame, truth
-
-REST_MAX_NS = 15_000_000
+from tests.drivers.can.can_words import Clock, pack_frame, truth
 
 MS = 1_000_000
 
@@ -215,28 +213,6 @@ def test_frames_that_the_kernel_dropped_cut_the_sweep_there(
             sound = reading.faults == 0
             assert any((reading.counts[sound] == truth(n)[sound]).all() for n in range(22))
         assert (readings[-1].counts == truth(21)).all()
-
-
-def test_the_loop_rests_while_no_reading_is_near(socket_bus: SocketBus) -> None:
-    """Descriptor or time: at any moment the loop has one of them to wait for."""
-    clock = Clock()
-    with over_socket(clock=clock, wall_clock=clock) as driver:
-        rests, readings = 0, 0
-        for sweep in range(20):
-            for part in (sweep_of_frames(sweep)[:12], sweep_of_frames(sweep)[12:]):
-                for frame in part:
-                    clock.now_ns += SLOT_NS
-                    socket_bus.send(frame)
-                    readings += len(driver.read_ready())
-                due_ns = driver.due_ns()
-                assert due_ns is not None
-                if driver.fileno() is None:
-                    rests += 1
-                    assert due_ns - clock.now_ns <= REST_MAX_NS
-        assert readings == 20
-        assert rests > 0
-        driver.close()
-        assert driver.due_ns() is driver.fileno() is None
 
 
 def test_the_loop_rests_until_a_millisecond_before_a_reading_and_fifteen_at_most(

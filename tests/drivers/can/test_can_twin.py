@@ -125,8 +125,3 @@ def test_a_library_that_does_not_work_here_says_why(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("drivers.can.bus.can.Bus", refuse)
     with pytest.raises(DriverError, match="does not work here: Windows only"):
         CanTwin("vector", "0", iter(())).open()
-
-
-def test_an_interface_that_nobody_has_is_refused_at_once() -> None:
-    with pytest.raises(ValueError, match="no interface 'nonsense'"):
-        CanTwin("nonsense", "x", iter(()))

@@ -87,8 +87,8 @@ def test_a_lost_sample_flags_its_electrode_and_shifts_no_other(lost: int, timed:
     assert counters.missed_readings == 0
 
 
-@pytest.mark.parametrize("burst", range(2, 24))
-@pytest.mark.parametrize("first", [0, 1, 11, 20])
+@pytest.mark.parametrize("burst", [2, 5, 12, 23])
+@pytest.mark.parametrize("first", [0, 11, 20])
 def test_a_burst_of_lost_samples_never_mixes_two_sweeps(first: int, burst: int) -> None:
     sweeps, counters = assembler()
     stream = concatenated([samples(n) for n in range(10)])
@@ -156,12 +156,6 @@ def test_joining_in_the_middle_waits_for_a_sweep_to_begin() -> None:
         assert_true(reading, sweep)
 
 
-def test_joining_where_the_first_electrode_is_lost_still_begins() -> None:
-    sweeps, _ = assembler()
-    readings = feed(sweeps, concatenated([samples(0)[10:], samples(1)[1:], samples(2)]))
-    assert [missing_electrodes(reading) for reading in readings] == [[1], []]
-
-
 def test_an_interrupted_sweep_is_dropped_and_not_mended() -> None:
     sweeps, counters = assembler()
     readings = feed(sweeps, samples(0) + samples(1)[:12])
@@ -185,27 +179,6 @@ def test_a_sweep_cut_by_silence_is_not_filled_up_later(known: bool) -> None:
     assert_true(readings[-2], before)
     assert_true(readings[-1], before + 1)
     assert counters.lost_frames == 24
-
-
-def test_an_outage_counts_as_one_missed_reading() -> None:
-    sweeps, counters = assembler()
-    stream = concatenated([samples(n) for n in range(10)])
-    later = [(channel, words, t_ns + 60 * OUTAGE_NS) for channel, words, t_ns in samples(10)]
-    readings = feed(sweeps, stream + later)
-    assert readings[-1].seq == readings[-2].seq + 2
-    assert counters.missed_readings == 1
-
-
-def test_frames_that_come_in_bursts_make_the_same_readings() -> None:
-    sweeps, counters = assembler("interleaved")
-    stream = concatenated([samples(n, "interleaved") for n in range(40)])
-    bursts = [stream[at : at + 7] for at in range(0, len(stream), 7)]
-    stream = [(channel, words, burst[-1][2]) for burst in bursts for channel, words, _ in burst]
-    readings = feed(sweeps, stream)
-    assert [reading.seq for reading in readings] == list(range(40))
-    for sweep, reading in enumerate(readings):
-        assert_true(reading, sweep)
-    assert counters.faulty_readings == counters.missed_readings == 0
 
 
 @pytest.mark.parametrize(

@@ -340,5 +340,5 @@ def test_the_faults_of_a_twin_are_counted() -> None:
 def test_a_twin_with_nonsense_settings_is_refused() -> None:
     with pytest.raises(ValueError, match="rate_hz"):
         JointTwin(rate_hz=0.0)
-    with pytest.raises(ValueError, match="bursts"):
+    with pytest.raises(ValueError, match="burst_frames"):
         JointTwin(faults=LinkFaults(burst_frames=2))

@@ -8,15 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.base import Fact, RecordingError
+from drivers.base import RecordingError
 from drivers.palm.packet import Palm
-from drivers.recordings.palm_file import PalmFileDriver
+from drivers.recordings.link_log_player import LinkLogDriver
+from drivers.recordings.palm_file import PalmFile
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import MS, Clock, datagrams, rows, tactile
 
 
-@pytest.mark.parametrize("palm", list(Palm))
-@pytest.mark.parametrize("can_record", [False, True])
+def player(path: Path, clock: Clock) -> tuple[PalmFile, LinkLogDriver[bytes]]:
+    log = PalmFile()
+    return log, LinkLogDriver([path], log, speed=1.0, clock=clock)
+
+
+@pytest.mark.parametrize(("palm", "can_record"), [(Palm.PALM_0220, True), (Palm.PALM_0250, False)])
 def test_a_file_of_packets_plays_count_for_count(
     tmp_path: Path, palm: Palm, can_record: bool
 ) -> None:
@@ -25,24 +30,14 @@ def test_a_file_of_packets_plays_count_for_count(
     path.write_bytes(b"".join(packet.to_bytes() for packet in twin.packets()) + bytes(5))
     readings = []
     clock = Clock()
-    with PalmFileDriver(path, clock=clock) as driver:
+    log, driver = player(path, clock)
+    with driver:
         while not driver.exhausted:
             clock.now_ns = driver.due_ns() or clock.now_ns
             readings += tactile(driver.read_ready())
-        assert driver.describe() == {"source": Fact(str(path))}
-        assert driver.counters.bad_lengths == 1  # the file ends in the middle of a packet
+        assert log.stream.counters.bad_lengths == 1  # the file ends in the middle of a packet
         assert driver.due_ns() is None
     assert np.array_equal([reading.counts for reading in readings], rows(40))
-
-
-def test_the_size_of_a_file_tells_the_length_where_one_packet_cannot(tmp_path: Path) -> None:
-    path = tmp_path / "hand.palm"
-    path.write_bytes(next(iter(PalmTwin(rows(1), can_record=True).packets())).to_bytes())
-    clock = Clock()
-    with PalmFileDriver(path, clock=clock) as driver:
-        driver.read_ready()
-        assert (driver.counters.packets, driver.counters.bad_lengths) == (1, 0)
-        assert driver.exhausted
 
 
 @pytest.mark.parametrize(
@@ -55,7 +50,7 @@ def test_half_of_the_packets_of_a_file_make_sense_and_with_one_length(
 ) -> None:
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(datagrams(1)[:good]) + bytes(nonsense))
-    driver = PalmFileDriver(path, clock=Clock())
+    _, driver = player(path, Clock())
     if plays:
         driver.open()
         driver.close()
@@ -69,7 +64,8 @@ def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
     path = tmp_path / "hand.palm"
     path.write_bytes(b"".join(datagrams(10)))
     times = []
-    with PalmFileDriver(path, clock=clock) as driver:
+    _, driver = player(path, clock)
+    with driver:
         start_ns = clock.now_ns
         while (due_ns := driver.due_ns()) is not None:
             clock.now_ns = due_ns
@@ -80,8 +76,8 @@ def test_a_file_plays_one_packet_per_millisecond(tmp_path: Path) -> None:
 def test_a_pipe_is_refused_instead_of_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "hand.palm"
     os.mkfifo(path)
-    with pytest.raises(RecordingError, match="is not a file"):
-        PalmFileDriver(path).open()
+    with pytest.raises(RecordingError, match="is not a regular file"):
+        player(path, Clock())[1].open()
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no packets at all" * 500, bytes(22000)])
@@ -90,19 +86,6 @@ def test_a_file_without_packets_is_refused(tmp_path: Path, content: bytes | None
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(RecordingError, match=r"hand\.palm"):
-        PalmFileDriver(path).open()
-    with pytest.raises(RecordingError, match=r"is not a file|cannot be opened"):
-        PalmFileDriver(tmp_path).open()
-
-
-def test_a_file_that_is_read_late_has_lost_no_packet(tmp_path: Path) -> None:
-    clock = Clock()
-    path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(datagrams(40)))
-    readings = []
-    with PalmFileDriver(path, clock=clock) as driver:
-        while not driver.exhausted:
-            readings += tactile(driver.read_ready())
-            clock.now_ns += 500 * MS
-        assert driver.counters.lost_packets == 0
-    assert np.array_equal([reading.counts for reading in readings], rows(40))
+        player(path, Clock())[1].open()
+    with pytest.raises(RecordingError, match="is a directory"):
+        player(tmp_path, Clock())[1].open()

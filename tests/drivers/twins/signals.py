@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES
 from drivers.twins.grasps.grasp_script import Timetable
-from drivers.twins.grasps.grasps import (
+from drivers.twins.grasps.grasps import Counts
+from drivers.twins.grasps.tactile_noise import (
     DRIFT_COUNTS_PER_S,
     NOISE_COUNTS,
     SPIKE_COUNTS,
     SPIKE_PROBABILITY,
-    Counts,
 )
 
 UNTOUCHED_COUNTS = (2400.0, 3400.0)
@@ -83,11 +83,8 @@ def fresh_residuals(held: NDArray[np.uint16]) -> NDArray[np.float64]:
     `held`: counts, shape (rows, fingers, 24), 100 Hz, five new values in seven rows. The result has
     five rows for seven. Level and drift are the straight line through an electrode's samples, moved
     so that the median residual is zero: the spikes, all downward, would pull a mean.
-    Raises `ValueError` for less than 70 rows, too few to tell which rows repeat.
     """
     rounds = len(held) // PALM_ROWS
-    if rounds < 10:
-        raise ValueError(f"{len(held)} rows are too few to tell which ones repeat")
     rows = held[: rounds * PALM_ROWS].astype(np.float64)
     # All fingers are sampled together, so that a row repeats an electrode on all of them at once.
     repeats = (np.diff(rows, axis=0, prepend=np.nan) == 0.0).all(axis=1)

@@ -119,13 +119,8 @@ def held(
 ) -> Iterator[tuple[float, Counts]]:
     """Times, s, and counts, shape (fingers, 24), of fingers that hold, or along which it slides.
 
-    Nothing moves for the first `rest_s`. The same seed gives the same stream. Raises `ValueError`
-    for a rate that is not positive or, held, not 100 Hz.
+    Nothing moves for the first `rest_s`. The same seed gives the same stream.
     """
-    if not 0.0 < rate_hz < float("inf"):
-        raise ValueError(f"rate_hz is {rate_hz}, must be positive")
-    if sampling is Sampling.HELD and rate_hz != RATE_HZ:
-        raise ValueError(f"held values come at {RATE_HZ:g} Hz, not {rate_hz}")
     rng = np.random.default_rng([seed, 3])
     hold, noise = Hold(sliding, rng, seconds, rest_s), HeldNoise(len(sliding), rng)
     sampler = HeldSampler if sampling is Sampling.HELD else FreshSampler

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers.twins.grasps.grasp_script import Durations, EndPoint
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.tactile_noise import MeasuredNoise
-from drivers.twins.grasps.whole_grasps import Moment, Sampling, WholeGrasps, synthetic_grasps
+from drivers.twins.grasps.whole_grasps import GraspRow, Sampling, WholeGrasps
 from tests.drivers.twins.signals import fresh_residuals, played
 
 REST = np.full((3, 24), 3000.0)
@@ -26,7 +26,7 @@ PAIRS = [(0,), *((first, first + 1) for first in range(1, 23, 2)), (23,)]
 """Electrodes sampled by one request, from 0: E1 (with TDC), E2/E3 ... E22/E23, E24."""
 
 
-def counts_of(moments: list[Moment]) -> NDArray[np.float64]:
+def counts_of(moments: list[GraspRow]) -> NDArray[np.float64]:
     return np.array([moment.counts for moment in moments], dtype=np.float64)
 
 
@@ -34,16 +34,6 @@ def untouched(sampling: Sampling) -> NDArray[np.float64]:
     """A minute of rest, shape (6000, 3, 24)."""
     grasps = WholeGrasps(REST, [UNPRESSED], sampling=sampling, durations=LONG_REST, seed=3)
     return counts_of(list(itertools.islice(grasps, 6000)))
-
-
-def test_held_pairs_repeat_in_two_of_seven_rows_on_all_fingers_together() -> None:
-    repeats = np.diff(untouched(Sampling.HELD), axis=0) == 0.0
-    for pair in PAIRS:
-        together = repeats[:, :, pair].all(axis=(1, 2))
-        assert together.mean() == pytest.approx(0.2857, abs=0.001)
-        gaps = np.diff(np.flatnonzero(together))
-        # Three values that are new and all the same by chance: 0.08 to the third.
-        assert np.isin(gaps, (3, 4)).mean() > 0.995
 
 
 def test_held_values_are_sampled_one_request_a_millisecond_in_the_order_of_the_palm() -> None:
@@ -103,33 +93,6 @@ def test_no_electrode_drifts_out_of_its_range() -> None:
     assert counts[100:, 0, 2].std() > 2.9
     assert np.median(counts[100:, 0, 2]) == pytest.approx(4045.0, abs=1.0)
     assert np.median(counts[100:, 1]) == pytest.approx(3210.0, abs=1.0)
-
-
-def test_a_palms_own_rate_can_be_played_fresh() -> None:
-    grasps = synthetic_grasps(rate_hz=1000 / 14, loop=True)
-    moments = list(itertools.islice(grasps, 200))
-    np.testing.assert_allclose([moment.t_s for moment in moments], 0.014 * np.arange(200))
-    assert not (np.diff(counts_of(moments), axis=0) == 0.0).all(axis=(1, 2)).any()
-
-
-def test_fresh_samples_are_found_in_held_rows() -> None:
-    samples = np.random.default_rng(0).normal(0.0, 40.0, (1001, 3, 24)).round() + 1000
-    held = np.zeros((1400, 3, 24), dtype=np.uint16)
-    for row in range(1400):
-        for place, pair in enumerate(PAIRS, 1):
-            electrodes = list(pair)
-            held[row][:, electrodes] = samples[(10 * row - place) // 14 + 1][:, electrodes]
-    residuals = fresh_residuals(held)
-    assert residuals.shape == (1000, 3, 24)
-    # What was taken away is a straight line. The first row counts as a repeat of what came before
-    # it for some electrodes, so their samples begin with the second.
-    bends = [np.diff(samples[at : at + 1000] - residuals, n=2, axis=0) for at in (0, 1)]
-    assert np.min([np.abs(bend).max(axis=0) for bend in bends], axis=0).max() < 1e-6
-
-
-def test_too_few_rows_do_not_tell_which_repeat() -> None:
-    with pytest.raises(ValueError, match="69 rows are too few"):
-        fresh_residuals(np.zeros((69, 3, 24), dtype=np.uint16))
 
 
 def test_real_residuals_are_as_wide_as_measured_and_hold_no_repeats(bts3_dir: Path) -> None:

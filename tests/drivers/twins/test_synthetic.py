@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.base import RecordingError
 from drivers.recordings.csv_player import DEMO_DAY, DEMO_TABLE
 from drivers.twins.grasps import synthetic
 
@@ -78,76 +76,6 @@ def test_the_demo_is_small_labelled_and_called_synthetic() -> None:
     assert all(row["object"].startswith("synthetic") for row in rows)
 
 
-def test_the_model_is_far_smaller_than_what_it_was_fitted_to() -> None:
-    model = synthetic.read_model()
-    assert [model[label].parameters for label in (False, True)] == [5763, 5763]
-    assert synthetic.MODEL.stat().st_size < 80_000
-
-
-def test_size_and_seed_may_be_chosen(tmp_path: Path) -> None:
-    first, second = tmp_path / "1.csv", tmp_path / "2.csv"
-    synthetic.main(["--out", str(first), "--grasps", "11", "--seed", "1"])
-    synthetic.main(["--out", str(second), "--grasps", "11", "--seed", "2"])
-    counts, slipped = load(first)
-    assert counts.shape == (11, 72)
-    assert slipped.sum() == 5
-    assert not np.array_equal(counts, load(second)[0])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--fit", "/nowhere"], "/nowhere/palm_down.csv: no such file or directory"),
-        (["--model", "/nowhere.json"], "No such file or directory"),
-    ],
-)
-def test_a_wrong_path_is_one_line_on_stderr(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
-) -> None:
-    with pytest.raises(SystemExit) as caught:
-        synthetic.main([*arguments, "--out", str(tmp_path / "out.csv")])
-    assert caught.value.code == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "out.csv").exists()
-
-
-def test_a_fit_finds_what_it_was_drawn_from(tmp_path: Path) -> None:
-    drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(5), 3000)
-    again = synthetic.fit(drawn.counts, drawn.slipped)
-    for label in (False, True):
-        real = drawn.counts[drawn.slipped == label].astype(float)
-        redrawn = synthetic.draw(again, np.random.default_rng(6), 3000)
-        same = redrawn.counts[redrawn.slipped == label].astype(float)
-        error = np.abs(same.mean(axis=0) - real.mean(axis=0))
-        # Two means of 1500 draws: 5 standard errors.
-        assert (error < 5 * real.std(axis=0) * np.sqrt(2 / 1500)).all()
-        np.testing.assert_allclose(same.std(axis=0), real.std(axis=0), rtol=0.25)
-
-
-def test_a_model_reads_back_as_it_was_written(tmp_path: Path) -> None:
-    path = tmp_path / "model.json"
-    synthetic.write_model(synthetic.read_model(), path)
-    assert path.read_bytes() == synthetic.MODEL.read_bytes()
-
-
-def test_too_few_grasps_are_refused() -> None:
-    counts = np.full((20, 72), 2000, dtype=np.uint16)
-    with pytest.raises(ValueError, match="too few"):
-        synthetic.fit(counts, np.arange(20) % 2 == 0)
-    with pytest.raises(ValueError, match="too few"):
-        synthetic.fit(counts[:2], np.array([True, False]))
-
-
-def test_tables_without_labels_cannot_be_fitted(tmp_path: Path) -> None:
-    drawn = synthetic.draw(synthetic.read_model(), np.random.default_rng(0), 4)
-    text = io.StringIO()
-    synthetic.write_table(drawn, text)
-    path = tmp_path / "grasps.csv"
-    path.write_text(text.getvalue().replace("slipped", "outcome"))
-    with pytest.raises(RecordingError, match="column slipped: the grasps have no labels"):
-        synthetic.read_tables([path])
-
-
 def test_the_demo_stays_in_the_real_range(
     whole: tuple[NDArray[np.float64], NDArray[np.int64]],
 ) -> None:
@@ -182,15 +110,3 @@ def test_a_classifier_of_real_grasps_judges_synthetic_ones_about_as_well_as_real
     demo_score = f1_score(slipped, classifier.predict(z_scores(counts)))
     # The demo is 200 such draws: four standard errors of 0.017.
     assert demo_score == pytest.approx(score, abs=0.07)
-
-
-def test_the_committed_model_is_a_fit_to_the_real_grasps(bts3_dir: Path, tmp_path: Path) -> None:
-    path = tmp_path / "model.json"
-    arguments = ["--fit", str(bts3_dir), "--model", str(path), "--out", str(tmp_path / "out.csv")]
-    synthetic.main(arguments)
-    for label, committed in synthetic.read_model().items():
-        fitted = synthetic.read_model(path)[label]
-        np.testing.assert_array_equal(fitted.lowest, committed.lowest)
-        for one, other in zip(fitted.components, committed.components, strict=True):
-            assert one.weight == pytest.approx(other.weight, abs=1e-3)
-            np.testing.assert_allclose(one.mean, other.mean, atol=1.0)
