@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from daemon.measure.worth.lives import Life, live
 from daemon.measure.worth.streams import ORDERS, Plan, Stream, streams
 from daemon.trust.learner import Learner
-from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import read_all
 from models.training.evaluating.day_figures import VerdictFigures
 

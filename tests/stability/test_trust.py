@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from daemon.trust.learner import Learner
 from daemon.trust.lift_book import LIFTS_MAX, GraspId
-from daemon.trust.risk import LOWEST, Permission, Risk, RiskLimits
-from daemon.trust.trust import Trust, encode
+from daemon.trust.trust import LOWEST, Permission, Risk, RiskLimits, Trust, encode
 
 Note = Callable[..., None]
 Random = np.random.Generator

@@ -78,17 +78,19 @@ def _stages(
     names = [name for finger in fingers for name in electrode_columns(finger)]
     header = (",".join(names) + "\n").encode()
     lines = [(",".join(map(str, row.ravel())) + "\n").encode() for row in counts]
-    sound = np.zeros(counts.shape[1:], dtype=np.bool_)
 
     def parse(index: int) -> None:
         for _ in Recording(Path("stage"), [header, lines[index]], fingers):
             pass
 
+    def follow(index: int) -> None:
+        hand.step(readings[index].t_ns, counts[index], checked[index])
+
     return {
         "parse a row of CSV, with its header": parse,
         "health": lambda index: health.check(readings[index]),
-        "contact and gate": lambda index: hand.step(readings[index], checked[index]),
-        "like the training?": lambda index: plausibility.examine(counts[index], sound),
+        "contact and gate": follow,
+        "like the training?": lambda index: plausibility.examine(counts[index], None),
         "image or features": lambda index: model.inputs.build(counts[index], model.input),
         "session (the network)": lambda _: model.run(),
         "decision": lambda _: decide(0.25, (), HELD, 0, limits),

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from daemon.measure.worth.streams import Stream
 from daemon.trust.learner import sigmoid
 from daemon.trust.lift_book import GraspId
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust
+from daemon.trust.trust import Permission, RiskLimits, Trust
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,8 +17,7 @@ from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.trust.lift_book import GraspId
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import Trust
+from daemon.trust.trust import RiskLimits, Trust
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts

@@ -21,7 +21,7 @@ from daemon.measure.worth import streams as module
 from daemon.measure.worth.lives import live
 from daemon.measure.worth.report import ALLOWED, ALONE, LEARNING, PUBLISHED, RISK, draw, measured
 from daemon.measure.worth.streams import ORDERS, Plan, Stream, streams
-from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import Grasps, read_all
 from models.training.data.protocols import DAYS
 from models.training.systems.system import System

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from daemon.trust.learner import sigmoid
 from daemon.trust.lift_book import LIFTS_MAX, GraspId, OutcomeStatus
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+from daemon.trust.trust import MAX_BYTES, Permission, RiskLimits, Trust, TrustState, decode, encode
 
 BOOT = "0123456789abcdef" * 2
 INPUTS = 26

@@ -18,7 +18,7 @@ from msgspec import structs
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskReport
+from daemon.trust.trust import RiskReport
 from daemon.watch.evidence import WATCHED
 from daemon.watch.fingers import FULL, HEIGHT, WIDTH, FingerMotion, Rest, image
 from daemon.watch.pixels import Canvas
