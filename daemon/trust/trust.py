@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from daemon.trust.learner import Learner, LearnerState, sigmoid
 from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, LiftBookState, OutcomeStatus
 
-VERSION: Final = 1
 MAX_BYTES: Final = 1 << 20
 """Of a state before it is compressed: of three fingers, with every outcome still out, 240 kB."""
 DIGEST_BYTES: Final = 32
@@ -166,9 +165,10 @@ class Risk:
 
     def supervised(self, permission: Permission, seed: str, grasp: int) -> bool:
         """Return True to ask for a lift under supervision; the same for the same seed and grasp."""
-        if permission is Permission.WITHHELD and self.limits.explore > 0.0:
-            return _draw(seed, grasp) < self.limits.explore
-        return permission is Permission.UNPROVEN
+        if permission is not Permission.WITHHELD:
+            return permission is Permission.UNPROVEN
+        digest = hashlib.blake2b(f"{seed} {grasp}".encode(), digest_size=8).digest()
+        return int.from_bytes(digest) / 2.0**64 < self.limits.explore
 
     def take(self, *, stable: bool, slipped: bool, proves: bool) -> None:
         """Take in an outcome, and whether the grasp had been called `stable`.
@@ -204,11 +204,11 @@ class Risk:
         if state.max_slip_when_stable != self.limits.max_slip_when_stable:
             self.proven = state.proven
             return
+        moved = state.max_slip_when_stable is not None
         alpha = state.max_slip_when_stable or 0.0
         highest = min(self.start + STEP * (alpha * state.lifts - state.slips), 0.0)
         lowest = LOWEST - STEP * (1.0 - alpha) * state.overdue
         rounding = 1e-12 * (state.lifts + 10)
-        moved = state.max_slip_when_stable is not None
         if state.slips > state.lifts or state.overdue > state.lifts:
             raise ValueError("counts more slips than lifts")
         if moved and not lowest - rounding <= state.theta <= highest + rounding:
@@ -261,13 +261,12 @@ class Trust:
         """
         self._model = model
         self._inputs = inputs
-        self._limits = limits or RiskLimits()
         self.learns = learns
         self._report: RiskReport | None = None
         self.learner = Learner(inputs)
         self._judging = self.learner if learns else Learner(inputs)
         """The learner by which grasps are judged; without learning, one that is never taught."""
-        self.risk = Risk(self._limits)
+        self.risk = Risk(limits or RiskLimits())
         self.lifts = LiftBook()
 
     def judge(
@@ -311,16 +310,14 @@ class Trust:
 
     def _permission(self, grasp: GraspId, log_odds: float) -> Permission:
         permission = self.risk.decide(log_odds)
-        has_rule = self._limits.max_slip_when_stable is not None
+        has_rule = self.risk.limits.max_slip_when_stable is not None
         if has_rule and permission is Permission.ALLOWED and self.lifts.is_told(grasp):
             return Permission.WITHHELD  # its outcome is known: a second lift would not be counted
         return permission
 
     def note(self, grasp: GraspId, assessment: Assessment, *, stable: bool) -> None:
-        """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed.
-
-        Nothing is learned from an assessment of another model, or of a grasp that was not judged.
-        """
+        """Enter the verdict on a grasp in the book. Raises `ValueError` if it was not allowed."""
+        # Nothing is learned from an assessment of another model.
         is_ours = len(assessment.features) == 8 * (self._inputs + 2)
         features = assessment.features if is_ours else NOT_ASSESSED
         if stable and assessment.permission is not Permission.ALLOWED:
@@ -343,7 +340,7 @@ class Trust:
         if self._report is None:
             risk = self.risk
             self._report = RiskReport(
-                target=self._limits.max_slip_when_stable,
+                target=risk.limits.max_slip_when_stable,
                 lifts=risk.lifts,
                 slips=risk.slips,
                 outstanding=self.lifts.outstanding,
@@ -353,10 +350,7 @@ class Trust:
         return self._report
 
     def sensors_exchanged(self, learned: LearnerState | None = None) -> None:
-        """Learn from the start, or from what these sensors taught before; slips stay counted.
-
-        Raises `ValueError` for what is of another model.
-        """
+        """Learn from the start, or go on from `learned`. Raises `ValueError` for another model's."""
         self.learner.reset()
         if learned is not None:
             self.learner.restore(learned)
@@ -367,7 +361,7 @@ class Trust:
     def state(self) -> TrustState:
         """Return what `restore` needs; later outcomes do not change it."""
         parts = self.learner.state(), self.risk.state(), self.lifts.state()
-        return TrustState(VERSION, self._model, *parts)
+        return TrustState(1, self._model, *parts)
 
     def fits(self, state: TrustState) -> bool:
         """Return True if a state is of this model."""
@@ -377,7 +371,7 @@ class Trust:
         """Go on from an earlier state. Raises `ValueError`, and changes nothing, if it is none."""
         if not self.fits(state):
             raise ValueError("is of another model")
-        learner, risk = Learner(self._inputs), Risk(self._limits)
+        learner, risk = Learner(self._inputs), Risk(self.risk.limits)
         learner.restore(state.learner)
         risk.restore(state.risk)
         self.lifts.restore(state.lifts, self._inputs + 2)
@@ -403,9 +397,3 @@ def decode(data: bytes) -> TrustState:
         return msgspec.msgpack.decode(plain, type=TrustState)
     except (zlib.error, msgspec.DecodeError, RecursionError) as error:
         raise ValueError(f"is nothing that was learned: {error}") from error
-
-
-def _draw(seed: str, grasp: int) -> float:
-    """Return a number in 0..1 that looks random, the same for the same seed and grasp."""
-    digest = hashlib.blake2b(f"{seed} {grasp}".encode(), digest_size=8).digest()
-    return int.from_bytes(digest) / 2.0**64

@@ -326,14 +326,6 @@ def test_after_a_gap_three_fresh_sweeps_are_judged_and_none_from_before() -> Non
     pytest.fail("it was never judged again")
 
 
-def test_a_single_reading_is_judged_as_it_came() -> None:
-    firm = Scenario("firm", GRASPED, UP, limits=replace(LIMITS, sweeps=1))
-    moment_s = settle_s(firm)
-    (judged,) = play(firm).judged
-    came = [reading.counts for t_s, reading in readings(firm) if abs(t_s - moment_s) < 1e-3]
-    np.testing.assert_array_equal(judged, came[0])
-
-
 def test_a_finger_lost_while_settled_is_contact_lost() -> None:
     steps = Steps(on_request=True)
     steps.hold()

@@ -194,13 +194,6 @@ def test_under_a_risk_nobody_gets_a_lucky_draw_by_waiting() -> None:
     assert trust.report().outstanding <= 1
 
 
-def test_after_its_outcome_was_told_a_grasp_is_not_stable_again() -> None:
-    hand, _ = risky(RiskLimits(0.5))
-    assert hand.play(Feel(times=60))[-1].decision is Decision.STABLE
-    hand.pipeline.outcome(GraspId(BOOT, 1), slipped=False)
-    assert {each.decision for each in hand.play(Feel(times=60))[10:]} == {Decision.UNKNOWN}
-
-
 def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -252,76 +248,9 @@ def test_a_session_of_other_fingers_begins_anew(
     assert session.grasps == 0
 
 
-def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    state = calibration().state()
-    data = {"version": 1, "fingers": FINGERS, "serials": {}, "saved_at": 0.0}
-    path = tmp_path / "right.json"
-    statistics = msgspec.to_builtins(state)
-    text = msgspec.json.encode(data | {"statistics": statistics}).decode()
-    path.write_text(text.replace('"squares":[0.0', '"squares":[-1.0', 1))
-    with pytest.raises(SessionFileError, match="not a session"):
-        load(path)
-
-
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(SessionFileError, match="No such file or directory"):
         SessionFile(tmp_path / "no" / "right.json")
-
-
-def test_a_full_disk_is_one_warning_and_no_crash(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    session, clock = calibration(), Clock()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, sensors(), file, clock)
-
-        def full(descriptor: int) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(os, "fsync", full)
-        for seed in range(3):
-            observe(session, 3, seed)
-            clock.now_ns += SAVE_PERIOD_NS
-            read_once(keeper)
-            keeper.wait(WAIT_S)
-        assert caplog.text.count("No space left on device") == 1
-        monkeypatch.undo()
-        keeper.save()
-        kept = file.load()
-    assert kept is not None
-    assert grasps_of(kept) == 9
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["right.json", "right.json.lock"]
-
-
-KILLED = """
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from daemon.session.file import SessionFile, kept_now
-from tests.daemon.session.test_session import FINGERS, calibration, observe
-session = calibration()
-with SessionFile(Path(sys.argv[1])) as file:
-    while True:
-        observe(session, 1, session.grasps)
-        file.save(kept_now(session.state(), FINGERS, {}))
-        print(session.grasps, flush=True)
-"""
-
-
-def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None:
-    path = tmp_path / "right.json"
-    for _ in range(3):
-        with subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
-        ) as process:
-            if process.stdout is None:
-                raise RuntimeError("no pipe")
-            for _ in range(20):
-                process.stdout.readline()
-            process.send_signal(signal.SIGKILL)
-        kept = load(path)
-        assert kept is not None
-        assert grasps_of(kept) >= 20
 
 
 def session_pipeline(*, learns: bool = True) -> Pipeline:
