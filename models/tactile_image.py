@@ -12,11 +12,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from models.inputs import scale_of
 from models.layout import D1, ELECTRODES, Layout
-
-SPREAD_FLOOR_COUNTS = 1.0
-"""A finger whose standard deviation is below one count has no image: a z-score would magnify the
-quantisation of the converter. On real fingers the electrodes differ by 145 counts or more."""
 
 
 class Fill(StrEnum):
@@ -69,18 +66,6 @@ def fill_matrix(layout: Layout, fill: Fill) -> NDArray[np.float64]:
                 matrix[row, column] = before[window][known[window]].mean(axis=0)
                 filled[row, column] = True
     return matrix.reshape(height * width, ELECTRODES + 1)
-
-
-def scale_of(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What deviations are multiplied by: one over the spread, 0 where that must not be judged.
-
-    Writes NaN into `spread` where it is infinite: it overflowed, so it is no number to judge by.
-    """
-    if 0 not in ((spread >= SPREAD_FLOOR_COUNTS) & (spread < np.inf)).tobytes():
-        return 1.0 / spread
-    spread[np.isinf(spread)] = np.nan
-    judgeable = spread >= SPREAD_FLOOR_COUNTS
-    return np.divide(1.0, spread, where=judgeable, out=np.zeros_like(spread))
 
 
 class TactileImager:

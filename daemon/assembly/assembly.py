@@ -23,8 +23,7 @@ from daemon.scene.drivers import (
     StreamJoints,
 )
 from daemon.scene.scene import GateMode
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import Trust
+from daemon.trust.trust import RiskLimits, Trust
 from drivers.base import Driver, DriverError, LinkError
 from models import own, trial, zoo
 from models.contract import ModelError, SessionInput

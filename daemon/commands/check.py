@@ -244,7 +244,7 @@ def _gate(wanted: scene.Scene, limits: HandLimits | None) -> str:
 def _still(wanted: scene.Scene, gate: GateLimits, period_ns: int | None) -> str:
     """What is known of motion when, and what is judged then."""
     from daemon.commands.operating_points import operating_points
-    from daemon.judge.windows import Tails
+    from daemon.judge.stillness import Tails
 
     tails = Tails.of(len(wanted.hand.fingers), gate.false_alarms, early=gate.early)
     soon, sure = operating_points(tails, period_ns or USUAL_PERIOD_NS)

@@ -7,18 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from daemon.judge.windows import (
-    LONG_NS,
-    MEAN_ABS,
-    SHORT_NS,
-    STEP_NS,
-    STEPS_MIN,
-    Noise,
-    Tails,
-    centred,
-    fast_limit,
-    slow_limit,
-)
+from daemon.judge.stillness import Tails, centred, fast_limit, slow_limit
+from daemon.judge.windows import LONG_NS, MEAN_ABS, SHORT_NS, STEP_NS, STEPS_MIN, Noise
 
 TYPICAL_COUNTS, TYPICAL_CORRELATIONS = 3.5 / math.sqrt(1.0 - 0.32), (0.32, 0.03)
 """Standard deviation of a held touch's electrode, and its correlation at one and two sweeps; by the

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from daemon.judge.contact import Contact
 from daemon.judge.decision import MEDIAN_SWEEPS, HandLimits
 from daemon.judge.gate import Gate
-from daemon.judge.health import NO_COUNT, Checked, all_of
+from daemon.judge.health import NO_COUNT, Checked
 from daemon.judge.reasons import Moment, Reason
-from drivers.base import ELECTRODES, JointReading, TactileReading
+from drivers.base import ELECTRODES, JointReading
 from models.contract import Finger
 
 if TYPE_CHECKING:
@@ -87,8 +87,7 @@ class FreshMedian:
         if usable is not None or not memory.all_full:
             self._fill(counts, usable, fresh)
         memory.last = counts if usable is None else np.where(usable, counts, memory.last)
-        low, high = np.minimum(oldest, middle), np.maximum(oldest, middle)
-        self.counts = np.maximum(low, np.minimum(high, newest))
+        self.counts = np.sort(memory.fresh, axis=0)[1]
 
     def is_full(self, usable: NDArray[np.bool_] | None) -> bool:
         """Return True if each `usable` electrode has three fresh values."""
@@ -110,7 +109,7 @@ class FreshMedian:
         first = fresh & (memory.number == 0)
         np.copyto(memory.fresh, counts, where=first)
         memory.number += fresh & (memory.number < MEDIAN_SWEEPS)
-        memory.all_full = all_of(memory.number == MEDIAN_SWEEPS)
+        memory.all_full = bool((memory.number == MEDIAN_SWEEPS).all())
 
 
 @dataclass(slots=True)
@@ -191,16 +190,45 @@ class HandTracker:
             self._joints.observe(reading, reading.made_ns)
 
     def step(
-        self, reading: TactileReading, checked: Checked, *, in_time: bool = True
+        self,
+        t_ns: int,
+        counts: NDArray[np.uint16],
+        checked: Checked,
+        *,
+        in_time: bool = True,
     ) -> tuple[Moment, NDArray[np.uint16] | None]:
-        """Take in a reading of these fingers and what was found in it.
+        """Take in the counts of a reading, shape (fingers, 24), made at `t_ns`.
 
-        Return where in a grasp the hand is, and the counts to judge, shape (fingers, 24), or None.
+        Return where in a grasp the hand is, and the counts to judge; None: judge nothing.
         """
-        t_ns, last_ns = reading.made_ns, self.memory.last_ns
         if checked.reasons:
             self.gate.skip(t_ns)
             return self.moment(), None
+        self._follow_time(t_ns)
+        usable = None if checked.broken is None else ~checked.broken
+        self._fresh.push(counts, usable)
+        median, fresh = self._fresh.counts, self._fresh.is_full(usable)
+        self._contact.observe(t_ns, counts, median, usable)
+        touching = tuple(compress(self._fingers, self._contact.memory.touching.tolist()))
+        tared = compress(self._fingers, self._contact.memory.tared.tolist())
+        objections = () if self.gate.required.issubset(tared) else (Reason.NOT_TARED,)
+        joints = None if self._joints is None else self._joints.objection(t_ns)
+        if joints is not None:
+            objections = (*objections, joints)
+        moment = self.gate.step(
+            t_ns, counts, median, usable, touching, objections, in_time=in_time, fresh=fresh
+        )
+        if not moment.judges:
+            return moment, None
+        return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else counts
+
+    def moment(self) -> Moment:
+        """Return where in a grasp the hand is without a new reading; it is not to be judged."""
+        return self.gate.moment(self._named(self._contact.memory.touching))
+
+    def _follow_time(self, t_ns: int) -> None:
+        """Forget what does not continue at the time of a usable reading."""
+        last_ns = self.memory.last_ns
         if last_ns is not None and not 0 <= t_ns - last_ns <= self._limits.gate.gap_ns:
             self._fresh.reset()
             if t_ns - last_ns > OUTAGE_NS:
@@ -210,37 +238,6 @@ class HandTracker:
         if self.memory.unsettled:
             self.memory.unsettled -= 1
             self.gate.restart(t_ns)
-        usable = None if checked.is_whole else ~checked.broken
-        self._fresh.push(reading.counts, usable)
-        median = self._fresh.counts
-        self._contact.observe(t_ns, reading.counts, median, usable)
-        moment = self.gate.step(
-            t_ns,
-            reading.counts,
-            median,
-            usable,
-            self._named(self._contact.memory.touching),
-            self._objections(t_ns),
-            in_time=in_time,
-            fresh=self._fresh.is_full(usable),
-        )
-        if not moment.judges:
-            return moment, None
-        return moment, median if self._limits.sweeps == MEDIAN_SWEEPS else reading.counts
-
-    def moment(self) -> Moment:
-        """Return where in a grasp the hand is without a new reading; it is not to be judged."""
-        return self.gate.moment(self._named(self._contact.memory.touching))
-
-    def _objections(self, t_ns: int) -> tuple[Reason, ...]:
-        """Return what tare and joints say against settling."""
-        objections: list[Reason] = []
-        if not self.gate.required.issubset(self.tared):
-            objections.append(Reason.NOT_TARED)
-        joints = None if self._joints is None else self._joints.objection(t_ns)
-        if joints is not None:
-            objections.append(joints)
-        return tuple(objections)
 
     def _named(self, which: NDArray[np.bool_]) -> tuple[Finger, ...]:
         return tuple(compress(self._fingers, which.tolist()))

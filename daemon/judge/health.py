@@ -73,10 +73,8 @@ class Checked:
 
     reasons: tuple[Reason, ...]
     """Against using it at all."""
-    broken: NDArray[np.bool_]
-    """Shape (fingers, 24): electrodes that mean nothing in it."""
-    is_whole: bool = False
-    """True if none is broken; a sound reading is known by this without a look at all."""
+    broken: NDArray[np.bool_] | None
+    """Shape (fingers, 24): electrodes that mean nothing in it. None: all are sound."""
 
 
 @dataclass(slots=True, eq=False)
@@ -168,9 +166,6 @@ class Health:
             sweeps=PastSweeps.none(fingers),
         )
         self._no_faults = self.memory.faults.tobytes()
-        nothing = np.zeros(shape, dtype=np.bool_)
-        nothing.flags.writeable = False  # one for all sound readings
-        self._sound = Checked((), nothing, is_whole=True)
         # Constants of full shape, and buffers: numpy takes half the time.
         self._one, self._jump, *limits = (
             np.full(shape, number, dtype=np.uint16) for number in (1, JUMP_COUNTS, *LIMITS)
@@ -213,7 +208,7 @@ class Health:
             if railed.any():
                 reasons.append(Reason.SATURATED)
             return Checked((*reasons, Reason.ELECTRODES_BROKEN), broken)
-        return Checked((), broken) if any_of(broken) else self._sound
+        return Checked((), broken if any_of(broken) else None)
 
     def electrodes(self) -> dict[tuple[int, int], Reason]:
         """Return what is wrong with which electrode, (finger, 0..23), by the last reading."""
@@ -265,11 +260,6 @@ class Health:
 def any_of(which: NDArray[np.bool_]) -> bool:
     """Return True if any is true. To search the bytes takes a tenth of the time of `any()`."""
     return 1 in which.tobytes()
-
-
-def all_of(which: NDArray[np.bool_]) -> bool:
-    """Return True if all are true; see `any_of`."""
-    return 0 not in which.tobytes()
 
 
 def too_many(broken: NDArray[np.bool_]) -> bool:

@@ -10,14 +10,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.health import all_of, any_of, too_many
+from daemon.judge.health import too_many
 from daemon.judge.reasons import Reason
 from drivers.base import COUNT_MAX, ELECTRODES
 from models.contract import Finger, ModelError, SeenCounts
 from models.electrodes import CONTRADICTING_MAX, ROUNDING, Electrodes, NoveltyCheck
-from models.inputs import SessionBuilder
+from models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
 from models.runtime import TactileModel
-from models.tactile_image import SPREAD_FLOOR_COUNTS
 
 if TYPE_CHECKING:
     from daemon.judge.calibration import Calibration
@@ -72,21 +71,23 @@ class Plausibility:
     def examine(
         self,
         counts: NDArray[np.uint16],
-        broken: NDArray[np.bool_],
+        broken: NDArray[np.bool_] | None,
         session: Calibration | None = None,
     ) -> Examined:
         """Return reasons against judging these counts, or the counts to judge by.
 
-        Shapes are (fingers, 24). `session` says how today's sensors differ from the training's.
+        Shapes are (fingers, 24). `broken`: electrodes known to be so; None if all are sound.
+        `session`: how today's sensors differ from the training's.
         """
         values = counts.astype(np.float64)
-        is_whole = not any_of(broken)
-        if _is_flat(values, None if is_whole else broken):
+        if _is_flat(values, broken):
             return Examined((Reason.FLAT,), counts)
         if session is not None:
-            if is_whole and self._is_plain(values, session):
+            if broken is None and self._is_plain(values, session):
                 return Examined((), counts, (), counts)
             values = session.to_training(values)
+        if broken is None:
+            broken = np.zeros(counts.shape, dtype=np.bool_)
         grasp, values = self._repair(counts, values, broken, session)
         known = int(np.count_nonzero(broken))
         at_most = known + CONTRADICTING_MAX + 1
@@ -132,12 +133,11 @@ class Plausibility:
         session: Calibration | None,
     ) -> tuple[NDArray[np.generic], NDArray[np.float64]]:
         """Return counts, and their values with the training's sensors, with `broken` repaired."""
-        if not any_of(broken):
+        if not broken.any():
             return counts, values
         values = self._electrodes.repaired(values, broken)
         expected = values if session is None else session.from_training(values)
-        expected = np.minimum(np.maximum(expected, 0.0), COUNT_MAX)
-        return np.where(broken, expected, counts), values
+        return np.where(broken, np.clip(expected, 0.0, COUNT_MAX), counts), values
 
     def _names(self, which: NDArray[np.bool_]) -> tuple[str, ...]:
         places = np.argwhere(which).tolist()
@@ -148,9 +148,9 @@ class Network:
     """Runs one model, softened while its session is young."""
 
     def __init__(self, model: TactileModel, slip_threshold: float) -> None:
-        """`slip_threshold` is the probability, 0..1, that softening must not cross."""
+        """`slip_threshold`: probability, 0..1, that softening must not cross."""
         self._model = model
-        self._threshold = slip_threshold
+        self._threshold = math.log(slip_threshold) - math.log1p(-slip_threshold)
         self.features = model.input if isinstance(model.inputs, SessionBuilder) else NO_FEATURES
         """What the network was asked about last, shape (inputs,), standardised by the session.
         Empty for models without a session: what they take is not of unit size."""
@@ -166,7 +166,7 @@ class Network:
         if session is not None and isinstance(model.inputs, SessionBuilder):
             model.inputs.use(session.features_mean, session.features_spread)
         spread = model.inputs.build(examined.counts, model.input)
-        if not all_of(spread >= SPREAD_FLOOR_COUNTS):  # also for NaN
+        if not (spread >= SPREAD_FLOOR_COUNTS).all():  # also for NaN
             return Opinion(None, (Reason.FLAT,), repaired)
         try:
             p_stable, p_slip = model.run()
@@ -177,7 +177,9 @@ class Network:
             return Opinion(None, (Reason.MODEL_FAILED,), repaired)
         margin = math.log(max(p_slip, TINY)) - math.log(max(p_stable, TINY))
         if session is not None and session.temperature != 1.0:
-            p_slip = _softened(margin, session.temperature, self._threshold)
+            # Counted from the threshold, so that it stays on the same side.
+            log_odds = self._threshold + (margin - self._threshold) / session.temperature
+            p_slip = 1.0 / (1.0 + math.exp(-log_odds))
         return Opinion(p_slip, (), repaired, margin)
 
 
@@ -199,12 +201,3 @@ def _is_flat(values: NDArray[np.float64], broken: NDArray[np.bool_] | None) -> b
         if number * square - total * total < (number * FLAT_SPREAD_COUNTS) ** 2:
             return True
     return False
-
-
-def _softened(margin: float, temperature: float, threshold: float) -> float:
-    """Divide the slip probability's log-odds, counted from the threshold, by the temperature.
-
-    So it is less sure, and on the same side of the threshold as before.
-    """
-    zero = math.log(threshold) - math.log1p(-threshold)
-    return 1.0 / (1.0 + math.exp(-(zero + (margin - zero) / temperature)))

@@ -19,7 +19,7 @@ from daemon.judge.decision import (
     RecentVerdict,
     decide,
 )
-from daemon.judge.health import Checked, Health, Number
+from daemon.judge.health import Health, Number
 from daemon.judge.network import NO_OPINION, Network, Opinion, Plausibility, electrode_name
 from daemon.judge.reasons import WATCHED_LIFT, Decision, GateState, Moment, Reason
 from daemon.trust.lift_book import NOT_ASSESSED, GraspId, LiftBook, OutcomeStatus
@@ -145,7 +145,8 @@ class Pipeline:
 
             self.hand, self.on_request = HandTracker(fingers, hand), hand.on_request
         self.memory = PipelineMemory(np.zeros(electrodes.centre.shape))
-        self._latest: TactileReading | None = None
+        self._latest_ns = 0, 0
+        """Of the last reading: `t_ns` and `made_ns`."""
         self.on_exchange: Callable[[SessionState | None, LearnerState | None], None] | None = None
         """Called when the sensors were exchanged, with what was known of the new ones."""
 
@@ -158,7 +159,8 @@ class Pipeline:
     @property
     def axis_ns(self) -> int:
         """Time from which a replay counts: `t_ns` less `made_ns`, 0 of live readings."""
-        return 0 if self._latest is None else self._latest.t_ns - self._latest.made_ns
+        t_ns, made_ns = self._latest_ns
+        return t_ns - made_ns
 
     def ask(self) -> None:
         """Judge the current grasp once it has settled: the controller waits for the verdict."""
@@ -223,17 +225,23 @@ class Pipeline:
         memory = self.memory
         if memory.is_to_learn:
             self.learn()
-        self._latest = reading
+        made_ns = reading.made_ns
+        self._latest_ns = reading.t_ns, made_ns
         memory.readings += 1
         checked = self._health.check(reading)
-        moment, counts = self._follow(reading, checked)
+        if self.hand is None:
+            counts = None if checked.reasons else reading.counts
+            moment = Moment(memory.readings, judges=counts is not None)
+        else:
+            in_time = 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns
+            moment, counts = self.hand.step(made_ns, reading.counts, checked, in_time=in_time)
         grasp = None
         if counts is not None:
             session = None if self._session is None else self._session.now
             examined = self._plausibility.examine(counts, checked.broken, session)
             grasp = examined.grasp
             memory.opinion, memory.assessment = self._network.judge(examined, session), None
-            if not checked.is_whole:
+            if checked.broken is not None:
                 counts = None
         elif moment.state is not GateState.JUDGED:
             self._forget_opinion()
@@ -241,11 +249,11 @@ class Pipeline:
         judgement = self._decide(
             reading.t_ns, checked.reasons, moment, memory.opinion, assessment, counts
         )
+        if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
+            self._keep_to_learn(grasp, moment.grasp)
         stable = judgement.decision is Decision.STABLE
         if stable or moment.judges or moment.judged:
             self._note(GraspId(self.boot_id, moment.grasp), assessment, stable=stable)
-        if grasp is not None and self._learns and Reason.STALE not in judgement.reasons:
-            self._keep_to_learn(grasp, moment.grasp)
         return judgement
 
     def watch(self, reading: TactileReading) -> None:
@@ -294,17 +302,6 @@ class Pipeline:
 
     def _forget_opinion(self) -> None:
         self.memory.opinion, self.memory.assessment = NO_OPINION, None
-
-    def _follow(
-        self, reading: TactileReading, checked: Checked
-    ) -> tuple[Moment, NDArray[np.uint16] | None]:
-        """Return where in a grasp the hand is, and the counts to judge; None: judge nothing."""
-        if self.hand is not None:
-            in_time = 0 <= self.clock() - reading.t_ns <= self._limits.max_age_ns
-            return self.hand.step(reading, checked, in_time=in_time)
-        usable = not checked.reasons
-        moment = Moment(self.memory.readings, judges=usable)
-        return moment, reading.counts if usable else None
 
     def _assess(self, moment: Moment) -> Assessment | None:
         """Return what the opinion is worth by the outcomes that are known now."""
@@ -386,7 +383,7 @@ class Pipeline:
         moment: Moment,
     ) -> Decision:
         """Return an earlier decision that still counts against `stable`, and note this one."""
-        memory, made_ns = self.memory, 0 if self._latest is None else self._latest.made_ns
+        memory, made_ns = self.memory, self._latest_ns[1]
         if moment.judges and p_slip is not None:
             said, _ = decide(p_slip, objections, HELD, 0, self._limits, withheld=withheld)
             if said is not Decision.STABLE:

@@ -1,28 +1,34 @@
 """Whether the fingers keep still: how each moves, in units of its own noise.
 
-Fast motion shows in the slopes of the electrodes, slow slides, which stop and turn, in how far they
-spread over a longer time. Steps of time are remembered, not sweeps, so memory is constant.
+Fast motion shows in the slopes of the electrodes over a short window, slow slides, which stop and
+turn, in how far they spread over a long one. Steps of time are remembered, not sweeps, so memory is
+constant.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.judge.health import Number
 from daemon.judge.windows import (
     APART,
+    BLOCK_STEPS,
+    BLOCKS,
     LONG_NS,
+    LOST_MAX,
+    MEAN_ABS,
     SHORT_NS,
     STEP_NS,
     STEP_SWEEPS_MAX,
     STEPS,
     STEPS_MIN,
+    MotionMemory,
     Noise,
-    Tails,
 )
 from drivers.base import ELECTRODES
 
@@ -34,73 +40,45 @@ SPIKE_SWEEPS_MAX = 3
 SPIKES_MAX = 4
 """More electrodes of a finger that jump in one sweep are motion: noise does that less than once a
 year."""
-BLOCK_STEPS, BLOCKS = 24, 16
-"""Noise is the lower quartile of 16 blocks of 24 steps (about 4 s at 100 Hz), so that a hand that
-closes or opens does not change it."""
 QUARTILE = 0.95
 """Lower quartile of the blocks' variances over their mean; the same for white noise."""
 BLOCKS_MIN = 4
 """Blocks from which on noise is known."""
 SIGMA_COUNTS = (0.5, 10.0)
 """An electrode wavers no less, as counts are whole numbers, and no more: measured 2.9 to 4.3."""
-LOST_MAX = 3
-"""Sweeps in a row for which an electrode that is not usable is taken to read what it read."""
 SOUND_MIN = 12
 """A finger of which fewer electrodes, of 24, were usable all the time is not known to be still."""
 ONES = np.ones(ELECTRODES, dtype=np.float32)
+SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
+"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
+CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
+"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
+its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
+240 ms."""
+FAST_SHARE = 0.1
+"""Share of the false alarms that the short window may have where the long one decides."""
 
 Times = NDArray[np.float64]
 
 
-@dataclass(slots=True, eq=False)
-class MotionMemory:
-    """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""
+class Tails(NamedTuple):
+    """How far a finger that holds may be above what is usual, in standard deviations."""
 
-    times_ns: NDArray[np.int64]
-    """Shape (2 * STEPS,), oldest first; as with `steps`, what is remembered is a slice."""
-    steps: NDArray[np.float32]
-    """Shape (2 * STEPS, fingers, 24): it moves to the right, and then goes back to the left."""
-    clean: NDArray[np.float32]
-    """The last sweep without spikes."""
-    counts: NDArray[np.float32]
-    """The last sweep as it came."""
-    jumped: NDArray[np.uint8]
-    """Number of sweeps for which it has jumped and was not believed."""
-    lost: NDArray[np.uint8]
-    """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
-    usable_since_ns: NDArray[np.int64]
-    """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
-    all_usable_since_ns: Number
-    """Since when all have."""
-    total: NDArray[np.float32]
-    """Sum of the sweeps of the step at hand."""
-    block: NDArray[np.float64]
-    """Sums of the squared differences of steps 1 to `APART` apart, shape (APART, fingers)."""
-    blocks: NDArray[np.float64]
-    """Their means, shape (BLOCKS, APART, fingers), written round and round."""
-    first: Number = 0
-    """Where in `steps` the oldest is."""
-    number: Number = 0
-    """Steps that are remembered."""
-    sweeps: Number = 0
-    """Sweeps of the step at hand."""
-    total_ns: Number = 0
-    """Sum of their times since the step before."""
-    last_ns: Number | None = None
-    """Time of the last sweep that ended a step."""
-    block_steps: Number = 0
-    """Steps of the block at hand."""
-    pending: Number = 0
-    """The last of these, which are still to be taken into it."""
-    block_number: Number = 0
-    """Blocks so far."""
+    slow: float
+    """In the long window."""
+    fast: float
+    """In the short window where the long one decides."""
+    alone: float
+    """In the short window where it decides alone."""
 
-    def __post_init__(self) -> None:
-        """Raise `ValueError` for what no such memory can be."""
-        end = self.first + self.number
-        pending_max = max(self.number - APART, 0)
-        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
-            raise ValueError("more steps than are remembered")
+    @classmethod
+    def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
+        """Return them by `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
+        if not 0.0 < false_alarms < 0.5:
+            raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
+        finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
+        slow, fast = (-NormalDist().inv_cdf(share) for share in (finger, FAST_SHARE * finger))
+        return cls(slow, fast, slow if early else fast)
 
 
 class Motion:
@@ -338,30 +316,70 @@ class Motion:
             self.sure = _within(self.slow, self.slow_limits) and _within(self.fast, beside)
 
     def _follow_fast(self, begin: int, end: int, times_s: Times, noise: Noise) -> list[float]:
-        """Find how steps have moved; return the limit where this window does not decide alone."""
-        memory = self.memory
-        line, by_noise, self.fast_limits, beside = noise.fast(times_s, self._tails)
-        slopes = line.astype(np.float32).dot(memory.steps[begin:end].reshape(len(line), -1))
-        slopes = np.abs(slopes, out=slopes).reshape(memory.clean.shape)
-        means = self._mean(slopes, begin)
+        """Find how steps moved; return the limit for where the long window decides, too."""
+        memory, tails = self.memory, self._tails
+        line = centred(times_s)
+        extent = float(line.dot(line))
+        root = math.sqrt(extent)
+        by_noise = [each / root for each in noise.slope[len(line)].tolist()]
+        weights = (line / extent).astype(np.float32)
+        slopes = np.abs(weights.dot(memory.steps[begin:end].reshape(len(line), -1)))
+        means = self._mean(slopes.reshape(memory.clean.shape), begin)
         self.fast = [mean / usual for mean, usual in zip(means, by_noise, strict=True)]
-        return beside
+        self.fast_limits = fast_limit(tails.alone, by_noise)
+        if tails.fast == tails.alone:
+            return self.fast_limits
+        return fast_limit(tails.fast, by_noise)
 
     def _follow_slow(self, begin: int, end: int, times_s: Times, noise: Noise) -> None:
         """Find how far steps have spread, and the limit of it."""
-        steps = self.memory.steps[begin:end]
+        steps, number, line = self.memory.steps[begin:end], end - begin, centred(times_s)
         middle = np.add.reduce(steps, axis=0)
-        middle /= len(steps)
-        deviations = steps - middle
-        squares = np.add.reduce(np.square(deviations, out=deviations), axis=0)
+        middle /= number
+        squares = np.add.reduce(np.square(steps - middle), axis=0)
         means = self._mean(squares, begin)
-        by_noise, self.slow_limits = noise.slow(times_s, self._tails)
+        by_noise = [each * (number - 1) for each in noise.variance[number].tolist()]
+        extent, spreads = float(line.dot(line)), noise.spread[number].tolist()
         self.slow = [math.sqrt(mean / usual) for mean, usual in zip(means, by_noise, strict=True)]
+        self.slow_limits = slow_limit(self._tails.slow, extent, by_noise, spreads)
 
     def _say_unknown(self) -> None:
         self.fast = self.slow = self._unknown
         self.fast_limits = self.slow_limits = self._no_limits
         self.looked = self.known = self.early = self.sure = False
+
+
+def fast_limit(tail: float, by_noise: Sequence[float]) -> list[float]:
+    """Return the limit of each finger's mean absolute slope over `by_noise`, both in counts/s."""
+    usual, creeps = math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
+    return [math.hypot(usual, creeps / each) for each in by_noise]
+
+
+def slow_limit(
+    tail: float, extent: float, by_noise: Sequence[float], spreads: Sequence[float]
+) -> list[float]:
+    """Return the limit of each finger's root mean square deviation over that of noise.
+
+    `extent` is the sum of the squares of the times around their mean, s**2, `by_noise` that of the
+    noise, counts**2, and `spreads` are those of `Noise`.
+    """
+    middle, tails, limits = CREEP_COUNTS_PER_S**2, creep(tail) ** 2, []
+    for noise, spread in zip(by_noise, spreads, strict=True):
+        usual, most = middle * (extent / noise), tails * (extent / noise)
+        # Noise and creep know nothing of each other: their deviations add up as squares do.
+        above = math.hypot(tail * spread * (1.0 + usual), most - usual)
+        limits.append(math.sqrt(1.0 + usual + above))
+    return limits
+
+
+def creep(tail: float) -> float:
+    """Return the speed of a held touch, counts/s, `tail` standard deviations above the median."""
+    return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
+
+
+def centred(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return times with a mean of 0."""
+    return np.asarray(times_s - np.add.reduce(times_s) / len(times_s))
 
 
 def _within(moves: list[float], limits: list[float]) -> bool:

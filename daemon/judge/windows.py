@@ -1,4 +1,4 @@
-"""The windows over which motion is looked for: what noise makes of them, and the limits.
+"""The windows over which motion is looked for: what is remembered, and what noise makes of them.
 
 The short one shows fast motion soon; the long one slow slides, which no short one can.
 """
@@ -6,14 +6,12 @@ The short one shows fast motion soon; the long one slow slides, which no short o
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.judge.health import Number
 from drivers.base import ELECTRODES
 
 STEP_NS = 5_000_000
@@ -28,16 +26,13 @@ STEPS_MIN = 3
 APART = 3
 """Steps that are so far apart have no noise in common: sensors show a correlation of 0.32 at one
 sweep and 0.03 at two, and a palm's stream at 100 Hz repeats 2 of 7 values besides."""
+BLOCK_STEPS, BLOCKS = 24, 16
+"""Noise is the lower quartile of 16 blocks of 24 steps (about 4 s at 100 Hz), so that a hand that
+closes or opens does not change it."""
+LOST_MAX = 3
+"""Sweeps in a row for which an electrode that is not usable is taken to read what it read."""
 MEAN_ABS = math.sqrt(2.0 / math.pi)
 """Mean absolute value of a Gaussian of standard deviation 1."""
-SLOPE_SPREAD = math.sqrt((math.pi / 2.0 - 1.0) / ELECTRODES)
-"""Standard deviation of the mean of 24 absolute values of a Gaussian, over its mean."""
-CREEP_COUNTS_PER_S, CREEP_SPREAD = 7.5, 0.67
-"""A held touch relaxes: median speed of its electrodes, root mean square, and standard deviation of
-its logarithm. With the noise it is what 44 held touches of one sensor showed, in windows of 50 to
-240 ms."""
-FAST_SHARE = 0.1
-"""Share of the false alarms that the short window may have where the long one decides."""
 SLOPE_ECHO = np.zeros((STEPS + 1, APART - 1))
 """`SLOPE_ECHO[n, k-1]`: lag-k autocorrelation of a centred ramp of n samples; scales the slope's
 variance for correlated noise."""
@@ -77,84 +72,53 @@ class Noise:
             spread=np.sqrt(2.0 * (1.0 + 2.0 * np.square(correlations).sum(axis=0)) / free),
         )
 
-    def fast(
-        self, times_s: NDArray[np.float64], tails: Tails
-    ) -> tuple[NDArray[np.float64], list[float], list[float], list[float]]:
-        """Describe the short window of steps at these times.
 
-        Return the weights by which a sum of steps is their slope; each finger's mean absolute slope
-        by noise alone, counts/s; and the limits of slopes over that, where the short window decides
-        alone and where it does not.
-        """
-        line = centred(times_s)
-        extent = float(line.dot(line))
-        root = math.sqrt(extent)
-        by_noise = [each / root for each in self.slope[len(line)].tolist()]
-        alone = beside = fast_limit(tails.alone, by_noise)
-        if tails.fast != tails.alone:
-            beside = fast_limit(tails.fast, by_noise)
-        return line / extent, by_noise, alone, beside
+@dataclass(slots=True, eq=False)
+class MotionMemory:
+    """The last steps and the noise of a hand; arrays of sweeps have shape (fingers, 24)."""
 
-    def slow(self, times_s: NDArray[np.float64], tails: Tails) -> tuple[list[float], list[float]]:
-        """Describe the long window of steps at these times.
+    times_ns: NDArray[np.int64]
+    """Shape (2 * STEPS,), oldest first; as with `steps`, what is remembered is a slice."""
+    steps: NDArray[np.float32]
+    """Shape (2 * STEPS, fingers, 24): it moves to the right, and then goes back to the left."""
+    clean: NDArray[np.float32]
+    """The last sweep without spikes."""
+    counts: NDArray[np.float32]
+    """The last sweep as it came."""
+    jumped: NDArray[np.uint8]
+    """Number of sweeps for which it has jumped and was not believed."""
+    lost: NDArray[np.uint8]
+    """Number of sweeps for which it has not been usable, up to `LOST_MAX` and one."""
+    usable_since_ns: NDArray[np.int64]
+    """Since when an electrode has been usable; gaps of `LOST_MAX` sweeps do not count."""
+    all_usable_since_ns: Number
+    """Since when all have."""
+    total: NDArray[np.float32]
+    """Sum of the sweeps of the step at hand."""
+    block: NDArray[np.float64]
+    """Sums of the squared differences of steps 1 to `APART` apart, shape (APART, fingers)."""
+    blocks: NDArray[np.float64]
+    """Their means, shape (BLOCKS, APART, fingers), written round and round."""
+    first: Number = 0
+    """Where in `steps` the oldest is."""
+    number: Number = 0
+    """Steps that are remembered."""
+    sweeps: Number = 0
+    """Sweeps of the step at hand."""
+    total_ns: Number = 0
+    """Sum of their times since the step before."""
+    last_ns: Number | None = None
+    """Time of the last sweep that ended a step."""
+    block_steps: Number = 0
+    """Steps of the block at hand."""
+    pending: Number = 0
+    """The last of these, which are still to be taken into it."""
+    block_number: Number = 0
+    """Blocks so far."""
 
-        Return each finger's sum of squared deviations by noise alone, counts**2, and the limits of
-        the root of a sum over that.
-        """
-        number, line = len(times_s), centred(times_s)
-        extent = float(line.dot(line))
-        by_noise = [each * (number - 1) for each in self.variance[number].tolist()]
-        return by_noise, slow_limit(tails.slow, extent, by_noise, self.spread[number].tolist())
-
-
-class Tails(NamedTuple):
-    """How far a finger that holds may be above what is usual, in standard deviations."""
-
-    slow: float
-    """In the long window."""
-    fast: float
-    """In the short window where the long one decides."""
-    alone: float
-    """In the short window where it decides alone."""
-
-    @classmethod
-    def of(cls, fingers: int, false_alarms: float, *, early: bool) -> Tails:
-        """Return them by `false_alarms`, 0..0.5. Raises `ValueError` for another share."""
-        if not 0.0 < false_alarms < 0.5:
-            raise ValueError(f"false_alarms is {false_alarms}, must be between 0 and 0.5")
-        finger = 1.0 - (1.0 - false_alarms) ** (1.0 / fingers)
-        slow, fast = (-NormalDist().inv_cdf(share) for share in (finger, FAST_SHARE * finger))
-        return cls(slow, fast, slow if early else fast)
-
-
-def fast_limit(tail: float, by_noise: Sequence[float]) -> list[float]:
-    """Return the limit of each finger's mean absolute slope over `by_noise`, both in counts/s."""
-    usual, creeps = math.exp(SLOPE_SPREAD * tail), MEAN_ABS * creep(tail)
-    return [math.hypot(usual, creeps / each) for each in by_noise]
-
-
-def slow_limit(
-    tail: float, extent: float, by_noise: Sequence[float], spreads: Sequence[float]
-) -> list[float]:
-    """Return the limit of each finger's root mean square deviation over that of noise.
-
-    `extent` is the sum of the squares of the times around their mean, s**2, `by_noise` that of the
-    noise, counts**2, and `spreads` are those of `Noise`.
-    """
-    middle, tails, limits = CREEP_COUNTS_PER_S**2, creep(tail) ** 2, []
-    for noise, spread in zip(by_noise, spreads, strict=True):
-        usual, most = middle * (extent / noise), tails * (extent / noise)
-        # Noise and creep know nothing of each other: their deviations add up as squares do.
-        above = math.hypot(tail * spread * (1.0 + usual), most - usual)
-        limits.append(math.sqrt(1.0 + usual + above))
-    return limits
-
-
-def creep(tail: float) -> float:
-    """Return the speed of a held touch, counts/s, `tail` standard deviations above the median."""
-    return CREEP_COUNTS_PER_S * math.exp(CREEP_SPREAD * tail)
-
-
-def centred(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return times with a mean of 0."""
-    return np.asarray(times_s - np.add.reduce(times_s) / len(times_s))
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for what no such memory can be."""
+        end = self.first + self.number
+        pending_max = max(self.number - APART, 0)
+        if self.number > STEPS or end > len(self.steps) or self.pending > pending_max:
+            raise ValueError("more steps than are remembered")

@@ -13,7 +13,7 @@ import msgspec
 
 from daemon.judge.reasons import Decision, GateCause, GateState, Reason
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskReport
+from daemon.trust.trust import RiskReport
 from models.contract import Finger
 
 WIRE_VERSION: Final = 1

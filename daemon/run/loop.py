@@ -23,9 +23,8 @@ from daemon.publish.companion import (
     at_once,
     hooks,
 )
-from daemon.publish.latency import Deadlines
 from daemon.publish.messages import State, Verdict
-from daemon.publish.outbox import Outbox
+from daemon.publish.outbox import Deadlines, Outbox
 from daemon.run.overload import LoadShedder, mark_repeats
 from daemon.trust.lift_book import (
     NOT_YOURS,

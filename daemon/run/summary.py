@@ -10,8 +10,8 @@ import msgspec
 
 from daemon.judge.pipeline import Judgement
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.latency import LatencyHistogram
 from daemon.publish.messages import Verdict
+from daemon.publish.outbox import LatencyHistogram
 from daemon.trust.trust import Trust
 
 WINDOW: Final = 50

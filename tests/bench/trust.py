@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from daemon.measure.streams import ORDERS, Life, Plan, Stream, live, streams
 from daemon.trust.learner import Learner
-from daemon.trust.risk import RiskLimits
+from daemon.trust.trust import RiskLimits
 from models.training.data.datasets import read_all
 from models.training.evaluating.day_figures import VerdictFigures
 

@@ -18,10 +18,9 @@ from drivers.base import TactileReading
 from models import zoo
 from models.contract import ModelContract, SessionInput
 from models.electrodes import Electrodes
-from models.inputs import SessionBuilder
+from models.inputs import SPREAD_FLOOR_COUNTS, SessionBuilder
 from models.runtime import TactileModel
 from models.session_statistics import HORIZON_GRASPS, SessionState
-from models.tactile_image import SPREAD_FLOOR_COUNTS
 from tests.stability.exact import Exact, exact_input, exact_softening, exact_standard
 from tests.stability.readings import Counts, Raw
 from tests.stability.reference import Reference

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from daemon.judge.network import TINY
 from models.contract import CountsInput, ImageInput, ModelContract, SessionInput
+from models.inputs import SPREAD_FLOOR_COUNTS
 from models.layout import LAYOUTS, Layout
 from models.session_statistics import SessionState
-from models.tactile_image import SPREAD_FLOOR_COUNTS, Composition, Fill, Normalisation
+from models.tactile_image import Composition, Fill, Normalisation
 
 Exact = NDArray[np.longdouble]
 Standard = tuple[Exact, Exact]

@@ -14,7 +14,6 @@ from daemon.judge.decision import HandLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
 from daemon.judge.reasons import Reason
-from drivers.base import TactileReading
 from drivers.palm.calibration import parse_calibration
 from drivers.palm.hall import CoupledTable, Table
 from models.contract import Finger
@@ -103,9 +102,7 @@ def grasp_through_gate(period_ns: int, touching: int) -> tuple[int, list[Reason]
         if number >= TARE_SWEEPS:
             mean[:, : ELECTRODES // 3] = TOUCH_COUNTS
         counts = np.rint(random.normal(mean, NOISE_COUNTS)).astype(np.uint16)
-        faults = np.zeros(counts.shape, dtype=np.uint8)
-        reading = TactileReading(number * period_ns, number, counts, faults)
-        moment, _ = hand.step(reading, Checked((), np.zeros(counts.shape, dtype=np.bool_)))
+        moment, _ = hand.step(number * period_ns, counts, Checked((), None))
         judged += moment.judges
         if number >= TARE_SWEEPS:
             reasons |= dict.fromkeys(moment.reasons)

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from daemon.trust.learner import Learner
-from daemon.trust.risk import LOWEST, Permission, Risk, RiskLimits
+from daemon.trust.trust import LOWEST, Permission, Risk, RiskLimits
 
 Note = Callable[..., None]
 Random = np.random.Generator

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from daemon.commands.operating_points import operating_points
-from daemon.judge.stillness import Motion
-from daemon.judge.windows import Tails
+from daemon.judge.stillness import Motion, Tails
 
 SIGMA_COUNTS, CORRELATION = 3.5, 0.32
 """Of real held touches: by the differences of sweeps, over the root of 2; at one sweep."""

@@ -400,30 +400,6 @@ def test_a_finger_that_loses_its_electrodes_lets_go() -> None:
     assert hand.play(touched(0.1, 500.0), usable).tolist() == [[True, True, False]] * 10
 
 
-def test_letting_go_takes_less_than_six_tenths_of_a_touch() -> None:
-    hand = Hand()
-    hand.play(still(1.5))
-    # Third deepest against the median electrode: 0.8 of the depth; a touch takes 20, 12 keeps it.
-    assert hand.play(touched(0.5, 50.0))[5:].all()
-    assert hand.play(touched(1.0, 24.0)).all(), "19 keeps a touch"
-    assert not hand.play(touched(1.0, 6.0))[5:].any(), "5 does not"
-    assert not hand.play(touched(0.5, 12.0)).any(), "10 begins none"
-
-
-def test_a_hold_is_measured_by_how_deep_it_was_seconds_before() -> None:
-    hand = Hand()
-    hand.play(still(2.0))
-    assert hand.play(touched(0.5, 400.0)).any(axis=0).all()
-    # Electrodes feel all or a fifth of a touch: their falls are four fifths of it apart. A quarter
-    # of 320, less 5 counts/s, is where it lets go: 64 after 13 s, 76 after 3 s.
-    assert hand.play(touched(3.0, 150.0))[-1].all()
-    assert not hand.play(touched(0.2, 85.0))[-1].any()
-    hand.play(still(2.0))
-    assert hand.play(touched(0.5, 400.0)).any(axis=0).all()
-    assert hand.play(touched(13.0, 150.0))[-1].all()
-    assert hand.play(touched(0.2, 95.0))[-1].all()
-
-
 def test_memory_does_not_grow() -> None:
     hand = Hand()
     sweeps = np.concatenate([still(3.0), touched(2.0, 100.0)])

@@ -135,7 +135,7 @@ def play(scenario: Scenario) -> Played:
             continue
         lost = scenario.unusable[0] <= t_s < scenario.unusable[1]
         checked = Checked((Reason.ELECTRODES_BROKEN,) if lost else (), ~ALL)
-        moment, counts = hand.step(reading, checked)
+        moment, counts = hand.step(reading.made_ns, reading.counts, checked)
         assert moment.judges is (counts is not None)
         assert moment.judges or not moment.judged
         if counts is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -161,40 +160,6 @@ def test_too_many_electrodes_at_a_rail_are_unknown(count: int) -> None:
     assert model.runs == 0
 
 
-def test_an_electrode_that_jumps_while_the_others_keep_still_has_a_loose_contact() -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(), clock)
-    random = np.random.default_rng(3)
-    held = random.integers(LOW + 300, HIGH - 300, (3, 24))
-    repaired = []
-    for number in range(60):
-        counts = (held + random.integers(-8, 9, (3, 24))).astype(np.uint16)
-        if number < 30 and number % 2:
-            counts[1, 4] += 250
-        moving = TactileReading(clock(), number, counts, np.zeros((3, 24), dtype=np.uint8))
-        judgement = judge.judge(moving)
-        assert judgement.decision is Decision.STABLE
-        repaired.append(judgement.opinion.repaired)
-    assert repaired[:3] == [()] * 3
-    assert repaired[5:30] == [("mf_5",)] * 25
-    assert repaired[-10:] == [()] * 10
-
-
-def test_a_touch_that_moves_many_electrodes_is_no_loose_contact() -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(), clock)
-    random = np.random.default_rng(4)
-    held = np.full((3, 24), 2200)
-    for number in range(40):
-        counts = held + random.integers(-8, 9, (3, 24))
-        if number % 2:
-            counts[:, :6] -= 400
-        touch = TactileReading(
-            clock(), number, counts.astype(np.uint16), np.zeros((3, 24), dtype=np.uint8)
-        )
-        assert judge.judge(touch).opinion.repaired == ()
-
-
 @pytest.mark.parametrize(
     ("p_slip", "reasons"),
     [(0.1, ()), (0.2, ()), (0.21, (Reason.LOW_CONFIDENCE,)), (0.79, (Reason.LOW_CONFIDENCE,))],
@@ -229,30 +194,6 @@ def test_counts_at_the_edge_of_what_was_seen_are_judged(count: int) -> None:
     assert pipeline(FakeModel(), clock).judge(edge).decision is Decision.STABLE
 
 
-def test_a_finger_that_repeats_itself_is_frozen_until_it_moves() -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(), clock)
-    first, second, third = reading(clock(), 1), reading(clock(), 2), reading(clock(), 3)
-    second.counts[1] = first.counts[1]
-    assert judge.judge(first).decision is Decision.STABLE
-    assert judge.judge(second).reasons == (Reason.FROZEN,)
-    assert judge.judge(third).decision is Decision.STABLE
-
-
-def test_an_electrode_that_keeps_its_count_is_repaired_in_time() -> None:
-    clock = Clock()
-    judge = pipeline(FakeModel(), clock)
-    decisions = []
-    for number in range(40):
-        stuck = reading(clock(), seed=number)
-        stuck.counts[2, 7] = 2000 if number < 30 else 2001 + number
-        judgement = judge.judge(stuck)
-        assert judgement.reasons == ()
-        decisions.append(judgement.opinion.repaired)
-    # 16 repeats after the first make it frozen, until it moves again.
-    assert decisions == [()] * 16 + [("th_8",)] * 14 + [()] * 10
-
-
 @pytest.mark.parametrize(
     ("age_ns", "stale"),
     [(0, False), (100 * MS, False), (100 * MS + 1, True), (10**15, True), (-1, True)],
@@ -275,26 +216,6 @@ def test_a_slow_network_makes_the_verdict_stale() -> None:
     judgement = pipeline(SlowModel(), clock).judge(reading(clock()))
     assert judgement.reasons == (Reason.STALE,)
     assert judgement.p_slip is None
-
-
-@pytest.mark.parametrize(
-    "answer", [math.nan, math.inf, -math.inf, -0.1, 1.1, RuntimeError("session is gone")]
-)
-def test_a_network_without_a_probability_is_unknown(answer: float | Exception) -> None:
-    clock = Clock()
-    judgement = pipeline(FakeModel(answer), clock).judge(reading(clock()))
-    assert judgement.decision is Decision.UNKNOWN
-    assert judgement.reasons == (Reason.MODEL_FAILED,)
-    assert judgement.p_slip is None
-
-
-def test_probabilities_that_do_not_sum_to_one_are_refused() -> None:
-    class Skewed(FakeModel):
-        def run(self) -> tuple[float, float]:
-            return 0.1, 0.1
-
-    clock = Clock()
-    assert pipeline(Skewed(), clock).judge(reading(clock())).reasons == (Reason.MODEL_FAILED,)
 
 
 @pytest.mark.parametrize("fingers", [("ff", "mf"), ("mf", "ff", "th"), (*FINGERS, "lf")])

@@ -10,7 +10,6 @@ from daemon.judge.decision import HandLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
 from daemon.judge.reasons import GateState
-from drivers.base import TactileReading
 from tests.daemon.judge.test_contact import PRESSED, Hand, at_rest, noisy, still
 
 SLOPES = np.random.default_rng(5).normal(0.0, 0.2, (3, 24))
@@ -86,8 +85,7 @@ def test_sensors_that_were_away_are_tared_anew() -> None:
     for pause_s, mean in ((0.0, at_rest()), (1.5, other)):
         t_ns += round(pause_s * 1e9)
         for counts in noisy(np.broadcast_to(mean, (300, 3, 24))):
-            faults = np.zeros(counts.shape, dtype=np.uint8)
-            moment, _ = hand.step(TactileReading(t_ns, 0, counts, faults), usable)
+            moment, _ = hand.step(t_ns, counts, usable)
             states.append(moment.state)
             t_ns += 10_000_000
     assert set(states) == {GateState.IDLE}

@@ -106,27 +106,6 @@ def test_no_sample_of_a_palm_counts_twice(untouched: Counts) -> None:
         np.testing.assert_array_equal(medians[5:][:, :, places], expected)
 
 
-def test_of_real_noise_never_more_counts_than_was_sampled(untouched: Counts) -> None:
-    held = held_pairs(untouched)
-    for pair, places in enumerate(PAIRS):
-        for finger in range(3):
-            for place in places:
-                values = untouched[:, finger, place].tolist()
-                counted = len(fresh_values(values))
-                sampled = len(values) - int(held[:, pair].sum())
-                assert 0.85 * sampled < counted <= sampled, "noise repeats itself now and then"
-
-
-def test_a_quiet_electrode_counts_every_second_time() -> None:
-    fresh = FreshMedian(SHAPE)
-    sweeps = np.full((6, *SHAPE), 3000, dtype=np.uint16)
-    full = []
-    for counts in sweeps:
-        fresh.push(counts, ALL)
-        full.append(fresh.is_full(ALL))
-    assert full == [False, False, False, False, True, True]
-
-
 @pytest.mark.parametrize("holds", [False, True])
 def test_one_spike_in_three_samples_never_shows(holds: bool) -> None:
     random = np.random.default_rng(3)

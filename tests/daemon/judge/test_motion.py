@@ -40,31 +40,6 @@ def moves(motion: Motion) -> NDArray[np.float64]:
     return np.array((motion.fast, motion.slow))
 
 
-@pytest.mark.parametrize("rate_hz", [1000 / 14, 100.0, 1000.0])
-@pytest.mark.parametrize("speed", [0.0, 60.0, 300.0])
-def test_motion_is_slope_and_spread_over_what_noise_makes_of_them(
-    rate_hz: float, speed: float
-) -> None:
-    sigma, motion = 4.0, Motion(1, 0.05, early=True)
-    begin_ns = fed(motion, wavering(4.5, rate_hz, sigma, 1), rate_hz)
-    times = np.arange(round(0.5 * rate_hz)) / rate_hz
-    counts = np.rint(wavering(0.5, rate_hz, sigma, 2) + speed * times[:, None, None])
-    fed(motion, counts, rate_hz, begin_ns)
-    if rate_hz == 1000.0:
-        # By the definition of a step: the mean of the sweeps of 5 ms, after the first of all.
-        counts = counts[1:496].reshape(99, 5, 1, 24).mean(axis=1)
-        times = times[1:496].reshape(99, 5).mean(axis=1)
-        sigma /= np.sqrt(5)
-    sigma = np.hypot(sigma, np.sqrt(1 / 12))  # of whole numbers
-    short, long = (times > times[-1] - window_s + 1e-6 for window_s in (0.1, 0.24))
-    slopes = np.polyfit(times[short], counts[short, 0], 1)[0]
-    extent = ((times[short] - times[short].mean()) ** 2).sum()
-    by_noise = np.sqrt(2 / np.pi) * sigma / np.sqrt(extent)
-    assert motion.fast[0] == pytest.approx(np.abs(slopes).mean() / by_noise, rel=0.07)
-    spread = np.sqrt(counts[long, 0].var(axis=0, ddof=1).mean())
-    assert motion.slow[0] == pytest.approx(spread / sigma, rel=0.07)
-
-
 @pytest.mark.parametrize(("share", "expected"), [(0.1, 61), (0.05, 66), (0.01, 77)])
 def test_the_limit_is_the_quantile_of_the_slopes_of_real_held_touches(
     share: float, expected: float

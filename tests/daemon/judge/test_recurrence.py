@@ -35,7 +35,6 @@ GRACE = 3
 UNDER_RING = 30
 """Sweeps after that."""
 HELD = Durations(first_rest_s=(3.0, 3.0), settle_s=(4.0, 4.0))
-RINGS = range(2, 65)
 
 
 @cache
@@ -50,8 +49,8 @@ def under_ring(rate_hz: float, sweeps: int, fingers: tuple[int, ...]) -> list[Fi
     return held(rate_hz).under(ring(sweeps, fingers), GateState.JUDGED, periods=periods)
 
 
-@pytest.mark.parametrize("sweeps", RINGS)
-@pytest.mark.parametrize("fingers", [(0, 1, 2), (0,), (1,), (2,)])
+@pytest.mark.parametrize("sweeps", [2, 3, 16, 64])
+@pytest.mark.parametrize("fingers", [(0, 1, 2), (0,), (2,)])
 @pytest.mark.parametrize("rate_hz", [PALM_RATE_HZ, RATE_HZ])
 def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(
     rate_hz: float, fingers: tuple[int, ...], sweeps: int
@@ -65,7 +64,7 @@ def test_a_ring_is_frozen_from_the_first_sweep_that_comes_again(
     assert all(Reason.FROZEN in finding.reasons for finding in again)
 
 
-@pytest.mark.parametrize("sweeps", [2, 3, 8, 31, 64])
+@pytest.mark.parametrize("sweeps", [2, 31, 64])
 def test_a_ring_between_palm_and_host_is_frozen_too(sweeps: int) -> None:
     periods = 2 * sweeps + GRACE + UNDER_RING
     found = held(PALM_RATE_HZ).under(ring_on_a_palm(sweeps), GateState.JUDGED, periods=periods)
@@ -75,7 +74,7 @@ def test_a_ring_between_palm_and_host_is_frozen_too(sweeps: int) -> None:
     assert set(decisions[sweeps + 1 :]) == {Decision.UNKNOWN}
 
 
-@pytest.mark.parametrize("packets", [15, 20, 27, 29, 35, 50, 64, 71, 896])
+@pytest.mark.parametrize("packets", [15, 64, 896])
 def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stable(
     packets: int,
 ) -> None:
@@ -158,7 +157,7 @@ def sweeps_of(
 
 
 @pytest.mark.parametrize("flagged", [0.0, 0.02, 0.2, 0.5])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [1])
 def test_what_recurs_is_what_the_definition_says(flagged: float, seed: int) -> None:
     past, definition = PastSweeps.none(len(FINGERS)), Definition()
     found = 0

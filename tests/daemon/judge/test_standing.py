@@ -17,8 +17,7 @@ from daemon.judge.decision import Limits
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.trust.lift_book import GraspId
-from daemon.trust.risk import RiskLimits
-from daemon.trust.trust import Trust
+from daemon.trust.trust import RiskLimits, Trust
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Phase
 from drivers.twins.grasps.grasps import Counts
@@ -193,13 +192,6 @@ def test_under_a_risk_nobody_gets_a_lucky_draw_by_waiting() -> None:
     reasons = {reason for each in said[60:] for reason in each.reasons}
     assert Reason.LOW_CONFIDENCE in reasons
     assert trust.report().outstanding <= 1
-
-
-def test_after_its_outcome_was_told_a_grasp_is_not_stable_again() -> None:
-    hand, _ = risky(RiskLimits(0.5))
-    assert hand.play(Feel(times=60))[-1].decision is Decision.STABLE
-    hand.pipeline.outcome(GraspId(BOOT, 1), slipped=False)
-    assert {each.decision for each in hand.play(Feel(times=60))[10:]} == {Decision.UNKNOWN}
 
 
 def test_a_grasp_is_judged_without_what_it_taught_the_session_until_it_is_over(

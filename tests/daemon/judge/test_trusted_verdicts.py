@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,8 +13,7 @@ from hypothesis import strategies as st
 from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, Reason
 from daemon.trust.lift_book import NOT_ASSESSED, GraspId
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import Trust
+from daemon.trust.trust import Permission, RiskLimits, Trust
 from drivers.base import ElectrodeFault
 from tests.daemon.fakes import Clock, FakeModel, pipeline, reading
 
@@ -38,18 +36,6 @@ def lift(judge: Pipeline, clock: Clock, seed: int, *, slipped: bool) -> Judgemen
     return judgement
 
 
-@pytest.mark.parametrize("p_slip", [0.0, 1e-9, 0.1, 0.4999, 0.5, 0.9, 1.0])
-def test_without_an_outcome_nothing_changes(p_slip: float) -> None:
-    clock = Clock()
-    plain = pipeline(FakeModel(p_slip), clock).judge(reading(clock()))
-    trusted = trusting(FakeModel(p_slip), clock).judge(reading(clock()))
-    assert trusted.p_slip == plain.p_slip == trusted.opinion.p_slip
-    assert trusted.assessment is not None
-    report = trusted.assessment.report
-    assert (report.target, report.bound, trusted.supervised) == (None, None, False)
-    assert msgspec.structs.replace(trusted, assessment=None) == plain
-
-
 def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:
     clock = Clock()
     judge = trusting(FakeModel(0.3), clock)
@@ -61,12 +47,6 @@ def test_outcomes_move_the_probability_and_not_what_the_network_says() -> None:
     assert found[-1].decision is Decision.SLIP
     assert found[-1].p_slip is not None
     assert found[-1].p_slip > 0.6
-
-
-def test_with_learning_off_outcomes_change_no_probability() -> None:
-    clock = Clock()
-    judge = trusting(FakeModel(0.3), clock, RiskLimits(0.5), learns=False)
-    assert {lift(judge, clock, seed, slipped=seed % 2 == 0).p_slip for seed in range(20)} == {0.3}
 
 
 def test_in_the_warm_up_grasps_are_to_be_lifted_under_supervision() -> None:
@@ -114,18 +94,6 @@ def test_when_too_many_slipped_nothing_is_stable_any_more() -> None:
     assert judgement.decision is Decision.UNKNOWN
     assert judgement.reasons == (Reason.RISK_EXCEEDED,)
     assert not judgement.supervised
-
-
-def test_exchanged_sensors_teach_nothing_of_the_new_ones() -> None:
-    clock = Clock()
-    judge = trusting(FakeModel(0.3), clock)
-    for seed in range(30):
-        lift(judge, clock, seed, slipped=True)
-    judge.sensors_exchanged()
-    judgement = judge.judge(reading(clock(), 31))
-    assert judgement.p_slip == 0.3
-    assert judgement.assessment is not None
-    assert judgement.assessment.outcomes == 0
 
 
 @pytest.mark.parametrize("p_slip", [math.nan, -0.5, 1.5, RuntimeError()])

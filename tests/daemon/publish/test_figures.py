@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from daemon.judge.reasons import Decision, Reason
-from daemon.publish.latency import BUCKETS, LatencyHistogram
 from daemon.publish.messages import DECISION_CODE, Verdict
+from daemon.publish.outbox import BUCKETS, LatencyHistogram
 from daemon.run.summary import WITHOUT_LEARNING, RunSummary, Tally
 from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust

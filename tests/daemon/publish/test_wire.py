@@ -32,7 +32,7 @@ from daemon.publish.messages import (
     schema,
 )
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskReport
+from daemon.trust.trust import RiskReport
 
 GOLDEN = Path(__file__).parent / "golden"
 SCHEMA_FILE = Path(__file__).parents[3] / "deploy" / "wire" / "messages.schema.json"

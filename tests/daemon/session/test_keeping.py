@@ -7,7 +7,6 @@ import select
 import stat
 import threading
 import time
-import tracemalloc
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ import pytest
 
 from daemon.session.file import SessionFile, kept_now, load
 from daemon.session.keeper import BUSY, HANGS, SAVE_PERIOD_NS, WAIT_S, WAITING_MAX, SessionKeeper
-from daemon.trust.lift_book import LIFTS_MAX, OutcomeStatus
+from daemon.trust.lift_book import OutcomeStatus
 from daemon.trust.trust import Trust, TrustState, decode
 from tests.daemon.fakes import Clock
 from tests.daemon.session.learning import (
@@ -401,36 +400,3 @@ def test_a_grasp_whose_outcome_is_out_is_kept_within_ten_seconds(
         go_round(keeper)
     assert disk.written == 1  # nothing is written where nothing is new
     assert kept_trust(file) == part.state()
-
-
-@pytest.mark.parametrize("content", [b"", b"x" * 100, b'{"version":2,"sha256":"","kept":{}}'])
-def test_two_damaged_files_are_one_warning_and_a_new_beginning(
-    tmp_path: Path, content: bytes, caplog: pytest.LogCaptureFixture
-) -> None:
-    path, part = tmp_path / "right.json", trust()
-    path.write_bytes(content)
-    path.with_name("right.json.former").write_bytes(content)
-    with SessionFile(path) as file:
-        keeper = session_keeper(calibration(), sensors(), file, Clock(), part=part)
-        assert [record.levelname for record in caplog.records] == ["WARNING"]
-        judge(part, 1)
-        keeper.save()
-        assert kept_trust(file) == part.state()
-
-
-def test_saving_takes_less_than_two_mebibytes_with_every_outcome_out(
-    file: SessionFile, keeper_of: KeeperOf
-) -> None:
-    judge(trust(), 0)  # what is imported on the way is none of it
-    part = trust()
-    tracemalloc.start()
-    try:
-        keeper = keeper_of(part)
-        for grasp in range(LIFTS_MAX):
-            judge(part, grasp)
-        keeper.save()
-        judge(part, LIFTS_MAX)
-        keeper.save()
-        assert tracemalloc.get_traced_memory()[1] < 2 << 20
-    finally:
-        tracemalloc.stop()

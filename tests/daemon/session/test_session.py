@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import stat
-import subprocess
-import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +16,6 @@ from daemon.judge.pipeline import Judgement, Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.session.file import SessionFile, SessionFileError, kept_now, load, others
 from daemon.session.keeper import SAVE_PERIOD_NS, WAIT_S
-from daemon.session.sensors import exchanged
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
@@ -216,22 +209,6 @@ def test_a_session_of_another_model_that_is_back_is_a_new_one(
     assert "a new session begins" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("before", "now", "fingers"),
-    [
-        ({}, {}, []),
-        ({}, {"ff": "A"}, []),
-        ({"ff": "A"}, {}, []),
-        ({"ff": "A"}, {"ff": "A"}, []),
-        ({"ff": "A", "th": "B"}, {"ff": "C", "th": "B"}, ["ff"]),
-    ],
-)
-def test_only_a_sensor_that_is_known_to_differ_is_another(
-    before: dict[str, str], now: dict[str, str], fingers: list[str]
-) -> None:
-    assert exchanged(before, now) == fingers
-
-
 def test_two_daemons_do_not_keep_one_session(tmp_path: Path) -> None:
     in_use = pytest.raises(SessionFileError, match="in use by another graspd")
     with SessionFile(tmp_path / "right.json"), in_use:
@@ -271,101 +248,9 @@ def test_a_session_of_other_fingers_begins_anew(
     assert session.grasps == 0
 
 
-def test_numbers_that_are_not_finite_are_refused(tmp_path: Path) -> None:
-    state = calibration().state()
-    data = {"version": 1, "fingers": FINGERS, "serials": {}, "saved_at": 0.0}
-    path = tmp_path / "right.json"
-    statistics = msgspec.to_builtins(state)
-    text = msgspec.json.encode(data | {"statistics": statistics}).decode()
-    path.write_text(text.replace('"squares":[0.0', '"squares":[-1.0', 1))
-    with pytest.raises(SessionFileError, match="not a session"):
-        load(path)
-
-
 def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(SessionFileError, match="No such file or directory"):
         SessionFile(tmp_path / "no" / "right.json")
-
-
-def test_a_full_disk_is_one_warning_and_no_crash(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    session, clock = calibration(), Clock()
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, sensors(), file, clock)
-
-        def full(descriptor: int) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(os, "fsync", full)
-        for seed in range(3):
-            observe(session, 3, seed)
-            clock.now_ns += SAVE_PERIOD_NS
-            read_once(keeper)
-            keeper.wait(WAIT_S)
-        assert caplog.text.count("No space left on device") == 1
-        monkeypatch.undo()
-        keeper.save()
-        kept = file.load()
-    assert kept is not None
-    assert grasps_of(kept) == 9
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["right.json", "right.json.lock"]
-
-
-def test_a_disk_that_hangs_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    session, clock = calibration(), Clock()
-    hangs, asked = threading.Event(), []
-
-    def slow(descriptor: int) -> None:
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):  # and not the folder, after the file
-            asked.append(True)
-        hangs.wait()
-
-    monkeypatch.setattr(os, "fsync", slow)
-    with SessionFile(tmp_path / "right.json") as file:
-        keeper = session_keeper(session, sensors(), file, clock)
-        for seed in range(3):
-            observe(session, 3, seed)
-            clock.now_ns += SAVE_PERIOD_NS
-            read_once(keeper)  # comes back, though nothing is on the disk yet
-        assert file.load() is None
-        hangs.set()
-        keeper.save()
-        kept = file.load()
-    assert kept is not None
-    assert grasps_of(kept) == 9
-    assert len(asked) == 2
-
-
-KILLED = """
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from daemon.session.file import SessionFile, kept_now
-from tests.daemon.session.test_session import FINGERS, calibration, observe
-session = calibration()
-with SessionFile(Path(sys.argv[1])) as file:
-    while True:
-        observe(session, 1, session.grasps)
-        file.save(kept_now(session.state(), FINGERS, {}))
-        print(session.grasps, flush=True)
-"""
-
-
-def test_a_file_that_is_cut_off_by_a_kill_is_still_whole(tmp_path: Path) -> None:
-    path = tmp_path / "right.json"
-    for _ in range(3):
-        with subprocess.Popen(
-            [sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE, text=True
-        ) as process:
-            if process.stdout is None:
-                raise RuntimeError("no pipe")
-            for _ in range(20):
-                process.stdout.readline()
-            process.send_signal(signal.SIGKILL)
-        kept = load(path)
-        assert kept is not None
-        assert grasps_of(kept) >= 20
 
 
 def session_pipeline(*, learns: bool = True) -> Pipeline:
@@ -449,16 +334,6 @@ def test_a_finger_that_dies_is_never_judged_by_the_others(bts3_dir: Path, grasps
     assert {judgement.decision for judgement in judge(pipeline, dead)} == {Decision.UNKNOWN}
 
 
-def test_swapped_fingers_are_hardly_ever_judged(bts3_dir: Path) -> None:
-    random = np.random.default_rng(4)
-    rows = read_table(bts3_dir / "palm_down.csv").counts
-    rows = rows[random.permutation(len(rows))]
-    pipeline = session_pipeline()
-    judge(pipeline, rows[:200])
-    judgements = judge(pipeline, rows[200:600, [1, 2, 0]])
-    assert np.mean([judgement.decision is Decision.UNKNOWN for judgement in judgements]) > 0.95
-
-
 @pytest.mark.parametrize("order", [[0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 def test_fingers_exchanged_from_the_first_grasp_are_unknown(
     bts3_dir: Path, order: list[int]
@@ -514,23 +389,6 @@ def test_a_session_learns_nothing_from_what_is_stale(bts3_dir: Path) -> None:
     assert {judgement.reasons[-1] for judgement in judgements} == {Reason.STALE}
     assert pipeline.session is not None
     assert pipeline.session.grasps == 0
-
-
-@pytest.mark.parametrize("threshold", [0.2, 0.5, 0.95])
-def test_a_young_session_is_less_sure_and_on_the_same_side(
-    bts3_dir: Path, threshold: float
-) -> None:
-    rows = read_table(bts3_dir / "palm_down.csv").counts[::20]
-    limits = Limits(max_age_ns=10**18, slip_threshold=threshold)
-    model = TactileModel(zoo.find("small-session"))
-    young = Pipeline(model, FINGERS, limits, lambda: 0, learns=False)
-    for judgement, row in zip(judge(young, rows), rows, strict=True):
-        if judgement.p_slip is None or judgement.opinion.repaired:
-            continue
-        model.inputs.build(row, model.input)
-        _, p_slip = model.run()
-        assert (p_slip >= threshold) is (judgement.decision is Decision.SLIP)
-        assert abs(judgement.p_slip - threshold) <= abs(p_slip - threshold) + 1e-6
 
 
 def test_the_serials_are_kept_even_if_the_session_does_not_learn(tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from daemon.trust.learner import sigmoid
 from daemon.trust.lift_book import LIFTS_MAX, GraspId, OutcomeStatus
-from daemon.trust.risk import Permission, RiskLimits
-from daemon.trust.trust import MAX_BYTES, Trust, TrustState, decode, encode
+from daemon.trust.trust import MAX_BYTES, Permission, RiskLimits, Trust, TrustState, decode, encode
 
 BOOT = "0123456789abcdef" * 2
 INPUTS = 26
@@ -145,27 +144,6 @@ def test_what_a_grasp_is_lifted_on_counts_the_first_verdict_or_the_first_stable_
         each.note(named(8), again, stable=True)  # too late to be what it was lifted on
         assert (each.risk.lifts, each.risk.slips, each.lifts.outstanding) == (1, 1, 0)
     assert part.learner.state() == expected.learner.state()
-
-
-def test_stable_said_after_the_outcome_is_not_what_was_lifted_on() -> None:
-    part = trust()
-    assert not judge(part, 7, 2.0)
-    assert part.outcome(named(7), slipped=True) is OutcomeStatus.TAKEN
-    kept = encode(part.state())
-    judge(part, 7, -9.0)
-    assert encode(part.state()) == kept
-    assert part.lifts.outstanding == 0
-
-
-def test_only_stable_grasps_without_an_outcome_count_as_unreported() -> None:
-    part = trust()
-    assert judge(part, 0)
-    assert part.outcome(named(0), slipped=False) is OutcomeStatus.TAKEN
-    assert not judge(part, 1, 6.0)
-    assert judge(part, 2)
-    for grasp in range(3, LIFTS_MAX + 3):
-        judge(part, grasp, 6.0)
-    assert part.lifts.unreported == 1
 
 
 def test_stable_cannot_be_noted_where_it_was_not_allowed() -> None:
@@ -376,11 +354,3 @@ def test_too_many_records_are_no_state() -> None:
     lifts = msgspec.structs.replace(state.lifts, records=many)
     with pytest.raises(ValueError, match="nothing that was learned"):
         decode(encode(msgspec.structs.replace(state, lifts=lifts)))
-
-
-def test_judging_changes_nothing() -> None:
-    part = full()
-    before = encode(part.state())
-    found = [part.judge(named(99), 0.2, -2.0, inputs(3)) for _ in range(3)]
-    assert len({(one.p_slip, one.permission, one.supervised) for one in found}) == 1
-    assert encode(part.state()) == before

@@ -14,7 +14,7 @@ from msgspec import structs
 from daemon.judge.reasons import ADVICE, Decision, GateState, Reason
 from daemon.publish.messages import LearnerHealth, Lifts, OutcomeMessage, encode
 from daemon.trust.lift_book import OutcomeStatus
-from daemon.trust.risk import RiskReport
+from daemon.trust.trust import RiskReport
 from daemon.watch.evidence import SUPERVISED
 from daemon.watch.history import History
 from daemon.watch.snapshot import Line, Snapshot, Tone

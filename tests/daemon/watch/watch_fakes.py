@@ -10,7 +10,7 @@ from rich.console import Console
 
 from daemon.judge.reasons import Decision, GateState, Reason
 from daemon.publish.messages import DECISION_CODE, State, Status, Tactile, Verdict, encode
-from daemon.trust.risk import RiskReport
+from daemon.trust.trust import RiskReport
 from daemon.watch.snapshot import Snapshot
 from daemon.watch.terminal import draw
 from daemon.watch.view import View
