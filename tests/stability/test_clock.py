@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.spi.clock import DeviceClock
+from drivers.spi.sweeps import BridgeCounters, DeviceClock
 
 TICK_HZ = 1_000_000
 S, MS = 1_000_000_000, 1_000_000
@@ -33,7 +33,7 @@ TEN_YEARS_TICKS = 10 * 365 * 86_400 * TICK_HZ
 def test_a_time_is_never_after_its_arrival(
     note: Callable[..., None], name: str, step_s: float, first_tick: int
 ) -> None:
-    clock, last_ns, last_faults = DeviceClock(TICK_HZ), 0, 0
+    clock, last_ns, last_faults = DeviceClock(TICK_HZ, BridgeCounters()), 0, 0
     too_fresh_ns, too_old_ns, never_back = [], [], True
     for number in range(6_000):
         made_ns = S + number * 10 * MS
@@ -46,8 +46,8 @@ def test_a_time_is_never_after_its_arrival(
         too_fresh_ns.append(mapped_ns - arrival_ns)
         too_old_ns.append(made_ns - mapped_ns)
         # Times go back only where the clock has just stopped being trusted.
-        never_back &= mapped_ns >= last_ns or clock.faults > last_faults
-        last_ns, last_faults = mapped_ns, clock.faults
+        never_back &= mapped_ns >= last_ns or clock.counters.clock_faults > last_faults
+        last_ns, last_faults = mapped_ns, clock.counters.clock_faults
     note(
         step=f"device clock, {name}",
         expected=f"never after its arrival, too old by {TOO_OLD_MAX_NS / MS:.0f} ms at most",

@@ -11,8 +11,7 @@ from drivers.base import ElectrodeFault
 from drivers.biotac import E1, PAC, PDC, SEQUENCE_ALL, SEQUENCE_INTERLEAVED, TDC
 from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.framing import encode_frame
-from drivers.spi.messages import DIGEST, BridgeStatus, Stop, encode
+from drivers.spi.messages import DIGEST, BridgeStatus, Stop, encode, encode_frame
 from tests.drivers.spi.bridge_bench import (
     FINGERS,
     Clock,

@@ -16,9 +16,8 @@ from drivers.base import Driver, DriverError
 from drivers.biotac import SEQUENCE_ALL
 from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.framing import encode_frame
 from drivers.spi.line import SerialLine
-from drivers.spi.messages import DIGEST, Ping, Start, Stop, encode
+from drivers.spi.messages import DIGEST, Ping, Start, Stop, encode, encode_frame
 from tests.drivers.spi.bridge_bench import (
     FINGERS,
     MS,
