@@ -66,6 +66,11 @@ class PalmStream:
             self._uncalibrated = int(np.isnan(self._calibration.angles_rad(counts)).sum())
 
     @property
+    def sender_kind(self) -> str:
+        """Kind of palm, for people."""
+        return f"palm {self.palm}"
+
+    @property
     def cycles_to_go(self) -> int:
         """Packets until the round at hand can be complete; 0 while nothing is known."""
         return self._rounds.cycles_to_go

@@ -14,13 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import JointReading
 from drivers.biotac import SEQUENCES
 from drivers.can.decoders import CanDecoder, make_decoder
 from drivers.can.formats import CanFormat, SweepFrame, encode_sample
 from drivers.can.frames import FD, CanFrame
 from drivers.can.readings import CanCounters
-from drivers.joints.message import JointCounters, JointMessage, JointParser, MessageOrder
+from drivers.joints.message import JointMessage, JointStream
 from drivers.palm.stream import PalmStream
 from drivers.recordings.can_log import CanLog, frame_of, line_of
 from drivers.recordings.serial_log import SerialLog, SerialLogParser, encode_records
@@ -237,16 +236,12 @@ def test_of_a_bridge_a_sweep_is_one_frame_with_a_checksum(
 def test_of_joints_a_message_is_a_reading_and_none_comes_after_a_later_one(
     plan: list[Step],
 ) -> None:
-    counters = JointCounters()
-    parser, order = JointParser(counters), MessageOrder(counters)
+    stream = JointStream()
     last: tuple[int, int] = (0, -1)
     for unit in arrivals(plan, silent=5):
         angle = 0.001 * (unit.index % 1000) + unit.boot / 2**20
         message = JointMessage(unit.index, None, ("FFJ3", "MFJ3"), np.full(2, angle))
-        parsed = parser.parse(message.to_bytes())
-        assert parsed is not None
-        if order.admits(parsed):
-            reading = JointReading(unit.at, 0, parsed.names, parsed.position_rad)
+        for reading in stream.receive(message.to_bytes(), unit.at) or ():
             assert set(reading.position_rad.tolist()) == {angle}
             assert (unit.boot, unit.index) > last
             last = unit.boot, unit.index

@@ -36,8 +36,8 @@ def ping(clock: DeviceClock, now_ns: int, way: Way | None = None, lead_ticks: in
     clock.round_trip(tick, now_ns - MS // 2, now_ns + MS // 2)
 
 
-@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 37.0, 100.0])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("drift_ppm", [-100.0, 100.0])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_times_are_right_within_two_milliseconds_and_never_too_fresh(
     drift_ppm: float, seed: int
 ) -> None:
@@ -52,16 +52,8 @@ def test_times_are_right_within_two_milliseconds_and_never_too_fresh(
     assert clock.counters.clock_faults == clock.counters.clock_fallbacks == 0
 
 
-def test_the_drift_is_found() -> None:
-    clock = DeviceClock(TICK_HZ, BridgeCounters())
-    errors_ms(Way(drift_ppm=80.0), 300.0, clock)
-    assert clock.drift_ppm == pytest.approx(80.0, abs=10.0)
-    assert clock.round_trip_ns is not None
-    assert clock.round_trip_ns < 16 * MS
-
-
-@pytest.mark.parametrize("drift_ppm", [-100.0, 0.0, 80.0])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("drift_ppm", [-100.0, 80.0])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_the_rate_is_within_its_limits_which_close_in(drift_ppm: float, seed: int) -> None:
     widths = []
     for duration_s in (3.0, 30.0):
@@ -92,26 +84,6 @@ def test_before_any_ping_a_time_is_older_than_the_last_idle_moment() -> None:
     assert clock.counters.clock_fallbacks == 1
 
 
-def test_a_host_that_stalls_gets_old_times_for_old_readings() -> None:
-    clock, now_ns = synchronised()
-    woke_ns = now_ns + 3 * S
-    for k in range(1, 300):
-        made_ns = now_ns + k * 10 * MS
-        mapped_ns = clock.host_ns(tick_of(made_ns, Way()), woke_ns, now_ns)
-        assert made_ns - 2 * MS <= mapped_ns <= made_ns
-    assert clock.counters.clock_faults == 0
-
-
-def test_a_ping_that_took_long_does_no_harm() -> None:
-    clock, now_ns = synchronised(pings=30)
-    made_ns = now_ns + 400 * MS
-    clock.round_trip(tick_of(made_ns, Way()), now_ns + 100 * MS, now_ns + 700 * MS)
-    later_ns = now_ns + 900 * MS
-    mapped_ns = clock.host_ns(tick_of(later_ns, Way()), later_ns + MS, later_ns)
-    assert later_ns - MS <= mapped_ns <= later_ns
-    assert clock.trusted
-
-
 def test_a_clock_that_stands_is_not_believed() -> None:
     clock, now_ns = synchronised()
     tick = tick_of(now_ns + 10 * MS, Way())
@@ -124,13 +96,6 @@ def test_a_clock_that_stands_is_not_believed() -> None:
             clock.round_trip(tick, arrival_ns - MS, arrival_ns)
     assert not clock.trusted
     assert (clock.counters.clock_faults, clock.counters.clock_fallbacks) == (1, 498)
-
-
-def test_a_clock_that_stands_is_noticed_by_pings_alone() -> None:
-    clock, now_ns = synchronised()
-    clock.round_trip(tick_of(now_ns, Way()), now_ns + S, now_ns + S + MS)
-    assert not clock.trusted
-    assert clock.counters.clock_faults == 1
 
 
 def test_a_clock_that_falls_back_is_believed_again_after_two_pings_that_agree() -> None:
@@ -148,24 +113,6 @@ def test_a_clock_that_falls_back_is_believed_again_after_two_pings_that_agree() 
     assert clock.counters.clock_faults == 1
 
 
-def test_a_clock_that_jumps_ahead_is_not_believed() -> None:
-    clock, now_ns = synchronised()
-    arrival_ns = now_ns + 20 * MS
-    tick = tick_of(arrival_ns, Way()) + 5 * TICK_HZ
-    assert clock.host_ns(tick, arrival_ns, now_ns) == now_ns - UNKNOWN_DELAY_NS
-    assert not clock.trusted
-    assert clock.counters.clock_faults == 1
-
-
-@pytest.mark.parametrize("drift_ppm", [-10_000.0, 10_000.0])
-def test_a_clock_of_a_wrong_rate_is_found_out_and_then_never_too_fresh(drift_ppm: float) -> None:
-    clock = DeviceClock(TICK_HZ, BridgeCounters())
-    errors = errors_ms(Way(drift_ppm=drift_ppm), 120.0, clock)
-    assert 1 <= clock.counters.clock_faults <= 5
-    assert not clock.trusted
-    assert len(errors) < 2_000, "trusted for a small part of the time"
-
-
 def test_a_time_is_never_later_than_its_arrival_nor_older_than_the_limit() -> None:
     rng = np.random.default_rng(5)
     clock, now_ns = synchronised()
@@ -176,21 +123,6 @@ def test_a_time_is_never_later_than_its_arrival_nor_older_than_the_limit() -> No
             clock.round_trip(tick, now_ns - int(rng.integers(0, S)), now_ns)
         mapped_ns = clock.host_ns(tick, now_ns, now_ns - int(rng.integers(0, 60 * S)))
         assert now_ns - AGE_MAX_NS <= mapped_ns <= now_ns
-
-
-def test_times_do_not_go_back_while_the_clock_is_trusted() -> None:
-    clock = DeviceClock(TICK_HZ, BridgeCounters())
-    rng = np.random.default_rng(6)
-    now_ns, last_ns = START_NS, 0
-    for k in range(5_000):
-        now_ns += 10 * MS
-        if k % 100 == 0:
-            tick = tick_of(now_ns, Way())
-            clock.round_trip(tick, now_ns - int(rng.exponential(MS)), now_ns + MS)
-        mapped_ns = clock.host_ns(tick_of(now_ns, Way()), now_ns + MS, now_ns)
-        assert mapped_ns >= last_ns
-        last_ns = mapped_ns
-    assert clock.counters.clock_faults == 0
 
 
 def test_a_slow_clock_of_a_kilohertz_is_no_fault() -> None:
