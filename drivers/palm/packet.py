@@ -22,7 +22,7 @@ from drivers.udp.driver import DatagramCounters
 CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""
 SENSORS = 37
-"""Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.hall`)."""
+"""Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.calibration`)."""
 MOTORS = 10
 """Motor records per packet: the even ones or the odd ones of 20."""
 TACTILE_FINGERS = 5

@@ -21,7 +21,7 @@ from drivers.palm.rounds import RoundAssembler
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drivers.palm.hall import JointCalibration
+    from drivers.palm.calibration import JointCalibration
 
 JOINT_PERIOD_NS: Final = 10_000_000
 """A joint reading at 100 Hz: the position of a hand has no more in it, and 1000 would be work."""
@@ -103,7 +103,7 @@ class PalmStream:
     def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
         if self._calibration is None or t_ns < self._joint_due_ns:
             return None
-        from drivers.palm.hall import JOINTS, impossible_angles
+        from drivers.palm.calibration import JOINTS, impossible_angles
 
         self._joint_due_ns += JOINT_PERIOD_NS
         if self._joint_due_ns <= t_ns:

@@ -17,8 +17,7 @@ from daemon.judge.health import Checked
 from daemon.judge.joint_motion import JointMotion
 from daemon.judge.reasons import Reason
 from drivers.base import JointReading, TactileReading
-from drivers.palm.calibration import parse_calibration
-from drivers.palm.hall import CoupledTable, Table
+from drivers.palm.calibration import CoupledTable, Table, parse_calibration
 from models.contract import Finger
 
 Note = Callable[..., None]

@@ -243,7 +243,7 @@ def test_without_a_calibration_there_are_no_joints_and_no_joint_code() -> None:
         "import sys\n"
         "from drivers.palm.driver import PalmDriver\n"
         f"with PalmDriver({LOOPBACK!r}):\n"
-        "    sys.exit(any('hall' in name or 'twins' in name for name in sys.modules))\n"
+        "    sys.exit(any('calibration' in name or 'twins' in name for name in sys.modules))\n"
     )
     assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0
 

@@ -109,10 +109,13 @@ def test_after_the_link_broke_readings_are_sound_within_two_rounds() -> None:
     expect_truth(played)
 
 
-@pytest.mark.parametrize("into_round", range(ROUND))
-def test_a_second_palm_after_silence_is_told_and_never_mixed_in(into_round: int) -> None:
+@pytest.mark.parametrize("into_round", [0, 1, 7, 13])
+def test_a_second_palm_after_silence_is_never_mixed_in(
+    monkeypatch: pytest.MonkeyPatch, into_round: int
+) -> None:
     """The first one breaks off in a round, the second is heard from anywhere in one of its own."""
     clock, hands = Clock(), (rows(4, seed=1), rows(4, seed=2))
+    clock.rule(monkeypatch)
     with (
         PalmDriver("udp://127.0.0.1:0", clock=clock) as driver,
         Sender(driver) as first,

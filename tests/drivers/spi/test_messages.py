@@ -248,13 +248,6 @@ def test_a_message_has_its_golden_bytes_and_comes_back(
     assert decode(0x04, wire) is None
 
 
-def test_words_come_back_in_the_order_of_slots_and_sensors() -> None:
-    back = decode(0x02, SWEEP.to_bytes())
-    assert isinstance(back, Sweep)
-    assert back.words.tolist() == SWEEP.words.tolist()
-    assert (back.seq, back.tick_start, back.tick_end, back.present) == (7, 1000, 2900, 5)
-
-
 # The document's own numbers.
 @pytest.mark.parametrize(
     ("sequence", "line_bytes"), [(SEQUENCE_ELECTRODES, 174), (SEQUENCE_INTERLEAVED, 355)]

@@ -13,14 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
-from drivers.palm.hall import (
+from drivers.palm.calibration import (
     HALL_SENSORS,
     JOINTS,
+    CalibrationError,
     CoupledTable,
     JointCalibration,
     Table,
     impossible_angles,
+    load_calibration,
+    parse_calibration,
 )
 
 EXAMPLE = Path(__file__).parents[3] / "deploy" / "calibration" / "example_hand.toml"
