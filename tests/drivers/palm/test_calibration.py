@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.palm.calibration import (
@@ -369,6 +369,7 @@ values = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(("version", "joints", "coupled"), values)))
 def test_whatever_a_file_holds_it_is_taken_or_refused(data: dict[str, object]) -> None:
     try:

@@ -8,7 +8,6 @@ import shutil
 import struct
 import subprocess
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -136,14 +135,6 @@ def test_exactly_the_4096_response_words_are_sound(bridge_probe: Path) -> None:
 
 
 SIZES = (0, 1, 2, 252, 253, 254, 255, 256, 507, 508, 509, 510, 668, 762, 763)
-
-
-def blobs(rng: random.Random) -> Iterator[bytes]:
-    """Data of every awkward size, with no, few and many zeros."""
-    for size in (*SIZES, *(rng.randrange(700) for _ in range(300))):
-        for zeros in (0.0, 0.01, 0.5):
-            data = (0 if rng.random() < zeros else rng.randrange(1, 256) for _ in range(size))
-            yield bytes(data)
 
 
 def test_every_frame_agrees_with_an_independent_computation(bridge_probe: Path) -> None:
