@@ -23,16 +23,16 @@ COUNT_MAX = 4095
 
 
 def check_fingers(fingers: Sequence[str]) -> None:
-    """Raise `ValueError` unless these are different ones of `FINGERS`, and at least one."""
+    """Raise `ValueError` unless these are one or more different `FINGERS`."""
     if not fingers or len(set(fingers)) != len(fingers) or not set(fingers) <= set(FINGERS):
         raise ValueError(f"fingers {list(fingers)} are not different ones of {list(FINGERS)}")
 
 
 def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
-    """Which sensor of a device, from 0, is which row of a reading.
+    """Return the sensor of a device, from 0, for each row of a reading.
 
-    `fingers`: the rows. `sensors`: the fingers in the order of the device, the same if None; it may
-    have more than are wanted. Raises `ValueError` for fingers that are none or not of the device.
+    `fingers`: the rows. `sensors`: all fingers in the order of the device, the same if None.
+    Raises `ValueError` for unknown fingers and for those that the device lacks.
     """
     check_fingers(fingers)
     if sensors is None:
@@ -44,7 +44,7 @@ def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[
 
 
 class ElectrodeFault(IntFlag):
-    """What is wrong with one electrode of one reading. Zero means: a fresh 12-bit count."""
+    """Faults of one electrode of one reading. Zero: a fresh 12-bit count."""
 
     NONE = 0
     MISSING = 1
@@ -63,11 +63,11 @@ class ElectrodeFault(IntFlag):
 
 @dataclass(frozen=True, slots=True)
 class Annotation:
-    """Where a reading stands in a table or stream, and its labels. Never used for judging."""
+    """Place of a reading in a table or stream, and its labels. Never used for judging."""
 
     source: Path
     line: int
-    """Line of the file, from 1, where the reading stands."""
+    """Line of the file, from 1."""
     object_name: str | None = None
     slipped: bool | None = None
     """How the lift ended: True slip, False stable, None not recorded."""
@@ -86,12 +86,11 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Shape (fingers, 24), `ElectrodeFault` bits per electrode."""
     annotation: Annotation | None = None
     recorded_ns: int | None = None
-    """Recordings only, as they may be played at any speed: when it was made, ns since the
-    recording's own zero."""
+    """Recordings only, which may be played at any speed: time since the recording's zero, ns."""
 
     @property
     def made_ns(self) -> int:
-        """When the sensor made it, ns: for intervals. `t_ns` is for age."""
+        """Time when the sensor made it, ns, for intervals. `t_ns` is for age."""
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
@@ -141,15 +140,15 @@ class DriverCounters:
 
 
 class LinkCause(Enum):
-    """Why a link is not up, for programs: texts are for people."""
+    """Cause of a link that is not up, for programs."""
 
     UNKNOWN = auto()
-    """Not tried yet, or told by the text alone."""
+    """Not tried yet, or known from the text alone."""
     NOT_FOUND = auto()
     DENIED = auto()
     IN_USE = auto()
     NO_INTERFACE = auto()
-    """There is no such network interface or device."""
+    """The network interface or device does not exist."""
     INTERFACE_DOWN = auto()
     NO_ADDRESS = auto()
     """The address to listen on is not one of this computer."""
@@ -163,9 +162,9 @@ class LinkCause(Enum):
     """The device went away or was reset."""
     VERSION = auto()
     SETTINGS = auto()
-    """The device does not sample what is wanted, or has changed what it samples."""
+    """The device does not sample what the scene needs, or has changed what it samples."""
     SERIALS = auto()
-    """The device tells other serial numbers of its sensors each time."""
+    """The device names other serial numbers each time."""
 
 
 _CAUSES: dict[int | None, LinkCause] = {
@@ -182,7 +181,7 @@ _CAUSES: dict[int | None, LinkCause] = {
 
 
 class DeviceFault(Enum):
-    """What is wrong with a device whose link is up, for programs."""
+    """Faults of a device whose link is up, for programs."""
 
     OLD_FIRMWARE = auto()
     NO_SENSOR = auto()
@@ -197,7 +196,7 @@ class DeviceFault(Enum):
 
 
 class Fact(NamedTuple):
-    """One thing that is known of a device: a text for people, and what is wrong with it."""
+    """One fact about a device: a text for people, and its fault."""
 
     text: str
     fault: LinkCause | DeviceFault | None = None
@@ -239,11 +238,11 @@ class Driver(Protocol):
 
     @property
     def exhausted(self) -> bool:
-        """True when no further reading can come: a recording has ended. Never for live links."""
+        """True when a recording has ended. False for live links."""
 
     @property
     def live(self) -> bool:
-        """True if readings come when the sensor makes them; those of a recording wait."""
+        """True if readings come when the sensor makes them, False for recordings."""
 
     @property
     def period_ns(self) -> int | None:
@@ -251,16 +250,16 @@ class Driver(Protocol):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Serial number of each finger's sensor, by finger, without those that are not known yet.
+        """Known serial numbers of the sensors, by finger.
 
-        A link that tells none names its sender instead. Another number is another sensor: between
-        the readings of the two, `read_ready` has given nothing once.
+        A link without serial numbers names its sender instead. Another number is another sensor:
+        between the readings of the two, `read_ready` has returned nothing once.
         """
 
     def describe(self) -> dict[str, Fact]:
-        """What is known of the device by name: versions, serials, why a link is down.
+        """Return facts about the device by name: versions, serials, why a link is down.
 
-        A live link is the fact `link`, whose fault is None while it is up.
+        Live links have the fact `link`, whose fault is None while it is up.
         """
 
     def open(self) -> None:
@@ -273,10 +272,10 @@ class Driver(Protocol):
         """Descriptor to wait on, or None while there is none."""
 
     def due_ns(self) -> int | None:
-        """Monotonic time, ns, when `read_ready` wants to be called without a byte, or None."""
+        """Monotonic time, ns, to call `read_ready` even if nothing has come, or None."""
 
     def read_ready(self) -> Sequence[Reading]:
-        """Readings that are complete now, oldest first, possibly none. Raises `DriverError`."""
+        """Return the readings that are complete now, oldest first. Raises `DriverError`."""
 
 
 class DriverError(Exception):
@@ -305,7 +304,7 @@ class LinkError(DriverError):
 
 
 class RecordingError(DriverError):
-    """A recording cannot be read as what it claims to be: give up."""
+    """A recording has the wrong content: give up."""
 
     def __init__(
         self, path: Path, problem: str, *, line: int | None = None, column: str | None = None

@@ -1,4 +1,4 @@
-"""State of a link: up or why not, and when it is tried again, by a backoff with a cap."""
+"""State of a link, and the schedule of its retries: a backoff with a cap."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from drivers.base import Fact, LinkCause
 BACKOFF_FIRST_S = 0.05
 BACKOFF_FACTOR = 1.8
 BACKOFF_MAX_S = 1.0
-"""A device that is plugged in again is found within this time plus its greeting, s."""
+"""Longest time until a device that is plugged in again is opened, s."""
 WARNINGS_MAX = 8
-"""Different reasons that one outage may warn of."""
+"""Most warnings of one outage, each with another reason."""
 
 _log = logging.getLogger(__name__)
 
 
 class LinkState(StrEnum):
-    """What a link is doing."""
+    """State of a link."""
 
     CLOSED = "closed"
     """Not opened, or closed by its owner."""
@@ -31,15 +31,13 @@ class LinkState(StrEnum):
 
 
 CLOSED, WAITING, GREETING, UP = LinkState
-"""By name: looking a member up in its enumeration takes longer, and is done at each reading."""
 
 
 class Link:
     """State and retry schedule of one link. Does no I/O; times are monotonic ns.
 
-    A failure is a warning when its reason is new in this outage and a debug line otherwise, so that
-    a night without the device does not fill the journal, and a device of the wrong version that is
-    plugged in at last is heard of.
+    A failure is a warning if its reason is new in this outage, else a debug line. So a night
+    without the device does not fill the journal, and a device of the wrong version is reported.
     """
 
     def __init__(self, name: str) -> None:
@@ -47,12 +45,12 @@ class Link:
         self.name = name
         self.state = LinkState.CLOSED
         self.retry_ns: int | None = None
-        """When to try again, while waiting."""
+        """Time of the next try, ns, while waiting."""
         self.losses = 0
         """Times that the link was up and was lost."""
         self.reason: str | None = None
         self.cause: LinkCause | None = None
-        """Why it is not up, None while it is or has not been tried."""
+        """Why it is not up; None while it is up or was not tried yet."""
         self._wait_s = BACKOFF_FIRST_S
         self._warned: set[str] = set()
         self._down_since_ns = 0
@@ -62,7 +60,7 @@ class Link:
         return self.retry_ns is None or now_ns >= self.retry_ns
 
     def start(self, now_ns: int) -> None:
-        """Begin to try; the first try is due at once."""
+        """Begin to try, at once."""
         self.state = LinkState.WAITING
         self.reason = self.cause = None
         self._wait_s = BACKOFF_FIRST_S
@@ -70,12 +68,12 @@ class Link:
         self._down_since_ns = self.retry_ns = now_ns
 
     def greeting(self) -> None:
-        """The device was opened."""
+        """Note that the device was opened."""
         self.state = LinkState.GREETING
         self.retry_ns = None
 
     def up(self, what: str, now_ns: int) -> None:
-        """The device has said what it is; `what` goes into the log."""
+        """Note that the device works; `what` names it in the log."""
         down_s = (now_ns - self._down_since_ns) / 1e9
         _log.info("%s: up after %.2f s: %s", self.name, down_s, what)
         self.state = LinkState.UP
@@ -105,11 +103,11 @@ class Link:
         self.retry_ns = None
 
     def describe(self) -> dict[str, Fact]:
-        """State, and why it is not up: part of what a driver describes."""
+        """Return the state and why it is not up, for `Driver.describe`."""
         cause = self.cause
         if cause is None and self.state is not UP:
             cause = LinkCause.SILENT if self.state is GREETING else LinkCause.UNKNOWN
-        known = {"link": Fact(str(self.state), cause)}
+        facts = {"link": Fact(str(self.state), cause)}
         if self.reason is not None:
-            known["why"] = Fact(self.reason)
-        return known
+            facts["why"] = Fact(self.reason)
+        return facts

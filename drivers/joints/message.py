@@ -12,37 +12,35 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.base import JointReading
 from drivers.hand import joint_name
 from drivers.udp.driver import DatagramCounters
 
 DATAGRAM_BYTES_MAX = 4096
 """All 28 joints in full precision have about 900 bytes."""
 ANGLE_MAX_RAD: Final = math.radians(200)
-"""J0, the sum of two joints, reaches 180 degrees. What is beyond is not an angle in radians."""
+"""J0, the sum of two joints, reaches 180 degrees. A larger value is not an angle in radians."""
 SEQ_MAX: Final = (1 << 63) - 1
 SEQ_JUMP_MAX: Final = 1000
-"""A sender that jumps ahead by more has begun anew."""
+"""A sender that jumps ahead by more has restarted."""
 OLD_MESSAGES_MAX: Final = 10
-"""So many messages with old but rising numbers may be a detour; one more is a sender anew."""
+"""Messages in a row with old but rising numbers that may be a detour; one more is a restart."""
 _joint_of: Final = functools.lru_cache(maxsize=64)(joint_name)
-"""Remembers 64 names, known or not: 28 joints with and without prefix."""
+"""Cache of 64 names: 28 joints with and without prefix, and a few unknown ones."""
 
 
 @dataclass(slots=True)
 class JointCounters(DatagramCounters):
-    """What happened to joint messages. `readings` are joint readings here.
-
-    `missed_readings` needs a sender that counts.
-    """
+    """Counters of joint messages. `missed_readings` needs a sender that counts."""
 
     bad_messages: int = 0
     """Datagrams that are not such a message; dropped."""
     old_messages: int = 0
     """Messages that came after a later one, or again; dropped."""
     restarts: int = 0
-    """Times that the sender began to count anew."""
+    """Times that the sender restarted its numbers."""
     unknown_names: int = 0
-    """Joints of a name that no Shadow hand has; left out."""
+    """Joints with a name that no Shadow hand has; left out."""
     bad_angles: int = 0
     """Values that are not an angle in radians; handed over as NaN."""
 
@@ -61,7 +59,7 @@ class JointMessage:
     """Shape (joints,); NaN for a value that is no angle."""
 
     def to_bytes(self) -> bytes:
-        """The datagram. Raises `ValueError` for what cannot be sent, NaN among it."""
+        """Return the datagram. Raises `ValueError` for NaN and more than 4096 bytes."""
         message: dict[str, Any] = {"joints": dict(zip(self.names, self.position_rad, strict=True))}
         if self.t_s is not None:
             message = {"t": self.t_s, **message}
@@ -73,83 +71,89 @@ class JointMessage:
         return data
 
 
-class JointParser:
-    """Datagrams in, messages out."""
+class JointStream:
+    """The joint messages of one sender in, readings out. A `DatagramStream`."""
 
-    def __init__(self, counters: JointCounters) -> None:
-        self._counters = counters
+    sender_kind = "joint stream"
+
+    def __init__(self) -> None:
+        self.counters = JointCounters()
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Take the next message for the first one."""
+        self._last: float | None = None
+        self._counted = False
+        self._last_old: float | None = None
+
+    def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
+        """Return the reading of a message, if it has a known joint; None if it is dropped."""
+        message = self.parse(data)
+        if message is None or not self.admits(message):
+            return None
+        if not message.names:
+            return []
+        seq = self.counters.readings + self.counters.missed_readings
+        self.counters.readings += 1
+        return [JointReading(t_ns, seq, message.names, message.position_rad)]
 
     def parse(self, data: bytes) -> JointMessage | None:
-        """The message, or None if it is none, which is counted."""
+        """Return the message of a datagram; count and return None for one that is none."""
         try:
             message = _message(data)
         except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
             message = None
         if message is None:
-            self._counters.bad_messages += 1
+            self.counters.bad_messages += 1
             return None
         seq, t_s, values = message
         angles: dict[str, float] = {}
         for name, value in values.items():
             joint = _joint_of(name)
             if joint is None:
-                self._counters.unknown_names += 1
+                self.counters.unknown_names += 1
                 continue
             angle = _angle(value)
-            self._counters.bad_angles += math.isnan(angle)
-            # `rh_FFJ3` beside `FFJ3` is one joint with two angles: neither is to be believed.
-            self._counters.bad_angles += joint in angles
+            self.counters.bad_angles += math.isnan(angle)
+            # `rh_FFJ3` beside `FFJ3` is one joint with two angles: neither is trusted.
+            self.counters.bad_angles += joint in angles
             angles[joint] = math.nan if joint in angles else angle
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
 
-
-class MessageOrder:
-    """Keeps late and doubled messages out, by their number or else by their time."""
-
-    def __init__(self, counters: JointCounters) -> None:
-        self._counters = counters
-        self.forget()
-
-    def forget(self) -> None:
-        """Whatever comes next is the first."""
-        self._last: float | None = None
-        self._counted = False
-        self._last_old: float | None = None
-
     def admits(self, message: JointMessage) -> bool:
-        """Whether a message comes after all admitted before."""
+        """Return True for a message newer than all admitted before, by number or else by time."""
         counted = message.seq is not None
         now = message.seq if counted else message.t_s
         if now is None:
             return True
         last = self._last if counted == self._counted else None
-        if last is not None and now <= last and not self._began_anew(now):
-            self._counters.old_messages += 1
+        if last is not None and now <= last and not self._has_restarted(now):
+            self.counters.old_messages += 1
             return False
         if last is not None and now > last and counted:
             self._count_gap(int(now - last) - 1)
         self._last, self._counted, self._last_old = now, counted, None
         return True
 
-    def _began_anew(self, now: float) -> bool:
-        """Old messages are a new start if enough of them rise: one that repeats itself does not."""
+    def _has_restarted(self, now: float) -> bool:
+        """Return True if enough old messages in a row have rising numbers."""
         if self._last_old is None or now <= self._last_old:
             self._old_in_a_row = 0
         self._old_in_a_row += 1
         self._last_old = now
-        began = self._old_in_a_row > OLD_MESSAGES_MAX
-        self._counters.restarts += began
-        return began
+        has_restarted = self._old_in_a_row > OLD_MESSAGES_MAX
+        self.counters.restarts += has_restarted
+        return has_restarted
 
     def _count_gap(self, missed: int) -> None:
         if missed > SEQ_JUMP_MAX:
-            self._counters.restarts += 1
+            self.counters.restarts += 1
         else:
-            self._counters.missed_readings += missed
+            self.counters.missed_readings += missed
 
 
 def _message(data: bytes) -> tuple[int | None, float | None, Mapping[str, Any]] | None:
-    """The fields of a datagram; None or `ValueError` if it is no message."""
+    """Return number, time and joints of a datagram; None or `ValueError` if it is no message."""
     if len(data) > DATAGRAM_BYTES_MAX:
         return None
     # JSON has no NaN; as text it costs only the joint that has it.
@@ -159,25 +163,26 @@ def _message(data: bytes) -> tuple[int | None, float | None, Mapping[str, Any]] 
     seq, t_s = message.get("seq"), message.get("t")
     if seq is not None and (type(seq) is not int or not 0 <= seq <= SEQ_MAX):
         return None
-    if t_s is not None and math.isnan(number := _number(t_s)):
-        return None
-    return seq, None if t_s is None else number, message["joints"]
+    if t_s is None:
+        return seq, None, message["joints"]
+    time_s = _finite(t_s)
+    return None if math.isnan(time_s) else (seq, time_s, message["joints"])
 
 
 def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    by_key = dict(pairs)
+    if len(by_key) < len(pairs):
         raise ValueError("a key stands twice")
-    return found
+    return by_key
 
 
-def _number(value: object) -> float:
-    """A finite number, else NaN. Truth values and text are none."""
+def _finite(value: object) -> float:
+    """Return a finite number, else NaN. Truth values and text are not numbers."""
     if type(value) is int:
         return float(value) if abs(value) <= SEQ_MAX else math.nan
     return value if type(value) is float and math.isfinite(value) else math.nan
 
 
 def _angle(value: object) -> float:
-    angle = _number(value)
+    angle = _finite(value)
     return angle if abs(angle) <= ANGLE_MAX_RAD else math.nan

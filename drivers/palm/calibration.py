@@ -1,4 +1,4 @@
-"""The calibration file of a hand: read and checked, so that a slip of the pen is not an angle.
+"""A hand's calibration: raw Hall values of a palm packet -> joint angles, and its checked file.
 
     version = 1
     hand = "378"                       # for people
@@ -10,34 +10,70 @@
     [coupled]                          # optional; without it THJ1 and THJ2 have no angle
     THJ1_THJ2 = [[2132, 2294, 0.0, -20.0], ...]   # [raw THJ1, raw THJ2, degrees, degrees]
 
-A joint that is left out has no angle (NaN). A mistake anywhere refuses the whole file. Files that
-hands were shipped with hold the very mistakes that are looked for: raw values with a digit too
-many, zeros where nobody measured, tables that turn back.
+Tables are linear between their points and, without clamping, beyond them, as in Shadow's driver.
+THJ1 and THJ2 see each other's magnets: both angles come from both raw values, linear in the
+triangles between points measured in pairs. J0 is the sum of J1 and J2 of a finger, which one motor
+moves. A joint that is left out has no angle (NaN).
+
+A mistake anywhere refuses the whole file. Files shipped with hands hold the mistakes that are
+looked for: raw values with a digit too many, zeros where nothing was measured, tables that turn
+back.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers import toml
 from drivers.base import COUNT_MAX, DriverError
-from drivers.palm.hall import (
-    COUPLED,
-    HALL_SENSORS,
-    RANGE_DEG,
-    RANGE_MARGIN_DEG,
-    SUMS,
-    CoupledPoint,
-    CoupledTable,
-    JointCalibration,
-    Point,
-    Table,
-)
+
+HALL_SENSORS: Final = {
+    **{
+        f"{finger}J{joint}": (4 * at + joint - 1,)
+        for at, finger in enumerate(("FF", "MF", "RF"))
+        for joint in (1, 2, 3, 4)
+    },
+    **{f"LFJ{joint}": (11 + joint,) for joint in (1, 2, 3, 4, 5)},
+    **{f"THJ{joint}": (16 + joint,) for joint in (1, 2, 3, 4)},
+    "THJ5": (21, 22),
+    "WRJ1": (23, 24),
+    "WRJ2": (25,),
+}
+"""Words of `PalmPacket.sensors` by joint; the mean of two, if it has two."""
+COUPLED = ("THJ1", "THJ2")
+"""The joints whose angles come from both raw values."""
+SUMS: Final = {f"{finger}J0": (f"{finger}J1", f"{finger}J2") for finger in ("FF", "MF", "RF", "LF")}
+JOINTS: Final = (*HALL_SENSORS, *SUMS)
+"""All joints of a reading, in its order: 24 with sensors of their own, and the four J0."""
+
+_FINGER_RANGES: Final = {0: (0, 180), 1: (0, 90), 2: (0, 90), 3: (-15, 90), 4: (-20, 20)}
+RANGE_DEG: Final[Mapping[str, tuple[int, int]]] = {
+    **{
+        f"{finger}J{joint}": limits
+        for finger in ("FF", "MF", "RF", "LF")
+        for joint, limits in _FINGER_RANGES.items()
+    },
+    "LFJ5": (0, 45),
+    "THJ1": (-15, 90),
+    "THJ2": (-40, 40),
+    "THJ3": (-12, 12),
+    "THJ4": (0, 70),
+    "THJ5": (-60, 60),
+    "WRJ1": (-40, 28),
+    "WRJ2": (-28, 10),
+}
+"""How far joints go, degrees (Shadow's documentation, ranges)."""
+RANGE_MARGIN_DEG = 10
+"""An angle further than this beyond its range, degrees, shows a wrong calibration or sensor."""
 
 VERSION = 1
 COUPLED_KEY = "THJ1_THJ2"
@@ -48,18 +84,126 @@ POINTS_MIN, POINTS_MAX = 2, 64
 COUPLED_POINTS_MIN, COUPLED_POINTS_MAX = 3, 49
 """Points of the coupled table; Shadow's own has 25, five by five."""
 SLOPE_MAX_DEG = 0.5
-"""Degrees per count from which a segment is too steep: a sensor's noise of one count would move
-the joint by as much. Usual are 0.03 to 0.1."""
+"""Steepest segment, degrees per count: noise of one count moves the joint by as much. Usual are
+0.03 to 0.1."""
+
+Point = tuple[float, float]
+"""(raw, degrees)."""
+CoupledPoint = tuple[float, float, float, float]
+"""(raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
+
+
+class Table:
+    """One raw value -> radians."""
+
+    def __init__(self, points: Sequence[Point]) -> None:
+        """Raises `ValueError` for fewer than two points, or two with the same raw value."""
+        ordered = sorted(points)
+        self._raws = [raw for raw, _ in ordered]
+        self._slopes: list[float] = []
+        self._offsets: list[float] = []
+        if len(ordered) < 2 or len(set(self._raws)) < len(ordered):
+            raise ValueError("a table needs two points or more, with different raw values")
+        for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(ordered):
+            slope = math.radians((next_degrees - degrees) / (next_raw - raw))
+            self._slopes.append(slope)
+            self._offsets.append(math.radians(degrees) - slope * raw)
+
+    def angle_rad(self, raw: float) -> float:
+        segment = bisect_right(self._raws, raw, 1, len(self._raws) - 1) - 1
+        return self._slopes[segment] * raw + self._offsets[segment]
+
+
+class CoupledTable:
+    """A pair of raw values -> a pair of radians, linear in the triangles between measured pairs."""
+
+    def __init__(self, points: Sequence[CoupledPoint]) -> None:
+        """Raises `ValueError` if the raw pairs span no triangle."""
+        table = np.array(points, dtype=np.float64)
+        triangles = _delaunay(table[:, :2])
+        if not len(triangles):
+            raise ValueError("the raw pairs do not span a triangle")
+        corners = np.concatenate([table[triangles, :2], np.ones((len(triangles), 3, 1))], axis=2)
+        self._to_weights = np.linalg.inv(corners)
+        """Shape (triangles, 3, 3): (raw 1, raw 2, 1) times this is the weights of the corners."""
+        self._angles_rad = np.radians(table[triangles, 2:])
+
+    def angles_rad(self, raw_1: float, raw_2: float) -> tuple[float, float]:
+        """Return both angles; outside all triangles, by the nearest triangle."""
+        weights = np.array([raw_1, raw_2, 1.0]) @ self._to_weights
+        nearest = int(np.argmax(weights.min(axis=1)))
+        first, second = weights[nearest] @ self._angles_rad[nearest]
+        return float(first), float(second)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointCalibration:
+    """Tables of one hand."""
+
+    tables: Mapping[str, Table]
+    coupled: CoupledTable | None = None
+
+    def angles_rad(self, sensors: Sequence[int]) -> NDArray[np.float64]:
+        """Return the angles of `JOINTS`, radians; NaN without a table or a raw value in 0..4095."""
+        angles = dict.fromkeys(JOINTS, math.nan)
+        for joint, table in self.tables.items():
+            raw = _raw(sensors, HALL_SENSORS[joint])
+            if raw is not None:
+                angles[joint] = table.angle_rad(raw)
+        if self.coupled is not None:
+            raw_1, raw_2 = (_raw(sensors, HALL_SENSORS[joint]) for joint in COUPLED)
+            if raw_1 is not None and raw_2 is not None:
+                both = self.coupled.angles_rad(raw_1, raw_2)
+                angles.update(zip(COUPLED, both, strict=True))
+        for joint, (first, second) in SUMS.items():
+            angles[joint] = angles[first] + angles[second]
+        return np.array(list(angles.values()))
+
+
+_LOW_RAD, _HIGH_RAD = (
+    np.radians([RANGE_DEG[joint][side] + sign * RANGE_MARGIN_DEG for joint in JOINTS])
+    for side, sign in ((0, -1), (1, 1))
+)
+
+
+def impossible_angles(position_rad: NDArray[np.float64]) -> int:
+    """Return how many angles of `JOINTS`, radians, are out of reach. NaN is not counted."""
+    return int(((position_rad < _LOW_RAD) | (position_rad > _HIGH_RAD)).sum())
+
+
+def _raw(sensors: Sequence[int], words: Sequence[int]) -> float | None:
+    values = [sensors[word] for word in words]
+    return None if max(values) > COUNT_MAX else sum(values) / len(values)
+
+
+def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return triangles, shape (n, 3), whose circumcircle has no point inside; points: (p, 2).
+
+    A calibration has 25 points, so all triples are tried. Four points on one circle give both
+    pairs of triangles: either is right.
+    """
+    triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
+    a, b, c = (points[triples[:, corner]] for corner in range(3))
+    edges = np.stack([b - a, c - a], axis=1)
+    broad = np.abs(np.linalg.det(edges)) > 0.5  # twice the area, counts squared; 0 on one line
+    triples, a, edges = triples[broad], a[broad], edges[broad]
+    # The circle's centre is as far from the first corner as from the others.
+    offset = np.linalg.solve(edges, (edges**2).sum(axis=2, keepdims=True) / 2)[:, :, 0]
+    distance = np.linalg.norm(points - (a + offset)[:, None, :], axis=2)
+    radius = np.linalg.norm(offset, axis=1, keepdims=True)
+    empty = (distance > radius * (1.0 - 1e-9)).all(axis=1)
+    triangles: NDArray[np.intp] = triples[empty]
+    return triangles
 
 
 class CalibrationError(DriverError):
-    """The calibration cannot be used: mend the file. The message has one line per mistake."""
+    """The file cannot be used. The message has one line per mistake."""
 
     def __init__(self, path: Path, problems: Sequence[str]) -> None:
         super().__init__("\n".join(f"{path}: {problem}" for problem in problems))
         self.path = path
         self.problems = tuple(problems)
-        """Without the path; those of a joint begin with its name."""
+        """Mistakes, each beginning with the name of its joint."""
 
 
 def load_calibration(path: Path) -> JointCalibration:
@@ -78,7 +222,7 @@ def load_calibration(path: Path) -> JointCalibration:
 
 
 def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
-    """Check the content of a file; `path` is for the message. Raises `CalibrationError`."""
+    """Check the content of a file. Raises `CalibrationError`, whose message names `path`."""
     problems = list(_problems(data))
     if problems:
         raise CalibrationError(path, problems)
@@ -140,15 +284,15 @@ def _coupled_problems(rows: object) -> Iterator[str]:
     if shape or not isinstance(rows, list):
         return
     points = _coupled(rows)
-    found = list(_raw_problems([raw for point in points for raw in point[:2]]))
+    problems = list(_raw_problems([raw for point in points for raw in point[:2]]))
     for at, joint in enumerate(COUPLED):
-        found += [
+        problems += [
             f"{joint}: {problem}"
             for problem in _degree_problems(joint, [point[2 + at] for point in points])
         ]
-    found += _steepness_problems(points)
-    yield from found
-    if not found:
+    problems += _steepness_problems(points)
+    yield from problems
+    if not problems:
         try:
             CoupledTable(points)
         except ValueError as error:
@@ -165,7 +309,7 @@ def _shape_problems(rows: object, width: int, least: int, most: int) -> Iterator
 
 
 def _is_number(value: object) -> bool:
-    """NaN and infinity are none, nor is anything that no raw value or angle could be."""
+    """Return True for a number that could be a raw value or angle; NaN and infinity cannot."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e9 < value < 1e9
 
 
@@ -203,7 +347,7 @@ def _curve_problems(points: Sequence[Point]) -> Iterator[str]:
 
 
 def _steepness_problems(points: Sequence[CoupledPoint]) -> list[str]:
-    """Points so near each other that noise would move the joints."""
+    """Return the pairs of points between which noise would move the joints."""
     problems = []
     for first, second in itertools.combinations(points, 2):
         distance = float(np.hypot(first[0] - second[0], first[1] - second[1]))

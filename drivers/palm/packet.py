@@ -1,12 +1,12 @@
 """The palm status packet of a Shadow hand: the motor, joint and tactile record of one millisecond.
 
-Bytes only. Little-endian and packed, as the palm's EtherCAT status memory holds it; which palm sent
-it is told by its length. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile
+Bytes only. Little-endian and packed, as the palm's EtherCAT status memory holds it; its length
+tells which palm sent it. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile
 protocol header published by Shadow Robot, and its driver, which reads a BioTac from the first 16
 bytes of a finger's tactile slot on every palm.
 
-A packet has neither checksum nor sequence number. The one thing that orders packets is
-`tactile_type`, which takes 14 values in turn.
+A packet has neither checksum nor sequence number. Only `tactile_type` orders packets: it takes 14
+values in turn.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from drivers.udp.driver import DatagramCounters
 CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""
 SENSORS = 37
-"""Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.hall`)."""
+"""Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.calibration`)."""
 MOTORS = 10
 """Motor records per packet: the even ones or the odd ones of 20."""
 TACTILE_FINGERS = 5
@@ -39,7 +39,7 @@ ROUND = 14
 """Packets until each channel of a BioTac has come once."""
 TYPE_METADATA_FIRST: Final = 0xFFF9
 TYPE_METADATA_LAST: Final = 0xFFFF
-"""From here to here `tactile` holds no samples but serial numbers, versions and the like."""
+"""Range of types whose `tactile` holds serial numbers and versions instead of samples."""
 
 VALID_OTHER_0, VALID_OTHER_1 = 4, 8
 """Bits of `TactileSlot.valid`; 1 and 2 are those of the PAC words."""
@@ -49,34 +49,25 @@ _CAN_RECORD: Final = struct.Struct("<BBH8s")
 
 
 class Channel(NamedTuple):
-    """What one of the two changing values of a slot is: an electrode 0..23, or something else."""
+    """Channel of one of a slot's two changing values; `electrode` is 0..23, or None for others."""
 
     name: str
     electrode: int | None
 
 
-def _channels(position: int) -> tuple[Channel, Channel | None]:
-    others = ("PDC", "TAC", "TDC")
-    names = [*others, *(f"E{number}" for number in range(1, ELECTRODES + 1)), None]
-    pair = names[2 * position : 2 * position + 2]
-    first, second = (
-        None if name is None else Channel(name, None if name in others else int(name[1:]) - 1)
-        for name in pair
-    )
-    if first is None:
-        raise ValueError(f"a round has no position {position}")
-    return first, second
-
-
-CHANNELS: tuple[tuple[Channel, Channel | None], ...] = tuple(map(_channels, range(ROUND)))
+_IN_TURN = (
+    *(Channel(name, None) for name in ("PDC", "TAC", "TDC")),
+    *(Channel(f"E{electrode + 1}", electrode) for electrode in range(ELECTRODES)),
+)
+CHANNELS: tuple[tuple[Channel, Channel | None], ...] = tuple(
+    zip(_IN_TURN[::2], (*_IN_TURN[1::2], None), strict=True)
+)
 """By position in the round: the channels of `other_0` and `other_1`. The last has only one."""
-
-
 _POSITIONS: Final = {2 * position + 1: position for position in range(ROUND)}
 
 
 def position_of(tactile_type: int) -> int | None:
-    """Position 0..13 in the round that a `tactile_type` stands for, or None if it is no sample.
+    """Return the position 0..13 in the round of a `tactile_type`, or None if it is no sample.
 
     0x0001 is (PDC, TAC), 0x0003 (TDC, E1), 0x0005 (E2, E3) ... 0x0019 (E22, E23), 0x001B (E24, -).
     """
@@ -84,7 +75,7 @@ def position_of(tactile_type: int) -> int | None:
 
 
 class Palm(StrEnum):
-    """Which palm a packet comes from, by its length."""
+    """Kind of palm, known by the length of its packets."""
 
     PALM_0220 = "0220"
     """220 bytes; also the 0240, which differs in what its inertial words mean."""
@@ -93,7 +84,7 @@ class Palm(StrEnum):
 
 
 class TactileSlot(NamedTuple):
-    """What one finger's BioTac says in one packet; raw words, 0..65535."""
+    """One finger's BioTac in one packet; raw words, 0..65535."""
 
     pac_0: int
     pac_1: int
@@ -139,7 +130,7 @@ class PalmPacket:
     can_record: CanRecord | None = None
 
     def to_bytes(self) -> bytes:
-        """The packet as the palm sends it; what is not read is zero. For twins and tests.
+        """Return the packet as the palm sends it, with zeros in what is not read. For twins.
 
         Raises `ValueError` for a value that its field cannot hold.
         """
@@ -159,10 +150,7 @@ class PalmPacket:
 
 @dataclass(slots=True)
 class PalmCounters(DatagramCounters):
-    """What became of packets, values and angles.
-
-    `readings` and `faulty_readings` are the tactile ones.
-    """
+    """Counters of packets, values and angles. `readings` are the tactile ones."""
 
     packets: int = 0
     """Packets with sensor data."""
@@ -171,11 +159,11 @@ class PalmCounters(DatagramCounters):
     empty_packets: int = 0
     """Packets that the palm was too late to fill."""
     service_packets: int = 0
-    """Packets of a service mode of the palm, in which `sensors` holds other things."""
+    """Packets of a service mode of the palm."""
     nonsense_packets: int = 0
     """Packets with a field that no palm sends."""
     lost_packets: int = 0
-    """Packets that a round was handed over without, for whatever reason."""
+    """Packets missing from rounds that were handed over."""
     duplicate_packets: int = 0
     """Packets that came again; the copy is dropped."""
     reordered_packets: int = 0
@@ -191,15 +179,15 @@ class PalmCounters(DatagramCounters):
     metadata_packets: int = 0
     """Packets whose tactile part is about the sensors themselves."""
     unknown_types: int = 0
-    """Packets whose `tactile_type` nobody knows."""
+    """Packets with an undocumented `tactile_type`."""
     held_values: int = 0
     """Electrode values that the palm marked as not fresh."""
     not_counts: int = 0
     """Electrode values outside 0..4095."""
     invalid_fingers: int = 0
-    """Slots of wanted fingers that the palm marked as not valid."""
+    """Slots that the palm marked as not valid."""
     absent_fingers: int = 0
-    """Fingers of rounds without a sensor: channels that are no counts, or nothing but zeros."""
+    """Fingers of rounds without a sensor: channels that are no counts, or only zeros."""
     joint_readings: int = 0
     """Joint readings handed over."""
     bad_angles: int = 0
@@ -217,10 +205,9 @@ class PalmParser:
         self._counters = counters
 
     def parse(self, data: bytes) -> PalmPacket | None:
-        """The packet, or None if it is none or has no sensor data, which is counted.
+        """Return the packet of a datagram; count and return None for one without sensor data.
 
-        With neither checksum nor sequence number, damage to a value that stays in its range
-        cannot be seen here.
+        Damage to a value that stays in its range is not noticed, for want of a checksum.
         """
         palm = PALM_OF_LENGTH.get(len(data))
         if palm is None:
@@ -282,7 +269,6 @@ PACKET_BYTES_MAX = max(PALM_OF_LENGTH)
 _MOTOR_WORDS = 4 + 2 * MOTORS
 _SLOT_WORDS = len(TactileSlot._fields)
 _TACTILE_WORDS = 2 + _SLOT_WORDS * TACTILE_FINGERS
-_WHICH_MOTORS = (0, 1)
 _CAN_BYTES_MAX = 8
 
 
@@ -319,8 +305,7 @@ def _unpack(data: bytes, layout: _Layout) -> PalmPacket:
 
 
 def _is_plausible(packet: PalmPacket) -> bool:
-    """Whether the fields of few values hold one of them. Padding may hold anything."""
-    record = packet.can_record
-    return packet.which_motors in _WHICH_MOTORS and (
-        record is None or record.length <= _CAN_BYTES_MAX
-    )
+    """Return True if the fields of few values hold one of them."""
+    if packet.can_record is not None and packet.can_record.length > _CAN_BYTES_MAX:
+        return False
+    return packet.which_motors in (0, 1)

@@ -1,16 +1,16 @@
-"""Palm packets -> one `TactileReading` per round of 14; what is missing is flagged.
+"""Palm packets -> one `TactileReading` per round of 14, with missing values flagged.
 
-A packet carries two channels of each BioTac, and only its `tactile_type` tells which. Packets have
-no other sequence, so a packet's place is its type, counted on from the furthest before it:
+A packet carries two channels of each BioTac, named by its `tactile_type`. Packets have no other
+sequence, so a packet's place is its type, counted on from the furthest packet before it:
 
-- A packet that does not come leaves its one or two electrodes `MISSING` in this round and moves
-  nothing else. A round that lacks packets is handed over when the first of the next round comes.
-- A packet up to half a round late goes where it belongs while its round is at hand.
+- A lost packet leaves its one or two electrodes `MISSING` in this round and moves no others. A
+  round that lacks packets is handed over when the first packet of the next round comes.
+- A packet up to half a round late takes its place while its round is the current one.
 - Two different packets for one place contradict each other (a damaged `tactile_type`, or a request
   that stands still): both are dropped and the place is `MISSING`.
-- Whole rounds that are lost are found by time alone, `LATE_MAX` packets after one was due.
+- Lost whole rounds are noticed by time alone, `LATE_MAX` cycles after a packet was due.
 
-What cannot be told: damage that leaves a value in 0..4095 and its validity bit set; a damaged
+Not noticed: damage that leaves a value in 0..4095 and its validity bit set; a damaged
 `tactile_type` that names the place of a packet lost in the same round.
 """
 
@@ -46,18 +46,18 @@ from drivers.palm.packet import (
 ROUND_NS: Final = ROUND * CYCLE_NS
 """Time between two samples of an electrode: 71.43 Hz."""
 LATE_MAX: Final = 10
-"""A packet may come so many cycles late; later than that, a whole round is taken for lost. So after
+"""Most cycles that a packet may be late; later, a whole round counts as lost. So after
 `ROUND - 1 + LATE_MAX` cycles of silence no packet counts for the round before."""
 OUTAGE_NS: Final = 2_000_000_000
-"""After this long, ns, nobody knows how many rounds were made: it counts as one missed."""
+"""After a longer outage, ns, the number of rounds is unknown: it counts as one missed."""
 
 _COMPLETE: Final = (1 << ROUND) - 1
 _TELLING: Final = 0b11
-"""The packets with pressure and temperature, by which an absent sensor is told."""
+"""The packets with pressure and temperature, which show an absent sensor."""
 
 
 class RoundAssembler:
-    """Rounds of the fingers that are wanted, in the order in which they are wanted."""
+    """Packets in, readings of the given fingers out."""
 
     def __init__(
         self, fingers: Sequence[str], counters: PalmCounters, *, heed_finger_bits: bool = True
@@ -77,22 +77,22 @@ class RoundAssembler:
         self._known = np.zeros(shape, dtype=np.bool_)
         self._was_absent = np.zeros(len(fingers), dtype=np.bool_)
         self._place: int | None = None
-        """The furthest place so far, counted on over all rounds; None until a round begins."""
+        """Furthest place so far, counted over all rounds; None until a round begins."""
         self._place_t_ns: int | None = None
         self._begin(0)
 
     @property
     def cycles_to_go(self) -> int:
-        """Packets until the round at hand can be complete; 0 while nothing is known."""
+        """Packets until the current round can be complete; 0 before the first round."""
         return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
 
     def repeats(self, packet: PalmPacket) -> bool:
-        """Whether the round at hand, or the one just finished, already has this very packet."""
+        """Return True if the current round already has this very packet."""
         position = position_of(packet.tactile_type)
         return position is not None and self.packets[position] == packet
 
     def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
-        """Take a packet, received at `t_ns`; the readings that it completes, oldest first."""
+        """Take a packet, received at `t_ns`; return the readings that it completes."""
         position = position_of(packet.tactile_type)
         if position is None:
             is_metadata = TYPE_METADATA_FIRST <= packet.tactile_type <= TYPE_METADATA_LAST
@@ -121,7 +121,7 @@ class RoundAssembler:
         return (*finished, self._finish()) if self._have == _COMPLETE else finished
 
     def interrupt(self) -> None:
-        """The link broke: drop the round at hand, wait for the beginning of another."""
+        """Drop the current round and wait for the beginning of another. Call after an outage."""
         self._counters.interrupted_rounds += not self._finished and self._have != 0
         self._place = None
         self._known[:] = False
@@ -140,7 +140,7 @@ class RoundAssembler:
         return self._round * ROUND
 
     def _move_on(self, to_round: int) -> Sequence[TactileReading]:
-        """Close the round at hand, incomplete as it may be, and begin another."""
+        """Close the current round, complete or not, and begin another."""
         finished = () if self._finished else (self._finish(),)
         self._miss(to_round - self._round - 1)
         self._begin(to_round)
@@ -194,7 +194,6 @@ class RoundAssembler:
             self._known[row, electrode] = True
 
     def _contradict(self, position: int) -> None:
-        """Drop what is known of this place."""
         self._counters.conflicting_packets += 1
         if self._finished:
             return
@@ -214,7 +213,7 @@ class RoundAssembler:
         return TactileReading(self._t_ns, self._round, self._counts.copy(), faults)
 
     def _drop_absent_fingers(self) -> None:
-        """A finger without a sensor shows memory that nobody wrote: no counts, or zeros only."""
+        """Flag fingers without a sensor, which show unwritten memory: no counts, or only zeros."""
         silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
         absent = np.array(self._absent)
         if self._have & _TELLING != _TELLING:
@@ -228,7 +227,7 @@ class RoundAssembler:
 
 
 def _step(place: int, position: int, elapsed_ns: int) -> int:
-    """Places from the furthest to this packet; not above 0 for one that comes late."""
+    """Return the places from the furthest packet to this one; 0 or less for a late one."""
     step = (position - place) % ROUND or ROUND
     if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
         return step - ROUND

@@ -1,10 +1,8 @@
-"""What one palm sends: packets in with their times, tactile and joint readings out. No I/O.
+"""Packets of one palm with their times in, tactile and joint readings out. No I/O.
 
-Palm packets have neither checksum nor sequence number. UDP's own checksum covers the way from the
-relay; what is damaged before it cannot be seen where it stays plausible, and two hands of one kind
-that share a relay's socket look like one: one port per hand. Checked are: length, command, which
-motors, finger bits, tactile type and its turn, sensors present, values in 0..4095, validity bits,
-the same packet again. See `drivers.palm.packet` and `drivers.palm.rounds`.
+Palm packets have neither checksum nor sequence number. UDP's checksum covers the way from the
+relay; plausible damage before it is not noticed. Two hands of one kind that share a relay's socket
+look like one: use one port per hand.
 """
 
 from __future__ import annotations
@@ -21,18 +19,18 @@ from drivers.palm.rounds import ROUND_NS, RoundAssembler
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from drivers.palm.hall import JointCalibration
+    from drivers.palm.calibration import JointCalibration
 
 JOINT_PERIOD_NS: Final = 10_000_000
-"""A joint reading at 100 Hz: the position of a hand has no more in it, and 1000 would be work."""
+"""100 Hz, which is enough for the position of a hand; 1000 Hz would cost processor time."""
 
 
 class PalmStream:
     """Makes a `TactileReading` of each round of 14 packets, and a `JointReading` every 10 ms.
 
-    Packets must come as the palm makes them, one a millisecond. Of a relay that sends them in
-    batches longer than 10 ms, rounds are flagged or counted as missed that were not; where it holds
-    packets back for more than 3 ms, the loss of a whole round may not be told.
+    Packets must come one a millisecond, as the palm makes them. With a relay that sends batches
+    longer than 10 ms, sound rounds are flagged or counted as missed. With one that holds packets
+    back for more than 3 ms, the loss of a whole round may go unnoticed.
     """
 
     period_ns: int | None = ROUND_NS
@@ -45,7 +43,7 @@ class PalmStream:
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
     ) -> None:
-        """`fingers` picks the fingers and their order; raises `ValueError` for ones that are none.
+        """`fingers`: the rows of a reading; raises `ValueError` for unknown fingers.
 
         Joint readings need the hand's `calibration` file; raises `CalibrationError` for one with
         mistakes. Without `heed_finger_bits` the packet's `tactile_valid` is ignored, for a palm
@@ -53,7 +51,7 @@ class PalmStream:
         """
         self.counters = PalmCounters()
         self.palm: Palm | None = None
-        """Which kind of palm is heard; None until a packet came, and after `interrupt`."""
+        """Kind of palm; None until a packet came, and after `interrupt`."""
         self._parser = PalmParser(self.counters)
         self._rounds = RoundAssembler(fingers, self.counters, heed_finger_bits=heed_finger_bits)
         self._previous = b""
@@ -69,15 +67,18 @@ class PalmStream:
             self._uncalibrated = int(np.isnan(self._calibration.angles_rad(counts)).sum())
 
     @property
+    def sender_kind(self) -> str:
+        """Kind of palm, for people."""
+        return f"palm {self.palm}"
+
+    @property
     def cycles_to_go(self) -> int:
-        """Packets until the round at hand can be complete; 0 while nothing is known."""
+        """See `RoundAssembler.cycles_to_go`."""
         return self._rounds.cycles_to_go
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
-        """Take a packet received at monotonic `t_ns`; the readings that it completes.
-
-        None for one that is dropped: no packet of this palm, or the same again.
-        """
+        """Return the readings that a packet completes, or None if it is dropped: no packet of
+        this palm, or the same again. `t_ns`: monotonic time of its arrival."""
         packet = self._parser.parse(data)
         if packet is None:
             return None
@@ -94,14 +95,14 @@ class PalmStream:
         return readings if joints is None else (joints, *readings)
 
     def interrupt(self) -> None:
-        """The link broke: drop the round at hand; what comes next may be another palm."""
+        """Drop the current round; another palm may come next."""
         self._rounds.interrupt()
         self.palm = None
 
     def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
         if self._calibration is None or t_ns < self._joint_due_ns:
             return None
-        from drivers.palm.hall import JOINTS, impossible_angles
+        from drivers.palm.calibration import JOINTS, impossible_angles
 
         self._joint_due_ns += JOINT_PERIOD_NS
         if self._joint_due_ns <= t_ns:

@@ -1,9 +1,9 @@
 """The link log of a serial line: its bytes with their times, and what the bridge says in them.
 
-One record after the other, each a frame of `drivers.spi.framing`: type 1 for bytes from the device,
-2 for bytes to it, 3 for the port having been opened; payload `t: u64` (monotonic ns, little-endian)
-and the bytes. COBS and CRC-32 let a reader find the next record after any damage, also the end of
-a file that was cut off.
+One record after the other, each a frame of `drivers.spi.messages`: type 1 for bytes from the
+device, 2 for bytes to it, 3 for the port having been opened; payload `t: u64` (monotonic ns,
+little-endian) and the bytes. COBS and CRC-32 let a reader find the next record after any damage,
+also the end of a file that was cut off.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from drivers.base import Reading
 from drivers.link import LinkState
 from drivers.recordings.csv_rows import open_recording
 from drivers.spi.conversation import Conversation
-from drivers.spi.framing import FrameParser, encode_frame
 from drivers.spi.line import LineEvent
+from drivers.spi.messages import FrameParser, encode_frame
 
 PIECE_MAX_BYTES: Final = 960
 """Bytes of one record: a frame has 1024 at most. What came at once is cut into several."""

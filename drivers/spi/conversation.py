@@ -8,23 +8,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from drivers.base import (
-    DeviceFault,
-    Fact,
-    LinkCause,
-    Reading,
-    TactileReading,
-    sensor_rows,
-)
+from drivers.base import DeviceFault, Fact, LinkCause, Reading, TactileReading, sensor_rows
 from drivers.link import GREETING, WAITING, Link
-from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
+    DELIMITER,
     DIGEST,
     FIRMWARE,
     VERSION,
     BridgeStatus,
+    FrameParser,
     Hello,
-    HelloHead,
     Message,
     Ping,
     Start,
@@ -32,40 +25,40 @@ from drivers.spi.messages import (
     Sweep,
     decode,
     encode,
-    frame_parser,
+    layout_of,
 )
 from drivers.spi.sweeps import BridgeCounters, SweepDecoder
 
 NAME: Final = "spi"
 GREETING_NS = 500_000_000
-"""How long the bridge may take to answer a PING at the start."""
+"""Timeout of a PING at the start, ns."""
 GREETING_TRIES = 4
-"""PINGs at the start before the port is opened anew, and one more if the last answer needs another
+"""PINGs at the start before the port is reopened, and one more if the last answer needs another
 that agrees: a board that resets when its port is opened needs a second or two."""
 PING_PERIOD_NS = 1_000_000_000
 PING_FIRST_NS = 50_000_000
 PINGS_FIRST = 8
-"""PINGs at the start that follow each other quickly, so that times are good from the start."""
+"""The first PINGs are this many and follow each other quickly, for good times from the start."""
 NONCES = 1 << 32
 PINGS_OUT_MAX = 8
 """PINGs that may wait for an answer; the oldest is given up."""
 PERIOD_MAX_NS = 1_000_000_000
-"""A bridge that sweeps less often is of no use, and its silence would not be noticed in time."""
+"""Longest period between sweeps, ns: the silence of a slower bridge would be noticed too late."""
 SILENCE_PERIODS = 10
-"""Sweeps that may be missing before the link is lost."""
+"""Missing sweeps after which the link is lost."""
 SILENCE_MIN_NS = 100_000_000
-"""Shortest silence that is one: above what a USB adapter or a busy host holds back."""
+"""Shortest timeout of a sweep, ns: more than a USB adapter or a busy host holds back."""
 
 _FROM_BRIDGE: Final = (Hello.TYPE, Sweep.TYPE, BridgeStatus.TYPE)
 
 
 class Conversation:
-    """What is said on one port, however often it is opened. All times are monotonic ns.
+    """The protocol's state on one port, over all its reopenings. All times are monotonic ns.
 
-    The owner of the port calls `opened`, then `receive` with what comes, then writes what `say`
-    gives and calls `sent` right before. `link` says how it stands: when it is `WAITING`, the port
-    is to be closed and opened again at `link.retry_ns`. A link log has no port and nothing to say:
-    it calls `opened`, `receive` and `sent` with what it holds.
+    The owner of the port calls `opened`, then `receive` with the bytes that come, then writes the
+    frames of `say` and calls `sent` right before each. While `link` is `WAITING`, the port must be
+    closed, and opened again at `link.retry_ns`. A link log has no port: it calls `opened`,
+    `receive` and `sent` with its records.
     """
 
     def __init__(
@@ -76,37 +69,35 @@ class Conversation:
         *,
         nonce: int = 0,
     ) -> None:
-        """`port` names it for people; `nonce` is that of the PING before the first.
+        """`port`: its name, for people. `nonce`: that of the PING before the first.
 
         `fingers`: the rows of a reading. `sensors`: the fingers in the order of the chip selects,
-        the same unless given. Raises `ValueError` for fingers that are none or not wired.
+        the same unless given. Raises `ValueError` for unknown or missing fingers.
         """
         self.link = Link(NAME)
         self.hello: Hello | None = None
         """The last HELLO of a bridge that fits, None before the first."""
-        self.period_ns: int | None = None
-        """Nominal time between sweeps by that HELLO, ns."""
-        self._serials: dict[str, str] = {}
-        self._believed: tuple[str, ...] = ()
-        """Serial number of each sensor that has one, as two HELLOs in a row have told it."""
-        self._doubted: tuple[str, ...] | None = None
-        """Those of a HELLO that told others, until the next one."""
+        self.serials: dict[str, str] = {}
+        """Serial numbers of that HELLO by finger, without sensors that did not answer."""
         self.status: BridgeStatus | None = None
         """The last STATUS, None before the first."""
+        self._confirmed: tuple[str, ...] = ()
+        """Serial number of each sensor, as two HELLOs in a row have told it."""
+        self._unconfirmed: tuple[str, ...] | None = None
+        """Serial numbers of a HELLO that told others, until the next one."""
         self._sensors = sensor_rows(fingers, sensors)
         self._fingers = tuple(fingers)
         self._port = port
         self._nonce = nonce
         self._counters = BridgeCounters()
-        self._parser, self._sent = frame_parser(), frame_parser()
-        self._next_seq = 0
+        self._parser, self._sent = FrameParser(DIGEST), FrameParser(DIGEST)
         self._sweeps: SweepDecoder | None = None
         self._pings: dict[int, int] = {}
-        """When the PINGs that wait for an answer were sent, by their nonce."""
+        """Send times of the PINGs that wait for an answer, by their nonce."""
 
     @property
     def counters(self) -> BridgeCounters:
-        """What came, and every kind of drop and fault."""
+        """Counts over all reopenings of the port."""
         frames, counters = self._parser.counters, self._counters
         counters.bytes, counters.frames = frames.bytes, frames.frames
         counters.bad_cobs, counters.bad_crc = frames.bad_cobs, frames.bad_crc
@@ -114,32 +105,32 @@ class Conversation:
         return counters
 
     @property
-    def serials(self) -> dict[str, str]:
-        """By finger, from the last HELLO; without the sensors that did not answer."""
-        return self._serials
+    def period_ns(self) -> int | None:
+        """Nominal time between sweeps by the last HELLO, ns; None before the first."""
+        return None if self.hello is None else self.hello.period_ns
 
     @property
     def due_ns(self) -> int:
-        """When to call `say`, though nothing has come."""
+        """When to call `say`, even if nothing has come."""
         if self._sweeps is None:
             return self._ping_due_ns
         return min(self._ping_due_ns, self._silent_at_ns)
 
     def describe(self) -> dict[str, Fact]:
         """Port, link, and what the bridge last said of itself."""
-        known = {"port": Fact(self._port), **self.link.describe()}
+        facts = {"port": Fact(self._port), **self.link.describe()}
         if self.hello is not None:
-            known |= _about(self.hello)
+            facts |= _about(self.hello)
             if self.hello.firmware < FIRMWARE:
-                known["newer firmware"] = Fact(_version(FIRMWARE), DeviceFault.OLD_FIRMWARE)
+                facts["newer firmware"] = Fact(_version(FIRMWARE), DeviceFault.OLD_FIRMWARE)
         if self._sweeps is not None:
-            known |= _about_time(self._sweeps)
+            facts |= _about_time(self._sweeps)
         if self.hello is not None and self.status is not None:
-            known["spi errors"] = _about_errors(self.status, self.hello)
-        return known
+            facts["spi errors"] = _about_errors(self.status, self.hello)
+        return facts
 
     def opened(self, now_ns: int) -> None:
-        """The port has just been opened: what was true of the bridge behind it is over."""
+        """Begin the greeting. Call right after the port was opened."""
         self._parser.reset()
         self._sent.reset()
         self._sweeps = None
@@ -150,7 +141,7 @@ class Conversation:
         self.link.greeting()
 
     def lost(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        """Nothing more can come until `opened`."""
+        """Give the link up until `opened`."""
         self._sweeps = None
         self._counters.link_failures += 1
         self._counters.unanswered_pings += len(self._pings)
@@ -158,32 +149,32 @@ class Conversation:
         self.link.failed(cause, why, now_ns)
 
     def say(self, now_ns: int) -> list[bytes]:
-        """What is to be sent now, frame by frame; may find that the link is lost instead."""
+        """Return the frames to send now. May lose the link instead, by a timeout."""
         if self.link.state is WAITING:
             return []
-        said = [encode(Start())] if self._starts else []
+        frames = [encode(Start())] if self._starts else []
         self._starts = False
         if self._sweeps is not None and now_ns >= self._silent_at_ns:
             self.lost(LinkCause.TIMEOUT, f"no sweep for {self._silence_ns / 1e6:.0f} ms", now_ns)
         elif now_ns < self._ping_due_ns:
-            return said
+            return frames
         elif self._sweeps is not None:
             is_first = self._pings_sent + 1 < PINGS_FIRST
             self._ping_due_ns = now_ns + (PING_FIRST_NS if is_first else PING_PERIOD_NS)
-            return [*said, self._next_ping()]
-        elif self._pings_sent < GREETING_TRIES + (self._doubted is not None):
+            return [*frames, self._next_ping()]
+        elif self._pings_sent < GREETING_TRIES + (self._unconfirmed is not None):
             self._ping_due_ns = now_ns + GREETING_NS
-            # The zero byte ends whatever the line held before.
+            # The zero byte ends an unfinished frame.
             return [DELIMITER + encode(Stop()), self._next_ping()]
-        elif self._doubted is None:
+        elif self._unconfirmed is None:
             self.lost(LinkCause.NO_ANSWER, f"no answer from {self._port}", now_ns)
         else:
-            others = f"{self._port}: the bridge names other sensors each time"
-            self.lost(LinkCause.SERIALS, others, now_ns)
+            why = f"{self._port}: the bridge names other sensors each time"
+            self.lost(LinkCause.SERIALS, why, now_ns)
         return []
 
     def sent(self, data: bytes, t_ns: int) -> None:
-        """Note what is sent: a PING is answered by a HELLO, which tells the bridge's time."""
+        """Note the time of each PING in `data`. Call right before it is written."""
         for kind, payload in self._sent.feed(data):
             message = decode(kind, payload)
             if isinstance(message, Ping):
@@ -194,19 +185,19 @@ class Conversation:
                 self._pings_sent += 1
 
     def not_sent(self) -> None:
-        """There was no room for a frame: it is given up."""
+        """Count a frame that was given up, as there was no room for it."""
         self._counters.host_tx_dropped += 1
 
     def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
-        """The readings that these bytes complete, oldest first; never raises.
+        """Return the readings that these bytes complete, oldest first. Never raises.
 
-        `idle_ns` is when nothing was waiting to be read for the last time before they came.
+        `idle_ns`: last time before they came at which nothing was waiting to be read.
         """
         readings: list[Reading] = []
         for kind, payload in self._parser.feed(chunk):
             if self.link.state is WAITING:
                 break  # lost because of a frame before this one
-            if kind == Hello.TYPE and not self._speaks_our_language(payload, arrival_ns):
+            if kind == Hello.TYPE and not self._has_our_layout(payload, arrival_ns):
                 continue
             message = decode(kind, payload)
             if message is None:
@@ -224,16 +215,16 @@ class Conversation:
         self._nonce = (self._nonce + 1) % NONCES or 1  # 0 is that of a reset
         return encode(Ping(self._nonce))
 
-    def _speaks_our_language(self, payload: bytes, now_ns: int) -> bool:
-        """Whether a HELLO is of our version and layout; if not the link is given up for now."""
-        head = HelloHead.from_bytes(payload)
-        if head is None or (head.version, head.digest) == (VERSION, DIGEST):
+    def _has_our_layout(self, payload: bytes, now_ns: int) -> bool:
+        """Return True if a HELLO is of our version and layout, else give the link up."""
+        layout = layout_of(payload)
+        if layout is None or layout == (VERSION, DIGEST):
             return True
-        if head.version != VERSION:
-            why = f"speaks version {head.version}, this is version {VERSION}"
+        version, digest = layout
+        if version != VERSION:
+            why = f"speaks version {version}, this is version {VERSION}"
         else:
-            layout = f"has layout 0x{head.digest:08X} of version {VERSION}"
-            why = f"{layout}, this is 0x{DIGEST:08X}"
+            why = f"has layout 0x{digest:08X} of version {VERSION}, this is 0x{DIGEST:08X}"
         self._refuse(LinkCause.VERSION, why, now_ns)
         return False
 
@@ -258,30 +249,29 @@ class Conversation:
             return
         sent_ns = self._pings.pop(hello.nonce, None)
         if sent_ns is None:
-            return  # an answer that came twice or too late says nothing about time
+            return  # an answer that came twice or too late
         if self._sweeps is None:
             self._greet(hello, arrival_ns)
         elif not self._sweeps.fits(hello):
             self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
-        elif not self._believes(hello.serials):
-            # Misread or exchanged: at STOP it reads them again.
+        elif not self._is_confirmed(hello.serials):
+            # Misread or exchanged: at STOP the bridge reads them again.
             self.lost(LinkCause.SERIALS, "the bridge names other sensors", arrival_ns)
         if self._sweeps is not None:
             self._take(hello)
-            self._sweeps.round_trip(hello, sent_ns, arrival_ns)
+            self._sweeps.clock.round_trip(hello.tick, sent_ns, arrival_ns)
 
-    def _believes(self, told: tuple[str, ...]) -> bool:
-        """Whether a HELLO tells the sensors that are known, or the same as the one before it."""
-        before = self._believed if len(self._believed) == len(told) else ("",) * len(told)
-        together = tuple(now or known for now, known in zip(told, before, strict=True))
-        if together != before and told != self._doubted:
-            self._doubted = told
+    def _is_confirmed(self, serials: tuple[str, ...]) -> bool:
+        """Return True if these are confirmed serial numbers, or those of the HELLO before."""
+        before = self._confirmed if len(self._confirmed) == len(serials) else ("",) * len(serials)
+        merged = tuple(new or old for new, old in zip(serials, before, strict=True))
+        if merged != before and serials != self._unconfirmed:
+            self._unconfirmed = serials
             return False
-        self._believed, self._doubted = together, None
+        self._confirmed, self._unconfirmed = merged, None
         return True
 
     def _on_reset(self, now_ns: int) -> None:
-        """The bridge says that it has just been reset."""
         if self._sweeps is not None:
             self._counters.restarts += 1
             self.lost(LinkCause.DISCONNECTED, "the bridge was reset", now_ns)
@@ -289,7 +279,7 @@ class Conversation:
             self._ping_due_ns = now_ns
 
     def _greet(self, hello: Hello, now_ns: int) -> None:
-        """Begin sweeping with a bridge that has just answered, if its sensors are believed."""
+        """Begin sweeping with a bridge that fits, once its serial numbers are confirmed."""
         needed = max(self._sensors) + 1
         if hello.sensors < needed:
             why = f"has {hello.sensors} sensors, the scene needs {needed}"
@@ -297,7 +287,7 @@ class Conversation:
         elif hello.period_ns > PERIOD_MAX_NS:
             why = f"sweeps once in {hello.period_ns / 1e9:g} s only"
             self._refuse(LinkCause.SETTINGS, why, now_ns)
-        elif not self._believes(hello.serials):
+        elif not self._is_confirmed(hello.serials):
             if self._pings_sent <= GREETING_TRIES:
                 self._ping_due_ns = now_ns
         else:
@@ -307,14 +297,15 @@ class Conversation:
             self._ping_due_ns = now_ns + PING_FIRST_NS
             self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
             self._silent_at_ns = now_ns + self._silence_ns
-            self._sweeps = SweepDecoder(hello, self._sensors, self._counters, self._next_seq)
+            self._sweeps = SweepDecoder(hello, self._sensors, self._counters)
 
     def _take(self, hello: Hello) -> None:
         self.hello = hello
-        self.period_ns = hello.period_ns
-        found = hello.serials
-        known = zip(self._fingers, self._sensors, strict=True)
-        self._serials = {finger: found[at] for finger, at in known if at < len(found) and found[at]}
+        serials = {
+            finger: hello.serials[sensor]
+            for finger, sensor in zip(self._fingers, self._sensors, strict=True)
+        }
+        self.serials = {finger: serial for finger, serial in serials.items() if serial}
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:
@@ -323,7 +314,6 @@ class Conversation:
         reading = self._sweeps.reading(sweep, arrival_ns, idle_ns)
         if reading is None:
             return None
-        self._next_seq = self._sweeps.next_seq
         self._silent_at_ns = arrival_ns + self._silence_ns
         if self.link.state is GREETING:
             about = _about(self._sweeps.hello).values()
@@ -332,7 +322,7 @@ class Conversation:
 
 
 def _about(hello: Hello) -> dict[str, Fact]:
-    """What a bridge says of itself."""
+    """Return what a bridge says of itself."""
     sensors = ", ".join(serial or "none" for serial in hello.serials)
     return {
         "board": Fact(hello.board or "unnamed"),
@@ -352,33 +342,33 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
 
 
 def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
-    """SPI errors by chip select, `-` for a chip select without a sensor, which always has some."""
+    """Return SPI errors by chip select, `-` for one without a sensor, which always has some."""
     errors = [
-        number if serial else None
-        for number, serial in zip(status.spi_errors, hello.serials, strict=False)
+        count if serial else None
+        for count, serial in zip(status.spi_errors, hello.serials, strict=False)
     ]
-    text = ", ".join("-" if number is None else str(number) for number in errors)
+    text = ", ".join("-" if count is None else str(count) for count in errors)
     return Fact(text, DeviceFault.SENSOR_WORDS if any(errors) else None)
 
 
 def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
-    """What is known of a bridge's clock and of how long its sweeps take."""
+    """Return what is known of a bridge's clock and of the duration of its sweeps."""
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
     trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
-    known = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}
+    facts = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}
     if clock.drift_ppm is not None:
-        known["clock drift"] = Fact(f"{clock.drift_ppm:+.1f} ppm")
+        facts["clock drift"] = Fact(f"{clock.drift_ppm:+.1f} ppm")
     elif clock.rate_limits_ppm is not None:
-        known["clock drift"] = Fact("{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm))
+        facts["clock drift"] = Fact("{:+.0f} to {:+.0f} ppm".format(*clock.rate_limits_ppm))
     if clock.round_trip_ns is not None:
-        known["round trip"] = Fact(f"{clock.round_trip_ns / 1e6:.2f} ms")
+        facts["round trip"] = Fact(f"{clock.round_trip_ns / 1e6:.2f} ms")
     if sweeps.longest_ticks:
         longest_ms, period_ms = 1e3 * sweeps.longest_ticks / tick_hz, sweeps.hello.period_ns / 1e6
         fits, fault = "at most, of", None
         if longest_ms >= period_ms:
             fits, fault = "is too long for", DeviceFault.SWEEP_TOO_LONG
-        known["sweep"] = Fact(f"{longest_ms:.2f} ms {fits} {period_ms:.2f} ms", fault)
-    return known
+        facts["sweep"] = Fact(f"{longest_ms:.2f} ms {fits} {period_ms:.2f} ms", fault)
+    return facts
 
 
 def _version(firmware: int) -> str:

@@ -16,26 +16,23 @@ from drivers.spi.sweeps import BridgeCounters
 BAUD = 921_600
 """Carries 92 kB/s, three times the longest sequence; 115200 is too slow for any."""
 POLL_NS = 2_000_000
-"""How often a port without a descriptor is read."""
+"""Time between reads of a port without a descriptor, ns."""
 
 
 class SpiBridgeDriver(Opened):
-    """Readings of the sensors behind one bridge; finds the bridge again whenever it was lost.
+    """Readings of the sensors behind one bridge; reconnects after every loss.
 
-    `fingers` are the rows of a reading. `sensors` are the fingers in the order of the chip selects,
-    the same unless given; a board may have more sensors than fingers are wanted. `t_ns` of a
-    reading is when the bridge finished the sweep, by `drivers.spi.clock`; `seq` goes on across
-    losses of the link. An electrode that the bridge's sequence leaves out, and every one of an
-    absent sensor, is `MISSING`.
+    `fingers` and `sensors`: see `Conversation`; a board may have more sensors. `t_ns` of a reading
+    is when the bridge finished the sweep; `seq` continues across losses of the link. Electrodes
+    that the bridge does not sample, and those of an absent sensor, are `MISSING`.
 
     `baud` means nothing to a USB device. Ports without a descriptor (`rfc2217://`, `loop://`) are
     polled. The constructor raises `ValueError`. `open` raises `DriverError` for a port name that
-    can never work; a device that is not there, now or later, raises nothing: `describe` says so.
+    can never work. A missing device raises nothing: `describe` tells of it.
     """
 
     name = NAME
     exhausted = False
-    """False: a link may always come back."""
     live = True
 
     def __init__(
@@ -54,7 +51,6 @@ class SpiBridgeDriver(Opened):
         self._line = SerialLine(port, baud)
         self._idle_ns = self._poll_due_ns = 0
         self.conversation = self._begin()
-        """What is said with the bridge since `open`, and how its link stands."""
 
     def _begin(self) -> Conversation:
         nonce = self._clock() % NONCES
@@ -62,53 +58,48 @@ class SpiBridgeDriver(Opened):
 
     @property
     def link_state(self) -> LinkState:
-        """What the link is doing; readings come while it is `UP`."""
         return self.conversation.link.state
 
     @property
     def counters(self) -> BridgeCounters:
-        """Counters since `open`."""
         return self.conversation.counters
 
     @property
     def period_ns(self) -> int | None:
-        """Nominal time between sweeps by the last HELLO, ns; None before the first."""
         return self.conversation.period_ns
 
     @property
     def serials(self) -> dict[str, str]:
-        """By finger, from the last HELLO; without the sensors that did not answer."""
         return self.conversation.serials
 
     def describe(self) -> dict[str, Fact]:
-        """Port, link, and what the bridge last said of itself."""
         return self.conversation.describe()
 
     def open(self) -> None:
-        """Forget all and try the port at once. Raises `DriverError` if no try can ever succeed."""
+        """Forget everything and try the port once. Raises `DriverError` if no try can succeed."""
         self.close()
         self.conversation = self._begin()
         self.conversation.link.start(self._clock())
         self._connect()
 
-    def tap(self, taker: Callable[[LineEvent, bytes], None]) -> None:
-        """Hand all bytes that come and go from now on to `taker` too."""
-        self._line.tap = taker
+    def tap(self, sink: Callable[[LineEvent, bytes], None]) -> None:
+        """Pass all bytes that come and go from now on to `sink` too."""
+        self._line.tap = sink
 
     def close(self) -> None:
         """Stop the bridge and give the port back."""
         if self.link_state in (GREETING, UP):
-            with contextlib.suppress(LinkError):  # one that is gone has stopped in its own way
+            with contextlib.suppress(LinkError):  # a bridge that is gone needs no STOP
                 self._line.write(encode(Stop()))
         self._line.close()
         self.conversation.link.close()
 
     def fileno(self) -> int | None:
-        """Descriptor of the port, or None: no port, or one that must be polled."""
+        """Descriptor of the port, or None: it is closed or must be polled."""
         return self._line.descriptor
 
     def due_ns(self) -> int | None:
-        """When the next try, PING or deadline is due, or None while closed."""
+        """Time of the next try, PING, timeout or poll, ns, or None while closed."""
         link = self.conversation.link
         if link.state in (CLOSED, WAITING):
             return link.retry_ns
@@ -116,7 +107,7 @@ class SpiBridgeDriver(Opened):
         return due_ns if self._line.descriptor is not None else min(due_ns, self._poll_due_ns)
 
     def read_ready(self) -> Sequence[Reading]:
-        """Readings of the sweeps that have arrived. Never raises for anything a bridge does."""
+        """Return the readings of the sweeps that have arrived. No bridge makes it raise."""
         link = self.conversation.link
         if link.state is CLOSED:
             raise RuntimeError("the bridge is not open")
@@ -134,7 +125,7 @@ class SpiBridgeDriver(Opened):
         readings = self.conversation.receive(chunk, self._clock(), self._idle_ns)
         if self._line.drained:
             self._idle_ns = began_ns
-        self._say()
+        self._send()
         return readings
 
     def _connect(self) -> None:
@@ -145,10 +136,10 @@ class SpiBridgeDriver(Opened):
             return
         self._idle_ns = self._poll_due_ns = now_ns = self._clock()
         self.conversation.opened(now_ns)
-        self._say()
+        self._send()
 
-    def _say(self) -> None:
-        """Write what is due to be said; give the port back if the link is lost."""
+    def _send(self) -> None:
+        """Write the frames that are due; close the port if the link is lost."""
         try:
             for frame in self.conversation.say(self._clock()):
                 self.conversation.sent(frame, self._clock())

@@ -1,7 +1,8 @@
-"""A serial port that never blocks the loop: pyserial, with its many failures made one."""
+"""A serial port that never blocks the loop: pyserial, with all its failures as `LinkError`."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -16,15 +17,15 @@ import serial
 from drivers.base import DriverError, LinkCause, LinkError
 
 READ_BYTES = 4096
-"""A terminal hands over no more than this at once."""
+"""Most bytes that a terminal gives at once."""
 SHORT_BYTES = READ_BYTES // 2
-"""A terminal that hands over less has no more: while more waits behind it, it is kept full."""
+"""A terminal that gives less has no more: the kernel keeps it full while more waits."""
 READS_MAX = 32
-"""Reads in one go: more than a kernel buffers (64 KiB), so that a flood cannot hold the loop."""
+"""Reads in one call: more than a kernel buffers (64 KiB), so that a flood cannot hold the loop."""
 DRAIN_TRIES, DRAIN_TRY_S = 10, 0.002
-"""Patience with the last few bytes when a port is closed."""
+"""Waits for the last bytes to leave when a port is closed, s each."""
 WRITE_TIMEOUT_S = 0.05
-"""Longest wait for room that was there a moment ago."""
+"""Longest wait for room in the port's buffer, which `select` has just reported, s."""
 
 _log = logging.getLogger(__name__)
 
@@ -35,32 +36,30 @@ class LineEvent(IntEnum):
     RECEIVED = 1
     SENT = 2
     OPENED = 3
-    """The port was opened: what came before is over."""
 
 
 class SerialLine:
-    """One port by device name (better `/dev/serial/by-id/...`) or URL as pyserial has them.
+    """One port by device name (better `/dev/serial/by-id/...`) or URL of pyserial.
 
-    `LinkError` means that the device is not there or went away. Opening and closing a `socket://`
-    or `rfc2217://` port can take seconds: they are for trying things out.
+    `LinkError`: the device is missing or went away. Opening and closing a `socket://` or
+    `rfc2217://` port can take seconds: they are for trying things out.
     """
 
     def __init__(self, port: str, baud: int) -> None:
-        """`baud` means nothing to a USB CDC device."""
         self.port = port
         self.drained = True
-        """Whether the last `read` left nothing behind."""
+        """True if the last `read` left nothing behind."""
         self.tap: Callable[[LineEvent, bytes], None] | None = None
-        """Gets all bytes that are read, and those that are about to be written."""
-        self._baud = baud
+        """Called with all bytes that were read, and with those that are about to be written."""
         self.descriptor: int | None = None
-        """To wait on; None while closed, and for a kind of port that must be polled."""
+        """Descriptor to wait on; None while closed, and for a port that must be polled."""
+        self._baud = baud
         self._serial: serial.Serial | None = None
         self._terminal: int | None = None
-        """Its descriptor, where the port is a terminal, which is read without pyserial."""
+        """Descriptor of a terminal, which is read without pyserial."""
 
     def open(self) -> None:
-        """Take the port for this process alone. Raises `LinkError`, or `DriverError` for ever."""
+        """Take the port exclusively. Raises `LinkError`; `DriverError` if no retry can help."""
         self.close()
         try:
             self._serial = serial.serial_for_url(
@@ -74,14 +73,18 @@ class SerialLine:
             raise LinkError.from_errno(error, f"{self.port}: {_reason(error)}") from error
         except ValueError as error:
             raise DriverError(f"{self.port}: {error}") from error
-        self.descriptor = self._find_descriptor()
+        with contextlib.suppress(OSError, AttributeError):
+            self.descriptor = self._serial.fileno()
         self._terminal = self.descriptor if type(self._serial) is serial.Serial else None
-        self._lower_latency()
+        try:  # an FTDI adapter then passes bytes on every 1 ms, not 16
+            self._serial.set_low_latency_mode(True)
+        except (OSError, ValueError, AttributeError) as error:
+            _log.debug("%s: no low latency mode: %s", self.port, error)
         if self.tap is not None:
             self.tap(LineEvent.OPENED, b"")
 
     def close(self) -> None:
-        """Give the port back. May be called more than once; a device that is gone is no error."""
+        """Release the port. May be called twice, and when the device is gone."""
         port, self._serial, self.descriptor = self._serial, None, None
         if port is None:
             return
@@ -106,14 +109,14 @@ class SerialLine:
             held.close()
 
     def read(self) -> bytes:
-        """All bytes that are there, possibly none. Raises `LinkError`."""
+        """Return all bytes that have arrived. Raises `LinkError`."""
         port, data = self._opened(), b""
         self.drained = False
         try:
             for _ in range(READS_MAX):
                 chunk = b"" if self._terminal is None else os.read(self._terminal, READ_BYTES)
                 self.drained = 0 < len(chunk) < SHORT_BYTES
-                if not chunk:  # of a terminal pyserial tells whether it is still there
+                if not chunk:  # pyserial also notices a terminal that went away
                     chunk = port.read(READ_BYTES)
                     self.drained = not chunk
                 data += chunk
@@ -122,14 +125,14 @@ class SerialLine:
         except BlockingIOError:
             self.drained = True
         except (OSError, termios.error) as error:
-            if not data:  # else the next call says so, after these bytes
+            if not data:  # else the next call raises, after these bytes
                 raise self._loss(error) from error
         if self.tap is not None and data:
             self.tap(LineEvent.RECEIVED, data)
         return data
 
     def write(self, data: bytes) -> bool:
-        """Write a few bytes if there is room; False if not. Raises `LinkError`."""
+        """Write a frame and return True, or return False if there is no room."""
         port = self._opened()
         try:
             if self.descriptor is not None and not select.select([], [self.descriptor], [], 0)[1]:
@@ -152,25 +155,12 @@ class SerialLine:
             raise RuntimeError(f"{self.port} is not open")
         return self._serial
 
-    def _find_descriptor(self) -> int | None:
-        try:
-            return self._opened().fileno()
-        except (OSError, AttributeError):
-            return None
-
-    def _lower_latency(self) -> None:
-        """An FTDI adapter then hands over bytes every 1 ms, not 16; others do not know the call."""
-        try:
-            self._opened().set_low_latency_mode(True)
-        except (OSError, ValueError, AttributeError) as error:
-            _log.debug("%s: no low latency mode: %s", self.port, error)
-
 
 def _reason(error: Exception) -> str:
-    """One short line; pyserial's own say the port's name twice, or several things at once."""
-    number = getattr(error, "errno", None)
-    if number in (errno.EAGAIN, errno.EBUSY):
+    """Return one short line; pyserial's own repeat the port's name."""
+    code = getattr(error, "errno", None)
+    if code in (errno.EAGAIN, errno.EBUSY):
         return "another program has it open"
-    if number is not None:
-        return os.strerror(number).lower()
+    if code is not None:
+        return os.strerror(code).lower()
     return str(error).partition("\n")[0]

@@ -1,7 +1,10 @@
-"""Messages of the bridge between BioTac SPs and a serial line, version 1.
+"""Frames and messages between the host and a bridge of BioTac SPs, version 1. Bytes only.
 
-Both directions, as `deploy/bridge/PROTOCOL.md` lays down: encoding validates and raises
-`ValueError`, decoding gives None for what makes no sense.
+`deploy/bridge/PROTOCOL.md` defines both. A frame is `COBS(type: u8 | payload | crc: u32) 0x00`.
+Encoding raises `ValueError`, decoding returns None, for a message that the protocol forbids.
+
+Each message has `to_bytes` for its payload, `from_bytes`, which returns None for a wrong length,
+and `is_sound`, which returns True if the protocol allows its values.
 """
 
 from __future__ import annotations
@@ -13,11 +16,16 @@ from typing import ClassVar, Final, Self
 
 import msgspec
 import numpy as np
+from cobs import cobs
 from numpy.typing import NDArray
 
 from drivers.biotac import FORBIDDEN_COMMAND
-from drivers.spi.framing import FrameParser, encode_frame
 
+DELIMITER: Final = b"\0"
+"""Ends a frame and occurs nowhere else, so that the next frame is found after any damage."""
+ENCODED_MAX_BYTES = 1024
+"""Longest encoded frame without its delimiter, and so the most that a parser holds back. The
+largest of version 1, a SWEEP of 64 slots and 5 sensors, takes 671."""
 VERSION = 1
 FIRMWARE = 0x0002
 """Firmware in `deploy/bridge` of this graspd, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
@@ -43,29 +51,102 @@ SLOTS_MAX = 64
 TEXT_BYTES = 16
 """Length of a board's name and of a sensor's serial number (manual table 10)."""
 TICK_HZ_MIN = 1_000
-"""A clock that is slower cannot tell sweeps apart."""
+"""A slower clock cannot tell sweeps apart."""
 
-_U8, _U16, _U32, _U64 = (1 << 8) - 1, (1 << 16) - 1, (1 << 32) - 1, (1 << 64) - 1
-_HEAD = struct.Struct("<BII")
+UNSEEDED: Final = (0x01, 0x81)
+"""HELLO and PING, which peers with different layouts must still be able to exchange."""
+_CRC_RESIDUE: Final = 0x2144DF1C
+"""CRC-32 of any bytes with their own checksum behind them, whatever it was continued from."""
+_U32 = struct.Struct("<I")
+_LAYOUT = struct.Struct("<BI")
 _HELLO = struct.Struct(f"<BIIQIH{TEXT_BYTES}sIBB")
 _SWEEP = struct.Struct("<IQQBBB")
 _STATUS = struct.Struct("<QIIIIB")
-_PING = struct.Struct("<I")
 _WORD = np.dtype(">u2")
 
 
-@dataclass(frozen=True, slots=True)
-class HelloHead:
-    """The part of HELLO that keeps its place in every version."""
+@dataclass(slots=True)
+class FrameCounters:
+    """What a parser has received since it was made. Every drop is one count."""
 
-    version: int
-    digest: int
-    nonce: int
+    bytes: int = 0
+    frames: int = 0
+    """Whole frames with the right checksum."""
+    bad_cobs: int = 0
+    """Frames that are no COBS."""
+    bad_crc: int = 0
+    """Frames with a wrong checksum, or without room for one."""
+    too_long: int = 0
+    """Frames longer than `ENCODED_MAX_BYTES`."""
 
-    @classmethod
-    def from_bytes(cls, payload: bytes) -> HelloHead | None:
-        """Head of any version's HELLO, or None if it is too short."""
-        return cls(*_HEAD.unpack_from(payload)) if len(payload) >= _HEAD.size else None
+
+def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
+    """Return a frame with its delimiter; `digest` begins its checksum unless it is `UNSEEDED`.
+
+    Raises `ValueError` for a type that is no byte and a frame longer than `ENCODED_MAX_BYTES`.
+    """
+    body = bytes([kind]) + payload
+    seed = 0 if kind in UNSEEDED else digest
+    encoded: bytes = cobs.encode(body + _U32.pack(zlib.crc32(body, seed)))
+    if len(encoded) > ENCODED_MAX_BYTES:
+        raise ValueError(f"the frame takes {len(encoded)} bytes, more than {ENCODED_MAX_BYTES}")
+    return encoded + DELIMITER
+
+
+class FrameParser:
+    """Bytes in, whole frames out. Never raises; damaged frames are counted and dropped."""
+
+    def __init__(self, digest: int = 0) -> None:
+        """`digest`: see `encode_frame`."""
+        self.counters = FrameCounters()
+        self._digest = digest
+        self.reset()
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of an unfinished frame that are held back, at most `ENCODED_MAX_BYTES`."""
+        return len(self._held)
+
+    def reset(self) -> None:
+        """Forget an unfinished frame. Call when the line was opened again."""
+        self._held = b""
+        self._is_overlong = False
+
+    def feed(self, chunk: bytes) -> list[tuple[int, bytes]]:
+        """Return type and payload of the frames that these bytes complete, oldest first."""
+        self.counters.bytes += len(chunk)
+        *ended, rest = chunk.split(DELIMITER)
+        frames = []
+        for piece in ended:
+            self._hold(piece)
+            frame = self._decode(self._held) if self._held else None
+            if frame is not None:
+                frames.append(frame)
+            self.reset()
+        self._hold(rest)
+        return frames
+
+    def _hold(self, piece: bytes) -> None:
+        if self._is_overlong:
+            return
+        self._held += piece
+        if len(self._held) > ENCODED_MAX_BYTES:
+            self.counters.too_long += 1
+            self._held = b""
+            self._is_overlong = True
+
+    def _decode(self, encoded: bytes) -> tuple[int, bytes] | None:
+        try:
+            decoded: bytes = cobs.decode(encoded)
+        except cobs.DecodeError:
+            self.counters.bad_cobs += 1
+            return None
+        seed = 0 if decoded and decoded[0] in UNSEEDED else self._digest
+        if len(decoded) <= _U32.size or zlib.crc32(decoded, seed) != _CRC_RESIDUE:
+            self.counters.bad_crc += 1
+            return None
+        self.counters.frames += 1
+        return decoded[0], decoded[1 : -_U32.size]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +156,7 @@ class Hello:
     TYPE: ClassVar[int] = 0x01
 
     nonce: int
-    """Of the PING that it answers, 0 after a reset."""
+    """That of the PING that it answers, 0 after a reset."""
     tick: int
     """The bridge's clock when it took the PING in."""
     tick_hz: int
@@ -93,12 +174,10 @@ class Hello:
 
     @property
     def sensors(self) -> int:
-        """Sensors on the bridge, 1..5."""
         return len(self.serials)
 
     @property
     def slots(self) -> int:
-        """Samples of each sensor per sweep, 1..64."""
         return len(self.commands)
 
     @property
@@ -106,19 +185,16 @@ class Hello:
         """Nominal time from one sweep to the next, ns."""
         return self.period_ticks * 1_000_000_000 // self.tick_hz
 
+    def is_sound(self) -> bool:
+        return (
+            self.tick_hz >= TICK_HZ_MIN
+            and self.period_ticks > 0
+            and 1 <= self.sensors <= SENSORS_MAX
+            and 1 <= self.slots <= SLOTS_MAX
+            and FORBIDDEN_COMMAND not in self.commands
+        )
+
     def to_bytes(self) -> bytes:
-        """The payload. Raises `ValueError`."""
-        _check_range("version", self.version, 0, _U8)
-        _check_range("digest", self.digest, 0, _U32)
-        _check_range("nonce", self.nonce, 0, _U32)
-        _check_range("tick", self.tick, 0, _U64)
-        _check_range("tick_hz", self.tick_hz, TICK_HZ_MIN, _U32)
-        _check_range("firmware", self.firmware, 0, _U16)
-        _check_range("period_ticks", self.period_ticks, 1, _U32)
-        _check_range("sensors", self.sensors, 1, SENSORS_MAX)
-        _check_range("slots", self.slots, 1, SLOTS_MAX)
-        if FORBIDDEN_COMMAND in self.commands:
-            raise ValueError(f"command 0x{FORBIDDEN_COMMAND:02X} must never be sent to a sensor")
         head = _HELLO.pack(
             self.version,
             self.digest,
@@ -136,24 +212,13 @@ class Hello:
 
     @classmethod
     def from_bytes(cls, payload: bytes) -> Hello | None:
-        """The message, or None if this is no HELLO of version 1."""
         if len(payload) < _HELLO.size:
             return None
         version, digest, nonce, tick, tick_hz, firmware, board, period_ticks, sensors, slots = (
             _HELLO.unpack_from(payload)
         )
         serials_end = _HELLO.size + sensors * TEXT_BYTES
-        commands = payload[serials_end:]
-        sound = (
-            version == VERSION
-            and tick_hz >= TICK_HZ_MIN
-            and period_ticks > 0
-            and 1 <= sensors <= SENSORS_MAX
-            and 1 <= slots <= SLOTS_MAX
-            and len(payload) == serials_end + slots
-            and FORBIDDEN_COMMAND not in commands
-        )
-        if not sound:
+        if version != VERSION or len(payload) != serials_end + slots:
             return None
         starts = range(_HELLO.size, serials_end, TEXT_BYTES)
         return cls(
@@ -162,7 +227,7 @@ class Hello:
             tick_hz=tick_hz,
             period_ticks=period_ticks,
             serials=tuple(_text(payload[start : start + TEXT_BYTES]) for start in starts),
-            commands=tuple(commands),
+            commands=tuple(payload[serials_end:]),
             firmware=firmware,
             board=_text(board),
             digest=digest,
@@ -185,34 +250,26 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
     """Shape (slots, sensors), 16-bit response words of either byte order, not yet judged (manual
     figure 15)."""
 
-    def to_bytes(self) -> bytes:
-        """The payload. Raises `ValueError`."""
-        if self.words.ndim != 2 or self.words.dtype not in (np.uint16, _WORD):
-            raise ValueError(f"words are {self.words.dtype} of shape {self.words.shape}")
+    def is_sound(self) -> bool:
         slots, sensors = self.words.shape
-        _check_range("seq", self.seq, 0, _U32)
-        _check_range("tick_start", self.tick_start, 0, self.tick_end)
-        _check_range("tick_end", self.tick_end, 0, _U64)
-        _check_range("sensors", sensors, 1, SENSORS_MAX)
-        _check_range("slots", slots, 1, SLOTS_MAX)
-        _check_range("present", self.present, 0, (1 << sensors) - 1)
+        return (
+            1 <= sensors <= SENSORS_MAX
+            and 1 <= slots <= SLOTS_MAX
+            and self.tick_start <= self.tick_end
+            and self.present < 1 << sensors
+        )
+
+    def to_bytes(self) -> bytes:
+        slots, sensors = self.words.shape
         head = _SWEEP.pack(self.seq, self.tick_start, self.tick_end, self.present, sensors, slots)
-        return head + self.words.astype(_WORD).tobytes()
+        return head + self.words.astype(_WORD, casting="equiv").tobytes()
 
     @classmethod
     def from_bytes(cls, payload: bytes) -> Sweep | None:
-        """The message, or None if this is no SWEEP."""
         if len(payload) < _SWEEP.size:
             return None
         seq, tick_start, tick_end, present, sensors, slots = _SWEEP.unpack_from(payload)
-        sound = (
-            1 <= sensors <= SENSORS_MAX
-            and 1 <= slots <= SLOTS_MAX
-            and len(payload) == _SWEEP.size + slots * sensors * 2
-            and tick_start <= tick_end
-            and present < 1 << sensors
-        )
-        if not sound:
+        if len(payload) != _SWEEP.size + slots * sensors * 2:
             return None
         words = np.ndarray((slots, sensors), _WORD, payload, _SWEEP.size)
         return cls(seq, tick_start, tick_end, present, words)
@@ -236,59 +293,38 @@ class BridgeStatus:
     spi_errors: tuple[int, ...]
     """Words per sensor whose parity was bad, error words among them."""
 
+    def is_sound(self) -> bool:
+        return 1 <= len(self.spi_errors) <= SENSORS_MAX
+
     def to_bytes(self) -> bytes:
-        """The payload. Raises `ValueError`."""
-        sensors = len(self.spi_errors)
-        _check_range("sensors", sensors, 1, SENSORS_MAX)
-        _check_range("tick", self.tick, 0, _U64)
         counts = (self.sweeps, self.overruns, self.tx_dropped, self.rx_errors)
-        for count in (*counts, *self.spi_errors):
-            _check_range("a count", count, 0, _U32)
+        sensors = len(self.spi_errors)
         head = _STATUS.pack(self.tick, *counts, sensors)
         return head + struct.pack(f"<{sensors}I", *self.spi_errors)
 
     @classmethod
     def from_bytes(cls, payload: bytes) -> BridgeStatus | None:
-        """The message, or None if this is no STATUS."""
         if len(payload) < _STATUS.size:
             return None
         tick, sweeps, overruns, tx_dropped, rx_errors, sensors = _STATUS.unpack_from(payload)
-        if not 1 <= sensors <= SENSORS_MAX or len(payload) != _STATUS.size + 4 * sensors:
+        if len(payload) != _STATUS.size + 4 * sensors:
             return None
         spi_errors = struct.unpack_from(f"<{sensors}I", payload, _STATUS.size)
         return cls(tick, sweeps, overruns, tx_dropped, rx_errors, spi_errors)
 
 
-@dataclass(frozen=True, slots=True)
-class Ping:
-    """Asks for a HELLO with the same nonce."""
-
-    TYPE: ClassVar[int] = 0x81
-
-    nonce: int
-
-    def to_bytes(self) -> bytes:
-        """The payload. Raises `ValueError`."""
-        _check_range("nonce", self.nonce, 0, _U32)
-        return _PING.pack(self.nonce)
-
-    @classmethod
-    def from_bytes(cls, payload: bytes) -> Ping | None:
-        """The message, or None if this is no PING."""
-        return cls(*_PING.unpack(payload)) if len(payload) == _PING.size else None
-
-
 @dataclass(frozen=True)
 class _Bare:
-    """A message that is all said by its type."""
+    """A message without payload."""
+
+    def is_sound(self) -> bool:
+        return True
 
     def to_bytes(self) -> bytes:
-        """The payload: nothing."""
         return b""
 
     @classmethod
     def from_bytes(cls, payload: bytes) -> Self | None:
-        """The message, or None if there is a payload."""
         return None if payload else cls()
 
 
@@ -299,50 +335,65 @@ class Start(_Bare):
 
 
 class Stop(_Bare):
-    """Ends sweeping after the sweep at hand."""
+    """Ends sweeping after the current sweep."""
 
     TYPE: ClassVar[int] = 0x83
 
 
+@dataclass(frozen=True)
+class Ping(_Bare):
+    """Asks for a HELLO with the same nonce."""
+
+    TYPE: ClassVar[int] = 0x81
+
+    nonce: int
+
+    def to_bytes(self) -> bytes:
+        return _U32.pack(self.nonce)
+
+    @classmethod
+    def from_bytes(cls, payload: bytes) -> Self | None:
+        return cls(*_U32.unpack(payload)) if len(payload) == _U32.size else None
+
+
 Message = Hello | Sweep | BridgeStatus | Ping | Start | Stop
 
-UNSEEDED: Final = frozenset({Hello.TYPE, Ping.TYPE})
-"""Frames that peers with different layouts must still be able to exchange."""
 _MESSAGES: dict[int, type[Message]] = {
     message.TYPE: message for message in (Hello, Sweep, BridgeStatus, Ping, Start, Stop)
 }
 
 
 def encode(message: Message, digest: int = DIGEST) -> bytes:
-    """The whole frame of a message as it goes on the wire. Raises `ValueError`."""
-    seed = 0 if message.TYPE in UNSEEDED else digest
-    return encode_frame(message.TYPE, message.to_bytes(), seed)
+    """Return the frame of a message. Raises `ValueError`."""
+    if not message.is_sound():
+        raise ValueError(f"{message} is forbidden by the protocol")
+    try:
+        payload = message.to_bytes()
+    except struct.error as error:
+        raise ValueError(f"{message}: {error}") from error
+    return encode_frame(message.TYPE, payload, digest)
 
 
 def decode(kind: int, payload: bytes) -> Message | None:
-    """The message of a frame, or None if it is none of version 1 or makes no sense."""
-    message = _MESSAGES.get(kind)
-    return None if message is None else message.from_bytes(payload)
+    """Return the message of a frame, or None if the protocol forbids it."""
+    message_type = _MESSAGES.get(kind)
+    message = None if message_type is None else message_type.from_bytes(payload)
+    return message if message is not None and message.is_sound() else None
 
 
-def frame_parser() -> FrameParser:
-    """A parser for frames of either direction."""
-    return FrameParser(DIGEST, UNSEEDED)
-
-
-def _check_range(name: str, value: int, low: int, high: int) -> None:
-    if not low <= value <= high:
-        raise ValueError(f"{name} is {value}, must be in {low}..{high}")
+def layout_of(payload: bytes) -> tuple[int, int] | None:
+    """Return version and digest of any version's HELLO, or None if it is too short."""
+    return _LAYOUT.unpack_from(payload) if len(payload) >= _LAYOUT.size else None
 
 
 def _text_to_bytes(text: str) -> bytes:
-    """NUL-padded ASCII of 16 bytes."""
+    """Return ASCII padded with NUL to 16 bytes."""
     if not text.isascii() or "\0" in text or len(text) > TEXT_BYTES:
         raise ValueError(f"{text!r} is not at most {TEXT_BYTES} ASCII characters")
     return text.encode("ascii").ljust(TEXT_BYTES, b"\0")
 
 
 def _text(padded: bytes) -> str:
-    """A sensor that answers nonsense must not take the link down: odd bytes become `?`."""
+    """Return the text with odd bytes as `?`: a sensor's nonsense must not take the link down."""
     text = padded.partition(b"\0")[0].decode("ascii", errors="replace")
     return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text)

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from drivers.base import Opened
 from drivers.biotac import E1, E24, SEQUENCE_ELECTRODES, encode_word, sample_command
-from drivers.spi.framing import DELIMITER
 from drivers.spi.messages import (
+    DELIMITER,
     DIGEST,
     FIRMWARE,
     TEXT_BYTES,
     VERSION,
     BridgeStatus,
+    FrameParser,
     Hello,
     Message,
     Ping,
@@ -32,7 +33,6 @@ from drivers.spi.messages import (
     Sweep,
     decode,
     encode,
-    frame_parser,
 )
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import Counts
@@ -117,7 +117,7 @@ class SpiTwin(Opened):
         self._ticks_per_ns = TICK_HZ / 1e9 * (1.0 + drift_ppm * 1e-6)
         self._clock = clock
         self._tap = tap
-        self._parser = frame_parser()
+        self._parser = FrameParser(DIGEST)
         self._master: int | None = None
         self._slave: int | None = None
         self._replug_ns: int | None = None

@@ -1,41 +1,66 @@
-"""Base of drivers that take datagrams from one sender: heard, silent, or broken and reopened."""
+"""Base of drivers that take the datagrams of one sender over UDP."""
 
 from __future__ import annotations
 
 import ipaddress
 import time
-from collections.abc import Callable, Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
-from drivers.base import DriverCounters, Fact, LinkCause, LinkError, Opened
+from drivers.base import DriverCounters, Fact, LinkCause, LinkError, Opened, Reading
 from drivers.link import Link, LinkState
 from drivers.udp.receiver import DatagramReceiver, Endpoint, Sender
 
 DRAIN_MAX = 256
-"""Datagrams taken at once at most: a flood must not keep the loop from its other work."""
+"""Most datagrams taken in one call: a flood must not keep the loop from its other work."""
 
 
 @dataclass(slots=True)
 class DatagramCounters(DriverCounters):
-    """What the link counts, in the counters of its driver."""
+    """Counters of the link, among those of its driver."""
 
     foreign_datagrams: int = 0
-    """Datagrams from another sender than the one that is listened to; dropped."""
+    """Datagrams from another sender than the current one; dropped."""
     kernel_drops: int = 0
     """Datagrams that the kernel dropped because they were not taken in time."""
     link_losses: int = 0
     """Times that the link was up and fell silent or broke."""
 
 
-class DatagramDriver(Opened):
-    """Takes the datagrams of one sender, each with its time of arrival.
+class DatagramStream(Protocol):
+    """Datagrams of one sender in, readings out. No I/O."""
 
-    The first sender of a good datagram is the sender until the link is lost: two hands on one port
-    would otherwise be mixed, as nothing else tells them apart. Its address and its port do: two
-    relays may run on one computer. With `only_from` no other address is ever heard.
+    @property
+    def counters(self) -> DatagramCounters:
+        """Counters since it was made."""
 
-    A subclass calls `listen` to open. To read it takes `datagrams`, calls `confirm` for each good
-    one before the next, and `fell_silent` after the last.
+    @property
+    def sender_kind(self) -> str:
+        """Kind of the sender, for people, such as `palm 0220`."""
+
+    def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
+        """Return the readings that a datagram completes, or None if it is dropped.
+
+        `t_ns`: monotonic time of its arrival.
+        """
+
+    def interrupt(self) -> None:
+        """The link broke: another sender may come next."""
+
+
+Stream = TypeVar("Stream", bound=DatagramStream)
+
+
+class DatagramDriver(Opened, Generic[Stream]):
+    """Passes the datagrams of one sender to a stream.
+
+    The sender of the first good datagram is the only one until the link is lost: two hands on one
+    port look like one. It is known by address and port, as one computer may run two relays.
+
+    The constructor raises `ValueError` for an argument out of range. `open` raises `LinkError` if
+    it cannot listen, which at the start means that the scene is wrong. `read_ready` raises nothing.
     """
 
     name: str
@@ -53,77 +78,85 @@ class DatagramDriver(Opened):
         only_from: str | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`source` is `udp://ADDRESS:PORT`, `only_from` an IP address; `clock` gives monotonic ns.
-
-        Raises `ValueError`.
-        """
+        """`source`: `udp://ADDRESS:PORT` to listen on. `only_from`: the only IP address to hear."""
         self._endpoint = Endpoint.parse(source)
         self._only_from = None if only_from is None else str(ipaddress.ip_address(only_from))
         self._clock = clock
         self._receiver: DatagramReceiver | None = None
-        self._begin(DatagramCounters())
+        self._reset()
 
-    def _begin(self, counters: DatagramCounters) -> None:
-        self._counters = counters
+    @abstractmethod
+    def _new_stream(self) -> Stream:
+        """Return the stream of one opening."""
+
+    def _reset(self) -> None:
+        self.stream = self._new_stream()
         self._link = Link(self.name)
         self._earlier_drops = 0
         self._sender: Sender | None = None
         self.sender: str | None = None
-        """Who was heard last, `udp://ADDRESS:PORT`; None before the first good datagram."""
+        """Last sender, `udp://ADDRESS:PORT`; None before the first good datagram."""
         self._t_ns = 0
         self._heard_from: str | None = None
-        """What was heard last, from whom."""
+        self._pauses = False
 
     @property
     def link_state(self) -> LinkState:
-        """What the link is doing: `GREETING` while listening and nothing good comes."""
+        """`GREETING` while it listens and no good datagram comes."""
         return self._link.state
 
     @property
     def port(self) -> int | None:
-        """The port that is listened on, or None."""
         return None if self._receiver is None else self._receiver.port
 
     @property
     def serials(self) -> dict[str, str]:
-        """Empty, unless a subclass knows of sensors."""
         return {}
 
     def describe(self) -> dict[str, Fact]:
-        """Address, state, what is heard, and why nothing is."""
-        known = {"source": Fact(str(self._endpoint)), **self._link.describe()}
+        facts = {"source": Fact(str(self._endpoint)), **self._link.describe()}
         if self._heard_from is not None:
-            known["heard"] = Fact(self._heard_from)
-        return known
+            facts["heard"] = Fact(self._heard_from)
+        return facts
 
-    def listen(self, counters: DatagramCounters) -> None:
-        """Begin to listen, while closed; `counters` count what comes.
-
-        Raises `LinkError` if it cannot: at the start that means that the scene is wrong.
-        """
-        self._begin(counters)
+    def open(self) -> None:
+        self.close()
+        self._reset()
         receiver = DatagramReceiver(self._endpoint, self.bytes_max)
         self._link.start(self._clock())
         self._use(receiver)
 
     def close(self) -> None:
-        """Stop listening."""
         self._drop_receiver()
         self._sender = None
         self._link.close()
 
     def fileno(self) -> int | None:
-        """Readable when a datagram waits."""
         return None if self._receiver is None else self._receiver.fileno()
 
     def due_ns(self) -> int | None:
-        """When to read without a datagram: to open again, or to notice silence."""
+        """Time to reopen the socket or to notice silence, ns."""
         if self._link.state is LinkState.UP:
             return self._good_t_ns + self.silence_ns
         return self._link.retry_ns
 
-    def datagrams(self) -> Iterator[tuple[bytes, int]]:
-        """Datagrams that wait, oldest first, each with its monotonic time of arrival, ns."""
+    def read_ready(self) -> Sequence[Reading]:
+        if self._pauses:  # between the readings of two senders: see `Driver.serials`
+            self._pauses = False
+            return ()
+        readings: list[Reading] = []
+        for data, t_ns in self._datagrams():
+            completed = self.stream.receive(data, t_ns)
+            if completed is not None:
+                self._confirm()
+                readings.extend(completed)
+        if self._fell_silent():
+            self.stream.interrupt()
+            self._pauses = bool(readings)
+        return readings
+
+    def _datagrams(self) -> Iterator[tuple[bytes, int]]:
+        """Yield the datagrams that wait, oldest first, each with its time of arrival, ns."""
         if self._link.state is LinkState.CLOSED:
             raise RuntimeError(f"the {self.name} link is not open")
         receiver = self._receiver or self._listen_again()
@@ -132,7 +165,7 @@ class DatagramDriver(Opened):
         try:
             for data, age_ns, sender in receiver.receive(DRAIN_MAX):
                 if not self._is_heard(sender):
-                    self._counters.foreign_datagrams += 1
+                    self.stream.counters.foreign_datagrams += 1
                     continue
                 self._heard = sender
                 self._t_ns = max(self._t_ns, self._clock() - age_ns)
@@ -141,19 +174,21 @@ class DatagramDriver(Opened):
             self._lose(error)
             self._drop_receiver()
         else:
-            self._counters.kernel_drops = self._earlier_drops + receiver.dropped
+            self.stream.counters.kernel_drops = self._earlier_drops + receiver.dropped
 
-    def confirm(self, what: str) -> None:
-        """The last datagram is good: `what` sent it, for the log."""
+    def _confirm(self) -> None:
+        """Note that the last datagram was good."""
         self._good_t_ns = self._t_ns
         if self._link.state is not LinkState.UP:
             self._sender = self._heard
             self.sender = str(Endpoint(*self._heard))
-            self._heard_from = f"{what} from {self._heard[0]} port {self._heard[1]}"
+            self._heard_from = (
+                f"{self.stream.sender_kind} from {self._heard[0]} port {self._heard[1]}"
+            )
             self._link.up(self._heard_from, self._clock())
 
-    def fell_silent(self) -> bool:
-        """True if the link is down now and was up the last time."""
+    def _fell_silent(self) -> bool:
+        """Return True if the link is down now and was up at the last call."""
         is_up = self._link.state is LinkState.UP
         if is_up and self._clock() - self._good_t_ns >= self.silence_ns:
             silence = f"nothing good for {self.silence_ns / 1e6:.0f} ms"
@@ -172,7 +207,7 @@ class DatagramDriver(Opened):
 
     def _lose(self, error: LinkError) -> None:
         self._link.failed(error.cause, str(error), self._clock())
-        self._counters.link_losses = self._link.losses
+        self.stream.counters.link_losses = self._link.losses
 
     def _use(self, receiver: DatagramReceiver) -> DatagramReceiver:
         self._receiver = receiver

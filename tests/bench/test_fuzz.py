@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.spi.framing import DELIMITER, FrameParser, encode_frame
+from drivers.spi.messages import DELIMITER, FrameParser, encode_frame
 from tests.bench.fuzz import FRAMES, TARGETS, FuzzError, Target, fuzz, load, main
 
 
@@ -38,7 +38,7 @@ class Faulty(FrameParser):
             if self._fault == "invents":
                 return [*frames, (1, b"invented")]
             if self._fault == "loses":
-                self._overlong = True
+                self._is_overlong = True
         return frames
 
     @property

@@ -35,8 +35,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
-from drivers.spi.framing import DELIMITER
-from drivers.spi.messages import Start, encode
+from drivers.spi.messages import DELIMITER, Start, encode
 from models import zoo
 from models.runtime import TactileModel
 from tests.bench.hands import (

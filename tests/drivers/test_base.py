@@ -19,7 +19,7 @@ from drivers.can.readings import CanCounters
 from drivers.joints.message import JointCounters
 from drivers.palm.packet import PalmCounters
 from drivers.recordings.faults import ReplayCounters
-from drivers.spi.framing import FrameCounters
+from drivers.spi.messages import FrameCounters
 from drivers.spi.sweeps import BridgeCounters
 from drivers.udp.driver import DatagramCounters
 

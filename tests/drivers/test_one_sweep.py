@@ -7,20 +7,21 @@ What boards must number and how long links may hold frames back, so that this ho
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.base import JointReading
+from drivers.base import Reading
 from drivers.biotac import SEQUENCES
 from drivers.can.decoders import CanDecoder, make_decoder
 from drivers.can.formats import CanFormat, SweepFrame, encode_sample
 from drivers.can.frames import FD, CanFrame
 from drivers.can.readings import CanCounters
-from drivers.joints.message import JointCounters, JointMessage, JointParser, MessageOrder
+from drivers.joints.message import JointMessage, JointStream
 from drivers.palm.stream import PalmStream
 from drivers.recordings.can_log import CanLog, frame_of, line_of
 from drivers.recordings.serial_log import SerialLog, SerialLogParser, encode_records
@@ -42,7 +43,7 @@ from tests.drivers.spi.bridge_bench import hello
 
 FINGERS = ("ff", "mf", "th")
 MS = 1_000_000
-PERIOD_NS = 10 * MS
+FRAME_NS = 10 * MS // 3
 BASE_ID = 0x100
 SILENT_NS = 110 * MS
 """How long a board says nothing after a reset, as deploy/can/PROTOCOL.md asks."""
@@ -53,17 +54,6 @@ PACKETS = [
     for packet in PalmTwin(counts_of(number_of(at)) for at in range(600)).packets()
 ]
 """More rounds than the longest plan has, and some for other starts."""
-
-
-@settings(max_examples=400)
-@given(plans(ROUND), st.integers(0, 20 * ROUND))
-def test_of_the_palm_a_round_of_fourteen_packets_is_a_sweep(plan: list[Step], first: int) -> None:
-    """A packet may be up to 3 ms late; a relay that was started again goes on in any round."""
-    stream = PalmStream(FINGERS)
-    for unit in arrivals(plan, silent=25):
-        at = first + unit.index + 37 * unit.boot
-        readings = stream.receive(PACKETS[at % len(PACKETS)], unit.at * MS)
-        expect_one_sweep(readings or ())
 
 
 @pytest.mark.parametrize("before", range(ROUND, 2 * ROUND))
@@ -86,26 +76,18 @@ def sweep_frame(unit: Unit, first: int) -> CanFrame:
     return CanFrame(BASE_ID + finger, frame.to_bytes(), FD)
 
 
-@settings(max_examples=400)
-@given(plans(3), st.sampled_from([0, (1 << 16) - 9]))
-def test_of_sweep_frames_number_and_tick_tell_the_sweep(plan: list[Step], first: int) -> None:
-    decoder, unit_ns = sweep_fd_decoder(), PERIOD_NS // 3
-    for unit in arrivals(plan, silent=SILENT_NS // unit_ns + 1, late_max=4):
-        expect_one_sweep(decoder.push(sweep_frame(unit, first), unit.at * unit_ns))
-
-
 @settings(max_examples=50)
 @given(st.integers(1, 3), st.integers(0, 2), st.integers(-2, 2))
 def test_a_counter_that_goes_round_while_frames_are_lost_is_told_by_time(
     came: int, row: int, off: int
 ) -> None:
     """All 65536 numbers are lost, so the next frame has the number of the sweep at hand."""
-    decoder, unit_ns, seen = sweep_fd_decoder(), PERIOD_NS // 3, 0
+    decoder, seen = sweep_fd_decoder(), 0
     before = [Unit(at, at, 0) for at in range(30 + came)]
     lost = 3 * (1 << 16) + 3 * off
     after = [Unit(at, at, 0) for at in range(lost + 30 + row, lost + 60)]
     for unit in (*before, *after):
-        seen += expect_one_sweep(decoder.push(sweep_frame(unit, 0), unit.at * unit_ns))
+        seen += expect_one_sweep(decoder.push(sweep_frame(unit, 0), unit.at * FRAME_NS))
     assert seen >= 17
 
 
@@ -140,14 +122,27 @@ def sample(unit: Unit, channels: Sequence[int]) -> CanFrame:
     return CanFrame(BASE_ID, encode_sample(channels[slot], words))
 
 
-@pytest.mark.parametrize("sequence", sorted(SEQUENCES))
-def test_of_samples_order_and_time_tell_the_sweep(sequence: str) -> None:
-    """For a board without a pause, of which two sweeps in a row have come."""
-    channels = SEQUENCES[sequence]
+Feed = Callable[[Unit], Sequence[Reading]]
 
-    @settings(max_examples=150)
-    @given(plans(len(channels), steady_sweeps=3))
-    def holds(plan: list[Step]) -> None:
+
+def palm(first: int) -> Feed:
+    """A relay that was started again goes on in any round."""
+    stream = PalmStream(FINGERS)
+
+    def feed(unit: Unit) -> Sequence[Reading]:
+        at = first + unit.index + 37 * unit.boot
+        return stream.receive(PACKETS[at % len(PACKETS)], unit.at * MS) or ()
+
+    return feed
+
+
+def sweep_frames(first: int) -> Feed:
+    decoder = sweep_fd_decoder()
+    return lambda unit: decoder.push(sweep_frame(unit, first), unit.at * FRAME_NS)
+
+
+def samples(sequence: str) -> Callable[[int], Feed]:
+    def begin(_first: int) -> Feed:
         decoder = make_decoder(
             CanFormat.SYNTOUCH,
             FINGERS,
@@ -156,29 +151,80 @@ def test_of_samples_order_and_time_tell_the_sweep(sequence: str) -> None:
             sequence=sequence,
             data_length=None,
         )
-        for unit in arrivals(plan, silent=len(channels)):
-            expect_one_sweep(decoder.push(sample(unit, channels), unit.at * SLOT_NS))
+        return lambda unit: decoder.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
+
+    return begin
+
+
+def bus_log(form: str, frame: Callable[[Unit], CanFrame], unit_ns: int) -> Callable[[int], Feed]:
+    """Through the lines of a log, which must tell no other story than the bus."""
+
+    def begin(_first: int) -> Feed:
+        log = CanLog(FINGERS, format=form, arbitration_id=BASE_ID, sequence="electrodes")
+
+        def feed(unit: Unit) -> Sequence[Reading]:
+            logged = frame_of(line_of(frame(unit), unit.at * unit_ns, "can0"))
+            assert logged is not None
+            return log.feed(*logged)
+
+        return feed
+
+    return begin
+
+
+@dataclass(frozen=True)
+class Assembler:
+    """A link whose driver assembles sweeps of units."""
+
+    begin: Callable[[int], Feed]
+    units: int
+    """Units of a sweep."""
+    silent: int
+    """Units that a board is silent after a start."""
+    late_max: int = 3
+    steady_sweeps: int = 1
+    """Undisturbed sweeps at the beginning."""
+
+
+ASSEMBLERS = {
+    "palm": Assembler(palm, ROUND, silent=25),
+    "sweep frames": Assembler(sweep_frames, 3, silent=SILENT_NS // FRAME_NS + 1, late_max=4),
+    "log of sweep frames": Assembler(
+        bus_log("sweep_fd", lambda unit: sweep_frame(unit, 0), FRAME_NS),
+        3,
+        silent=SILENT_NS // FRAME_NS + 1,
+    ),
+    "log of samples": Assembler(
+        bus_log("syntouch", lambda unit: sample(unit, SEQUENCES["electrodes"]), SLOT_NS),
+        24,
+        silent=SILENT_NS // SLOT_NS + 1,
+        steady_sweeps=3,
+    ),
+    # A board without a pause, of which two sweeps in a row have come.
+    **{
+        f"samples, {sequence}": Assembler(
+            samples(sequence), len(channels), silent=len(channels), steady_sweeps=3
+        )
+        for sequence, channels in SEQUENCES.items()
+    },
+}
+
+
+@pytest.mark.parametrize("name", ASSEMBLERS)
+def test_no_reading_mixes_two_sweeps(name: str) -> None:
+    assembler = ASSEMBLERS[name]
+
+    @settings(max_examples=150)
+    @given(
+        plans(assembler.units, assembler.steady_sweeps),
+        st.sampled_from([0, 5 * ROUND + 3, (1 << 16) - 9]),
+    )
+    def holds(plan: list[Step], first: int) -> None:
+        feed = assembler.begin(first)
+        for unit in arrivals(plan, assembler.silent, assembler.late_max):
+            expect_one_sweep(feed(unit))
 
     holds()
-
-
-@settings(max_examples=100)
-@given(st.tuples(plans(3), st.just(True)) | st.tuples(plans(24, steady_sweeps=3), st.just(False)))
-def test_a_log_of_a_bus_is_no_other_than_the_bus(given_: tuple[list[Step], bool]) -> None:
-    plan, numbered = given_
-    channels = SEQUENCES["electrodes"]
-    log = CanLog(
-        FINGERS,
-        format="sweep_fd" if numbered else "syntouch",
-        arbitration_id=BASE_ID,
-        sequence="electrodes",
-    )
-    unit_ns = PERIOD_NS // 3 if numbered else SLOT_NS
-    for unit in arrivals(plan, silent=SILENT_NS // unit_ns + 1):
-        frame = sweep_frame(unit, 0) if numbered else sample(unit, channels)
-        found = frame_of(line_of(frame, unit.at * unit_ns, "can0"))
-        assert found is not None
-        expect_one_sweep(log.feed(*found))
 
 
 def spi_sweep(unit: Unit) -> bytes:
@@ -237,16 +283,12 @@ def test_of_a_bridge_a_sweep_is_one_frame_with_a_checksum(
 def test_of_joints_a_message_is_a_reading_and_none_comes_after_a_later_one(
     plan: list[Step],
 ) -> None:
-    counters = JointCounters()
-    parser, order = JointParser(counters), MessageOrder(counters)
+    stream = JointStream()
     last: tuple[int, int] = (0, -1)
     for unit in arrivals(plan, silent=5):
         angle = 0.001 * (unit.index % 1000) + unit.boot / 2**20
         message = JointMessage(unit.index, None, ("FFJ3", "MFJ3"), np.full(2, angle))
-        parsed = parser.parse(message.to_bytes())
-        assert parsed is not None
-        if order.admits(parsed):
-            reading = JointReading(unit.at, 0, parsed.names, parsed.position_rad)
+        for reading in stream.receive(message.to_bytes(), unit.at) or ():
             assert set(reading.position_rad.tolist()) == {angle}
             assert (unit.boot, unit.index) > last
             last = unit.boot, unit.index

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.base import Fact, LinkCause, LinkError
+from drivers.base import Fact, LinkCause, LinkError, Reading
 from drivers.link import LinkState
 from drivers.udp.driver import DatagramCounters, DatagramDriver
 from drivers.udp.receiver import Datagram, DatagramReceiver, Endpoint
@@ -44,40 +44,61 @@ class Receiver:
         self.closed = True
 
 
-class Listener(DatagramDriver):
-    """A driver that a test opens and reads by hand."""
+class Stream:
+    """Takes datagrams that do not begin with `x`, each as one reading of its age."""
 
+    sender_kind = "somebody"
+
+    def __init__(self, clock: Clock) -> None:
+        self.counters = DatagramCounters()
+        self.heard: list[tuple[bytes, int]] = []
+        self.interrupts = 0
+        self._clock = clock
+
+    def receive(self, data: bytes, t_ns: int) -> list[Reading] | None:
+        self.heard.append((data, self._clock.now_ns - t_ns))
+        return None if data.startswith(b"x") else []
+
+    def interrupt(self) -> None:
+        self.interrupts += 1
+
+
+class Listener(DatagramDriver[Stream]):
     name = "test"
     bytes_max = 100
     silence_ns = SILENCE_NS
 
-    def open(self) -> None: ...
+    def __init__(self, clock: Clock, only_from: str | None) -> None:
+        self._test_clock = clock
+        super().__init__("udp://127.0.0.1:5700", only_from=only_from, clock=clock)
+
+    def _new_stream(self) -> Stream:
+        return Stream(self._test_clock)
 
 
 class Bench:
-    """A link, its clock, and the sockets that it opens one after the other."""
+    """An open link, its clock, and the sockets that it opens one after the other."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, only_from: str | None = None) -> None:
         self.sockets = [Receiver(3), Receiver(4)]
         waiting = list(self.sockets)
         monkeypatch.setattr("drivers.udp.driver.DatagramReceiver", lambda *_: waiting.pop(0))
         self.clock = Clock()
-        self.link = Listener(
-            "udp://127.0.0.1:5700",
-            only_from=only_from,
-            clock=self.clock,
-        )
-        self.counters = DatagramCounters()
+        self.link = Listener(self.clock, only_from)
+        self.link.open()
+        self.counters = self.link.stream.counters
 
-    def hear(self, *sent: Datagram, good: bool = True) -> list[tuple[bytes, int]]:
-        """What comes through of what is sent."""
+    def hear(self, *sent: Datagram) -> list[tuple[bytes, int]]:
+        """Return the datagrams that come through, with their age."""
         self.sockets[0].waiting += sent
-        heard = []
-        for data, t_ns in self.link.datagrams():
-            heard.append((data, self.clock.now_ns - t_ns))
-            if good:
-                self.link.confirm("somebody")
-        return heard
+        before = len(self.link.stream.heard)
+        assert self.link.read_ready() == []
+        return self.link.stream.heard[before:]
+
+    def fell_silent(self) -> bool:
+        before = self.link.stream.interrupts
+        self.link.read_ready()
+        return self.link.stream.interrupts > before
 
     def listening(self) -> tuple[int | None, int | None]:
         return self.link.fileno(), self.link.port
@@ -85,13 +106,11 @@ class Bench:
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    made = Bench(monkeypatch)
-    made.link.listen(made.counters)
-    return made
+    return Bench(monkeypatch)
 
 
 def test_the_first_good_sender_is_the_only_one_until_it_is_silent(bench: Bench) -> None:
-    assert bench.hear(Datagram(b"x", 0, THERE), good=False) == [(b"x", 0)]
+    assert bench.hear(Datagram(b"x", 0, THERE)) == [(b"x", 0)]
     assert bench.link.link_state is LinkState.GREETING
     assert bench.hear(Datagram(b"a", 0, HERE), Datagram(b"b", 0, THERE)) == [(b"a", 0)]
     assert bench.counters.foreign_datagrams == 1
@@ -101,7 +120,7 @@ def test_the_first_good_sender_is_the_only_one_until_it_is_silent(bench: Bench) 
         "heard": Fact("somebody from 127.0.0.1 port 7"),
     }
     bench.clock.now_ns += SILENCE_NS
-    assert bench.link.fell_silent()
+    assert bench.fell_silent()
     assert bench.hear(Datagram(b"b", 0, THERE)) == [(b"b", 0)]
 
 
@@ -112,7 +131,6 @@ def test_only_one_address_is_heard_if_that_is_wanted(
     monkeypatch: pytest.MonkeyPatch, only_from: str | None, heard: bool
 ) -> None:
     bench = Bench(monkeypatch, only_from)
-    bench.link.listen(bench.counters)
     assert bool(bench.hear(Datagram(b"a", 0, HERE))) == heard
     assert bench.counters.foreign_datagrams == (not heard)
 
@@ -126,14 +144,14 @@ def test_a_datagram_is_as_old_as_the_kernel_says_and_never_older_than_the_one_be
 
 def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
     assert bench.link.due_ns() is None
-    assert not bench.link.fell_silent()
+    assert not bench.fell_silent()
     bench.hear(Datagram(b"a", 10 * MS, HERE))
     assert bench.link.due_ns() == bench.clock.now_ns + SILENCE_NS - 10 * MS
     bench.clock.now_ns += SILENCE_NS - 10 * MS - 1
-    assert not bench.link.fell_silent()
+    assert not bench.fell_silent()
     bench.clock.now_ns += 1
-    assert bench.link.fell_silent()
-    assert not bench.link.fell_silent()
+    assert bench.fell_silent()
+    assert not bench.fell_silent()
     assert (bench.link.link_state, bench.counters.link_losses) == (LinkState.GREETING, 1)
     assert bench.link.describe()["link"] == Fact("greeting", LinkCause.TIMEOUT)
     assert bench.link.describe()["why"].text == "nothing good for 100 ms"
@@ -141,9 +159,9 @@ def test_silence_is_noticed_when_it_is_due_and_once(bench: Bench) -> None:
 
 
 def test_a_link_that_never_was_up_does_not_fall_silent(bench: Bench) -> None:
-    bench.hear(Datagram(b"x", 0, HERE), good=False)
+    bench.hear(Datagram(b"x", 0, HERE))
     bench.clock.now_ns += 10 * SILENCE_NS
-    assert not bench.link.fell_silent()
+    assert not bench.fell_silent()
     assert bench.counters.link_losses == 0
 
 
@@ -190,7 +208,7 @@ def test_a_closed_link_says_whom_it_heard_and_cannot_be_read(bench: Bench) -> No
     bench.link.close()
     assert bench.link.describe()["heard"].text == "somebody from 127.0.0.1 port 7"
     with pytest.raises(RuntimeError, match="test link is not open"):
-        next(bench.link.datagrams())
+        bench.link.read_ready()
 
 
 @pytest.mark.parametrize(

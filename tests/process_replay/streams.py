@@ -23,7 +23,7 @@ from drivers.recordings.csv_player import DEMO_RECORDING, ReplayDriver
 from drivers.recordings.serial_log import encode_records
 from drivers.spi.conversation import Conversation
 from drivers.spi.line import LineEvent
-from drivers.spi.messages import Hello, Message, Ping, Sweep, decode, encode, frame_parser
+from drivers.spi.messages import DIGEST, FrameParser, Hello, Message, Ping, Sweep, decode, encode
 from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaultInjector, LinkFaults
 from drivers.twins.grasps.grasps import Counts, recorded_counts
@@ -131,7 +131,7 @@ class _Line:
         self._log = log
         self._host = Conversation("bridge", FINGERS, WIRED)
         self._injector = LinkFaultInjector(FRAME_FAULTS)
-        self._parser = frame_parser()
+        self._parser = FrameParser(DIGEST)
         self._answers: list[Message] = []
         self._open(START_NS)
 

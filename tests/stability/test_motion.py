@@ -14,8 +14,7 @@ from daemon.judge.decision import HandLimits
 from daemon.judge.hand import HandTracker
 from daemon.judge.health import Checked
 from daemon.judge.reasons import Reason
-from drivers.palm.calibration import parse_calibration
-from drivers.palm.hall import CoupledTable, Table
+from drivers.palm.calibration import CoupledTable, Table, parse_calibration
 from models.contract import Finger
 
 Note = Callable[..., None]

@@ -73,7 +73,7 @@ BUSES = {
 """Modules that only this driver needs; python-can brings asyncio, sqlite3 and plugins'
 names."""
 JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
-HALL = {"drivers.palm.hall", "drivers.palm.calibration"}
+HALL = {"drivers.palm.calibration"}
 GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")}
 STATISTICS = {"daemon.judge.calibration", "models.session_statistics"}
 KEPT = {"daemon.session.file", "daemon.session.keeper"}

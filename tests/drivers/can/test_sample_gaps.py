@@ -81,24 +81,6 @@ def check_losing(sequence: str, lost: int, where: float, begun: int) -> None:
     assert [reading.seq for reading in readings] == tags
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_losses_of_any_length_never_mix_two_sweeps(seed: int) -> None:
-    chance = random.Random(seed)
-    sweeps, _ = assembler("interleaved")
-    stream = concatenated([samples(n, "interleaved") for n in range(400)])
-    at = chance.randrange(54, 400)
-    while at < len(stream):
-        del stream[
-            at : at + chance.choice([1, 2, 53, 54, 55, 107, 108, 109, chance.randrange(300)])
-        ]
-        at += chance.randrange(1, 600)
-    jittered = [
-        (channel, words, t_ns + chance.randrange(1_000_000)) for channel, words, t_ns in stream
-    ]
-    for reading in feed(sweeps, jittered):
-        assert_of_one_sweep(reading)
-
-
 @pytest.mark.parametrize("lost", [22, 23, 24, 25, 46, 47, 48])
 def test_untouched_sensors_that_repeat_themselves_make_no_copies_of_lost_samples(lost: int) -> None:
     """The words of all sweeps are the same, so only time tells that a sample is no copy."""

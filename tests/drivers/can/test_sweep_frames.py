@@ -212,35 +212,6 @@ def running(sweeps: FrameAssembler, sweep: int) -> int:
     return sweep * PERIOD_NS
 
 
-@pytest.mark.parametrize("is_known", [True, False], ids=["period known", "period unknown"])
-@pytest.mark.parametrize("tick_stuck", [False, True], ids=["tick", "stuck tick"])
-@pytest.mark.parametrize("down_ns", [PERIOD_NS, 3 * PERIOD_NS, 300_000_000])
-def test_a_board_that_was_reset_never_completes_the_sweep_at_hand(
-    *, is_known: bool, tick_stuck: bool, down_ns: int
-) -> None:
-    """One finger of sweep 8 comes before the reset, then the numbers begin again at 0."""
-    sweeps, counters = frame_sweeps()
-    now_ns = running(sweeps, 8) if is_known else 8 * PERIOD_NS
-    if not is_known:
-        whole(sweeps, 7, 7 * PERIOD_NS)
-    readings = push(sweeps, 0, 8, now_ns, tick_us=80_000)
-    now_ns += down_ns
-    for again in range(20):
-        tick_us = 80_000 if tick_stuck else 1_000 + 10_000 * again
-        counts = again + 100
-        for row in range(FINGERS):
-            words = b"".join(word(int(count)) for count in truth(counts)[row])
-            faults = ElectrodeFault.HELD if tick_stuck else 0  # as the decoder says
-            readings += sweeps.push(row, again, tick_us, words, faults, now_ns)
-        now_ns += PERIOD_NS
-    for reading in readings:
-        sound = reading.faults == 0
-        fits = [n for n in range(130) if (truth(n)[sound] == reading.counts[sound]).all()]
-        assert fits, "a reading has fingers of two sweeps"
-    assert tick_stuck or not readings[-1].faults.any()
-    assert tick_stuck or counters.restarts + counters.contradicting_frames > 0
-
-
 def test_a_finger_that_was_lacking_for_two_periods_is_of_another_sweep() -> None:
     sweeps, counters = frame_sweeps()
     due_ns = running(sweeps, 9)

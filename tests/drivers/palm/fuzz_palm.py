@@ -15,10 +15,8 @@ from drivers.base import COUNT_MAX, FINGERS
 from drivers.hand import JOINTS
 from drivers.joints.message import (
     ANGLE_MAX_RAD,
-    JointCounters,
     JointMessage,
-    JointParser,
-    MessageOrder,
+    JointStream,
 )
 from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
 from drivers.palm.rounds import RoundAssembler
@@ -119,15 +117,13 @@ class _Joints:
     """Messages, and behind them their order."""
 
     def __init__(self) -> None:
-        counters = JointCounters()
-        self._parser = JointParser(counters)
-        self._order = MessageOrder(counters)
+        self._stream = JointStream()
 
     def feed(self, chunk: bytes) -> list[Angles]:
-        message = self._parser.parse(chunk)
+        message = self._stream.parse(chunk)
         if message is None:
             return []
-        self._order.admits(message)
+        self._stream.admits(message)
         return [_comparable(message)]
 
     @property

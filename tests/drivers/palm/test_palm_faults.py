@@ -6,21 +6,13 @@ What no test can ask for: a palm packet has no checksum, so a flipped bit that l
 
 from __future__ import annotations
 
-import dataclasses
-import gc
-import tracemalloc
-
-import numpy as np
 import pytest
 
-from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
+from drivers.base import COUNT_MAX, ElectrodeFault
 from drivers.palm.driver import PalmDriver
-from drivers.palm.packet import PalmCounters, PalmParser
-from drivers.palm.rounds import RoundAssembler
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import (
-    FINGERS,
     MS,
     ROUND,
     Clock,
@@ -48,12 +40,6 @@ def expect_truth(played: Played) -> None:
         assert row_of(reading, truth[reading.seq : reading.seq + 1]) == 0
     numbers = [reading.seq for reading in played.readings]
     assert numbers == sorted(set(numbers))
-
-
-def test_without_faults_every_reading_is_sound() -> None:
-    played, _, _ = run(LinkFaults())
-    assert len(played.sound()) == len(played.readings) == ROUNDS
-    expect_truth(played)
 
 
 @pytest.mark.parametrize("probability", [0.001, 0.2])
@@ -87,13 +73,6 @@ def test_swapped_packets_find_their_place_or_are_counted_as_late() -> None:
     expect_truth(played)
 
 
-def test_bursts_lose_nothing() -> None:
-    played, twin, _ = run(LinkFaults(burst_frames=9))
-    assert twin.injected["burst"] > 100
-    assert len(played.sound()) == ROUNDS
-    expect_truth(played)
-
-
 def test_a_flipped_bit_is_seen_or_stays_within_the_range_of_a_count() -> None:
     played, twin, _ = run(LinkFaults(bit_flip_probability=0.2, seed=3))
     truth, wrong = rows(ROUNDS), 0
@@ -109,25 +88,12 @@ def test_a_flipped_bit_is_seen_or_stays_within_the_range_of_a_count() -> None:
     assert len(played.readings) > 0.95 * ROUNDS
 
 
-def test_a_dead_electrode_reads_zero_for_ever() -> None:
-    played, _, _ = run(LinkFaults(dead_electrodes=((0, 7), (2, 23))))
-    assert {int(reading.counts[0, 7]) for reading in played.readings} == {0}
-    assert {int(reading.counts[2, 23]) for reading in played.readings} == {0}
-    assert len(played.sound()) == ROUNDS  # the judge calls it saturated
-
-
 def test_a_finger_pulled_out_has_no_electrode_left() -> None:
     played, _, _ = run(LinkFaults(unplugged_fingers=(0, 2)))
     assert played.counters.absent_fingers == 2 * ROUNDS
     for reading in played.readings:
         assert (reading.faults[[0, 2]] == ElectrodeFault.MISSING).all()
         assert not reading.faults[1].any()
-
-
-def test_packets_of_a_later_version_are_all_refused() -> None:
-    played, twin, _ = run(LinkFaults(wrong_version=True))
-    assert played.readings == []
-    assert played.counters.bad_lengths == twin.packets_made == ROUNDS * ROUND
 
 
 def test_after_the_link_broke_readings_are_sound_within_two_rounds() -> None:
@@ -143,64 +109,13 @@ def test_after_the_link_broke_readings_are_sound_within_two_rounds() -> None:
     expect_truth(played)
 
 
-def test_all_faults_together_end_in_readings_and_counters() -> None:
-    faults = LinkFaults(
-        drop_probability=0.05,
-        duplicate_probability=0.05,
-        reorder_probability=0.05,
-        burst_frames=3,
-        disconnect_every_frames=2500,
-        unplugged_fingers=(1,),
-    )
-    played, twin, _ = run(faults)
-    # Of all the packets made, each was silenced, cut, dropped, or came (once or twice).
-    came = twin.packets_made - sum(twin.injected[name] for name in ("silenced", "drop"))
-    counters = played.counters
-    assert counters.packets + counters.bad_lengths == came + twin.injected["duplicate"]
-    assert counters.readings == len(played.readings) > 0.7 * ROUNDS
-    expect_truth(played)
-
-
-def test_rounds_of_damaged_packets_keep_no_memory_and_end_with_the_damage() -> None:
-    """Single packets are fuzzed by `tests.bench.fuzz`; here whole streams, as they come."""
-    seed = 11
-    random = np.random.default_rng(seed)
-    good = [packet.to_bytes() for packet in PalmTwin(rows(40)).packets()]
-    counters = PalmCounters()
-    parser, sweeps = PalmParser(counters), RoundAssembler(FINGERS, counters)
-
-    def feed(data: bytes, cycle: int) -> list[TactileReading]:
-        packet = parser.parse(data)
-        if packet is None or sweeps.repeats(packet):
-            return []
-        return list(sweeps.push(packet, cycle * MS))
-
-    def damaged(data: bytes) -> bytes:
-        spoiled = bytearray(data)
-        for at in random.integers(0, len(data), int(random.integers(1, 9))):
-            spoiled[at] = int(random.integers(256))
-        spoiled[132] = int(random.integers(1, 28))
-        return bytes(spoiled)
-
-    tracemalloc.start()
-    sizes = []
-    for cycle in range(20_000):
-        for reading in feed(damaged(good[cycle % len(good)]), cycle):
-            assert reading.counts.max() <= COUNT_MAX, f"seed {seed}, packet {cycle}"
-        if cycle % 10_000 == 9_999:
-            gc.collect()
-            sizes.append(tracemalloc.get_traced_memory()[0])
-    tracemalloc.stop()
-    assert sizes[1] - sizes[0] < 50_000, f"seed {seed}"
-    readings = [reading for cycle, data in enumerate(good, 20_000) for reading in feed(data, cycle)]
-    assert np.array_equal(readings[-1].counts, rows(40)[-1]), f"seed {seed}"
-    assert not any(reading.faults.any() for reading in readings[3:]), f"seed {seed}"
-
-
-@pytest.mark.parametrize("into_round", range(ROUND))
-def test_a_second_palm_after_silence_is_told_and_never_mixed_in(into_round: int) -> None:
+@pytest.mark.parametrize("into_round", [0, 1, 7, 13])
+def test_a_second_palm_after_silence_is_never_mixed_in(
+    monkeypatch: pytest.MonkeyPatch, into_round: int
+) -> None:
     """The first one breaks off in a round, the second is heard from anywhere in one of its own."""
     clock, hands = Clock(), (rows(4, seed=1), rows(4, seed=2))
+    clock.rule(monkeypatch)
     with (
         PalmDriver("udp://127.0.0.1:0", clock=clock) as driver,
         Sender(driver) as first,
@@ -216,9 +131,3 @@ def test_a_second_palm_after_silence_is_told_and_never_mixed_in(into_round: int)
             assert driver.serials["ff"] == f"udp://127.0.0.1:{sender.port}"
             clock.now_ns += PalmDriver.silence_ns
             assert driver.read_ready() == []
-
-
-def test_the_faults_of_a_twin_come_again_with_the_same_seed() -> None:
-    faults = LinkFaults(drop_probability=0.1, bit_flip_probability=0.1, seed=8)
-    assert run(faults, 20)[2] == run(faults, 20)[2]
-    assert run(faults, 20)[2] != run(dataclasses.replace(faults, seed=9), 20)[2]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import struct
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,7 @@ import pytest
 from drivers.base import ElectrodeFault
 from drivers.palm.packet import PalmCounters, PalmPacket
 from drivers.palm.rounds import RoundAssembler
-from drivers.twins.faults import LinkFaults
-from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.palm import PalmTwin
-from tests.conftest import data_dir
 from tests.drivers.palm.palm_stream import (
     FINGERS,
     MS,
@@ -85,12 +81,6 @@ def test_fingers_come_in_the_order_asked_for(order: tuple[str, ...]) -> None:
                 assert (reading.faults[place] == MISSING).all()
 
 
-@pytest.mark.parametrize("fingers", [(), ("ff", "ff"), ("ff", "xx")])
-def test_other_fingers_are_refused(fingers: tuple[str, ...]) -> None:
-    with pytest.raises(ValueError, match="different ones"):
-        RoundAssembler(fingers, PalmCounters())
-
-
 @pytest.mark.parametrize("position", range(ROUND))
 def test_a_lost_packet_takes_its_electrodes_and_moves_no_other(position: int) -> None:
     stream: list[PalmPacket | None] = [*packets(3)]
@@ -103,19 +93,6 @@ def test_a_lost_packet_takes_its_electrodes_and_moves_no_other(position: int) ->
     assert (damaged.counts[damaged.faults != 0] == 0).all()
     assert [reading.faults.any() for reading in played.readings[::2]] == [False, False]
     assert played.counters.lost_packets == 1
-
-
-@pytest.mark.parametrize("lost", [2, 6, 7, 13, 14, 15, 28, 33, 60])
-def test_losses_in_a_row_are_counted_and_the_round_is_found_again(lost: int) -> None:
-    stream: list[PalmPacket | None] = [*packets(10)]
-    stream[20 : 20 + lost] = [None] * lost
-    played = play_packets(stream)
-    expect_no_invention(played, 10)
-    assert played.counters.lost_packets == lost
-    for reading in played.readings:
-        assert row_of(reading, rows(10)) == reading.seq
-    assert played.readings[-1].seq == 9
-    assert played.counters.missed_readings == 10 - len(played.readings)
 
 
 def test_a_value_that_is_not_fresh_is_held_or_missing() -> None:
@@ -152,19 +129,6 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
     sweeps = RoundAssembler(FINGERS, PalmCounters(), heed_finger_bits=False)
     heedless = [reading for packet in stream for reading in sweeps.push(packet, 0)]
     assert not heedless[0].faults.any()
-
-
-def test_the_garbage_of_an_absent_sensor_is_no_reading() -> None:
-    twin = PalmTwin(rows(20), faults=LinkFaults(unplugged_fingers=(1,)))
-    first = struct.unpack_from("<HHHBxH", next(iter(twin.packets())).to_bytes(), 138 + 16)
-    assert first[2] == -22072 & 0xFFFF  # as recorded from a hand without this sensor
-    assert first[3:] == (0b1111, 32570)  # even with all valid bits set
-    played = play(PalmTwin(rows(20), faults=LinkFaults(unplugged_fingers=(1,))).cycles())
-    assert len(played.readings) == 20
-    for reading, row in zip(played.readings, rows(20), strict=True):
-        assert flags(reading, MISSING) == [[1, electrode] for electrode in range(24)]
-        assert np.array_equal(reading.counts[::2], row[::2])
-    assert played.counters.absent_fingers == 20
 
 
 @pytest.mark.parametrize("position", [0, 1])
@@ -225,77 +189,6 @@ def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str
     played = play_packets([*stream[:20], other, *stream[20:]])
     assert getattr(played.counters, counter) == 1
     assert not any(reading.faults.any() for reading in played.readings)
-
-
-def test_a_request_that_stands_still_gives_no_reading() -> None:
-    played = play(PalmTwin(rows(50), faults=LinkFaults(stuck_clock=True)).cycles())
-    assert played.readings == []
-    assert played.counters.conflicting_packets == 50 * ROUND - 1
-
-
-def test_a_packet_that_comes_again_and_again_gives_no_reading() -> None:
-    stream = packets(2)
-    played = play_packets([*stream[:ROUND], *stream[:ROUND] * 20])
-    assert len(played.readings) == 1
-    assert played.counters.duplicate_packets == 20 * ROUND
-
-
-def test_after_an_interruption_a_reading_begins_with_a_round() -> None:
-    counters = PalmCounters()
-    sweeps = RoundAssembler(FINGERS, counters)
-    stream = packets(60)
-    readings = [reading for at in range(20) for reading in sweeps.push(stream[at], at * MS)]
-    sweeps.interrupt()
-    for at in range(20 + 500, len(stream)):
-        readings += sweeps.push(stream[at], at * MS)
-    assert [row_of(reading, rows(60)) for reading in readings] == [0, *range(38, 60)]
-    assert not any(reading.faults.any() for reading in readings)
-    assert counters.interrupted_rounds == 1
-    assert counters.unsynchronised_packets == 38 * ROUND - 520
-    assert readings[1].seq - readings[0].seq == pytest.approx(38, abs=1)
-
-
-@pytest.mark.parametrize("late_ms", range(1, 10))
-def test_a_relay_that_hesitates_loses_nothing(late_ms: int) -> None:
-    cycles = [[packet.to_bytes()] for packet in packets(6)]
-    held = [data for cycle in cycles[30 : 30 + late_ms] for data in cycle]
-    cycles[30 : 30 + late_ms] = [[]] * late_ms
-    cycles[30 + late_ms] = [*held, *cycles[30 + late_ms]]
-    played = play(cycles)
-    assert len(played.sound()) == len(played.readings) == 6
-
-
-def test_a_hand_sampled_at_100_hz_repeats_two_of_seven_and_the_driver_none() -> None:
-    """Each electrode is fresh at 1000 / 14 = 71.43 Hz, so 1 - 71.43 / 100 of the rows are stale."""
-    made = [packet.to_bytes() for packet in PalmTwin(rows(700)).packets()]
-    held: dict[int, int] = {}  # as the ROS driver does: what does not come keeps its old value
-    samples = []
-    for index, data in enumerate(made):
-        (kind,) = struct.unpack_from("<I", data, 132)
-        first, second = (
-            struct.unpack_from("<H", data, 142)[0],
-            struct.unpack_from("<H", data, 146)[0],
-        )
-        held[kind - 3], held[kind - 2] = first, second  # E1 is the second of 0x0003
-        if index % 10 == 9:
-            samples.append([held.get(electrode, 0) for electrode in range(1, 25)])
-    table = np.array(samples[2:])
-    repeats = (table[1:] == table[:-1]).mean(axis=0)
-    assert repeats == pytest.approx(2 / 7, abs=0.002)
-    played = play([data] for data in made)
-    assert len(played.sound()) / (len(made) / 1000) == pytest.approx(71.43, abs=0.01)
-    counts = np.array([reading.counts for reading in played.readings])
-    assert (counts[1:] == counts[:-1]).mean() < 0.01
-
-
-def test_the_real_hand_has_the_same_signature() -> None:
-    folder = data_dir()
-    if folder is None:
-        pytest.skip("the real recordings are not there: set $GRASPD_DATA")
-    counts = np.array(list(recorded_counts(folder / "untouched" / "untouched.csv")))
-    for pair in PAIRS[2:-1]:
-        stale = (counts[1:, :, pair] == counts[:-1, :, pair]).all(axis=(1, 2))
-        assert stale.mean() == pytest.approx(2 / 7, abs=0.003)
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from drivers.recordings.serial_log import (
     SerialRecord,
     encode_records,
 )
-from drivers.spi.framing import FrameParser
 from drivers.spi.line import LineEvent
+from drivers.spi.messages import FrameParser
 from tests.drivers.can.can_words import Clock
 
 FD_LENGTHS = (0, 8, 12, 16, 20, 24, 32, 48, 64)

@@ -19,7 +19,7 @@ from drivers.base import TactileReading
 from drivers.biotac import SEQUENCE_ELECTRODES, encode_word, sample_command
 from drivers.link import LinkState
 from drivers.spi.driver import SpiBridgeDriver
-from drivers.spi.messages import Hello, Message, Ping, Sweep, decode, encode, frame_parser
+from drivers.spi.messages import DIGEST, FrameParser, Hello, Message, Ping, Sweep, decode, encode
 from drivers.twins.spi import SpiTwin
 
 MS = 1_000_000
@@ -46,7 +46,7 @@ class ScriptedBridge:
         tty.setraw(self._slave)
         self.port = os.ttyname(self._slave)
         self.sent_bytes = 0
-        self._parser = frame_parser()
+        self._parser = FrameParser(DIGEST)
 
     def __enter__(self) -> Self:
         return self

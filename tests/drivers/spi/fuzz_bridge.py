@@ -6,11 +6,13 @@ import random
 
 import numpy as np
 
-from drivers.spi.framing import DELIMITER, ENCODED_MAX_BYTES, encode_frame
 from drivers.spi.messages import (
+    DELIMITER,
     DIGEST,
+    ENCODED_MAX_BYTES,
     UNSEEDED,
     BridgeStatus,
+    FrameParser,
     Hello,
     Message,
     Ping,
@@ -18,7 +20,7 @@ from drivers.spi.messages import (
     Stop,
     Sweep,
     decode,
-    frame_parser,
+    encode_frame,
 )
 from tests.bench.fuzz import Target
 
@@ -70,7 +72,7 @@ def _frame(rng: random.Random) -> tuple[bytes, Value]:
 FRAMING = Target(
     name="framing",
     frame=_frame,
-    parser=frame_parser,
+    parser=lambda: FrameParser(DIGEST),
     held_max=ENCODED_MAX_BYTES,
     delimiter=DELIMITER,
 )

@@ -8,11 +8,9 @@ import shutil
 import struct
 import subprocess
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from cobs import cobs
 
 from drivers.biotac import ERROR_WORDS
 from drivers.spi.messages import FIRMWARE
@@ -33,7 +31,6 @@ from tests.drivers.spi.bridge_c import (
     build_program,
     damaged,
     frame,
-    hexed,
     judged,
 )
 
@@ -138,41 +135,6 @@ def test_exactly_the_4096_response_words_are_sound(bridge_probe: Path) -> None:
 
 
 SIZES = (0, 1, 2, 252, 253, 254, 255, 256, 507, 508, 509, 510, 668, 762, 763)
-
-
-def blobs(rng: random.Random) -> Iterator[bytes]:
-    """Data of every awkward size, with no, few and many zeros."""
-    for size in (*SIZES, *(rng.randrange(700) for _ in range(300))):
-        for zeros in (0.0, 0.01, 0.5):
-            data = (0 if rng.random() < zeros else rng.randrange(1, 256) for _ in range(size))
-            yield bytes(data)
-
-
-def test_checksums_and_stuffing_agree_with_zlib_and_cobs(bridge_probe: Path) -> None:
-    data = list(blobs(random.Random(1)))
-    assert list(map(int, ask(bridge_probe, [f"crc {DIGEST} {hexed(d)}" for d in data]))) == [
-        zlib.crc32(d, DIGEST) for d in data
-    ]
-    encoded = [cobs.encode(d) for d in data]
-    assert ask(bridge_probe, [f"encode {hexed(d)}" for d in data]) == [hexed(e) for e in encoded]
-    assert ask(bridge_probe, [f"decode {hexed(e)}" for e in encoded]) == [hexed(d) for d in data]
-
-
-def test_damaged_stuffing_is_judged_as_cobs_does(bridge_probe: Path) -> None:
-    rng = random.Random(2)
-    damaged = []
-    for data in blobs(rng):
-        encoded = bytearray(cobs.encode(data))
-        encoded[rng.randrange(len(encoded))] = rng.randrange(256)
-        damaged.append(bytes(encoded[: rng.randrange(1, len(encoded) + 1)]))
-    expected = []
-    for one in damaged:
-        try:
-            expected.append(hexed(cobs.decode(one)))
-        except cobs.DecodeError:
-            expected.append("bad")
-    assert ask(bridge_probe, [f"decode {hexed(one)}" for one in damaged]) == expected
-    assert 100 < expected.count("bad") < len(expected) - 100
 
 
 def test_every_frame_agrees_with_an_independent_computation(bridge_probe: Path) -> None:

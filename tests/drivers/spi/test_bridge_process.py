@@ -10,7 +10,6 @@ import struct
 import subprocess
 import time
 from collections.abc import Callable, Sequence
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 
 from drivers.base import ElectrodeFault, TactileReading
 from drivers.spi.driver import SpiBridgeDriver
-from drivers.twins.grasps.grasps import recorded_counts
 from tests.drivers.spi.bridge_c import (
     DIGEST,
     ELECTRODE_COMMANDS,
@@ -35,7 +33,6 @@ from tests.drivers.spi.bridge_c import (
     judged,
     pattern,
     seq_of,
-    words_of,
 )
 
 pytestmark = pytest.mark.usefixtures("comes_first")
@@ -76,19 +73,6 @@ def test_sweeps_carry_what_the_sensors_feel(start_bridge: StartBridge) -> None:
     np.testing.assert_array_equal(counts_of(again), pattern(0))
 
 
-def test_a_file_of_counts_is_played_again_at_its_end(
-    start_bridge: StartBridge, tmp_path: Path
-) -> None:
-    rows = np.random.default_rng(4).integers(0, 4096, (7, 5, 24))
-    text = "# five sensors\n" + "\n".join(", ".join(map(str, row.ravel())) for row in rows)
-    (tmp_path / "counts").write_text(text)
-    host = start_bridge("--counts", tmp_path / "counts", "--sensors", 5, "--period-us", 4000)
-    host.hello()
-    host.send(frame(START))
-    for row, sweep in enumerate(host.next_of(SWEEP, 20)):
-        np.testing.assert_array_equal(counts_of(sweep), rows[row % 7])
-
-
 def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBridge) -> None:
     rows = np.random.default_rng(5).integers(0, 4096, (12, 1, 24))
     lines = "".join(" ".join(map(str, row.ravel())) + "\n" for row in rows)
@@ -100,30 +84,6 @@ def test_a_stream_of_counts_ends_the_bridge_when_it_ends(start_bridge: StartBrid
     assert host.process.stdin is not None
     host.process.stdin.close()  # not earlier: what nobody has read is lost with the terminal
     assert host.process.wait(100) == 0
-
-
-def test_faults_look_as_on_the_real_sensor(start_bridge: StartBridge) -> None:
-    host = start_bridge(
-        *("--unplug", 1, "--dead", "0:8", "--answer", "2:5:A558", "--answer", "2:24:A259"),
-        *("--settle-us", "0:50", "--period-us", 3000),
-    )
-    hello = host.hello()
-    assert hello[61:77] == bytes(16)
-    host.send(frame(START))
-    words = words_of(host.next_of(SWEEP)[0])
-    assert (words[:, 1] == 0xFFFF).all()
-    assert words[7, 0] == 0x0101
-    assert words[4, 2] == 0xA558
-    assert words[23, 2] == 0xA259
-
-
-def test_a_sensor_that_needs_longer_answers_the_error_word(start_bridge: StartBridge) -> None:
-    host = start_bridge("--settle-us", "2:80", "--period-us", 3000)
-    assert host.hello()[77:93] == bytes(16)
-    host.send(frame(START))
-    sweep = host.next_of(SWEEP)[0]
-    assert (words_of(sweep)[:, 2] == 0xA52D).all()
-    assert sweep[20] == 0b011
 
 
 def test_a_sensor_that_is_plugged_in_again_comes_back(start_bridge: StartBridge) -> None:
@@ -263,18 +223,6 @@ def test_the_driver_reads_random_counts_count_for_count(
     t_ns = np.array([reading.t_ns for reading in readings])
     assert began_ns < t_ns[0] < t_ns[-1] < time.monotonic_ns()
     assert np.median(np.diff(t_ns)) == pytest.approx(5_000_000, rel=0.01)
-
-
-def test_the_driver_reads_a_real_recording_count_for_count(
-    start_bridge: StartBridge, tmp_path: Path, bts3_dir: Path
-) -> None:
-    recording = bts3_dir.parent / "untouched" / "untouched.csv"
-    if not recording.is_file():
-        pytest.skip("the recording of an untouched hand is not there")
-    rows = np.array(list(islice(recorded_counts(recording, FINGERS), 400)))
-    file = write_counts(tmp_path / "counts", rows)
-    host = start_bridge("--counts", file, "--period-us", 6000, "--sequence", "interleaved")
-    check_count_for_count(read(host.path, len(rows)), rows)
 
 
 def test_the_driver_flags_what_is_wrong_with_a_sensor(start_bridge: StartBridge) -> None:

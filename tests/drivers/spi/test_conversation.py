@@ -9,11 +9,11 @@ import pytest
 from drivers.base import DeviceFault, Fact, LinkCause
 from drivers.link import LinkState
 from drivers.spi.conversation import Conversation
-from drivers.spi.framing import encode_frame
 from drivers.spi.messages import (
     DIGEST,
     FIRMWARE,
     BridgeStatus,
+    FrameParser,
     Message,
     Ping,
     Start,
@@ -21,7 +21,7 @@ from drivers.spi.messages import (
     Sweep,
     decode,
     encode,
-    frame_parser,
+    encode_frame,
 )
 from tests.drivers.spi.bridge_bench import FINGERS, MS, hello, sweep, words
 
@@ -32,7 +32,7 @@ S = 1000 * MS
 def said(conversation: Conversation, now_ns: int) -> list[Message]:
     """What the host says, taken as sent."""
     messages = []
-    parser = frame_parser()
+    parser = FrameParser(DIGEST)
     for data in conversation.say(now_ns):
         conversation.sent(data, now_ns)
         messages += [decode(*frame) for frame in parser.feed(data)]

@@ -204,13 +204,6 @@ def say_garbage(master: int, stop: Callable[[], bool]) -> None:
         time.sleep(0.01)
 
 
-def say_it_back(master: int, stop: Callable[[], bool]) -> None:
-    while not stop():
-        with contextlib.suppress(BlockingIOError):
-            os.write(master, os.read(master, 500))
-        time.sleep(0.01)
-
-
 @contextlib.contextmanager
 def held() -> Iterator[str]:
     with port_that(None) as port, serial.Serial(port, exclusive=True):
@@ -223,14 +216,8 @@ WRONG: dict[str, tuple[Callable[[Path], contextlib.AbstractContextManager[str]],
         f"the bridge has layout 0x{DIGEST ^ 1:08X} of version 1",
         "flash the firmware of this graspd",
     ),
-    "another version": (
-        lambda folder: bridge(folder, faults=LinkFaults(wrong_version=True)),
-        "the bridge speaks version 2",
-        "flash the firmware of this graspd",
-    ),
     "silence": (lambda _: port_that(None), "no answer from /dev/pts/", "not a bridge yet: flash"),
     "garbage": (lambda _: port_that(say_garbage), "no answer from /dev/pts/", "not a bridge yet"),
-    "an echo": (lambda _: port_that(say_it_back), "no answer from /dev/pts/", "not a bridge yet"),
     "another program": (lambda _: held(), "another program has it open", "systemctl stop"),
     "no port": (
         lambda folder: contextlib.nullcontext(str(folder / "right.toml")),
@@ -252,17 +239,6 @@ def test_what_is_wrong_with_a_bridge_gets_a_cause_and_advice(
     assert cause in link["what"]
     assert advice in link["advice"]
     assert not [finding for finding in found if finding["level"] == "ok"], "no fault is fine"
-
-
-def test_bytes_that_are_no_frames_are_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with port_that(say_garbage) as port:
-        found = findings(port, tmp_path, capsys)
-    damaged = [finding for finding in found if re.search(r"\d bad (cobs|crc)", finding["what"])]
-    assert {finding["cause"] for finding in damaged} == {"not-a-bridge"}
-    assert damaged
-    assert all("damaged or foreign bytes" in finding["advice"] for finding in damaged)
 
 
 def test_older_firmware_is_named_with_how_to_flash_the_newer(

@@ -5,24 +5,24 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.hand import JOINTS as HAND_JOINTS
-from drivers.palm.calibration import CalibrationError, load_calibration, parse_calibration
-from drivers.palm.hall import (
+from drivers.palm.calibration import (
     HALL_SENSORS,
     JOINTS,
+    CalibrationError,
     CoupledTable,
     JointCalibration,
     Table,
     impossible_angles,
+    load_calibration,
+    parse_calibration,
 )
 
 EXAMPLE = Path(__file__).parents[3] / "deploy" / "calibration" / "example_hand.toml"
@@ -99,13 +99,6 @@ def test_two_sensors_are_averaged_before_the_table_not_after() -> None:
     assert angle == pytest.approx(-10.0)  # at 1750; the mean of -40 and 10 would be -15
 
 
-def test_the_order_of_the_points_does_not_matter() -> None:
-    for rows in (FFJ1, FFJ1[::-1], FFJ1[2:] + FFJ1[:2]):
-        assert degrees(calibration(FFJ1=rows), FFJ1=2000)["FFJ1"] == pytest.approx(
-            22.5 + 22.5 * (2673 - 2000) / (2673 - 1942)
-        )
-
-
 def test_j0_is_the_sum_of_j1_and_j2() -> None:
     both = calibration(FFJ1=FFJ1, FFJ2=[[3000, 0.0], [1000, 90.0]])
     angles = degrees(both, FFJ1=1942, FFJ2=2000)
@@ -144,10 +137,6 @@ RANGES_DEG = {
     **{"LFJ5": (0, 45), "THJ1": (-15, 90), "THJ2": (-40, 40), "THJ3": (-12, 12)},
     **{"THJ4": (0, 70), "THJ5": (-60, 60), "WRJ1": (-40, 28), "WRJ2": (-28, 10)},
 }
-
-
-def test_a_hand_has_the_joints_of_shadows_documentation() -> None:
-    assert set(RANGES_DEG) == HAND_JOINTS
 
 
 @pytest.mark.parametrize("joint", RANGES_DEG)
@@ -245,16 +234,6 @@ def test_the_coupled_table_is_met_at_each_of_its_points() -> None:
         assert angles["THJ2"] == pytest.approx(second)
 
 
-def test_a_flat_coupled_table_is_a_plane_inside_and_outside() -> None:
-    raws = np.random.default_rng(3).uniform(500, 3500, (25, 2))
-    rows = [(a, b, 0.01 * a - 0.002 * b + 1, 0.004 * a + 0.006 * b - 30) for a, b in raws]
-    table = CoupledTable(rows)
-    for a, b in np.random.default_rng(4).uniform(0, 4095, (200, 2)):
-        first, second = table.angles_rad(a, b)
-        assert math.degrees(first) == pytest.approx(0.01 * a - 0.002 * b + 1)
-        assert math.degrees(second) == pytest.approx(0.004 * a + 0.006 * b - 30)
-
-
 def test_a_coupled_table_is_cut_where_its_points_are_near_each_other() -> None:
     """Of a flat kite: along the short diagonal, whose ends are 10 and 20 degrees."""
     kite = [(1000, 1000, 0, 0), (3000, 1000, 0, 0), (2000, 1400, 10, 1), (2100, 600, 20, 2)]
@@ -276,12 +255,6 @@ def test_the_coupled_table_agrees_with_an_independent_interpolation() -> None:
             inside += 1
             assert np.degrees(table.angles_rad(*pair)) == pytest.approx(expected, abs=1e-6)
     assert inside > 150
-
-
-def test_without_the_coupled_table_the_thumb_tip_has_no_angles() -> None:
-    angles = degrees(load_calibration(EXAMPLE), THJ1=2000, THJ2=2000)
-    assert math.isnan(angles["THJ1"])
-    assert math.isnan(angles["THJ2"])
 
 
 @pytest.mark.parametrize(
@@ -380,23 +353,6 @@ def test_a_file_has_at_most_256_kilobytes(tmp_path: Path, length: int, taken: bo
             load_calibration(path)
 
 
-@pytest.mark.parametrize(("raw", "taken"), [(1, True), (4095, True), (4096, False)])
-def test_a_raw_value_has_12_bits(raw: float, taken: bool) -> None:
-    data: dict[str, object] = {"version": 1, "joints": {"FFJ1": [[raw, 0.0], [2000, 45.0]]}}
-    if taken:
-        parse_calibration(data, FILE)
-    else:
-        assert problems(data) == (f"FFJ1: raw {raw} is not in 1..4095",)
-
-
-def test_the_example_says_what_is_missing() -> None:
-    text = EXAMPLE.read_text()
-    listed = set(tomllib.loads(text)["joints"])
-    assert listed == {"FFJ1", "FFJ3", "FFJ4", "THJ4", "THJ5"}
-    for missing in ("FFJ2", "MFJ1", "RFJ4", "LFJ5", "THJ3", "WRJ1", "WRJ2", "THJ1 and THJ2"):
-        assert missing in text
-
-
 def test_a_table_needs_two_different_points() -> None:
     for points in ([], [(5.0, 1.0)], [(5.0, 1.0), (5.0, 2.0)]):
         with pytest.raises(ValueError, match="two points"):
@@ -413,6 +369,7 @@ values = st.recursive(
 )
 
 
+@settings(max_examples=40)
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(("version", "joints", "coupled"), values)))
 def test_whatever_a_file_holds_it_is_taken_or_refused(data: dict[str, object]) -> None:
     try:

@@ -1,0 +1,394 @@
+"""Frames and messages of the serial bridge, against the protocol's own document."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+import re
+import struct
+import zlib
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from drivers.biotac import SEQUENCE_ELECTRODES, SEQUENCE_INTERLEAVED, sample_command
+from drivers.spi.messages import (
+    DIGEST,
+    SCHEMA,
+    BridgeStatus,
+    FrameParser,
+    Hello,
+    Message,
+    Ping,
+    Start,
+    Stop,
+    Sweep,
+    decode,
+    encode,
+    encode_frame,
+    layout_of,
+)
+from tests.conftest import ROOT
+
+ENCODED_MAX_BYTES = 1024
+"""As the document says."""
+DOCUMENT = ROOT / "deploy" / "bridge" / "PROTOCOL.md"
+HELLO = Hello(
+    nonce=0x11223344,
+    tick=5_000_000,
+    tick_hz=1_000_000,
+    period_ticks=10_000,
+    serials=("BTSP-0001", "", "BTTB-0003"),
+    commands=tuple(sample_command(channel) for channel in SEQUENCE_ELECTRODES),
+    firmware=0x0102,
+    board="bench-7",
+)
+SWEEP = Sweep(
+    seq=7,
+    tick_start=1000,
+    tick_end=2900,
+    present=0b101,
+    words=np.array([[0xA251, 0xFFFF, 0x94B9], [0x0101, 0x0000, 0xFEF8]], dtype=np.uint16),
+)
+STATUS = BridgeStatus(1 << 40, 70_000, 1, 2, 3, (4, 5, 6))
+
+
+def slow_crc32(data: bytes, start: int = 0) -> int:
+    """CRC-32 bit by bit, from its definition."""
+    crc = start ^ 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xEDB88320 if crc & 1 else 0)
+    return crc ^ 0xFFFFFFFF
+
+
+def slow_cobs(data: bytes) -> bytes:
+    """COBS from its definition (Cheshire and Baker 1999): blocks of at most 254 bytes."""
+    encoded, block, block_open = bytearray(), bytearray(), True
+    for byte in data:
+        block_open = True
+        if byte:
+            block.append(byte)
+        if not byte or len(block) == 254:
+            encoded += bytes([len(block) + 1]) + block
+            block.clear()
+            block_open = not byte
+    if block_open:
+        encoded += bytes([len(block) + 1]) + block
+    return bytes(encoded)
+
+
+def slow_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
+    body = bytes([kind]) + payload
+    return slow_cobs(body + slow_crc32(body, digest).to_bytes(4, "little")) + b"\0"
+
+
+# The check value of CRC-32 is that of "123456789"; the other bytes are COBS by hand.
+@pytest.mark.parametrize(
+    ("kind", "payload", "wire"),
+    [
+        (0x31, b"23456789", "0E 31 32 33 34 35 36 37 38 39 26 39 F4 CB 00"),
+        (0x00, b"", "01 05 8D EF 02 D2 00"),  # CRC-32 of one zero byte is D202EF8D
+        (0x00, b"\0\0\0", "01 01 01 01 05 1C DF 44 21 00"),  # of four: 2144DF1C
+    ],
+)
+def test_a_frame_has_its_golden_bytes(kind: int, payload: bytes, wire: str) -> None:
+    assert encode_frame(kind, payload) == bytes.fromhex(wire)
+    assert FrameParser().feed(bytes.fromhex(wire)) == [(kind, payload)]
+
+
+@pytest.mark.parametrize("length", [0, 3, 249, 250, 251, 1000])
+def test_frames_are_those_of_an_independent_encoder(length: int) -> None:
+    for content in (bytes(length), b"\xff" * length, random.Random(length).randbytes(length)):
+        wire = encode_frame(0x02, content, DIGEST)
+        assert wire == slow_frame(0x02, content, DIGEST)
+        assert FrameParser(DIGEST).feed(wire) == [(0x02, content)]
+
+
+@pytest.mark.parametrize("size", [1, 7, 4096])
+def test_frames_come_out_however_the_bytes_are_cut(size: int) -> None:
+    sent = [(kind, bytes([kind]) * kind) for kind in range(1, 60)]
+    stream = b"\0" + b"".join(encode_frame(*frame) for frame in sent)
+    parser = FrameParser()
+    got = []
+    for at in range(0, len(stream), size):
+        got += parser.feed(stream[at : at + size])
+    assert got == sent
+    counters = parser.counters
+    assert (counters.frames, counters.bytes) == (59, len(stream))
+    assert counters.bad_cobs == counters.bad_crc == counters.too_long == 0
+
+
+def test_a_frame_of_another_layout_fails_unless_its_type_has_none() -> None:
+    parser = FrameParser(0x1234)
+    assert parser.feed(encode_frame(0x02, b"abc", 0x1235)) == []
+    assert parser.feed(encode_frame(0x02, b"abc")) == []
+    assert parser.counters.bad_crc == 2
+    for kind in (0x01, 0x81):
+        assert parser.feed(slow_frame(kind, b"abc")) == [(kind, b"abc")]
+    assert parser.feed(encode_frame(0x02, b"abc", 0x1234)) == [(0x02, b"abc")]
+
+
+@pytest.mark.parametrize(
+    ("wire", "counter"),
+    [
+        ("05 11 22 33 00", "bad_cobs"),  # says four bytes and has three
+        ("02 31 00", "bad_crc"),  # no room for a checksum
+        ("05 11 22 33 44 00", "bad_crc"),
+        ("01 01 01 01 01 00", "bad_crc"),  # of nothing, the right one
+        ("0E 31 32 33 34 35 36 37 38 39 26 39 F4 CA 00", "bad_crc"),
+    ],
+)
+def test_damage_is_counted_and_the_next_frame_is_found(wire: str, counter: str) -> None:
+    parser = FrameParser()
+    assert parser.feed(bytes.fromhex(wire)) == []
+    assert getattr(parser.counters, counter) == 1
+    assert parser.feed(encode_frame(0x31, b"next")) == [(0x31, b"next")]
+
+
+def test_a_frame_with_a_flipped_bit_is_never_another_frame() -> None:
+    wire = encode_frame(0x02, bytes(range(40)), DIGEST)
+    good = encode_frame(0x03, b"next", DIGEST)
+    for bit in range(8 * len(wire)):
+        damaged = bytearray(wire)
+        damaged[bit // 8] ^= 1 << bit % 8
+        parser = FrameParser(DIGEST)
+        assert parser.feed(bytes(damaged)) == []
+        assert parser.feed(b"\0" + good) == [(0x03, b"next")]
+
+
+def test_an_overlong_frame_is_dropped_and_never_held() -> None:
+    parser = FrameParser()
+    for _ in range(100):
+        assert parser.feed(b"\x55" * 1000) == []
+        assert parser.held_bytes <= ENCODED_MAX_BYTES
+    assert parser.counters.too_long == 1
+    assert parser.feed(b"\0" + encode_frame(1, b"x")) == [(1, b"x")]
+    assert parser.feed(b"\x55" * 100_000 + b"\0" + encode_frame(1, b"y")) == [(1, b"y")]
+    assert parser.counters.too_long == 2
+
+
+def test_the_longest_frame_is_taken_and_one_byte_more_is_not() -> None:
+    parser = FrameParser()
+    parser.feed(b"\xff" * ENCODED_MAX_BYTES + b"\0")
+    assert parser.counters.too_long == 0
+    parser.feed(b"\xff" * (ENCODED_MAX_BYTES + 1) + b"\0")
+    assert parser.counters.too_long == 1
+    longest = bytes(1019)  # each zero takes one byte, type and checksum five
+    assert len(encode_frame(1, longest[:-1])) == ENCODED_MAX_BYTES + 1
+    with pytest.raises(ValueError, match="1025 bytes, more than 1024"):
+        encode_frame(1, longest)
+
+
+def test_after_a_reset_the_rest_of_a_frame_is_forgotten() -> None:
+    parser = FrameParser()
+    parser.feed(b"\x05\x11\x22")
+    parser.reset()
+    assert parser.feed(encode_frame(9, b"fresh")) == [(9, b"fresh")]
+
+
+def test_schema_and_digest_are_those_of_the_document() -> None:
+    document = DOCUMENT.read_text(encoding="utf-8")
+    _, schema, _ = re.split(r"^-{60,}\n", document, flags=re.MULTILINE)
+    assert schema == SCHEMA
+    assert slow_crc32(schema.encode()) == DIGEST == zlib.crc32(schema.encode())
+    assert f"**0x{DIGEST:08X}**" in document
+
+
+# Written down by hand from the document. The smallest HELLO has neither name nor firmware.
+LEAST = Hello(0, 0, 1000, 1, ("",), (0xA2,))
+GOLDEN: list[tuple[int, Message, str]] = [
+    (
+        0x01,
+        HELLO,
+        "01 D6E4990D 44332211 404B4C0000000000 40420F00 0201 62656E63682D37000000000000000000"
+        " 10270000 03 18"
+        " 425453502D3030303100000000000000 00000000000000000000000000000000"
+        " 425454422D3030303300000000000000"
+        " A2A4A7A8ABADAEB0 B3B5B6B9BABCBFC1 C2C4C7C8CBCDCED0",
+    ),
+    (
+        0x01,
+        LEAST,
+        "01 D6E4990D 00000000 0000000000000000 E8030000 0000 00000000000000000000000000000000"
+        " 01000000 01 01 00000000000000000000000000000000 A2",
+    ),
+    (0x02, SWEEP, "07000000 E803000000000000 540B000000000000 05 03 02 A251FFFF94B9 01010000FEF8"),
+    (
+        0x03,
+        STATUS,
+        "0000000000010000 70110100 01000000 02000000 03000000 03 04000000 05000000 06000000",
+    ),
+    (0x81, Ping(0x04030201), "01020304"),
+    (0x82, Start(), ""),
+    (0x83, Stop(), ""),
+]
+
+
+@pytest.mark.parametrize(("kind", "message", "payload"), GOLDEN)
+def test_a_message_has_its_golden_bytes_and_comes_back(
+    kind: int, message: Message, payload: str
+) -> None:
+    wire = bytes.fromhex(payload)
+    back = decode(kind, wire)
+    assert back is not None
+    assert type(back) is type(message)
+    assert back.to_bytes() == wire
+    if not isinstance(message, Sweep):
+        assert back == message
+    seed = 0 if kind in (0x01, 0x81) else DIGEST
+    assert encode(message) == slow_frame(kind, wire, seed)
+    assert FrameParser(DIGEST).feed(encode(message)) == [(kind, wire)]
+    for length in range(len(wire)):
+        assert decode(kind, wire[:length]) is None
+    assert decode(kind, wire + b"\0") is None
+    assert decode(0x04, wire) is None
+
+
+# The document's own numbers.
+@pytest.mark.parametrize(
+    ("sequence", "line_bytes"), [(SEQUENCE_ELECTRODES, 174), (SEQUENCE_INTERLEAVED, 355)]
+)
+def test_a_sweep_is_as_long_as_the_document_says(
+    sequence: tuple[int, ...], line_bytes: int
+) -> None:
+    words = np.full((len(sequence), 3), 0xA251, dtype=np.uint16)
+    sweep = Sweep(0x01010101, 0x0101010101010101, 0x0101010101010102, 7, words)
+    assert len(encode(sweep)) == line_bytes
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"version": 2},
+        {"tick_hz": 999},
+        {"period_ticks": 0},
+        {"sensors": 0},
+        {"sensors": 6},
+        {"slots": 0},
+        {"slots": 65},
+        {"command": 0xA1},
+    ],
+    ids=str,
+)
+def test_a_hello_that_makes_no_sense_is_nothing(changes: dict[str, int]) -> None:
+    fields = {"version": 1, "tick_hz": 1_000_000, "period_ticks": 9, "sensors": 2, "slots": 3}
+    fields = {**fields, "command": 0xA2, **changes}
+    payload = struct.pack("<BIIQ", fields["version"], DIGEST, 1, 2)
+    payload += struct.pack("<IH16sI", fields["tick_hz"], 0, b"b", fields["period_ticks"])
+    payload += bytes([fields["sensors"], fields["slots"]]) + bytes(16 * fields["sensors"])
+    payload += bytes([fields["command"]]) * fields["slots"]
+    assert decode(0x01, payload) is None
+
+
+@pytest.mark.parametrize(
+    ("sensors", "slots", "present", "ticks", "sense"),
+    [
+        (1, 1, 1, (2, 2), True),
+        (5, 64, 31, (1, 2), True),
+        (0, 1, 0, (1, 2), False),
+        (1, 0, 0, (1, 2), False),
+        (6, 1, 0, (1, 2), False),
+        (1, 65, 0, (1, 2), False),
+        (3, 1, 0b1000, (1, 2), False),
+        (3, 1, 0, (2, 1), False),
+    ],
+)
+def test_a_sweep_that_makes_no_sense_is_nothing(
+    sensors: int, slots: int, present: int, ticks: tuple[int, int], sense: bool
+) -> None:
+    """However well its length fits."""
+    payload = struct.pack("<IQQBBB", 7, *ticks, present, sensors, slots)
+    assert (decode(0x02, payload + bytes(2 * sensors * slots)) is not None) == sense
+
+
+@pytest.mark.parametrize(("sensors", "sense"), [(0, False), (1, True), (5, True), (6, False)])
+def test_a_status_has_1_to_5_sensors(sensors: int, sense: bool) -> None:
+    payload = struct.pack("<QIIIIB", 1, 2, 3, 4, 5, sensors) + bytes(4 * sensors)
+    assert (decode(0x03, payload) is not None) == sense
+
+
+def test_the_layout_of_a_later_version_can_be_read() -> None:
+    later = struct.pack("<BI", 2, 0xCAFEF00D)
+    assert layout_of(later + b"anything") == layout_of(later) == (2, 0xCAFEF00D)
+    assert layout_of(later[:4]) is None
+
+
+def test_a_serial_number_of_odd_bytes_does_not_break_the_hello() -> None:
+    payload = bytearray(HELLO.to_bytes())
+    start = payload.index(b"BTSP")
+    payload[start : start + 5] = b"B\xff\n\x80P"
+    back = decode(0x01, bytes(payload))
+    assert isinstance(back, Hello)
+    assert back.serials[0] == "B???P0001"
+
+
+U16, U32, U64 = 0xFFFF, 0xFFFFFFFF, 0xFFFFFFFFFFFFFFFF
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Hello(U32, U64, U32, U32, ("S" * 16,) * 5, (0xD0,) * 64, U16, "B" * 16, digest=U32),
+        Sweep(U32, U64, U64, 0b11111, np.full((64, 5), 0xFEF8, np.uint16)),
+        BridgeStatus(U64, U32, U32, U32, U32, (U32,) * 5),
+        Ping(U32),
+    ],
+    ids=lambda message: type(message).__name__,
+)
+def test_the_largest_messages_come_back(message: Message) -> None:
+    ((kind, payload),) = FrameParser(DIGEST).feed(encode(message))
+    back = decode(kind, payload)
+    assert back is not None
+    assert back.to_bytes() == message.to_bytes()
+    assert len(encode(message)) <= 672, "the document's longest frame"
+
+
+@pytest.mark.parametrize(
+    ("message", "field", "value"),
+    [
+        (HELLO, "nonce", 1 << 32),
+        (HELLO, "tick", -1),
+        (HELLO, "tick_hz", 999),
+        (HELLO, "period_ticks", 0),
+        (HELLO, "serials", ()),
+        (HELLO, "serials", ("S",) * 6),
+        (HELLO, "serials", ("S" * 17,)),
+        (HELLO, "board", "für"),
+        (HELLO, "board", "a\0b"),
+        (HELLO, "commands", ()),
+        (HELLO, "commands", (0xA2, 0xA1)),
+        (HELLO, "commands", (0xA2,) * 65),
+        (SWEEP, "seq", 1 << 32),
+        (SWEEP, "present", 8),
+        (SWEEP, "tick_start", 3000),
+        (SWEEP, "words", np.zeros((2, 6), np.uint16)),
+        (SWEEP, "words", np.zeros((0, 3), np.uint16)),
+        (STATUS, "spi_errors", ()),
+        (STATUS, "sweeps", 1 << 32),
+        (Ping(1), "nonce", -1),
+    ],
+    ids=str,
+)
+def test_encoding_refuses_what_the_protocol_forbids(
+    message: Message,
+    field: str,
+    value: Any,  # noqa: ANN401 (of any field)
+) -> None:
+    replace: Any = msgspec.structs.replace if isinstance(message, Sweep) else dataclasses.replace
+    with pytest.raises(ValueError, match=r"protocol|format|at most|range"):
+        encode(replace(message, **{field: value}))
+
+
+def test_random_payloads_never_raise() -> None:
+    seed = random.SystemRandom().randrange(1 << 32)
+    rng = random.Random(seed)
+    for _ in range(5_000):
+        payload = rng.randbytes(rng.randrange(200))
+        for kind in (0x01, 0x02, 0x03, 0x81, 0x82, 0x83):
+            message = decode(kind, payload)
+            if message is not None:
+                assert message.to_bytes() == payload or isinstance(message, Hello), seed
