@@ -27,28 +27,26 @@ Step = Callable[[Lab], Outcome]
 STEPS: Final[tuple[Step, ...]] = (
     steps_install.prepare,
     steps_install.install,
-    steps_install.install_again,
-    steps_install.unit,
-    steps_install.check,
+    steps_install.doctor,
     steps_install.start,
     steps_install.realtime,
     steps_install.access,
-    steps_verdicts.can_verdicts,
+    steps_faults.unplugged,
+    steps_faults.disk_full,
     steps_verdicts.serial_verdicts,
-    steps_verdicts.can_frames,
+    steps_verdicts.can_verdicts,
+    steps_verdicts.can_overload,
     steps_faults.killed,
     steps_faults.hung,
     steps_faults.bus_down,
-    steps_faults.unplugged,
-    steps_faults.bridge_hung,
-    steps_faults.disk_full,
     steps_faults.clock_stepped,
     steps_faults.wrong_reload,
     steps_faults.stopped,
     steps_faults.wrong_start,
-    steps_install.boot,
+    steps_install.enabled,
     steps_install.uninstall,
 )
+"""Grasps come over both links from `start` on, while the other steps are done."""
 NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
 """Without these there is no use in going on."""
 
