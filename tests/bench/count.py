@@ -28,7 +28,7 @@ from daemon.run.loop import Loop
 from models.runtime import TactileModel
 from tests.process_replay import streams
 
-EVERY: Final = 25
+EVERY: Final = 13
 """One round in this many is counted: a counted one takes a second."""
 COUNTED: Final = 100
 """Rounds that are counted."""
