@@ -28,6 +28,11 @@ from tests.drivers.twins.signals import crept_s, fresh_residuals, played
 
 TABLES = ("palm_down", "palm_side")
 MAX_AGE_NS = 100_000_000
+STILL_COUNTS_PER_S = 20.0
+"""A hand is still when its electrodes move no faster, in the mean: so does a held touch of a real
+sensor, which relaxes."""
+QUIET_PHASES = (Phase.REST, Phase.APPROACH, Phase.TOUCH, Phase.CLOSE)
+"""No verdict may come in these."""
 
 
 @dataclass(slots=True)
