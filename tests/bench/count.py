@@ -28,9 +28,11 @@ from daemon.run.loop import Loop
 from models.runtime import TactileModel
 from tests.process_replay import streams
 
-EVERY: Final = 13
-"""One round in this many is counted: a counted one takes a second."""
-COUNTED: Final = 100
+EVERY: Final = 97
+"""One round in this many is counted, mostly idle ones: a counted one takes seconds."""
+AFTER: Final = 10
+"""Rounds after a judged one that are counted: a held grasp is judged again within 100 ms."""
+COUNTED: Final = 60
 """Rounds that are counted."""
 SWITCH: Final = """
 #include <valgrind/callgrind.h>
@@ -65,15 +67,17 @@ def count(switch: Path, log: Path) -> None:
     """Replay a log, and have callgrind count some rounds of the loop; runs within valgrind."""
     valgrind, go_round = ctypes.CDLL(str(switch)), Loop._go_round  # noqa: SLF001
     judged, readings = calls_of(TactileModel, "run"), calls_of(Loop, "_judge")
-    rounds = counted = 0
+    rounds = counted = last = 0
 
     def counted_round(*arguments: Any) -> None:  # noqa: ANN401
-        nonlocal rounds, counted
+        nonlocal rounds, counted, last
         rounds += 1
-        if rounds % EVERY:
-            go_round(*arguments)
-            return
         before = readings(), judged()
+        if rounds % EVERY and rounds > last:
+            go_round(*arguments)
+            if judged() > before[1]:
+                last = rounds + AFTER
+            return
         valgrind.begin()
         go_round(*arguments)
         kind = "judged" if judged() > before[1] else "idle"
@@ -88,6 +92,9 @@ def count(switch: Path, log: Path) -> None:
 
 def report(kind: str, dumps: Sequence[str]) -> None:
     """Print the medians of one kind of readings."""
+    if not dumps:
+        sys.stdout.write(f"{kind}: none counted\n")
+        return
     instructions, lines = [], []
     for dump in dumps:
         names = re.findall(r"^events: (.*)$", dump, re.M)[0].split()
