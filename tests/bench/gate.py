@@ -1,12 +1,7 @@
-"""Whole grasps made from real end points, through the judge behind its gate: when, and how right.
-
-`python -m tests.bench.gate DIR --grasps 500` prints a few lines per rate; DIR is the folder that
-holds `bts3/` and `untouched/`. What is made of slides: `tests.bench.stillness`.
-"""
+"""Whole grasps made from real end points, through the judge behind its gate."""
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -28,7 +23,6 @@ from drivers.twins.grasps.whole_grasps import (
     read_end_points,
     rest_above,
 )
-from models import zoo
 from models.runtime import TactileModel
 from tests.drivers.twins.signals import crept_s, fresh_residuals, played
 
@@ -159,66 +153,3 @@ def streams(
         ),
         "100 Hz fresh": WholeGrasps(rest, points, noise=played(noise), seed=seed),
     }
-
-
-def lines(name: str, found: Study, *, early: bool) -> Iterator[str]:
-    """What was found, for people."""
-    grasps = found.grasps
-    judged = [seen for seen in grasps if seen.before_lift]
-    times = 1 + early
-    as_often = sum(len(seen.before_lift) == times for seen in grasps)
-    yield (
-        f"{name}: {len(grasps)} grasps, {len(judged)} judged before the lift, {as_often} of them "
-        f"{'early and surely' if early else 'once'}"
-    )
-    for place, kind in enumerate(("early", "sure") if early else ("sure",)):
-        told = [
-            (seen, seen.before_lift[place][0]) for seen in judged if len(seen.before_lift) > place
-        ]
-        for since in ("still", "the end of closing"):
-            closes = since != "still"
-            begins = [seen.truth.closed_s if closes else seen.still_s for seen, _ in told]
-            waited_ms = 1e3 * (np.array([t_s for _, t_s in told]) - begins)
-            yield (
-                f"  from {since} to the {kind} verdict: p50 {np.quantile(waited_ms, 0.5):.0f}, "
-                f"p99 {np.quantile(waited_ms, 0.99):.0f}, max {waited_ms.max():.0f} ms"
-            )
-        spare_s = min(seen.truth.lift_s - t_s for seen, t_s in told)
-        yield f"  {1e3 * spare_s:.0f} ms or more before the lift"
-    same = sum(all(said.decision is seen.row for _, said in seen.before_lift) for seen in judged)
-    quiet = ", ".join(f"{number} in {phase}" for phase, number in found.too_early.items())
-    yield (
-        f"  verdict as on the table's row: {same} of {len(judged)}; verdicts too early: "
-        f"{quiet or 'none'}; gone {1e3 * found.outlived_s:.0f} ms after the hand begins to open"
-    )
-    for seen in judged:
-        for _, said in seen.before_lift:
-            if said.decision is not seen.row:
-                yield (
-                    f"    grasp {seen.truth.grasp}: row {seen.row} {_shown(seen.row_p_slip)}, "
-                    f"stream {said.decision} {_shown(said.p_slip)} {' '.join(said.reasons)}"
-                )
-
-
-def _shown(p_slip: float | None) -> str:
-    return "" if p_slip is None else f"(p_slip {p_slip:.3f})"
-
-
-def main() -> None:
-    """Print the study."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.gate", description=__doc__)
-    parser.add_argument("data", type=Path, metavar="DIR")
-    parser.add_argument("--grasps", type=int, default=500)
-    parser.add_argument("--model", default="cnn1")
-    parser.add_argument("--sweeps", type=int, choices=(1, 3), default=3)
-    options = parser.parse_args()
-    points, rest = end_points(options.data / "bts3", options.grasps)
-    model = TactileModel(zoo.find(options.model))
-    for early in (False, True):
-        for name, stream in streams(options.data, points, rest).items():
-            found = study(stream, points, model, options.sweeps, early=early)
-            print("\n".join(lines(name, found, early=early)), flush=True)  # noqa: T201
-
-
-if __name__ == "__main__":
-    main()

@@ -1,21 +1,16 @@
-"""What several hands on one computer cost, and several subscribers to one.
+"""A hand whose latency is measured: a daemon or an echo, its twin, and what a subscriber hears.
 
-`python -m tests.bench.hands` prints a Markdown table: 1, 2, 4 and 8 daemons, each with a twin at
-100 Hz, then one daemon with 1, 10 and 100 subscribers. A question is asked for every reading, so
-that each is judged; the latency, of those that were, is from just before the system call that
-writes the last byte to a subscriber in another process.
+A question is asked for every reading, so that each is judged. The latency is from just before the
+system call that writes the last byte to a subscriber in another process.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import struct
-import sys
-import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,20 +21,14 @@ import zmq
 from numpy.typing import NDArray
 
 from daemon.publish.messages import decode_verdict
-from models import zoo
 from tests.bench.live import (
     PATIENCE_S,
     Child,
-    Kind,
     Subscriber,
     TwinPlan,
-    Usage,
-    end_children_at_sigterm,
     new_tally,
     start_daemon,
-    start_listeners,
     start_twin,
-    table,
     tactile_section,
     usage,
     where_of,
@@ -138,12 +127,10 @@ def percentiles(values: Sequence[Micros]) -> dict[str, float]:
     return {n: round(float(np.quantile(all_of_them, share)), 1) for n, share in shares.items()}
 
 
-def scene_text(
-    tactile: str, endpoint: str, model: str, hand: str, *, realtime: bool, settled: bool
-) -> str:
+def scene_text(tactile: str, endpoint: str, model: str, *, realtime: bool, settled: bool) -> str:
     """A scene that keeps nothing and judges what has settled, as by default, or when asked."""
     text = (
-        f'{tactile}[hand]\nname = "{hand}"\n[model]\nname = "{model}"\n'
+        f'{tactile}[hand]\nname = "right"\n[model]\nname = "{model}"\n'
         f'[session]\nkeep = false\n[publish]\nendpoint = "{endpoint}"\n'
     )
     text += "" if settled else f'[gate]\nmode = "request"\n[ask]\nendpoint = "{endpoint}.ask"\n'
@@ -160,24 +147,13 @@ def promote(pid: int, priority: int) -> None:
 class Hand:
     """One publisher, daemon or echo, and its twin."""
 
-    def __init__(
-        self,
-        folder: Path,
-        kind: Kind,
-        name: str = "right",
-        *,
-        ends: int = 0,
-        settled: bool = False,
-    ) -> None:
+    def __init__(self, folder: Path, *, ends: int = 0, settled: bool = False) -> None:
         """`ends`: priority in realtime of the twin; 0 for none. `settled`: whole grasps, each of
         which is judged once it has settled, and not each reading of one that lasts, as `ask`ed."""
-        self.folder = folder / name
-        self.folder.mkdir()
-        self.log = self.folder / "log"
-        self.name = name
-        self.where = where_of(kind, self.folder)
+        self.folder = folder
+        self.log = folder / "log"
+        self.where = where_of("spi", folder)
         self.endpoint = f"ipc://{self.folder}/graspd"
-        self.kind = kind
         self.record = Record()
         self.settled = settled
         self._ends = ends
@@ -193,10 +169,8 @@ class Hand:
     def start_daemon(self, model: str, *, realtime: bool = False) -> None:
         """Publish verdicts of this model."""
         scene = self.folder / "scene.toml"
-        tactile = tactile_section(self.kind, self.where)
-        text = scene_text(
-            tactile, self.endpoint, model, self.name, realtime=realtime, settled=self.settled
-        )
+        tactile = tactile_section("spi", self.where)
+        text = scene_text(tactile, self.endpoint, model, realtime=realtime, settled=self.settled)
         scene.write_text(text)
         if not self.settled:
             context = self._stack.enter_context(zmq.Context())
@@ -226,7 +200,7 @@ class Hand:
             time.sleep(PERIOD_S)
         new_tally(self.folder / "tally")
         plan = TwinPlan(
-            kind=self.kind,
+            kind="spi",
             where=self.where,
             tally=str(self.folder / "tally"),
             held=not self.settled,
@@ -244,124 +218,41 @@ class Hand:
         return stamps_ns
 
 
-def hear(
-    subscriber: Subscriber, hands: Mapping[bytes, Hand], seconds: float, *, echo: bool = False
-) -> None:
-    """Take in what the hands publish, by topic, for so long."""
+def hear(subscriber: Subscriber, hand: Hand, seconds: float, *, echo: bool = False) -> None:
+    """Take in what the hand publishes, for so long."""
     until_s = time.monotonic() + seconds
     while (left_s := until_s - time.monotonic()) > 0:
         message = subscriber.take(left_s)
-        if message is not None:
-            hand = hands[message[0]]
-            if echo:
-                hand.record.add_echo(message[1], subscriber.received_ns)
-            else:
-                hand.record.add(message[1], subscriber.received_ns, settled=hand.settled)
-                hand.ask()
+        if message is None:
+            continue
+        if echo:
+            hand.record.add_echo(message[1], subscriber.received_ns)
+        else:
+            hand.record.add(message[1], subscriber.received_ns, settled=hand.settled)
+            hand.ask()
 
 
-def measure(
-    hands: Sequence[Hand], seconds: float, *, ends: int = 0, echo: bool = False
-) -> list[float]:
-    """Fill the hands' records for so long; share of a core that each publisher used, %.
+def measure(hand: Hand, seconds: float, *, ends: int = 0, echo: bool = False) -> float:
+    """Fill the hand's record for so long; return the share of a core that it used, %.
 
     Raises `RuntimeError` if not all that was to be judged was.
     """
-    by_topic = {f"verdict.{hand.name}".encode(): hand for hand in hands}
-    with Subscriber(*(hand.endpoint for hand in hands)) as subscriber:
+    record = hand.record
+    with Subscriber(hand.endpoint) as subscriber:
         deadline_s = time.monotonic() + PATIENCE_S
-        while any(not hand.record.judged for hand in hands) and time.monotonic() < deadline_s:
-            hear(subscriber, by_topic, WARM_UP_S, echo=echo)
-        hear(subscriber, by_topic, WARM_UP_S, echo=echo)
-        for hand in hands:
-            hand.record.clear()
-        before = [usage(hand.publisher.pid) for hand in hands]
+        while not record.judged and time.monotonic() < deadline_s:
+            hear(subscriber, hand, WARM_UP_S, echo=echo)
+        hear(subscriber, hand, WARM_UP_S, echo=echo)
+        record.clear()
+        before = usage(hand.publisher.pid)
         promote(os.getpid(), ends)
-        hear(subscriber, by_topic, seconds, echo=echo)
+        hear(subscriber, hand, seconds, echo=echo)
         promote(os.getpid(), 0)
-        after = [usage(hand.publisher.pid) for hand in hands]
-    for hand in hands:
-        judged, readings = hand.record.judged, hand.record.readings
-        if not judged or (judged < JUDGED_MIN_SHARE * readings and not hand.settled):
-            why = dict(hand.record.reasons)
-            raise RuntimeError(f"{judged} of {readings} readings were judged; others: {why}")
-    return [100 * (b.cpu_s - a.cpu_s) / (b.t_s - a.t_s) for a, b in zip(before, after, strict=True)]
-
-
-def measured(
-    hands: Sequence[Hand], seconds: float
-) -> tuple[list[float], list[Usage], list[Micros]]:
-    """Share of a core, %, and use of each daemon, and latencies, us; ends the hands."""
-    shares = measure(hands, seconds)
-    used = [usage(hand.publisher.pid) for hand in hands]
-    took_us = []
-    for hand in hands:
-        stamps_ns = hand.stop()
-        record = hand.record
-        known, sweeps = matched(record, stamps_ns)
-        took_us.append((np.array(record.received_ns)[known] - stamps_ns[sweeps, 1]) / 1e3)
-    return shares, used, took_us
-
-
-def row(name: str, hands: Sequence[Hand], seconds: float) -> list[str]:
-    """A row of the table; ends the hands."""
-    shares, used, took_us = measured(hands, seconds)
-    us = percentiles(took_us)
-    return [
-        name,
-        f"{np.mean(shares):.1f}",
-        f"{sum(shares):.1f}",
-        f"{np.mean([one.rss_kib for one in used]) / 1024:.0f}",
-        f"{sum(one.pss_kib for one in used) / 1024:.0f}",
-        f"{us['p50']:.0f}",
-        f"{us['p99']:.0f}",
-    ]
-
-
-def with_daemons(number: int, model: str, kind: Kind, seconds: float) -> list[str]:
-    """So many hands, one subscriber to all of them."""
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        hands = [stack.enter_context(Hand(Path(folder), kind, f"h{n}")) for n in range(number)]
-        for hand in hands:
-            hand.start_daemon(model)
-        return row(f"{number} daemons", hands, seconds)
-
-
-def with_subscribers(number: int, model: str, kind: Kind, seconds: float) -> list[str]:
-    """One hand, so many subscribers; one of them is timed, the others share a process."""
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        hand = stack.enter_context(Hand(Path(folder), kind))
-        hand.start_daemon(model)
-        if number > 1:
-            stack.enter_context(start_listeners(hand.endpoint, number - 1)).line()
-        return row(f"{number} subscribers", [hand], seconds)
-
-
-HEAD = (
-    "",
-    "CPU of each, % of a core",
-    "of all",
-    "RSS of each, MiB",
-    "PSS of all",
-    "to a subscriber p50, us",
-    "p99",
-)
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench.hands", description=__doc__)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each row")
-    parser.add_argument("--model", default="small-session", choices=zoo.names())
-    parser.add_argument("--link", choices=("spi", "can"), default="spi")
-    parser.add_argument("--daemons", nargs="*", type=int, default=(1, 2, 4, 8))
-    parser.add_argument("--subscribers", nargs="*", type=int, default=(1, 10, 100))
-    given = parser.parse_args()
-    end_children_at_sigterm()
-    rows = [with_daemons(n, given.model, given.link, given.seconds) for n in given.daemons]
-    rows += [with_subscribers(n, given.model, given.link, given.seconds) for n in given.subscribers]
-    sys.stdout.write(table(HEAD, rows))
-
-
-if __name__ == "__main__":
-    main()
+        after = usage(hand.publisher.pid)
+    is_enough = hand.settled or record.judged >= JUDGED_MIN_SHARE * record.readings
+    if not record.judged or not is_enough:
+        why = dict(record.reasons)
+        raise RuntimeError(
+            f"{record.judged} of {record.readings} readings were judged; others: {why}"
+        )
+    return 100 * (after.cpu_s - before.cpu_s) / (after.t_s - before.t_s)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from daemon.process.text import markdown_table
 from drivers.base import FINGERS
 from drivers.spi.messages import Message, Sweep
-from drivers.twins.can import CanTwin, Outgoing
+from drivers.twins.can import CanTwin
 from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasp_script import Durations, Phase
 from drivers.twins.grasps.grasps import Counts
@@ -52,8 +52,6 @@ SETTLED_SWEEPS = 200
 HEARING = "hearing"
 DRAIN_S = 0.5
 """How long a twin that was told to stop stays there, s, so that all it sent is read."""
-CAN_FRAMES = 3
-"""Frames of a sweep: one per finger."""
 
 Kind = Literal["spi", "can"]
 Stamp = tuple[int, int, int]
@@ -80,8 +78,8 @@ class TwinPlan(msgspec.Struct, frozen=True, kw_only=True):
     """File for the time of each sweep's end, monotonic ns, 64-bit integers, in its place by the
     tally (`spi` only)."""
     stamps: str | None = None
-    """File for the times of each sweep: shape (sweeps, 3), monotonic ns of its end, and of before
-    and after the system call that wrote its last bytes."""
+    """File for the times of each sweep (`spi` only): shape (sweeps, 3), monotonic ns of its end,
+    and of before and after the system call that wrote its last bytes."""
 
 
 def new_tally(path: Path) -> Tally:
@@ -136,28 +134,6 @@ class StampedSpiTwin(SpiTwin):
             self.stamps_ns.append((end_ns, self._before_ns, self._after_ns))
 
 
-class StampedCanTwin(CanTwin):
-    """Notes when the last frame of each sweep is written; for sweeps without faults."""
-
-    def __init__(self, plan: TwinPlan, counts: Iterator[Counts], first_sweep: int) -> None:
-        super().__init__(
-            "udp_multicast",
-            plan.where,
-            counts,
-            format="sweep_fd",
-            arbitration_id=can_id(plan.where),
-            rate_hz=plan.rate_hz,
-            first_sweep=first_sweep % (1 << 16),
-            faults=plan.faults,
-        )
-        self.frames_ns: list[Stamp] = []
-
-    def put(self, outgoing: Outgoing) -> None:
-        before_ns = time.monotonic_ns()
-        super().put(outgoing)
-        self.frames_ns.append((before_ns, before_ns, time.monotonic_ns()))
-
-
 def serve_twin(plan: TwinPlan) -> None:
     """Be a twin until SIGTERM."""
     stop = threading.Event()
@@ -197,15 +173,22 @@ def _serve_can(plan: TwinPlan, tally: Tally, stop: threading.Event) -> list[Stam
         for sweeps, counts in enumerate(_counts(plan), 1):
             known = {**twin.injected, "sweeps": sweeps, "unsent": twin.unsent}
             tally[:] = before + [known.get(name, 0) for name in TALLIED]
-            if plan.stamps is None:
-                twin.frames_ns.clear()
             yield counts
 
-    twin = StampedCanTwin(plan, counted(), int(before[0]))
+    twin = CanTwin(
+        "udp_multicast",
+        plan.where,
+        counted(),
+        format="sweep_fd",
+        arbitration_id=can_id(plan.where),
+        rate_hz=plan.rate_hz,
+        first_sweep=int(before[0]) % (1 << 16),
+        faults=plan.faults,
+    )
     with twin:
         twin.serve(stop)
         time.sleep(DRAIN_S)
-    return twin.frames_ns[CAN_FRAMES - 1 :: CAN_FRAMES]
+    return []
 
 
 def tactile_section(kind: Kind, where: str) -> str:

@@ -1,24 +1,19 @@
 """From the last byte on the wire to the verdict in another process, readings paced at 100 Hz.
 
-`python -m tests.bench.wire` prints a Markdown table, and with `--json FILE` writes all figures. The
-twin, the daemon and the subscriber are processes of their own, and CLOCK_MONOTONIC is the same to
-all. In the same run, in turns of some seconds: a bare onnxruntime session of the same model, in a
-process of its own, and an empty echo over the same path. With `[realtime]` echo and session run at
-the same priority. The last byte counts from just before the system call that writes it (on CAN,
-with python-can's packing): it may return late, after the daemon has begun. Needs stress-ng for the
-loaded half.
+`python -m tests.bench.wire` prints a Markdown table. The twin, the daemon and the subscriber are
+processes of their own, and CLOCK_MONOTONIC is the same to all. In the same run, in turns of some
+seconds: a bare onnxruntime session of the same model, in a process of its own, and an empty echo
+over the same path. With `[realtime]` echo and session run at the same priority. The last byte
+counts from just before the system call that writes it: it may return late, after the daemon has
+begun. Needs stress-ng for the loaded half. What must be told to 5 %: `tests.bench.count`.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import json
 import os
-import platform
 import select
-import socket
-import struct
 import subprocess
 import sys
 import tempfile
@@ -30,7 +25,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import zmq
 from numpy.typing import NDArray
@@ -52,11 +46,8 @@ from tests.bench.hands import (
     promote,
 )
 from tests.bench.live import (
-    CAN_FRAMES,
-    CPUS,
     PATIENCE_S,
     Child,
-    Kind,
     end_children_at_sigterm,
     table,
 )
@@ -70,8 +61,6 @@ SWEEP_MIN_BYTES = 100
 """A SWEEP has 170 bytes, a STATUS 40."""
 GREETING_S = 0.2
 """A bridge that was just plugged in has said HELLO by then, and sends no more before START."""
-CAN_PORT = 43113
-"""Of python-can's `udp_multicast`."""
 AS_ECHO = ("-m", "tests.bench.wire", "--echo")
 LOADS = ("idle", "loaded")
 STRESS = ("stress-ng", "--cpu", "2", "--quiet")
@@ -81,38 +70,19 @@ STRESS = ("stress-ng", "--cpu", "2", "--quiet")
 class Times:
     """What was measured of one candidate, us, each array one value per reading."""
 
-    before: list[Micros] = field(default_factory=list)
+    whole: list[Micros] = field(default_factory=list)
     """From just before the system call that wrote the last byte to the subscriber."""
-    after: list[Micros] = field(default_factory=list)
-    """The same from its return."""
     published: list[Micros] = field(default_factory=list)
     """From just before that call until the daemon passed the verdict to ZeroMQ."""
-    told: list[Micros] = field(default_factory=list)
-    """From the reading's `t_mono_ns` to the subscriber."""
     cpu_percent: list[float] = field(default_factory=list)
 
     def add(self, record: Record, stamps_ns: NDArray[np.int64], cpu_percent: float) -> None:
         """Take in a turn. Raises `RuntimeError` if messages and sweeps do not fit."""
         known, sweeps = matched(record, stamps_ns)
-        _, before, after = stamps_ns[sweeps].T
-        received = np.array(record.received_ns)[known]
-        self.before.append((received - before) / 1e3)
-        self.after.append((received - after) / 1e3)
-        self.published.append((np.array(record.published_ns)[known] - before) / 1e3)
-        self.told.append((received - np.array(record.told_ns)[known]) / 1e3)
+        written = stamps_ns[sweeps, 1]
+        self.whole.append((np.array(record.received_ns)[known] - written) / 1e3)
+        self.published.append((np.array(record.published_ns)[known] - written) / 1e3)
         self.cpu_percent.append(cpu_percent)
-
-    def as_dict(self) -> dict[str, object]:
-        """Percentiles of each, us, the processor's share and the number of readings."""
-        found: dict[str, object] = {
-            name: percentiles(getattr(self, name))
-            for name in ("before", "after", "published", "told")
-            if getattr(self, name)
-        }
-        if self.cpu_percent:
-            found["cpu_percent"] = round(float(np.mean(self.cpu_percent)), 2)
-        found["readings"] = sum(map(len, self.before))
-        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +90,6 @@ class Options:
     """How to measure."""
 
     seconds: float
-    kind: Kind
     ends: int
     settled: bool
 
@@ -129,10 +98,10 @@ def daemon_turn(options: Options, model: str, times: Times, realtime: bool) -> N
     """One turn of the daemon."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Hand(Path(folder), options.kind, ends=options.ends, settled=options.settled) as hand,
+        Hand(Path(folder), ends=options.ends, settled=options.settled) as hand,
     ):
         hand.start_daemon(model, realtime=realtime)
-        (cpu,) = measure([hand], options.seconds, ends=options.ends)
+        cpu = measure(hand, options.seconds, ends=options.ends)
         times.add(hand.record, hand.stop(), cpu)
 
 
@@ -140,12 +109,12 @@ def echo_turn(options: Options, times: Times, realtime: bool) -> None:
     """One turn of the empty echo."""
     with (
         tempfile.TemporaryDirectory() as folder,
-        Hand(Path(folder), options.kind, ends=options.ends) as hand,
+        Hand(Path(folder), ends=options.ends) as hand,
     ):
-        hand.publish(Child([*AS_ECHO, options.kind, hand.where, hand.endpoint], hand.log))
+        hand.publish(Child([*AS_ECHO, hand.where, hand.endpoint], hand.log))
         if realtime:
             promote(hand.publisher.pid, PRIORITY)
-        (cpu,) = measure([hand], options.seconds, ends=options.ends, echo=True)
+        cpu = measure(hand, options.seconds, ends=options.ends, echo=True)
         times.add(hand.record, hand.stop(), cpu)
 
 
@@ -156,7 +125,7 @@ def session_turn(options: Options, model: str, times: Times, realtime: bool) -> 
         if realtime:
             promote(child.pid, PRIORITY)
         printed, _ = child.process.communicate(timeout=options.seconds + PATIENCE_S)
-    times.before.append(np.array(json.loads(printed), dtype=np.float64))
+    times.whole.append(np.array(json.loads(printed), dtype=np.float64))
 
 
 def run_session(model: str, seconds: float) -> None:
@@ -174,18 +143,17 @@ def run_session(model: str, seconds: float) -> None:
     sys.stdout.write(json.dumps(took_us))
 
 
-def run_echo(kind: Kind, where: str, endpoint: str) -> None:
+def run_echo(where: str, endpoint: str) -> None:
     """The process of the echo: for each sweep as many bytes as a verdict, without looking at it."""
     with zmq.Context() as context, context.socket(zmq.PUB) as out:
         out.bind(endpoint)
         padding = bytes(VERDICT_BYTES - ECHO.size)
-        sweeps = whole_serial(where) if kind == "spi" else whole_multicast(where)
-        for number, _ in enumerate(sweeps):
+        for number, _ in enumerate(whole_sweeps(where)):
             head = ECHO.pack(number, time.monotonic_ns())
             out.send_multipart((b"verdict.right", head + padding))
 
 
-def whole_serial(where: str) -> Iterator[None]:
+def whole_sweeps(where: str) -> Iterator[None]:
     """Once for each sweep that has come."""
     while not Path(where).exists():
         time.sleep(PERIOD_S)
@@ -199,20 +167,6 @@ def whole_serial(where: str) -> Iterator[None]:
         *frames, held = (held + os.read(line, 4096)).split(DELIMITER)
         for frame in frames:
             if len(frame) >= SWEEP_MIN_BYTES:
-                yield
-
-
-def whole_multicast(where: str) -> Iterator[None]:
-    """Once for each sweep that has come."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as bus:
-        bus.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bus.bind((where, CAN_PORT))
-        group = struct.pack("4sL", socket.inet_aton(where), socket.INADDR_ANY)
-        bus.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
-        for frame in itertools.count(1):
-            select.select([bus], [], [])
-            bus.recv(4096)
-            if frame % CAN_FRAMES == 0:
                 yield
 
 
@@ -247,7 +201,7 @@ def turns(models: Sequence[str], options: Options) -> dict[str, Turn]:
 
 def run_all(given: argparse.Namespace) -> dict[Case, Times]:
     """Every case in every round."""
-    options = Options(given.seconds, given.link, given.ends, given.settled)
+    options = Options(given.seconds, given.ends, given.settled)
     found: dict[Case, Times] = {}
     for number in range(given.rounds):
         for load_name in given.loads:
@@ -266,9 +220,6 @@ HEAD = (
     "p99.9",
     "max, us",
     "to publishing p50",
-    "p99.9",
-    "after the write p50",
-    "by `t_mono_ns` p50",
     "echo p50",
     "session p50",
     f"of echo + {SESSION_SHARE:g} session",
@@ -276,39 +227,22 @@ HEAD = (
 )
 
 
-def report(found: Mapping[Case, Times]) -> list[dict[str, object]]:
-    """One row for each case of the daemon: its figures, and those of echo and session."""
-    rows = []
-    for (load_name, realtime, name), times in found.items():
+def rows(times: Mapping[Case, Times]) -> Iterator[list[str]]:
+    """A row of the table for each case of the daemon, beside echo and session."""
+    for (load_name, realtime, name), daemon in times.items():
         what, _, model = name.partition(" ")
         if what != "daemon":
             continue
-        echo, session = (found[load_name, realtime, n] for n in ("echo", f"session {model}"))
-        echo_p50, session_p50 = (percentiles(t.before)["p50"] for t in (echo, session))
-        aim = echo_p50 + SESSION_SHARE * session_p50
-        row: dict[str, object] = {"model": model, "load": load_name, "realtime": realtime}
-        row |= {"daemon": times.as_dict(), "echo": echo.as_dict(), "session": session.as_dict()}
-        row["of_the_aim"] = round(percentiles(times.before)["p50"] / aim, 2)
-        rows.append(row)
-    return rows
-
-
-def cells(times: Times, row: Mapping[str, object], found: Mapping[Case, Times]) -> list[object]:
-    """A row of the table."""
-    load_name, realtime, model = str(row["load"]), bool(row["realtime"]), row["model"]
-    whole, published = percentiles(times.before), percentiles(times.published)
-    name = f"`{model}`, {load_name}{', `[realtime]`' if realtime else ''}"
-    figures = [
-        *whole.values(),
-        published["p50"],
-        published["p99.9"],
-        percentiles(times.after)["p50"],
-        percentiles(times.told)["p50"],
-        percentiles(found[load_name, realtime, "echo"].before)["p50"],
-        percentiles(found[load_name, realtime, f"session {model}"].before)["p50"],
-    ]
-    cpu = float(np.mean(times.cpu_percent))
-    return [name, *(f"{us:.0f}" for us in figures), row["of_the_aim"], f"{cpu:.1f}"]
+        whole = percentiles(daemon.whole)
+        echo = percentiles(times[load_name, realtime, "echo"].whole)["p50"]
+        session = percentiles(times[load_name, realtime, f"session {model}"].whole)["p50"]
+        micros = (*whole.values(), percentiles(daemon.published)["p50"], echo, session)
+        yield [
+            f"`{model}`, {load_name}{', `[realtime]`' if realtime else ''}",
+            *(f"{us:.0f}" for us in micros),
+            f"{whole['p50'] / (echo + SESSION_SHARE * session):.2f}",
+            f"{np.mean(daemon.cpu_percent):.1f}",
+        ]
 
 
 def main() -> None:
@@ -316,7 +250,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench.wire", description=__doc__)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each turn")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--link", choices=("spi", "can"), default="spi")
     parser.add_argument("--models", nargs="+", default=MODELS, choices=zoo.names())
     parser.add_argument("--loads", nargs="+", default=LOADS, choices=LOADS)
     parser.add_argument("--no-realtime", dest="realtime", action="store_false")
@@ -329,8 +262,7 @@ def main() -> None:
         help="whole grasps, each of which is judged once it has settled, as by default, instead of "
         "each reading of one that lasts",
     )
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--echo", nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument("--echo", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--session", nargs=2, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.echo:
@@ -339,14 +271,7 @@ def main() -> None:
         run_session(given.session[0], float(given.session[1]))
     else:
         end_children_at_sigterm()
-        found = run_all(given)
-        rows = report(found)
-        daemons = [found[str(r["load"]), bool(r["realtime"]), f"daemon {r['model']}"] for r in rows]
-        lines = [cells(times, row, found) for times, row in zip(daemons, rows, strict=True)]
-        sys.stdout.write(table(HEAD, lines))
-        if given.json is not None:
-            machine = {"machine": platform.platform(), "cpus": len(CPUS)}
-            given.json.write_bytes(msgspec.json.encode({**machine, "rows": rows}))
+        sys.stdout.write(table(HEAD, list(rows(run_all(given)))))
 
 
 if __name__ == "__main__":

@@ -8,9 +8,8 @@ import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
-from daemon.publish.keys import make
 from drivers.recordings.csv_player import DEMO_RECORDING, DEMO_TABLE
 from tests.daemon.processes import TIMEOUT_S, start, wait_for
 
@@ -78,31 +77,6 @@ def _one_grasp(path: Path) -> Path:
     lines = [f"{number / RATE_HZ},{row}" for number, row in enumerate(kept)]
     path.write_text("\n".join([head, *lines, ""]))
     return path
-
-
-class Unlisted(NamedTuple):
-    """Keys of a client that a daemon does not know yet."""
-
-    section: str
-    """Of the daemon's scene."""
-    server: Path
-    own: Path
-    public: Path
-    clients: Path
-
-    def admit(self) -> None:
-        """Put the key on the daemon's list."""
-        self.public.rename(self.clients / self.public.name)
-
-
-def unlisted(folder: Path) -> Unlisted:
-    """Make them in a folder."""
-    server, secret = make(folder, "daemon")
-    public, own = make(folder / "theirs", "lab")
-    clients = folder / "clients"
-    make(clients, "other")
-    section = f'[curve]\nsecret_key = "{secret}"\nclients = "{clients}"\n'
-    return Unlisted(section, server, own, public, clients)
 
 
 def free_endpoint() -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import shutil
 import subprocess
@@ -45,7 +46,7 @@ def compiled(name: str) -> Path:
 def kept(command: Callable[[Path], Words], name: str) -> Path:
     """The program that `command` makes in the folder that it is given, or did of the same sources.
 
-    Four seconds of a processor for one, in each of the processes that run tests.
+    Four seconds of a processor for one, so processes that run tests wait for the first of them.
     """
     sources = [
         *CPP.glob("*.?pp"),
@@ -58,11 +59,13 @@ def kept(command: Callable[[Path], Words], name: str) -> Path:
     for source in sorted(sources):
         digest.update(source.read_bytes())
     program = KEPT / digest.hexdigest()[:16] / name
-    if not program.exists():
-        program.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=program.parent) as folder:
-            subprocess.run(command(Path(folder)), check=True, timeout=200)
-            (Path(folder) / name).replace(program)
+    program.parent.mkdir(parents=True, exist_ok=True)
+    with (program.parent / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not program.exists():
+            with tempfile.TemporaryDirectory(dir=program.parent) as folder:
+                subprocess.run(command(Path(folder)), check=True, timeout=200)
+                (Path(folder) / name).replace(program)
     return program
 
 

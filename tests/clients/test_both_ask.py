@@ -97,26 +97,19 @@ ANSWERS: dict[str, tuple[Answer, str]] = {
 
 @pytest.mark.parametrize(("answer", "expected"), ANSWERS.values(), ids=ANSWERS)
 def test_only_an_answer_that_fits_allows_a_lift(
-    tmp_path: Path, answer: Answer, expected: str
-) -> None:
-    with (
-        false_daemon(tmp_path, answer),
-        Client(f"ipc://{tmp_path}/out", ask_endpoint=f"ipc://{tmp_path}/ask") as graspd,
-    ):
-        said = graspd.may_i_lift(100.0 if expected != "unknown" else DEADLINE_S)
-    assert (bool(said), said.verdict.decision) == (expected == "stable", expected)
-
-
-@pytest.mark.parametrize(("answer", "expected"), ANSWERS.values(), ids=ANSWERS)
-def test_in_cpp_only_an_answer_that_fits_allows_a_lift(
     lift_gate: Path, tmp_path: Path, answer: Answer, expected: str
 ) -> None:
     deadline_s = 100.0 if expected != "unknown" else DEADLINE_S
     places = [f"ipc://{tmp_path}/out", str(deadline_s), f"ipc://{tmp_path}/ask"]
-    with false_daemon(tmp_path, answer):
+    with (
+        false_daemon(tmp_path, answer),
+        Client(places[0], ask_endpoint=places[2]) as graspd,
+    ):
+        said = graspd.may_i_lift(deadline_s)
         result = subprocess.run(
             [lift_gate, *places], capture_output=True, text=True, timeout=200, check=False
         )
+    assert (bool(said), said.verdict.decision) == (expected == "stable", expected)
     assert result.stdout.split()[0] == expected
     assert (result.returncode == 0) == (expected == "stable")
 
@@ -178,15 +171,8 @@ STILL: dict[str, tuple[dict[str, Any], bool, bool]] = {
     "moving": ({"still_ms": 0.0}, False, True),
     "not known": ({"still_ms": None}, False, True),
     "not told": ({}, False, True),
-    "less than nothing": ({"still_ms": -1.0}, False, False),
     "no number": ({"still_ms": float("nan")}, False, False),
-    "for ever": ({"still_ms": float("inf")}, False, False),
-    "a text": ({"still_ms": "240"}, False, False),
     "true": ({"still_ms": True}, False, False),
-    "a list": ({"still_ms": [240.0]}, False, False),
-    "early is no word": ({"still_ms": 240.0, "early": "no"}, False, False),
-    "moves less than not": ({"still_ms": 240.0, "motion": {"ff": -1.0}}, False, False),
-    "without a limit": ({"still_ms": 240.0, "motion_limits": {"ff": None}}, False, False),
 }
 """What the daemon says, whether one may lift who wants 240 ms, and who does not ask for any."""
 
@@ -222,21 +208,6 @@ def test_both_answer_and_newest_message_must_have_been_still(
         assert bool(graspd.may_i_lift(deadline_s, still_ms=240.0)) is may
         words = ["--still", "240", places[0], str(deadline_s), places[1]]
         assert cpp_lifts(lift_gate, *words) is may
-
-
-def test_a_supervised_lift_must_have_been_still_as_any(lift_gate: Path, tmp_path: Path) -> None:
-    out = f"ipc://{tmp_path}/out"
-    more = ADDED | {"supervised": True, "p_slip_model": None, "reasons": ["unproven"]}
-    with false_daemon(tmp_path, told(), "unknown", **more | {"still_ms": 130.0}):
-        with Client(out) as graspd:
-            assert graspd.may_i_lift(100.0, supervised=True, still_ms=100)
-            assert not graspd.may_i_lift(DEADLINE_S, supervised=True, still_ms=240)
-        asked = [str(lift_gate), "--supervised", "--still"]
-        for still_ms, code in (("100", 0), ("240", 1)):
-            result = subprocess.run(
-                [*asked, still_ms, out, "1.0"], capture_output=True, timeout=200, check=False
-            )
-            assert result.returncode == code
 
 
 @pytest.mark.parametrize("still_ms", [-1.0, float("nan"), float("inf"), True, "240"])
@@ -334,15 +305,10 @@ TAKEN: dict[str, tuple[list[bytes], str]] = {
     "refused": ([b'{"v":1,"ok":false,"why":"unknown grasp: no"}'], "unknown grasp: no"),
     "not kept": ([b'{"v":1,"ok":false,"why":"not kept: no room"}'], "not kept: no room"),
     "of a later version": ([b'{"v":2,"ok":true}'], "version"),
-    "without a version": ([b'{"ok":true}'], "malformed"),
     "refused without why": ([b'{"v":1,"ok":false}'], "malformed"),
-    "refused with no word": ([b'{"v":1,"ok":false,"why":""}'], "malformed"),
     "refused with a number": ([b'{"v":1,"ok":false,"why":1}'], "malformed"),
-    "a number": ([b'{"v":1,"ok":1}'], "malformed"),
     "a verdict": ([json.dumps(verdict()).encode()], "malformed"),
     "not JSON": ([b"yes"], "malformed"),
-    "no object": ([b"[]"], "malformed"),
-    "no number": ([b'{"v":1,"ok":true,"later":NaN}'], "malformed"),
     "empty": ([b""], "malformed"),
     "of two frames": ([b'{"v":1,"ok":true}'] * 2, "malformed"),
     "nothing": ([], "no-answer"),
@@ -372,23 +338,7 @@ def test_an_outcome_has_the_object_as_it_was_given(
     assert found == [" ".join(["outcome", BOOT, "42", "slip", *given]).encode()] * 2
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "a mug",
-        "mug,cup",
-        '"mug"',
-        "mug's",
-        "müg",
-        "mug\n",
-        "x" * 65,
-        "=1",
-        "-1",
-        ".a",
-        "a/b",
-        "a@b",
-    ],
-)
+@pytest.mark.parametrize("name", ["a mug", "mug,cup", "müg", "mug\n", "x" * 65, "=1", "a/b"])
 def test_a_name_that_is_no_word_of_an_outcome_is_not_sent(
     lift_gate: Path, tmp_path: Path, name: str
 ) -> None:
@@ -450,12 +400,3 @@ def test_in_cpp_an_outcome_has_a_name(
     with heard(tmp_path, [b'{"v":1,"ok":true}']) as found:
         assert told_in_cpp(lift_gate, tmp_path, BOOT, "42", word)[0] == 0
     assert found == [f"outcome {BOOT} 42 {sent}".encode()]
-
-
-@pytest.mark.parametrize(
-    "words", [("", "42", "slip"), (BOOT, "0", "slip"), (BOOT, "42", "Slip"), (BOOT, "x", "slip")]
-)
-def test_in_cpp_an_outcome_of_nothing_is_a_wrong_command_line(
-    lift_gate: Path, tmp_path: Path, words: tuple[str, ...]
-) -> None:
-    assert told_in_cpp(lift_gate, tmp_path, *words)[0] == 2

@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from daemon.publish.keys import make
-from tests.clients.bench import Daemon, free_endpoint, unlisted
+from tests.clients.bench import Daemon, free_endpoint
 from tests.clients.building import sleep_at_will
 from tests.clients.messages import frames, verdict
 
@@ -66,13 +66,6 @@ def test_a_grasp_that_settles_may_be_lifted_by_who_listens_and_by_who_asks(
             assert code == MAY, text
 
 
-def test_nobody_there_is_no_at_the_deadline(lift_gate: Path, tmp_path: Path) -> None:
-    began_s = time.monotonic()
-    code, text = asked(lift_gate, f"ipc://{tmp_path}/nobody", 0.3)
-    assert time.monotonic() - began_s >= 0.3
-    assert (code, text.startswith("unknown [ no-message ]")) == (MAY_NOT, True)
-
-
 def test_stopped_restarted_and_slow_it_says_so(lift_gate: Path, tmp_path: Path) -> None:
     with Daemon(tmp_path) as daemon, watching(lift_gate, daemon.endpoint) as watch:
         former = boot_id(line_with(watch, "stable", "slip"))
@@ -103,21 +96,6 @@ def test_only_who_has_keys_is_told(lift_gate: Path, tmp_path: Path) -> None:
             line_with(watch, "stable", "slip")
         code, text = asked(lift_gate, endpoint, 0.3)
     assert (code, text.startswith("unknown [ no-message ]")) == (MAY_NOT, True)
-
-
-def test_who_was_turned_away_is_let_in_when_its_key_is_on_the_list(
-    lift_gate: Path, tmp_path: Path
-) -> None:
-    keys = unlisted(tmp_path)
-    endpoint = free_endpoint()
-    with (
-        Daemon(tmp_path, keys.section, endpoint=endpoint),
-        watching(lift_gate, endpoint, keys.server, keys.own) as watch,
-    ):
-        line_with(watch, "no-message")
-        time.sleep(1.5)
-        keys.admit()
-        line_with(watch, "stable", "slip")
 
 
 def test_what_came_before_the_computer_slept_is_unknown_however_young_it_looks(

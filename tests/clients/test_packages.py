@@ -78,18 +78,6 @@ def test_cmake_finds_the_installed_client(prefix: Path, project: Path) -> None:
     works(project / "build" / PROGRAM, project)
 
 
-def test_cmake_takes_the_sources_of_the_client(prefix: Path, project: Path) -> None:
-    del prefix  # skips where there is no compiler
-    lines = [
-        f'add_subdirectory("{CPP}" client)' if line.startswith("find_package") else line
-        for line in block("cmake", "cmake_minimum")
-    ]
-    (project / "CMakeLists.txt").write_text("\n".join(lines))
-    run("cmake", "-S", project, "-B", project / "build")
-    run("cmake", "--build", project / "build")
-    works(project / "build" / PROGRAM, project)
-
-
 def test_pkg_config_finds_the_installed_client(prefix: Path, project: Path) -> None:
     (described,) = prefix.glob("share/**/graspd_client.pc")
     line = block("sh", "cmake -S")[1]

@@ -67,56 +67,6 @@ def test_noise_is_counted_and_never_stable(payload: bytes) -> None:
     assert newest.counts.malformed == 1
 
 
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"[" * 60_000,
-        json.dumps(verdict(0, START_NS)).replace("0.125", "NaN").encode(),
-        json.dumps(verdict(0, START_NS)).replace("1700000000.0", "Infinity").encode(),
-        json.dumps(verdict(0, START_NS)).replace("1700000000.0", "1e999").encode(),
-        json.dumps(verdict(0, START_NS)).encode("utf-16"),
-        b"\xef\xbb\xbf" + json.dumps(verdict(0, START_NS)).encode(),
-        json.dumps([verdict(0, START_NS)]).encode(),
-    ],
-    ids=["deep", "nan", "infinity", "huge", "utf-16", "bom", "list"],
-)
-def test_what_only_some_readers_take_for_json_is_malformed(payload: bytes) -> None:
-    newest = local()
-    newest.take([TOPIC, payload], START_NS, START_NS)
-    assert newest.at(START_NS).reasons == ("malformed",)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"reasons": ["moving"]},
-        {"reasons": None},
-        {"valid": False},
-        {"valid": 1},
-        {"verdict_code": 2},
-        {"verdict_code": True},
-        {"verdict": "Stable"},
-        {"p_slip": None},
-        {"p_slip": 1.01},
-        {"p_slip": True},
-        {"silence_ms": 1.1e12},
-        {"silence_ms": -1.0},
-        {"age_ms": "1"},
-        {"seq": 0.0},
-        {"seq": -1},
-        {"grasp": None},
-        {"boot_id": 7},
-        {"verdict": "unknown", "verdict_code": 0, "valid": False, "reasons": ["moving"]},
-        {"verdict": "unknown", "verdict_code": 0, "valid": False, "p_slip": None},
-    ],
-    ids=str,
-)
-def test_a_message_that_contradicts_itself_is_malformed(change: dict[str, object]) -> None:
-    newest = local()
-    newest.take(frames(verdict(0, START_NS) | change), START_NS, START_NS)
-    assert newest.at(START_NS).reasons == ("malformed",)
-
-
 def said(message: dict[str, Any]) -> Verdict:
     """What is known at once of a message."""
     newest = local()
@@ -163,58 +113,6 @@ def test_golden_verdicts_are_understood_with_and_without_what_was_added(path: Pa
         )
 
 
-@pytest.mark.parametrize("outcome", ["stable", "slip"])
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"p_slip_model": 1.01},
-        {"p_slip_model": "0.3"},
-        {"p_slip_model": True},
-        {"outcomes": None},
-        {"outcomes": -1},
-        {"outcomes": 1.0},
-        {"outcomes": True},
-        {"supervised": None},
-        {"supervised": 1},
-        {"supervised": "false"},
-        {"risk": []},
-        {"risk": False},
-        {"risk": {}},
-        *({"risk": {key: RISK[key] for key in RISK if key != name}} for name in RISK),
-        {"risk": RISK | {"target": 1.5}},
-        {"risk": RISK | {"target": "0.05"}},
-        {"risk": RISK | {"lifts": None}},
-        {"risk": RISK | {"lifts": 1}},
-        {"risk": RISK | {"slips": 2.0}},
-        {"risk": RISK | {"bound": -1.0}},
-        {"risk": RISK | {"bound": True}},
-        {"risk": RISK | {"warm_up_left": -1}},
-        {"early": None},
-        {"early": 0},
-        {"early": "false"},
-        {"still_ms": -1.0},
-        {"still_ms": "240"},
-        {"still_ms": True},
-        {"still_ms": 1.1e12},
-        {"motion": []},
-        {"motion": 1.0},
-        {"motion": {"ff": -0.1}},
-        {"motion": {"ff": "1"}},
-        {"motion": {"ff": False}},
-        {"motion_limits": [1.5]},
-        {"motion_limits": {"ff": None}},
-        {"motion_limits": {"ff": -1.5}},
-    ],
-    ids=str,
-)
-def test_what_was_added_and_contradicts_itself_is_malformed(
-    outcome: str, change: dict[str, object]
-) -> None:
-    assert said(verdict(0, START_NS, outcome, **ADDED)).decision == outcome
-    found = said(verdict(0, START_NS, outcome, **ADDED | change))
-    assert (found.reasons, found.supervised) == (("malformed",), False)
-
-
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -235,37 +133,6 @@ def test_a_lift_under_supervision_is_not_stable() -> None:
     assert (bool(found), found.supervised, found.reasons) == (False, True, ("unproven",))
     assert not said(verdict(0, START_NS, supervised=True))
     assert said(verdict(0, START_NS, "slip", supervised=True)).supervised
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"reasons": ["unproven", "moving"]},
-        {"reasons": ["stale"]},
-        {"reasons": ["of-a-later-version"]},
-        {"v": 2},
-        {"v": None},
-        {"supervised": 1},
-        {"p_slip_model": 0.3},
-        {"outcomes": -1},
-        {"risk": {}},
-    ],
-    ids=str,
-)
-def test_what_is_not_only_unproven_is_not_to_be_lifted_under_supervision(
-    change: dict[str, Any],
-) -> None:
-    found = said(supervised(0, START_NS, **change))
-    assert (bool(found), found.supervised) == (False, False)
-
-
-@pytest.mark.parametrize("later_ms", [100, 101, 200])
-def test_a_lift_under_supervision_gets_old_as_any(later_ms: int) -> None:
-    newest = local()
-    newest.take(frames(supervised(0, START_NS)), START_NS, START_NS)
-    assert newest.at(START_NS + 99 * MS).supervised
-    found = newest.at(START_NS + MS + later_ms * MS)
-    assert (found.decision, found.supervised) == ("unknown", False)
 
 
 def test_another_version_is_unknown_until_this_one_comes_again() -> None:

@@ -15,7 +15,7 @@ import pytest
 from models import trial, zoo
 from models.contract import ModelError
 from models.runtime import TactileModel
-from tests.bench.attacks import files
+from tests.models import hostile
 
 
 @pytest.fixture(autouse=True)
@@ -86,7 +86,7 @@ def test_one_that_takes_too_long_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("onnx", reason="needs the train extra")
-    path = files.giant(tmp_path)
+    path = hostile.giant(tmp_path)
     monkeypatch.setattr(trial, "TRIAL_S", 3.0)
     began_s = time.monotonic()
     with pytest.raises(ModelError, match="takes too long: no answer within 3 s"):
@@ -96,12 +96,12 @@ def test_one_that_takes_too_long_is_refused(
 
 def test_one_that_takes_too_much_memory_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("onnx", reason="needs the train extra")
-    path = files.giant(tmp_path, side=20_000)
+    path = hostile.giant(tmp_path, side=20_000)
     with pytest.raises(ModelError, match=r"Failed to allocate|no answer within|takes more than"):
         trial.load(path)
 
 
-@pytest.mark.parametrize("make", [files.external, files.endless])
+@pytest.mark.parametrize("make", [hostile.external, hostile.endless])
 def test_what_is_not_the_model_alone_is_refused_without_being_loaded(
     tmp_path: Path,
     make: Callable[[Path], Path],

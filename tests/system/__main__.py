@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.system import steps_faults, steps_install, steps_verdicts
-from tests.system.image import ImageError, image
+from tests.system.image import CACHE, ImageError, image
 from tests.system.lab import Bridge, Lab, Outcome
 from tests.system.machine import Machine, MachineError
 from tests.system.payload import make_payload
@@ -27,28 +27,26 @@ Step = Callable[[Lab], Outcome]
 STEPS: Final[tuple[Step, ...]] = (
     steps_install.prepare,
     steps_install.install,
-    steps_install.install_again,
-    steps_install.unit,
-    steps_install.check,
+    steps_install.doctor,
     steps_install.start,
     steps_install.realtime,
     steps_install.access,
-    steps_verdicts.can_verdicts,
+    steps_faults.unplugged,
+    steps_faults.disk_full,
     steps_verdicts.serial_verdicts,
-    steps_verdicts.can_frames,
+    steps_verdicts.can_verdicts,
+    steps_verdicts.can_overload,
     steps_faults.killed,
     steps_faults.hung,
     steps_faults.bus_down,
-    steps_faults.unplugged,
-    steps_faults.bridge_hung,
-    steps_faults.disk_full,
     steps_faults.clock_stepped,
     steps_faults.wrong_reload,
     steps_faults.stopped,
     steps_faults.wrong_start,
-    steps_install.boot,
+    steps_install.enabled,
     steps_install.uninstall,
 )
+"""Grasps come over both links from `start` on, while the other steps are done."""
 NEEDED: Final = frozenset((steps_install.prepare, steps_install.install, steps_install.start))
 """Without these there is no use in going on."""
 
@@ -57,13 +55,6 @@ def main(arguments: list[str] | None = None) -> int:
     """Run all steps; 0 if all is as it must be, 1 if something is not, 2 if it cannot be tried."""
     parser = argparse.ArgumentParser(prog="python -m tests.system", description=__doc__)
     parser.add_argument(
-        "--cache",
-        type=Path,
-        default=Path.home() / ".cache" / "graspd-system",
-        metavar="DIR",
-        help="image and wheels by their recipes, for all working copies; default %(default)s",
-    )
-    parser.add_argument(
         "--rebuild", action="store_true", help="build the image even if it is there"
     )
     options = parser.parse_args(arguments)
@@ -71,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     table = Table()
     try:
         with tempfile.TemporaryDirectory(prefix="graspd-system-") as folder:
-            _run(options.cache.resolve(), Path(folder), options.rebuild, table)
+            _run(Path(folder), options.rebuild, table)
     except (ImageError, MachineError) as error:
         sys.stderr.write(f"{error}\n")
         return 2
@@ -79,12 +70,12 @@ def main(arguments: list[str] | None = None) -> int:
     return 1 if table.failed else 0
 
 
-def _run(cache: Path, folder: Path, rebuild: bool, table: Table) -> None:
+def _run(folder: Path, rebuild: bool, table: Table) -> None:
     with table.timed("image") as seen:
-        built, is_new = image(cache, rebuild=rebuild)
+        built, is_new = image(CACHE, rebuild=rebuild)
         seen.append("built" if is_new else "from the cache")
     with table.timed("payload") as seen:
-        make_payload(cache, folder / "payload")
+        make_payload(CACHE, folder / "payload")
         seen.append("wheels, deploy, programs for the machine")
     bridge = Bridge(folder / "bridge")
     with bridge.serving(), Machine(built, folder / "payload", bridge.path, folder) as machine:

@@ -1,4 +1,7 @@
-"""The machine's disk: a small Debian with its own kernel, made by mmdebstrap and kept by recipe."""
+"""The machine's disk: a small Debian with its own kernel, made by mmdebstrap and kept by recipe.
+
+`python -m tests.system.image` builds it, if it is not there; any Python does, without packages.
+"""
 
 from __future__ import annotations
 
@@ -64,6 +67,10 @@ MASKED: Final = (
 SIZE_MIB: Final = 1600
 """Room for two virtual environments of graspd at once, as an upgrade needs."""
 BUILD_TIMEOUT_S: Final = 900.0
+
+
+CACHE: Final = Path.home() / ".cache" / "graspd-system"
+"""Keeps image and wheels, for all working copies."""
 
 
 class ImageError(Exception):
@@ -158,3 +165,7 @@ def run(command: list[str]) -> str:
     if done.returncode:
         raise ImageError(f"{command[0]} failed ({done.returncode}):\n{done.stderr.strip()[-4000:]}")
     return done.stdout
+
+
+if __name__ == "__main__":
+    image(CACHE)

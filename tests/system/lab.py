@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
-import shlex
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -162,12 +161,16 @@ class Lab:
             f"{PYTHON} {PAYLOAD}/guest/observe.py {endpoints}"
         )
 
-    def twin(self, *options: str) -> None:
-        """Start the CAN board's twin on vcan0, or another one in its place."""
+    def twin(self, rate_hz: float) -> None:
+        """Start the CAN board's twin on vcan0, or another one in its place.
+
+        It plays a recording, which costs it less than to make up grasps.
+        """
         self.sh(
             "systemctl stop twin-can 2>/dev/null; systemctl reset-failed twin-can 2>/dev/null\n"
             "systemd-run -q --unit=twin-can /usr/local/bin/graspd twin can "
-            f"--interface socketcan --channel vcan0 --format sweep_fd {shlex.join(options)}"
+            f"--interface socketcan --channel vcan0 --format sweep_fd --rate {rate_hz} "
+            f"--recording {PAYLOAD}/recording.csv --loop"
         )
 
     def await_twin(self) -> None:
@@ -186,7 +189,6 @@ class Bridge:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._quiet = threading.Event()
         grasps = synthetic_grasps(rate_hz=SERIAL_RATE_HZ, durations=GRASPS, loop=True)
         counts = (moment.counts for moment in grasps)
         self._twin = SpiTwin(path, counts, rate_hz=SERIAL_RATE_HZ)
@@ -197,16 +199,5 @@ class Bridge:
         with self._twin, at_work(self._serve):
             yield
 
-    @contextlib.contextmanager
-    def hung(self) -> Iterator[None]:
-        """Meanwhile the bridge neither hears nor says anything."""
-        self._quiet.set()
-        try:
-            yield
-        finally:
-            self._quiet.clear()
-
     def _serve(self, stop: threading.Event) -> None:
-        while not stop.is_set():
-            self._twin.serve(lambda: stop.is_set() or self._quiet.is_set())
-            stop.wait(0.01)
+        self._twin.serve(stop.is_set)

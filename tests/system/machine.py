@@ -26,7 +26,6 @@ ANSWER_TIMEOUT_S: Final = 200.0
 COMMAND_TIMEOUT_S: Final = 600.0
 SYNCHRONISE_S: Final = 5.0
 """After this long the agent is asked again: while it starts it loses what it was asked."""
-BOOT_ID: Final = "cat /proc/sys/kernel/random/boot_id"
 POLL_S: Final = (0.05, 0.1, 0.2, 0.5)
 """Waits between looks at whether a command has ended; the last one again and again."""
 AGENT_PORT: Final = "org.qemu.guest_agent.0"
@@ -105,20 +104,6 @@ class Machine:
             if self._qemu.poll() is not None:
                 raise MachineError(f"QEMU has ended: {self._complaint()}")
         raise MachineError(f"the machine has not booted in {BOOT_TIMEOUT_S:g} s")
-
-    def reboot(self) -> None:
-        """Start the machine anew, in good order; the messages so far are forgotten."""
-        former = self.run(BOOT_ID).out
-        self._begin("systemctl --no-block reboot")
-        deadline_s = time.monotonic() + BOOT_TIMEOUT_S
-        while time.monotonic() < deadline_s:
-            # The old one answers until it is stopped, and then in the middle no more.
-            with contextlib.suppress(MachineError):
-                if self.run(BOOT_ID, ANSWER_TIMEOUT_S).out != former:
-                    self.messages.forget()
-                    return
-            time.sleep(POLL_S[-1])
-        raise MachineError(f"the machine has not booted again in {BOOT_TIMEOUT_S:g} s")
 
     def _synchronise(self) -> None:
         """Ask the agent for a number, and read until it comes: what comes before is stale."""

@@ -62,11 +62,6 @@ class Messages:
             with at_work(partial(self._listen, port)):
                 yield
 
-    def forget(self) -> None:
-        """All messages so far: the machine's clock has started anew."""
-        with self._changed:
-            self._all = []
-
     def wait(self, wanted: Wanted, timeout_s: float, after_s: float = 0.0) -> Message | None:
         """The first that is wanted and came later than `after_s`; None if none came in time."""
         deadline_s = time.monotonic() + timeout_s

@@ -37,14 +37,19 @@ def make_payload(cache: Path, disk: Path) -> None:
         shutil.copytree(_dependencies(cache), wheels)
         _wheel(wheels, "--no-deps", str(PROJECT))
         shutil.copytree(PROJECT / "deploy", content / "deploy")
-        grasps = synthetic_grasps(RECORDED, rate_hz=CAN_RATE_HZ, durations=CAN_GRASPS)
-        with (content / "recording.csv").open("w") as file:
-            write_stream(grasps, file, t_decimals=1)
+        write_recording(content / "recording.csv")
         shutil.copytree(GUEST, content / "guest", ignore=shutil.ignore_patterns("__pycache__"))
         bytes_ = sum(path.stat().st_size for path in content.rglob("*"))
         size = f"{(bytes_ >> 20) * 5 // 4 + SLACK_MIB}M"
         options = ["-t", "ext4", "-E", "root_owner=0:0", "-d", str(content)]
         run(["mke2fs", "-q", *options, str(disk), size])
+
+
+def write_recording(path: Path) -> None:
+    """Write what the CAN board plays: the same grasps each time."""
+    grasps = synthetic_grasps(RECORDED, rate_hz=CAN_RATE_HZ, durations=CAN_GRASPS)
+    with path.open("w") as file:
+        write_stream(grasps, file, t_decimals=1)
 
 
 def _dependencies(cache: Path) -> Path:

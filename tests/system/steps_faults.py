@@ -7,7 +7,7 @@ from typing import Final
 
 from tests.system.lab import HANDS, PATIENCE_S, Lab, Outcome, StepError
 from tests.system.messages import Message
-from tests.system.steps_verdicts import REPLAY_TIMEOUT_S, judgement
+from tests.system.steps_verdicts import judgement
 
 OUTAGE_S: Final = 2.0
 """How long a cable stays unplugged."""
@@ -24,6 +24,7 @@ done
 cat /proc/cpuinfo > {FILLER}.last 2>/dev/null && exit 1
 :"""
 """Shell: fill the disk to the last block, without writing; fails if a file still fits."""
+REPLAY_TIMEOUT_S: Final = 600.0
 NO_SPACE: Final = "No space left on device"
 CANNOT_KEEP: Final = f"cannot keep the session: {NO_SPACE}"
 CANNOT_RECORD: Final = f"{NO_SPACE}; nothing is recorded"
@@ -85,22 +86,6 @@ def unplugged(lab: Lab) -> Outcome:
     _same_process(lab, "serial", pid)
     unknown_s = said.t_s - out_s
     return Outcome(f"silent {unknown_s:.1f} s after pull; from plug to reading", reading.t_s - in_s)
-
-
-def bridge_hung(lab: Lab) -> Outcome:
-    """The bridge hangs and comes back, the port stays."""
-    pid = lab.show("serial", "MainPID")
-    out_s = lab.now_s()
-    with lab.bridge.hung():
-        said = lab.await_message("serial", out_s, "silence", _stale)
-        time.sleep(OUTAGE_S)
-        in_s = lab.now_s()
-    reading = lab.await_message("serial", in_s, "a reading", _fresh)
-    _same_process(lab, "serial", pid)
-    unknown_s = said.t_s - out_s
-    return Outcome(
-        f"silent after {unknown_s:.1f} s; from its return to reading", reading.t_s - in_s
-    )
 
 
 def _unknown(message: Message) -> bool:

@@ -1,4 +1,4 @@
-"""The tally of the step `can_frames`, from messages as a subscriber has them that came late."""
+"""The tally of the step `can_overload`, from messages as a subscriber has them that came late."""
 
 from __future__ import annotations
 

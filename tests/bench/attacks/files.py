@@ -1,7 +1,4 @@
-"""Files made to break who reads them: scenes, models, recordings; and browsers that never finish.
-
-Each goes to a real process: a daemon at SIGHUP, `graspd check`, `graspd replay`, `graspd watch`.
-"""
+"""Scenes and models made to break a daemon that reads them at SIGHUP."""
 
 from __future__ import annotations
 
@@ -11,19 +8,17 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from unittest.mock import patch
 
 from drivers.recordings.csv_player import DEMO_RECORDING
-from models import zoo
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import PATIENCE_S, Child, Subscriber, start_daemon, usage
+from tests.models.hostile import giant
 from tests.threads import at_work
 
 MIB = 1024
@@ -39,9 +34,6 @@ END_MAX_S = 15.0
 """Until a command must have refused a file, s: a model is tried for ten."""
 STOP_MAX_S = 2.0
 """Until a daemon that was told to stop is gone, s."""
-REPLAY_MAX_MIB = 256
-"""Memory of a replay; one of a sound recording of minutes takes half of it."""
-
 REFUSED = "the new scene is wrong, the former one goes on"
 
 SCENE = """
@@ -221,7 +213,7 @@ def _storm(plan: Plan) -> Outcome:
                 sent += 1
 
         with at_work(hang_up):
-            gap_s = running.hear(max(plan.seconds, 8.0))
+            gap_s = running.hear(max(plan.seconds, 4.0))
         growth_mib = running.rss_mib() - rest_mib
         running.hear(2.0)  # the last one was late
         other = running.reload(scene(plan.folder, 'name = "mlp"'))
@@ -235,297 +227,24 @@ def _storm(plan: Plan) -> Outcome:
     return Outcome(sent, happened, held and stops_s < STOP_MAX_S)
 
 
-def _zoo_model() -> Any:  # noqa: ANN401 - onnx has no types
-    import onnx
-
-    return onnx.load(zoo.find("small-session"))
-
-
-def external(folder: Path) -> Path:
-    """A zoo model whose weights are in a file beside it, which may be changed under its sha."""
-    import onnx
-
-    model, path = _zoo_model(), folder / "external.onnx"
-    onnx.save_model(
-        model, path, save_as_external_data=True, location="weights.bin", size_threshold=1024
-    )
-    return path
-
-
-def endless(folder: Path) -> Path:
-    """A zoo model that counts for ever before it answers."""
-    import onnx
-    from onnx import TensorProto, helper
-
-    model, path = _zoo_model(), folder / "endless.onnx"
-    graph = model.graph
-    node = next(node for node in graph.node if "probability" in node.output)
-    node.output[0] = "sound"
-    body = helper.make_graph(
-        [
-            helper.make_node("Identity", ["go"], ["go_on"]),
-            helper.make_node("Add", ["x", "nothing"], ["y"]),
-        ],
-        "body",
-        [
-            helper.make_tensor_value_info("i", TensorProto.INT64, []),
-            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
-        ],
-        [
-            helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
-            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
-        ],
-        [helper.make_tensor("nothing", TensorProto.FLOAT, [], [0.0])],
-    )
-    graph.initializer.append(helper.make_tensor("ever", TensorProto.INT64, [], [2**62]))
-    graph.initializer.append(helper.make_tensor("yes", TensorProto.BOOL, [], [True]))
-    loop = helper.make_node("Loop", ["ever", "yes", "sound"], ["probability"], body=body)
-    graph.node.append(loop)
-    onnx.save_model(model, path)
-    return path
-
-
-def giant(folder: Path, side: int = 5000) -> Path:
-    """A zoo model of a few bytes more that multiplies matrices of so many rows for minutes."""
-    import onnx
-    from onnx import TensorProto, helper
-
-    model, path = _zoo_model(), folder / "giant.onnx"
-    graph = model.graph
-    node = next(node for node in graph.node if "probability" in node.output)
-    node.output[0] = "sound"
-    graph.initializer.append(helper.make_tensor("sides", TensorProto.INT64, [2], [side, side]))
-    graph.initializer.append(helper.make_tensor("none", TensorProto.FLOAT, [], [0.0]))
-    graph.node.append(helper.make_node("ReduceSum", ["sound"], ["sum"], keepdims=0))
-    graph.node.append(helper.make_node("Mul", ["sum", "none"], ["zero"]))
-    graph.node.append(helper.make_node("Expand", ["zero", "sides"], ["m0"]))
-    for number in range(40):
-        graph.node.append(
-            helper.make_node("MatMul", [f"m{number}", f"m{number}"], [f"m{number + 1}"])
-        )
-    graph.node.append(helper.make_node("ReduceSum", ["m40"], ["nothing"], keepdims=0))
-    graph.node.append(helper.make_node("Add", ["sound", "nothing"], ["probability"]))
-    onnx.save_model(model, path)
-    return path
-
-
-def _command(folder: Path, *arguments: object) -> tuple[int | None, float, float, str]:
-    """Exit code (None if it had to be killed), seconds, peak MiB, stderr."""
-    began_s = time.monotonic()
-    with (folder / "said").open("w+") as said:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "daemon", *map(str, arguments)],
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=said,
-        )
-        ended, peak_mib = False, 0.0
-        while not ended and time.monotonic() < began_s + 2 * END_MAX_S:
-            peak_mib = max(peak_mib, _peak_mib(process.pid))
-            time.sleep(0.02)
-            ended = process.poll() is not None
-        process.kill()
-        process.wait()
-        said.seek(0)
-        text = said.read()
-    code = process.returncode if ended else None
-    return code, time.monotonic() - began_s, peak_mib, text
-
-
-def _model(make: Callable[[Path], Path]) -> Callable[[Plan], Outcome]:
-    def run(plan: Plan) -> Outcome:
-        path = make(plan.folder)
-        wanted = scene(plan.folder, f'path = "{path}"')
-        tried, slowest_s, gap_s, held = 0, 0.0, 0.0, True
-        for _ in plan.rounds():
-            tried += 2
-            checked = plan.folder / "checked.toml"
-            checked.write_text(wanted)
-            code, seconds, _, said = _command(plan.folder, "check", checked)
-            slowest_s = max(slowest_s, seconds)
-            held = held and code == 2 and str(path) in said and seconds < END_MAX_S
-            with Running(plan.folder) as running:
-                found = running.reload(wanted)
-                refused = found.told == REFUSED
-                gap_s = max(gap_s, found.gap_s)
-                held = held and found.alive and refused and found.gap_s < GAP_MAX_S
-                running.scene.write_text(wanted)
-                running.daemon.process.send_signal(signal.SIGHUP)
-                running.hear(0.5)  # SIGTERM comes while it is read
-                stops_s = running.stops_in_s()
-                held = held and stops_s < STOP_MAX_S
-        happened = (
-            f"check ends after {slowest_s:.1f} s with {code}, the reload is "
-            f"{'refused' if refused else 'not refused'}, longest gap in the verdicts "
-            f"{gap_s * 1e3:.0f} ms, ends {stops_s:.1f} s after SIGTERM"
-        )
-        return Outcome(tried, happened, held)
-
-    return run
-
-
-def _mcap(chunks: Iterator[tuple[str, int, bytes]]) -> Iterator[bytes]:
-    """A recording of graspd with chunks as (compression, size that is said, bytes as they are)."""
-    from io import BytesIO
-
-    from mcap.data_stream import RecordBuilder
-    from mcap.records import Chunk
-    from mcap.writer import Writer
-
-    from daemon.record.header import RecordingHeader
-    from daemon.record.mcap import METADATA
-
-    stream = BytesIO()
-    writer = Writer(stream)
-    writer.start(profile="", library="graspd")
-    header = RecordingHeader(
-        fingers=("ff", "mf", "th"),
-        joints=False,
-        boot_id="0" * 32,
-        scene={"hand": {}},
-        model="cnn1",
-        model_sha256="0" * 64,
-    )
-    writer.add_metadata(METADATA, header.texts())
-    writer.flush()
-    yield stream.getvalue()
-    for compression, size, data in chunks:
-        builder = RecordBuilder()
-        Chunk(compression, data, 0, 0, 0, size).write(builder)
-        yield builder.end()
-
-
-def _messages(size: int) -> bytes:
-    """So many bytes of the smallest messages."""
-    import struct
-
-    message = struct.pack("<BQHIQQ", 5, 22 + 2, 1, 0, 0, 0) + b"{}"
-    return message * (size // len(message))
-
-
-def _bombs() -> dict[str, Callable[[], list[tuple[str, int, bytes]]]]:
-    import lz4.frame
-    import zstandard
-
-    def zstd(size: int) -> bytes:
-        return zstandard.ZstdCompressor(level=19).compress(_messages(size))
-
-    def unsized(size: int) -> bytes:
-        packer = zstandard.ZstdCompressor(level=19, write_content_size=False).compressobj()
-        return packer.compress(_messages(size)) + packer.flush()
-
-    big, chunk = 96 << 20, 1 << 20
-    return {
-        "one large chunk": lambda: [("zstd", big, zstd(big))],
-        "a chunk larger than it says": lambda: [("zstd", chunk, zstd(big))],
-        "a chunk that does not say": lambda: [("zstd", big, unsized(big))],
-        "lz4": lambda: [("lz4", chunk, lz4.frame.compress(_messages(big)))],
-        "many chunks": lambda: [("zstd", len(_messages(chunk)), zstd(chunk))] * 90,
-    }
-
-
-def _bomb(plan: Plan) -> Outcome:
-    tried, slowest_s, most_mib, largest, held = 0, 0.0, 0.0, 0, True
-    path = plan.folder / "bomb.mcap"
+def _model(plan: Plan) -> Outcome:
+    text = scene(plan.folder, f'path = "{giant(plan.folder)}"')
+    tried, gap_s, stops_s, held = 0, 0.0, 0.0, True
     for _ in plan.rounds():
-        for make in _bombs().values():
-            path.write_bytes(b"".join(_mcap(iter(make()))))
-            largest = max(largest, path.stat().st_size)
-            code, seconds, mib, said = _command(plan.folder, "replay", path)
-            tried += 1
-            slowest_s, most_mib = max(slowest_s, seconds), max(most_mib, mib)
-            refused = code == 2 and "bomb.mcap" in said and "Traceback" not in said
-            held = held and refused and seconds < END_MAX_S and mib < REPLAY_MAX_MIB
-    happened = f"refused after {slowest_s:.1f} s and {most_mib:.0f} MiB at most"
-    if not held:
-        happened = f"up to {slowest_s:.1f} s and {most_mib:.0f} MiB"
-    return Outcome(tried, f"{happened} (largest file {largest // 1000} kB)", held)
-
-
-class _Slow:
-    """Connections that send a byte of their request every second, and come again when cut off."""
-
-    def __init__(self, port: int, number: int, sent: bytes, buffer_bytes: int | None) -> None:
-        self._port, self._number = port, number
-        self._sent, self._buffer_bytes = sent, buffer_bytes
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._go)
-        self.opened = 0
-
-    def __enter__(self) -> _Slow:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_details: object) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    def _connect(self) -> socket.socket:
-        link = socket.socket()
-        if self._buffer_bytes is not None:
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._buffer_bytes)
-        link.connect(("127.0.0.1", self._port))
-        link.sendall(self._sent)
-        self.opened += 1
-        return link
-
-    def _go(self) -> None:
-        links: list[socket.socket] = []
-        while not self._stop.wait(1.0 if links else 0.0):
-            still = []
-            for link in links:
-                try:
-                    link.sendall(b"a")
-                    still.append(link)
-                except OSError:
-                    link.close()
-            with contextlib.suppress(OSError):
-                while len(still) < self._number:
-                    still.append(self._connect())
-            links = still
-        for link in links:
-            link.close()
-
-
-def _get_s(port: int) -> float:
-    """How long it takes until the page is there, s; raises `OSError` if it is not."""
-    began_s = time.monotonic()
-    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as link:
-        link.settimeout(PATIENCE_S)
-        link.sendall(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n")
-        answer = link.makefile("rb").read()
-    if not answer.startswith(b"HTTP/1.0 200") or b"</html>" not in answer:
-        raise OSError("no page")
-    return time.monotonic() - began_s
-
-
-def _slowloris(
-    sent: bytes, number: int, buffer_bytes: int | None = None
-) -> Callable[[Plan], Outcome]:
-    def run(plan: Plan) -> Outcome:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            port = free.getsockname()[1]
-        asked = unserved = 0
-        slowest_s = 0.0
-        page = ["-m", "daemon", "watch", "--web", "--port", str(port)]
-        with Child([*page, "--connect", f"ipc://{plan.folder}/v"]) as child:
-            child.line()
-            with _Slow(port, number, sent, buffer_bytes) as slow:
-                time.sleep(2.0)
-                end_s = time.monotonic() + max(plan.seconds, 8.0)
-                while time.monotonic() < end_s:
-                    asked += 1
-                    try:
-                        slowest_s = max(slowest_s, _get_s(port))
-                    except OSError:
-                        unserved += 1
-                    time.sleep(0.2)
-        happened = f"{unserved} of {asked} visitors not served, the slowest after {slowest_s:.2f} s"
-        return Outcome(slow.opened, happened, unserved == 0 and slowest_s < 1.0)
-
-    return run
+        tried += 1
+        with Running(plan.folder) as running:
+            reloaded = running.reload(text)
+            gap_s = max(gap_s, reloaded.gap_s)
+            held = held and reloaded.alive and reloaded.told == REFUSED
+            running.scene.write_text(text)
+            running.daemon.process.send_signal(signal.SIGHUP)
+            running.hear(0.5)  # SIGTERM comes while it is read
+            stops_s = max(stops_s, running.stops_in_s())
+    happened = (
+        f"the reload is {'refused' if held else 'not refused'}, longest gap in the verdicts "
+        f"{gap_s * 1e3:.0f} ms, ends {stops_s:.1f} s after SIGTERM"
+    )
+    return Outcome(tried, happened, held and gap_s < GAP_MAX_S and stops_s < STOP_MAX_S)
 
 
 ATTACKS = (
@@ -538,45 +257,10 @@ ATTACKS = (
     ),
     Attack("sighup-storm", Aim.FALLS, "SIGHUP every half millisecond", "signals", _storm),
     Attack(
-        "model-external",
-        Aim.FALSE_STABLE,
-        "a model whose weights are in another file, to check and at SIGHUP",
-        "models",
-        _model(external),
-    ),
-    Attack(
-        "model-endless",
-        Aim.FALLS,
-        "a model with a loop without end, to check and at SIGHUP",
-        "models",
-        _model(endless),
-    ),
-    Attack(
         "model-giant",
         Aim.FALLS,
-        "a model that multiplies matrices for minutes, to check and at SIGHUP",
+        "a model that multiplies matrices for minutes, at SIGHUP",
         "models",
-        _model(giant),
-    ),
-    Attack(
-        "recording-bomb",
-        Aim.FALLS,
-        "replay of small MCAP files that unpack to hundreds of megabytes",
-        "recordings",
-        _bomb,
-    ),
-    Attack(
-        "page-slow-head",
-        Aim.FALLS,
-        "20 connections to the page that send a byte of their request a second",
-        "connections",
-        _slowloris(b"GET / HTTP/1.0\r\nX: ", 20),
-    ),
-    Attack(
-        "page-slow-reader",
-        Aim.FALLS,
-        "20 connections to the page that ask for it and do not read",
-        "connections",
-        _slowloris(b"GET / HTTP/1.0\r\nHost: localhost\r\n\r\n", 20, 1024),
+        _model,
     ),
 )

@@ -1,8 +1,7 @@
-"""Another hand on the link, a serial number that was misread, and sweeps that are torn apart."""
+"""Another hand on the link, and a serial number that was misread."""
 
 from __future__ import annotations
 
-import itertools
 import operator
 import socket
 import time
@@ -15,12 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from daemon.assembly import assembly
-from daemon.publish.messages import Verdict, decode_tactile, decode_verdict
+from daemon.publish.messages import Verdict, decode_verdict
 from daemon.scene import load as load_scene
 from daemon.session.file import SessionFile, kept_now, load
 from drivers.spi.messages import Hello
-from drivers.twins.can import CanTwin
-from drivers.twins.faults import LinkFaults
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import synthetic_grasps
 from drivers.twins.palm import PalmTwin
@@ -30,11 +27,9 @@ from tests.bench.live import (
     HELD,
     SEED,
     Subscriber,
-    can_id,
     judged_counts,
     start_daemon,
     tactile_section,
-    where_of,
 )
 from tests.ports import free_port
 from tests.threads import at_work
@@ -44,7 +39,6 @@ SILENCE_S = 0.16
 """Above the 140 ms after which the palm's link is given up."""
 HELD_S = 2.0
 KEPT_GRASPS = 30
-TORN_S = 6.0
 SPI_VERDICTS = 60
 UP_S = 15.0
 """Longest wait for a daemon's first verdict, s."""
@@ -180,96 +174,6 @@ def misread_serial(plan: Plan) -> Outcome:
     return Outcome(tried, happened, wiped == 0)
 
 
-def exchanged_sensor(plan: Plan) -> Outcome:
-    """A sensor is exchanged for another while the bridge is unplugged, and later put back."""
-    kept: list[tuple[int, int]] = []
-    for folder in plan.folders():
-        tactile = tactile_section("spi", str(folder / "bridge"))
-        session = f'[session]\nfile = "{folder}/session.json"\n'
-        file = keep_grasps(folder, tactile + session)
-        found = []
-        for misread in (lambda _: True, lambda _: False):
-            with (
-                bridge(MisreadTwin(folder / "bridge", misread)),
-                daemon_of(folder, tactile, "small-session", session) as subscriber,
-            ):
-                hear(subscriber, lambda heard: len(heard.verdicts) >= SPI_VERDICTS, UP_S)
-            found.append(kept_grasps(file))
-        kept.append((found[0], found[1]))
-    held = all(other < KEPT_GRASPS <= back for other, back in kept)
-    happened = f"{kept[-1][0]} grasps known of the other sensor, {kept[-1][1]} when it was back"
-    return Outcome(len(kept), happened, held)
-
-
-def numbered() -> Iterator[Counts]:
-    """Sweeps whose counts are their number."""
-    return (np.full((3, 24), 50 + at % 4000, dtype=np.uint16) for at in itertools.count())
-
-
-def mixed(payload: bytes) -> bool:
-    """Whether a reading holds counts of more than one sweep."""
-    message = decode_tactile(payload)
-    counts, faults = np.ravel(message.counts), np.ravel(message.faults)
-    return len(np.unique(counts[faults == 0])) > 1
-
-
-def torn(plan: Plan, link: str) -> Outcome:
-    """Frames are lost, doubled, swapped and held back, and the board is unplugged and reset."""
-    readings = torn_ones = flagged = 0
-    for tried, folder in enumerate(plan.folders()):
-        faults = LinkFaults(
-            drop_probability=0.02,
-            duplicate_probability=0.02,
-            reorder_probability=0.02,
-            bit_flip_probability=0.02 if link == "spi" else 0.0,  # CAN has a checksum of its own
-            burst_frames=1 + tried % 3,
-            disconnect_every_frames={"spi": 150, "sweep_fd": 451, "syntouch": 3611}[link],
-            seed=plan.random.randrange(1 << 30),
-        )
-        tactile, twin = torn_twin(folder, link, faults)
-        endpoint = f"ipc://{folder}/verdicts"
-        with (
-            twin,
-            daemon_of(folder, tactile, "cnn1", "[session]\nkeep = false\n"),
-            Subscriber(endpoint, topics=("tactile.",)) as subscriber,
-        ):
-            end_s = time.monotonic() + TORN_S
-            while time.monotonic() < end_s:
-                message = subscriber.take(0.1)
-                if message is not None:
-                    readings += 1
-                    torn_ones += mixed(message[1])
-                    flagged += bool(np.any(decode_tactile(message[1]).faults))
-    happened = f"{torn_ones} of {readings:,} readings of two sweeps; {flagged} flagged"
-    return Outcome(readings, happened, torn_ones == 0 and readings > 100)
-
-
-def torn_twin(
-    folder: Path, link: str, faults: LinkFaults
-) -> tuple[str, AbstractContextManager[None]]:
-    """The scene's section, and the twin at work."""
-    if link == "spi":
-        port = folder / "bridge"
-        return tactile_section("spi", str(port)), bridge(SpiTwin(port, numbered(), faults=faults))
-    group = where_of("can", folder)
-    twin = CanTwin(
-        "udp_multicast",
-        group,
-        numbered(),
-        format=link,
-        arbitration_id=can_id(group),
-        faults=faults,
-    )
-    return tactile_section("can", group).replace("sweep_fd", link), board(twin)
-
-
-@contextmanager
-def board(twin: CanTwin) -> Iterator[None]:
-    """A twin on a bus at work in a thread."""
-    with twin, at_work(twin.serve):
-        yield
-
-
 def any_valid(heard: Heard) -> bool:
     """Whether something was judged."""
     return bool(heard.verdicts) and heard.verdicts[-1].valid
@@ -293,22 +197,5 @@ ATTACKS = (
         "a bridge misreads one character of a serial number in one of its first HELLOs",
         "times",
         misread_serial,
-    ),
-    Attack(
-        "exchanged-sensor",
-        Aim.FALSE_STABLE,
-        "a sensor is exchanged for another and later put back",
-        "times",
-        exchanged_sensor,
-    ),
-    *(
-        Attack(
-            f"torn-{link.replace('_', '-')}",
-            Aim.FALSE_STABLE,
-            f"frames of {name} are lost, doubled, swapped and held back, and its board is reset",
-            "readings",
-            partial(torn, link=link),
-        )
-        for link, name in (("spi", "SPI"), ("syntouch", "CAN (`syntouch`)"), ("sweep_fd", "CAN FD"))
     ),
 )

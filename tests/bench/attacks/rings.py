@@ -1,19 +1,17 @@
 """Old sweeps in a ring, and joint angles that stand still to the bit, while the hand opens.
 
-A bridge, relay or recording goes on with new numbers and times, but what it sends was read before.
+A bridge or relay goes on with new numbers and times, but what it sends was read before.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import itertools
 import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +19,13 @@ import numpy as np
 from daemon.judge.reasons import Decision
 from daemon.publish.messages import Verdict, decode_verdict
 from drivers.joints.message import JointMessage
-from drivers.twins.can import CanTwin
-from drivers.twins.grasps.grasp_script import JOINT_NAMES, Durations
+from drivers.twins.grasps.grasp_script import JOINT_NAMES
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.whole_grasps import (
     PALM_RATE_HZ,
     RATE_HZ,
-    GraspRow,
     synthetic_grasps,
-    write_stream,
 )
-from drivers.twins.palm import PalmTwin
 from drivers.twins.spi import SpiTwin
 from tests.bench.attacks.attack import Aim, Attack, Outcome, Plan
 from tests.bench.live import (
@@ -39,10 +33,8 @@ from tests.bench.live import (
     PATIENCE_S,
     SEED,
     Subscriber,
-    can_id,
     start_daemon,
     tactile_section,
-    where_of,
 )
 from tests.ports import free_port
 from tests.threads import at_work
@@ -55,16 +47,12 @@ UNDER_ATTACK_S = 2.5
 """How long the ring turns, s, the first turn and the grace not counted."""
 STABLE_FIRST = 30
 """Verdicts `stable` before it begins."""
-HOLD_S = 1.5
-"""How long the grasp of a recording is held before it begins, s."""
 JOINTS_MAY_STAND_S = 1.5
 """How long joint angles may be equal to the bit before no verdict may be `stable`, s."""
 
 RATES_HZ = (PALM_RATE_HZ, RATE_HZ)
 Send = Callable[[threading.Event], None]
 """Sends until it is told to stop."""
-Link = Callable[[Path, Iterator[Counts], float], tuple[str, Send]]
-"""The scene's `[tactile]`, and what sends the counts, so many a second."""
 
 
 class Ring:
@@ -111,31 +99,6 @@ def over_spi(folder: Path, counts: Iterator[Counts], rate_hz: float) -> tuple[st
             twin.serve(stop.is_set)
 
     return tactile_section("spi", str(folder / "bridge")), serve
-
-
-def over_can(
-    format_: str, folder: Path, counts: Iterator[Counts], rate_hz: float
-) -> tuple[str, Send]:
-    where = where_of("can", folder)
-    identifier = can_id(where)
-    twin = CanTwin(
-        "udp_multicast", where, counts, format=format_, arbitration_id=identifier, rate_hz=rate_hz
-    )
-
-    def serve(stop: threading.Event) -> None:
-        with twin:
-            twin.serve(stop)
-
-    return (
-        f'[tactile]\ndriver = "can"\ninterface = "udp_multicast"\nchannel = "{where}"\n'
-        f'format = "{format_}"\narbitration_id = {identifier}\n'
-    ), serve
-
-
-def over_palm(_folder: Path, counts: Iterator[Counts], _rate_hz: float) -> tuple[str, Send]:
-    target = f"udp://127.0.0.1:{free_port(socket.SOCK_DGRAM)}"
-    serve = partial(PalmTwin(counts).serve, target)
-    return f'[tactile]\ndriver = "palm"\nsource = "{target}"\n', serve
 
 
 def scene_in(folder: Path, sections: str) -> Path:
@@ -211,57 +174,14 @@ def tallied(verdicts: Iterable[tuple[int, int]]) -> Outcome:
     return Outcome(tried, f"{stable} of {said:,} verdicts `stable`", said > 0 and stable == 0)
 
 
-def ring_over(over: Link, rates_hz: Sequence[float], plan: Plan) -> Outcome:
-    """A ring over a link, at one of these rates."""
+def ring_over_spi(plan: Plan) -> Outcome:
+    """A ring over a serial line, at one of the two rates."""
 
     def one(folder: Path, sweeps: int, finger: int | None) -> tuple[int, int]:
-        rate_hz = plan.random.choice(rates_hz)
-        ring = Ring(sweeps, finger, rate_hz)
-        section, serve = over(folder, ring.counts(), rate_hz)
-        return under_attack(folder, section, [serve], ring.begin, lambda: ring.turned_ns)
-
-    return tallied(one(*each) for each in rings(plan))
-
-
-def recorded(
-    ring: int, finger: int | None, rate_hz: float, hold_s: float
-) -> tuple[list[GraspRow], int]:
-    """Rows of a recording whose grasp is held so long, and from which on none may be `stable`."""
-    durations = Durations(first_rest_s=(1.5, 1.5), settle_s=(hold_s + 2.0, hold_s + 2.0))
-    grasps = synthetic_grasps(1, durations=durations, seed=SEED, rate_hz=rate_hz)
-    moments = list(grasps)
-    begin = round((next(grasps.timetables()).closed_s + hold_s) * rate_hz)
-    last = [moment.counts for moment in moments[begin - ring : begin]]
-    for number, moment in enumerate(moments[begin:]):
-        counts = ringed(last[number % ring], moment.counts, finger)
-        moments[begin + number] = dataclasses.replace(moment, counts=counts)
-    return moments, begin + ring + GRACE
-
-
-def ring_replayed(plan: Plan) -> Outcome:
-    """A ring in a recording that is played."""
-
-    def one(folder: Path, ring: int, finger: int | None) -> tuple[int, int]:
         rate_hz = plan.random.choice(RATES_HZ)
-        moments, late_from = recorded(ring, finger, rate_hz, HOLD_S + plan.random.random())
-        with (folder / "rows.csv").open("w") as file:
-            write_stream(moments, file, 6)
-        said: list[Verdict] = []
-        section = f'[tactile]\ndriver = "replay"\nrecordings = ["{folder / "rows.csv"}"]\n'
-        with (
-            Subscriber(f"ipc://{folder}/graspd") as subscriber,
-            start_daemon(scene_in(folder, section), folder / "log"),
-        ):
-            while (message := subscriber.take(2.0 if said else PATIENCE_S)) is not None:
-                said.append(decode_verdict(message[1]))
-        # By their times, for nobody may be there yet to hear the first.
-        end_ns = max(verdict.t_mono_ns for verdict in said)
-        late_ns = end_ns - round((len(moments) - 1 - late_from) / rate_hz * 1e9)
-        before = [verdict for verdict in said if verdict.t_mono_ns < late_ns - 1_000_000]
-        late = {verdict.t_mono_ns: verdict.verdict for verdict in said[len(before) :]}
-        if Decision.STABLE not in {verdict.verdict for verdict in before}:
-            raise RuntimeError("the recorded grasp was not judged before the ring began")
-        return len(late), list(late.values()).count(Decision.STABLE)
+        ring = Ring(sweeps, finger, rate_hz)
+        section, serve = over_spi(folder, ring.counts(), rate_hz)
+        return under_attack(folder, section, [serve], ring.begin, lambda: ring.turned_ns)
 
     return tallied(one(*each) for each in rings(plan))
 
@@ -298,18 +218,14 @@ def joints_frozen(plan: Plan) -> Outcome:
     return tallied(one(folder) for folder in plan.folders())
 
 
-def _ring(door: str, run: Callable[[Plan], Outcome]) -> Attack:
-    what = f"the last 2 to 64 sweeps of a held grasp, of a finger or all, for ever {door}"
-    name = f"ring-{door.split()[-1].lower().replace('_', '-')}"
-    return Attack(name, Aim.FALSE_STABLE, what, "rings", run)
-
-
 ATTACKS = (
-    _ring("over SPI", partial(ring_over, over_spi, RATES_HZ)),
-    _ring("over CAN as sweep_fd", partial(ring_over, partial(over_can, "sweep_fd"), RATES_HZ)),
-    _ring("over CAN as syntouch", partial(ring_over, partial(over_can, "syntouch"), RATES_HZ)),
-    _ring("over the palm", partial(ring_over, over_palm, [PALM_RATE_HZ])),
-    _ring("in a recording", ring_replayed),
+    Attack(
+        "ring-spi",
+        Aim.FALSE_STABLE,
+        "the last 2 to 64 sweeps of a held grasp, of a finger or all, for ever over SPI",
+        "rings",
+        ring_over_spi,
+    ),
     Attack(
         "joints-frozen",
         Aim.FALSE_STABLE,

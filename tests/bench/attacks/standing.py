@@ -1,15 +1,13 @@
-"""Verdicts that outlive what they are about: a grasp that drifts, and a hand that is open."""
+"""Verdicts that outlive what they are about: a grasp that drifts to slip."""
 
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +42,6 @@ FRESH_NS = 100_000_000
 """A verdict must not be older than this."""
 SAME = 1e-6
 """Probabilities of the same counts: the same network ran twice."""
-OPEN_S = 3.0
 
 
 class Network:
@@ -83,13 +80,6 @@ def drifting() -> Iterator[Counts]:
         held += moment.phase is Phase.SETTLE
         share = np.clip((held - HELD_SWEEPS) / DRIFT_SWEEPS, 0.0, 1.0)
         yield np.rint(moment.counts + share * towards).astype(np.uint16)
-
-
-def at_rest() -> Iterator[Counts]:
-    """An open hand."""
-    moments = synthetic_grasps(1, durations=HELD, seed=SEED)
-    drawn = [moment.counts for moment in itertools.islice(moments, 140)]
-    return itertools.cycle(drawn)
 
 
 @dataclass
@@ -142,19 +132,19 @@ class Told:
         return verdict.t_mono_ns - self._said[0][0]
 
 
-def scene_text(folder: Path, gate: str) -> str:
+def scene_text(folder: Path) -> str:
     return (
         tactile_section("spi", str(folder / "bridge"))
-        + f'[model]\nname = "{MODEL}"\n[session]\nkeep = false\n[gate]\n{gate}\n'
+        + f'[model]\nname = "{MODEL}"\n[session]\nkeep = false\n[gate]\nearly = true\n'
         f'[publish]\nendpoint = "ipc://{folder}/v"\ntactile_hz = 10000\n[ask]\nendpoint = "ipc://{folder}/ask"\n'
     )
 
 
-def drifts(plan: Plan, gate: str) -> Outcome:
+def drifts(plan: Plan) -> Outcome:
     """Ask all the while that a held grasp drifts to what the network calls slip."""
     told = Told()
     for folder in plan.folders():
-        _drift_once(folder, gate, told)
+        _drift_once(folder, told)
     happened = (
         f"{told.false:,} of {told.valid:,} verdicts `stable` after 100 ms of slip, {told.slips:,} "
         f"`slip`; oldest `p_slip` {told.oldest_ns / 1e6:.0f} ms; "
@@ -164,9 +154,9 @@ def drifts(plan: Plan, gate: str) -> Outcome:
     return Outcome(told.valid, happened, not told.false and fresh and told.slips > 0)
 
 
-def _drift_once(folder: Path, gate: str, told: Told) -> None:
+def _drift_once(folder: Path, told: Told) -> None:
     scene = folder / "scene.toml"
-    scene.write_text(scene_text(folder, gate))
+    scene.write_text(scene_text(folder))
     sweeps = drifting()
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     with (
@@ -206,62 +196,12 @@ def _hear(subscriber: Subscriber, asker: zmq.Socket[bytes], twin: SpiTwin, told:
             waiting.remove(answer)
 
 
-def open_hand(plan: Plan) -> Outcome:
-    """Have each reading of an open hand judged as a grasp."""
-    verdicts = stable = refused = tried = 0
-    for folder in plan.folders():
-        scene = folder / "scene.toml"
-        scene.write_text(scene_text(folder, 'mode = "every"'))
-        command = [sys.executable, "-m", "daemon", "check", str(scene)]
-        checked = subprocess.run(command, capture_output=True, text=True, check=False)
-        refused += checked.returncode == 2 and "gate.mode" in checked.stderr
-        tried += 1
-        heard = _open_once(folder, scene)
-        verdicts += len(heard)
-        stable += sum(verdict.verdict == "stable" for verdict in heard)
-    happened = f"{stable:,} of {verdicts:,} verdicts `stable`; {refused} of {tried} scenes refused"
-    return Outcome(tried, happened, not stable and (refused == tried or verdicts > 0))
-
-
-def _open_once(folder: Path, scene: Path) -> list[Verdict]:
-    heard: list[Verdict] = []
-    with (
-        start_daemon(scene, folder / "log") as daemon,
-        Subscriber(f"ipc://{folder}/v") as subscriber,
-        SpiTwin(folder / "bridge", at_rest()) as twin,
-        at_work(lambda stop: twin.serve(stop.is_set)),
-    ):
-        ends_s = time.monotonic() + PATIENCE_S
-        while not heard and daemon.process.poll() is None and time.monotonic() < ends_s:
-            if (message := subscriber.take(0.1)) is not None:
-                heard.append(decode_verdict(message[1]))
-                ends_s = time.monotonic() + OPEN_S
-        while heard and time.monotonic() < ends_s:
-            if (message := subscriber.take(0.1)) is not None:
-                heard.append(decode_verdict(message[1]))
-    return heard
-
-
 ATTACKS = (
-    *(
-        Attack(
-            f"drift-{name}",
-            Aim.FALSE_STABLE,
-            f"a held grasp drifts by {DRIFT_COUNTS:.0f} counts to slip, `{gate}`, with questions",
-            "verdicts",
-            partial(drifts, gate=gate),
-        )
-        for name, gate in (
-            ("settled", 'mode = "settled"'),
-            ("request", 'mode = "request"'),
-            ("early", "early = true"),
-        )
-    ),
     Attack(
-        "every-open-hand",
+        "drift-early",
         Aim.FALSE_STABLE,
-        'an open hand under `mode = "every"` over SPI',
-        "scenes",
-        open_hand,
+        f"a held grasp drifts by {DRIFT_COUNTS:.0f} counts to slip, `early = true`, with questions",
+        "verdicts",
+        drifts,
     ),
 )

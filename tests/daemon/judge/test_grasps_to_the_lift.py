@@ -12,7 +12,7 @@ from models.runtime import TactileModel
 from tests.bench.gate import Study, end_points, streams, study
 
 GRASPS = 40
-"""Per rate; `python -m tests.bench.gate DIR --grasps 500` judges more."""
+"""Per rate."""
 RATES = ("71.43 Hz held", "100 Hz fresh")
 STILL_S = 0.24
 """What is looked back at; the end of closing is no part of it."""

@@ -1,0 +1,83 @@
+"""Models made to harm who loads them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from models import zoo
+
+
+def _zoo_model() -> Any:  # noqa: ANN401 - onnx has no types
+    import onnx
+
+    return onnx.load(zoo.find("small-session"))
+
+
+def external(folder: Path) -> Path:
+    """A zoo model whose weights are in a file beside it, which may be changed under its sha."""
+    import onnx
+
+    model, path = _zoo_model(), folder / "external.onnx"
+    onnx.save_model(
+        model, path, save_as_external_data=True, location="weights.bin", size_threshold=1024
+    )
+    return path
+
+
+def endless(folder: Path) -> Path:
+    """A zoo model that counts for ever before it answers."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    model, path = _zoo_model(), folder / "endless.onnx"
+    graph = model.graph
+    node = next(node for node in graph.node if "probability" in node.output)
+    node.output[0] = "sound"
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["go"], ["go_on"]),
+            helper.make_node("Add", ["x", "nothing"], ["y"]),
+        ],
+        "body",
+        [
+            helper.make_tensor_value_info("i", TensorProto.INT64, []),
+            helper.make_tensor_value_info("go", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
+        ],
+        [
+            helper.make_tensor_value_info("go_on", TensorProto.BOOL, []),
+            helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
+        ],
+        [helper.make_tensor("nothing", TensorProto.FLOAT, [], [0.0])],
+    )
+    graph.initializer.append(helper.make_tensor("ever", TensorProto.INT64, [], [2**62]))
+    graph.initializer.append(helper.make_tensor("yes", TensorProto.BOOL, [], [True]))
+    loop = helper.make_node("Loop", ["ever", "yes", "sound"], ["probability"], body=body)
+    graph.node.append(loop)
+    onnx.save_model(model, path)
+    return path
+
+
+def giant(folder: Path, side: int = 5000) -> Path:
+    """A zoo model of a few bytes more that multiplies matrices of so many rows for minutes."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    model, path = _zoo_model(), folder / "giant.onnx"
+    graph = model.graph
+    node = next(node for node in graph.node if "probability" in node.output)
+    node.output[0] = "sound"
+    graph.initializer.append(helper.make_tensor("sides", TensorProto.INT64, [2], [side, side]))
+    graph.initializer.append(helper.make_tensor("none", TensorProto.FLOAT, [], [0.0]))
+    graph.node.append(helper.make_node("ReduceSum", ["sound"], ["sum"], keepdims=0))
+    graph.node.append(helper.make_node("Mul", ["sum", "none"], ["zero"]))
+    graph.node.append(helper.make_node("Expand", ["zero", "sides"], ["m0"]))
+    for number in range(40):
+        graph.node.append(
+            helper.make_node("MatMul", [f"m{number}", f"m{number}"], [f"m{number + 1}"])
+        )
+    graph.node.append(helper.make_node("ReduceSum", ["m40"], ["nothing"], keepdims=0))
+    graph.node.append(helper.make_node("Add", ["sound", "nothing"], ["probability"]))
+    onnx.save_model(model, path)
+    return path
