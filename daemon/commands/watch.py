@@ -19,15 +19,13 @@ from daemon.process.text import complain
 from daemon.publish.keys import KeysError
 from daemon.scene import SceneError
 from daemon.watch.feed import Feed, load_keys
-from daemon.watch.view import HandFeed, View
+from daemon.watch.view import TICK_S, HandFeed, View
 
 ENDPOINT = "ipc:///run/graspd/right.ipc"
 """Where the daemon publishes unless its scene says otherwise."""
 PORT = 8377
 FOXGLOVE_PORT = 8765
 """Where viewers look unless they are told otherwise."""
-TICK_S = 0.02
-"""Between two looks at what has come for viewers, s."""
 NICENESS = 10
 """Drawing takes a tenth of a processor, and a daemon on the same one comes first."""
 HANDS_MAX = 8
