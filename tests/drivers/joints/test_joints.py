@@ -31,8 +31,10 @@ LOOPBACK = "udp://127.0.0.1:0"
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    clock.rule(monkeypatch)
+    return clock
 
 
 @pytest.fixture
