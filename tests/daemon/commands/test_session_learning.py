@@ -18,7 +18,7 @@ from daemon.trust.trust import Trust, TrustState, decode
 from drivers.recordings.csv_columns import SLIPPED
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.recordings.csv_rows import read_rows
-from tests.daemon.processes import graspd
+from tests.daemon.commands.inside import graspd
 from tests.daemon.record.test_export import Writer
 
 FINGERS = ("ff", "mf", "th")
