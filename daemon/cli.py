@@ -25,7 +25,7 @@ COMMANDS = {
     "run": ("daemon.commands.run", "run the daemon on a scene"),
     "replay": ("daemon.commands.replay", "judge recordings and print the verdicts"),
     "watch": ("daemon.commands.watch", "see it live, in a terminal (extra: watch) or a browser"),
-    "scene": ("daemon.commands.scene", "print an example scene, or what each of its keys means"),
+    "scene": ("daemon.commands.texts", "print an example scene, or what each of its keys means"),
     "check": ("daemon.commands.check", "say whether a scene is right and what it needs"),
     "doctor": (
         "daemon.commands.doctor",

@@ -1,1 +1,1 @@
-"""The commands of `graspd`, one module each, imported only when called."""
+"""The commands of `graspd`, imported only when called."""

@@ -1,4 +1,4 @@
-"""`graspd schema`, `graspd manual` and `graspd completion SHELL`: print a text that is ready."""
+"""`graspd scene`, `schema`, `manual` and `completion`: print a text that is ready."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from daemon.publish.messages import schema
+from daemon.scene import explained
 
 FILES = Path(__file__).parent / "shell"
 """Made of the command line's parsers by `python -m tests.daemon.commands.shell_files`."""
@@ -15,8 +16,10 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the argument of `completion`; the other commands have none."""
-    if parser.prog == "graspd completion":
+    """Declare the arguments of `scene` and `completion`; the other commands have none."""
+    if parser.prog == "graspd scene":
+        _add_scene_arguments(parser)
+    elif parser.prog == "graspd completion":
         parser.add_argument(
             "shell",
             choices=SHELLS,
@@ -25,9 +28,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
 
 
+def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        "--example",
+        choices=explained.examples(),
+        help="print a commented scene to edit, as in `graspd scene --example spi > right.toml`; "
+        "then `graspd check right.toml`",
+    )
+    what.add_argument(
+        "--schema",
+        action="store_true",
+        help="print the JSON Schema of a scene, by which an editor completes and explains keys",
+    )
+    what.add_argument(
+        "--page", action="store_true", help="print type, unit, default and range of every key"
+    )
+
+
 def run(args: argparse.Namespace) -> int:
     """Print the text."""
     match args.command:
+        case "scene" if args.example is not None:
+            text = explained.example(args.example)
+        case "scene":
+            text = explained.schema_text() if args.schema else explained.page()
         case "schema":
             text = schema_text()
         case "manual":

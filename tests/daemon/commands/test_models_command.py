@@ -16,7 +16,7 @@ from daemon.scene import Scene, parse
 from models import own, zoo
 from models.contract import ModelError
 from models.runtime import read
-from tests.daemon.processes import graspd
+from tests.daemon.commands.inside import graspd
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from daemon.trust.lift_book import GraspId
 from daemon.trust.trust import Trust, TrustState, decode
 from drivers.recordings.csv_player import DEMO_TABLE
 from drivers.recordings.csv_rows import SLIPPED, read_rows
-from tests.daemon.processes import graspd
+from tests.daemon.commands.inside import graspd
 from tests.daemon.record.test_export import Writer
 
 FINGERS = ("ff", "mf", "th")

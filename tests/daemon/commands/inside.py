@@ -1,0 +1,45 @@
+"""Running a command of graspd inside this process: as sure as in one of its own, and far faster."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import resource
+from collections.abc import Iterator
+from subprocess import CompletedProcess
+
+from daemon import cli
+from daemon.process.logs import LOGGERS
+
+
+def graspd(*arguments: object) -> CompletedProcess[str]:
+    """Run a command to its end."""
+    words = [str(argument) for argument in arguments]
+    output, errors = io.StringIO(), io.StringIO()
+    with (
+        _as_it_was(),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(errors),
+    ):
+        try:
+            code = cli.main(words)
+        except SystemExit as left:
+            code = left.code if isinstance(left.code, int) else 1
+    return CompletedProcess(words, code, output.getvalue(), errors.getvalue())
+
+
+@contextlib.contextmanager
+def _as_it_was() -> Iterator[None]:
+    """Let the command set up its log and its limits as in a new process; undo that after it."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    root = logging.getLogger()
+    handlers, levels = root.handlers, [logging.getLogger(name).level for name in LOGGERS]
+    root.handlers = []
+    try:
+        yield
+    finally:
+        root.handlers = handlers
+        for name, level in zip(LOGGERS, levels, strict=True):
+            logging.getLogger(name).setLevel(level)
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
