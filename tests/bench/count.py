@@ -81,6 +81,8 @@ def count(switch: Path, log: Path) -> None:
         valgrind.begin()
         go_round(*arguments)
         kind = "judged" if judged() > before[1] else "idle"
+        if kind == "judged":
+            last = rounds + AFTER
         valgrind.end((kind if readings() == before[0] + 1 else "other").encode())
         counted += 1
         if counted == COUNTED:
