@@ -15,7 +15,7 @@ from models.session_statistics import SessionState, SessionStatistics, is_odd
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """What is known of a session at one moment; what it learns later is in the next one."""
+    """Snapshot of a session's statistics; later grasps make the next one."""
 
     features_mean: NDArray[np.float64]
     """Of what a session model takes, shape (fingers * 26,), before standardising."""
@@ -37,7 +37,7 @@ class Calibration:
     """What the margin of a verdict must be divided by, with so few grasps."""
 
     def to_training(self, counts: NDArray[np.generic]) -> NDArray[np.float64]:
-        """What counts (fingers, 24) would have been with the training's sensors."""
+        """Return counts (fingers, 24) as the training's sensors would read them."""
         deviation = counts.astype(np.float64) - self.counts_mean
         values: NDArray[np.float64] = self.training_mean + deviation * self.scale
         return values
@@ -75,7 +75,7 @@ class SessionCalibration:
 
     @property
     def calibrated(self) -> bool:
-        """Whether they are enough for what the model's card says, and can have been grasps."""
+        """True if they are as many as the model's card asks for, and can have been grasps."""
         return self.now.calibrated
 
     def observe(self, counts: NDArray[np.generic], *, slip: bool | None = None) -> None:
@@ -85,12 +85,12 @@ class SessionCalibration:
             self.now = self._calibration()
 
     def reset(self) -> None:
-        """A sensor was exchanged: start again."""
+        """Start again: a sensor was exchanged."""
         self._statistics.reset()
         self.now = self._calibration()
 
     def state(self) -> SessionState:
-        """To be kept for `restore`."""
+        """Return what `restore` needs."""
         return self._statistics.state()
 
     def restore(self, state: SessionState) -> None:

@@ -1,4 +1,4 @@
-"""Whether the hand's joints keep still, as far as they are heard of."""
+"""Whether the joints that send angles keep still."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class JointMotion:
         latest_ns = memory.latest_ns.get(names, t_ns)
         before = past[-1][1] if past else None
         if not 0 <= t_ns - latest_ns <= self._limits.late_ns:
-            past.clear()  # time went back, or nobody knows what the joints did meanwhile
+            past.clear()  # time went back, or it is not known what the joints did meanwhile
         memory.latest_ns[names] = t_ns
         if not past or t_ns - past[-1][0] >= self._limits.window_ns // ANGLES:
             angles = reading.position_rad[valid]
@@ -103,7 +103,7 @@ class JointMotion:
 
     @property
     def is_frozen(self) -> bool:
-        """Whether angles came for too long without a change of any."""
+        """True if angles came for too long without a change of any."""
         memory = self.memory
         if memory.changed_ns is None or not memory.latest_ns:
             return False

@@ -106,7 +106,7 @@ class GateState(StrEnum):
     SETTLED = "settled"
     """All fingers touch and are still; waits to be judged."""
     JUDGED = "judged"
-    """The verdict of the grasp, judged ever anew, stands as long as readings confirm it."""
+    """The verdict stands, and is refreshed while readings confirm that the grasp is the same."""
     RELEASED = "released"
     """Nothing touches any more, for a moment."""
 

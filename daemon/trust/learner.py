@@ -27,7 +27,7 @@ DRIFT: Final = 2e-3
 """Share of the prior's variances by which an outcome widens the posterior: what was learned fades
 within some hundred lifts."""
 MEAN_SPREADS_MAX: Final = 50.0
-"""A weight stays within so many of its prior's standard deviations, whatever is told."""
+"""A weight stays within this many standard deviations of its prior, whatever is told."""
 
 Vector = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ class Learner:
     """
 
     def __init__(self, inputs: int) -> None:
-        """Start at the prior, for a model with so many input features."""
+        """Start at the prior of a model with `inputs` features."""
         self._width = inputs + 2
         self._prior_mean = np.zeros(self._width)
         self._prior_mean[0] = 1.0
@@ -67,15 +67,14 @@ class Learner:
     def reset(self) -> None:
         """Forget all outcomes: a sensor was exchanged."""
         self.outcomes = 0
-        """How many were learned from since the start or the last reset."""
+        """Number of outcomes learned since the start or the last reset."""
         self._mean = self._prior_mean.copy()
         self._covariance = np.diag(self._prior_variance)
         self._is_prior = True
 
     @property
     def uncertainty(self) -> float:
-        """Variances of the weights over those at the start, in the mean: 1 until the first outcome,
-        towards 0 as more is known."""
+        """Mean ratio of the weights' variances to the prior's, from 1 at first towards 0."""
         ratio = self._covariance.diagonal() / self._prior_variance
         return min(float(ratio.mean()), 1.0)
 
@@ -89,13 +88,11 @@ class Learner:
         """
         if inputs.shape != (self._width - 2,):
             raise ValueError(f"inputs are of shape {inputs.shape}, not ({self._width - 2},)")
-        within = (np.abs(inputs) <= INPUT_MAX).tobytes()  # false for NaN
-        if 0 in within or not math.isfinite(margin):
+        is_within = (np.abs(inputs) <= INPUT_MAX).all()  # false for NaN
+        if not (is_within and math.isfinite(margin)):
             raise ValueError("margin or inputs are not finite, or too large")
-        features = np.empty(self._width)
-        features[0] = min(max(margin, -MARGIN_MAX), MARGIN_MAX) / TEMPERATURE
-        features[1] = 1.0
-        features[2:] = inputs
+        limited = min(max(margin, -MARGIN_MAX), MARGIN_MAX)
+        features = np.concatenate(([limited / TEMPERATURE, 1.0], inputs))
         # The prior's covariance is diagonal: the same in a third of the time.
         prior = self._prior_variance if self._is_prior else None
         seen = self._covariance @ features if prior is None else prior * features
@@ -140,13 +137,13 @@ class Learner:
 
 
 def sigmoid(log_odds: float) -> float:
-    """Probability of these log-odds."""
+    """Return the probability of these log-odds."""
     small = math.exp(-abs(log_odds))  # of a negative number only: never overflows
     return (1.0 if log_odds >= 0.0 else small) / (1.0 + small)
 
 
 def vector(data: bytes, width: int) -> Vector:
-    """Float64 values (width,) from bytes. Raises `ValueError` for other lengths, and not finite."""
+    """Return float64 values (width,). Raises `ValueError` if not finite or of another length."""
     if len(data) != 8 * width:
         raise ValueError(f"is of {len(data) // 8} values, not of {width}")
     values = np.frombuffer(data, "<f8").astype(np.float64)

@@ -350,7 +350,7 @@ class Trust:
         return self._report
 
     def sensors_exchanged(self, learned: LearnerState | None = None) -> None:
-        """Start learning again, or go on from `learned`; raise `ValueError` for another model's."""
+        """Learn from the start, or from `learned`. Raises `ValueError` for another model's."""
         self.learner.reset()
         if learned is not None:
             self.learner.restore(learned)

@@ -412,8 +412,8 @@ def test_after_time_went_back_angles_have_a_second_to_change() -> None:
     assert reasons == [Reason.MOVING] * 8 + [None] * 93 + [Reason.JOINTS_FROZEN] * 20
 
 
-@pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("joints", [1, 3, 24])
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("joints", [1, 24])
 def test_joints_with_the_noise_of_a_hall_sensor_are_never_frozen(joints: int, seed: int) -> None:
     """Words as Shadow documents them, 1 ms apart: plus or minus a count, so 1 in 3 is equal."""
     rng, motion = np.random.default_rng(seed), JointMotion(LIMITS)

@@ -18,8 +18,6 @@ HAND = np.ones((3, 24), dtype=np.bool_)
 FINGER = HAND[:1]
 STREAMS = 12
 
-Counts = NDArray[np.uint16]
-
 
 def wavering(seconds: float, rate_hz: float, sigma: float, seed: int) -> NDArray[np.float64]:
     """White noise of one finger around 2000 counts, shape (sweeps, 1, 24)."""
