@@ -54,7 +54,7 @@ class LinkFaults:
         """Raise `ValueError` if one of these faults is asked for: this link cannot show it."""
         for name in names:
             if getattr(self, name) != getattr(LinkFaults(), name):
-                raise ValueError(f"{link} has no fault {name}")
+                raise ValueError(f"{link} cannot show the fault {name.replace('_', '-')}")
 
 
 class LinkFaultInjector:

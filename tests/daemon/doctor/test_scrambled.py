@@ -46,9 +46,9 @@ def scrambled(monkeypatch: pytest.MonkeyPatch) -> None:
     ) -> tuple[object, ...]:
         return tuple.__new__(kind, (XXX, fault))
 
-    def error(self: LinkError, cause: LinkCause, _text: str) -> None:
+    def error(self: LinkError, cause: LinkCause, _text: str, endpoint: str | None = None) -> None:
         Exception.__init__(self, XXX)
-        self.cause = cause
+        self.cause, self.endpoint = cause, endpoint
 
     monkeypatch.setattr(Fact, "__new__", fact)
     monkeypatch.setattr(LinkError, "__init__", error)

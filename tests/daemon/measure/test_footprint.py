@@ -65,13 +65,12 @@ BUSES = {
     },
     "spi": {"serial", "cobs", "drivers.spi.driver", "drivers.spi.line"},
     "can": {
-        *("can", "asyncio", "sqlite3", "importlib.metadata", "email"),
+        *("can", "asyncio", "sqlite3"),
         *("drivers.can.driver", "drivers.can.bus"),
     },
     "palm": {"drivers.palm.driver", "drivers.palm.packet"},
 }
-"""Modules that only this driver needs; python-can brings asyncio, sqlite3 and plugins'
-names."""
+"""Modules that only this driver needs; python-can brings asyncio and sqlite3."""
 JOINTS = {"daemon.judge.joint_motion", "drivers.joints.driver", "drivers.joints.message"}
 HALL = {"drivers.palm.calibration"}
 GATE = {f"daemon.judge.{name}" for name in ("gate", "contact", "hand", "stillness")}

@@ -149,7 +149,7 @@ def test_there_are_descriptors_for_all_peers_and_none_is_given_up(
     assert limits == taken
 
 
-@pytest.mark.parametrize("package", ["rich"])
+@pytest.mark.parametrize("package", ["joblib", "sklearn", "torch"])
 def test_a_missing_extra_is_asked_for_from_the_source_and_from_no_index(package: str) -> None:
     code = (
         "import sys, importlib.abc\n"
