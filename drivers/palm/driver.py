@@ -13,8 +13,7 @@ from typing import Final
 from drivers.base import Reading
 from drivers.link import LinkState
 from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
-from drivers.palm.rounds import ROUND_NS
-from drivers.palm.stream import PalmStream
+from drivers.palm.stream import ROUND_NS, PalmStream
 from drivers.udp.driver import DatagramDriver
 
 SPARE_CYCLES: Final = 2

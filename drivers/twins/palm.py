@@ -10,13 +10,12 @@ import numpy as np
 
 from drivers.base import FINGERS
 from drivers.palm.packet import (
+    CAN_RECORD_BYTES,
     CHANNELS,
     COMMAND_SENSOR_DATA,
     CYCLE_NS,
-    MOTORS,
     ROUND,
     VALID_ALL,
-    CanRecord,
     Channel,
     Palm,
     PalmPacket,
@@ -35,9 +34,6 @@ SENSORS_AT_REST = (
 """Raw sensor words of a real hand (Shadow's documentation), with noise of one count."""
 HALL_WORDS = 26
 """Of these, the ones with noise."""
-IDLE_TIMES_US = (430, 394)
-MOTORS_ARRIVED = (0x55555, 0xAAAAA)
-"""Of the packets with even and with odd motors (same source)."""
 OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
 PAC_COUNT = 2048
 ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
@@ -75,7 +71,7 @@ class PalmTwin:
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
         self._palm = palm
-        self._can_record = CanRecord(0, 0, 0, bytes(8)) if can_record else None
+        self._appended = bytes(CAN_RECORD_BYTES if can_record else 0)
         self._faults = faults
         self._injector = LinkFaultInjector(faults)
         self._sensors = np.array(sensors)
@@ -105,7 +101,7 @@ class PalmTwin:
                 self.injected["silenced"] += 1
                 yield []
                 continue
-            data = packet.to_bytes()
+            data = packet.to_bytes() + self._appended
             if self._faults.wrong_version:
                 data += bytes(LATER_VERSION_BYTES)
             if self._injector.breaks_here():
@@ -125,7 +121,6 @@ class PalmTwin:
         send_paced(self.cycles(), Endpoint.parse(target), stop, period_ns)
 
     def _packet(self, position: int, counts: Counts) -> PalmPacket:
-        odd = self.packets_made % 2
         sensors = self._sensors.copy()
         sensors[:HALL_WORDS] += self._random.integers(-1, 2, HALL_WORDS)
         fitted = sum(1 << FINGERS.index(finger) for finger in self._rows)
@@ -133,16 +128,10 @@ class PalmTwin:
             palm=self._palm,
             command=COMMAND_SENSOR_DATA,
             sensors=tuple(sensors.tolist()),
-            motor_type=0,
-            which_motors=odd,
-            motors_arrived=MOTORS_ARRIVED[odd],
-            motors_failed=0,
-            motor_words=(0, 0) * MOTORS,
+            which_motors=self.packets_made % 2,
             tactile_type=2 * position + 1,
             tactile_valid=fitted,
             tactile=tuple(self._slot(finger, position, counts) for finger in FINGERS),
-            idle_time_us=IDLE_TIMES_US[odd],
-            can_record=self._can_record,
         )
 
     def _slot(self, finger: str, position: int, counts: Counts) -> TactileSlot:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def test_a_file_of_packets_plays_count_for_count(
 ) -> None:
     twin = PalmTwin(rows(40), palm=palm, can_record=can_record)
     path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(packet.to_bytes() for packet in twin.packets()) + bytes(5))
+    path.write_bytes(b"".join(itertools.chain.from_iterable(twin.cycles())) + bytes(5))
     readings = []
     clock = Clock()
     log, driver = player(path, clock)
