@@ -55,7 +55,7 @@ _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module 
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """A bus of python-can. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no later try can succeed."""
     if interface not in can.VALID_INTERFACES:
         known = "socketcan, slcan, udp_multicast, virtual"
         raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
@@ -83,7 +83,7 @@ def _what_is_missing(interface: str, error: Exception) -> str:
 
 
 class CanBus:
-    """Opens, drains and closes one bus."""
+    """One bus."""
 
     def __init__(
         self,
@@ -93,17 +93,17 @@ class CanBus:
         clock: Callable[[], int],
         wall_clock: Callable[[], int],
     ) -> None:
-        """`options` go to the constructor of python-can's bus, over the ones that we need."""
+        """`options`: arguments of python-can's bus, which replace our own."""
         self.failure: LinkError | None = None
-        """Why the bus is of no use any more, None while it is."""
+        """Why the bus broke; None while it works."""
         self.more = False
         """True if the last drain left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
-        """Gets what every drain brings, if it brings anything."""
+        """Called with the frames of each drain that has some."""
         self.malformed = 0
-        """Records from the socket that are no CAN frames; its owner resets it."""
+        """Records from the socket that are no CAN frames. The owner resets it."""
         self.kernel_drops = 0
-        """Frames dropped by the kernel because its buffer was full, likewise."""
+        """Frames that the kernel dropped as its buffer was full. The owner resets it."""
         self._interface = interface
         self._channel = channel
         self._options = {**_OPTIONS.get(interface, {}), **options}
@@ -115,7 +115,7 @@ class CanBus:
         self._fileno: int | None = None
 
     def open(self) -> None:
-        """Take the bus. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+        """Take the bus. Raises as `open_bus` does."""
         self.close()
         self.failure = None
         self._idle_ns = self._clock()
@@ -127,7 +127,6 @@ class CanBus:
             self._use_socket(bus)
 
     def close(self) -> None:
-        """Let go of the bus, whatever state it is in."""
         bus, self._bus = self._bus, None
         self._socket = self._fileno = None
         if bus is None:
@@ -141,13 +140,13 @@ class CanBus:
                 port.close()
 
     def fileno(self) -> int | None:
-        """Descriptor to wait on, None where the interface has none."""
+        """Descriptor to wait on; None if the interface has none."""
         return self._fileno
 
     def drain(self) -> list[Stamped]:
-        """Frames that have arrived, oldest first, at most `FRAMES_PER_DRAIN`.
+        """Return up to `FRAMES_PER_DRAIN` frames that have arrived, oldest first.
 
-        Never raises and never waits: a broken bus sets `failure`, after the frames before it.
+        Never raises: a broken bus sets `failure`, after the frames before it.
         """
         frames: list[Stamped] = []
         self.more = False
@@ -167,7 +166,6 @@ class CanBus:
         return frames
 
     def _use_socket(self, bus: can.BusABC) -> None:
-        """Read the bus's socket ourselves, and have the kernel report what it drops."""
         raw = getattr(bus, "socket", None)
         if not isinstance(raw, socket.socket):
             return
@@ -199,7 +197,7 @@ class CanBus:
                 frames.append((frame, t_ns, t_ns))
 
     def _count_drops(self, total: int, frames: list[Stamped]) -> None:
-        """The kernel reports a running sum of 32 bits per socket, with the frame after the loss."""
+        """Take the kernel's running sum of 32 bits, which comes with the frame after a loss."""
         dropped = (total - self._drops_seen) % (1 << 32)
         if dropped:
             now_ns = self._clock()
@@ -233,7 +231,6 @@ class CanBus:
 
 
 def _fileno(bus: can.BusABC) -> int | None:
-    """Descriptor of a bus, None where it has none."""
     try:
         descriptor = bus.fileno()
     except Exception:  # noqa: BLE001 (python-can lets any exception through)
@@ -251,7 +248,7 @@ def _has_more(descriptor: int | None) -> bool:
 
 
 def _enlarge_buffer(descriptor: int) -> None:
-    """Let the kernel keep more frames while the loop is busy, where the descriptor is a socket."""
+    """Let the kernel keep more frames while the loop is busy, if the descriptor is a socket."""
     if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
         return
     with socket.socket(fileno=os.dup(descriptor)) as same, contextlib.suppress(OSError):

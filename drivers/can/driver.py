@@ -17,19 +17,20 @@ import can
 
 from drivers.base import DriverError, Fact, LinkError, Opened, Reading
 from drivers.can.bus import STAMPED_INTERFACES, CanBus
+from drivers.can.decoders import BoardOptions
 from drivers.can.formats import CanFormat
 from drivers.can.frames import LOST, Stamped
 from drivers.can.readings import CanCounters
-from drivers.can.stream import NAME, BoardOptions, CanStream
+from drivers.can.stream import NAME, CanStream
 from drivers.link import CLOSED, UP, WAITING, LinkState
 
 POLL_NS: Final = 1_000_000
-"""How often a bus without a descriptor is asked for frames, ns."""
+"""Time between reads of a bus without a descriptor, ns."""
 REST_MARGIN_NS: Final = 1_000_000
 REST_MAX_NS: Final = 15_000_000
-"""Where a reading takes many frames, waking for each costs more than the frames. The kernel keeps
-them meanwhile: the loop rests until this time before the reading should be complete, and at most a
-quarter of what the kernel's usual buffer holds, ns."""
+"""Waking for each of a reading's many frames costs more than the frames. The loop rests until this
+margin before the reading should be complete, and at most a quarter of what the kernel's usual
+buffer holds, ns."""
 RATE_WINDOW_NS: Final = 1_000_000_000
 """Frames per second are counted over this time, ns."""
 FD_CLOCK_HZ: Final = 80_000_000
@@ -39,16 +40,14 @@ FD_CLOCK_HZ: Final = 80_000_000
 class CanBridgeDriver(Opened):
     """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for the two formats.
 
-    The constructor raises `ValueError` for an argument out of range. `open` raises `DriverError`
-    only where no later try can succeed, such as an interface that python-can does not have;
-    otherwise the driver tries again until the bus is there. A bus that fails is closed, opened
-    again, and counted; a sweep that was cut through by that is dropped. A bus without a frame of
-    ours for ten periods, 100 ms at least, is `GREETING` until one comes.
+    The constructor raises `ValueError` for an argument out of range. `open` and `read_ready` raise
+    `DriverError` only if no later try can succeed, such as for an interface that python-can does
+    not have. A bus that fails is closed and opened again; a sweep that is cut by that is dropped.
+    A bus without a frame of ours for ten periods, 100 ms at least, is `GREETING` until one comes.
     """
 
     name = NAME
     exhausted = False
-    """A live link never is."""
     live = True
 
     def __init__(
@@ -63,15 +62,13 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """Describe the bus; nothing is opened yet.
+        """`bitrate` and `data_bitrate`, bit/s: not with socketcan, where they belong to `ip link`.
 
-        `bitrate` and `data_bitrate`, bit/s: not with socketcan, where they belong to `ip link`.
-        `fingers` and `board`: as those of a `CanStream`.
+        `fingers` and `board`: see `drivers.can.decoders.make_decoder`.
         """
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()
-        """What the bus has brought since `open`, and how its link stands."""
         frame_format = CanFormat(board.get("format", CanFormat.SYNTOUCH))
         options = _bus_options(interface, frame_format, bitrate, data_bitrate)
         self._bus = CanBus(interface, channel, options, clock, wall_clock)
@@ -80,12 +77,11 @@ class CanBridgeDriver(Opened):
 
     @property
     def counters(self) -> CanCounters:
-        """Counters since `open`."""
         return self.stream.counters
 
     @property
     def link_state(self) -> LinkState:
-        """What the link is doing. `GREETING`: the bus is open, no frame of ours has come yet."""
+        """`GREETING` while the bus is open and no frame of ours comes."""
         return self.stream.link.state
 
     @property
@@ -96,23 +92,21 @@ class CanBridgeDriver(Opened):
 
     @property
     def period_ns(self) -> int | None:
-        """Time between readings, ns, as measured; None until it is known."""
         return self.stream.period_ns
 
     @property
     def serials(self) -> dict[str, str]:
-        """Always empty: no CAN frame carries a sensor's serial number."""
+        """Empty: no CAN frame carries a sensor's serial number."""
         return {}
 
     def describe(self) -> dict[str, Fact]:
-        """Bus, link, and how much it brings."""
-        known = self.stream.describe()
+        facts = self.stream.describe()
         if self.link_state is UP:
-            known["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
-        return known
+            facts["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
+        return facts
 
     def open(self) -> None:
-        """Take the bus, or begin to try. Raises `DriverError` if no try can ever succeed."""
+        """Try once to take the bus. Raises `DriverError` if no try can ever succeed."""
         self.close()
         self.stream = self._make_stream()
         self._resting_until_ns = None
@@ -122,21 +116,20 @@ class CanBridgeDriver(Opened):
         self.stream.link.start(now_ns)
         self._try_to_open()
 
-    def tap(self, taker: Callable[[list[Stamped]], None]) -> None:
-        """Hand all frames that come from now on to `taker` too."""
-        self._bus.tap = taker
+    def tap(self, sink: Callable[[list[Stamped]], None]) -> None:
+        """Pass all frames that come from now on to `sink` too."""
+        self._bus.tap = sink
 
     def close(self) -> None:
-        """Let go of the bus."""
         self._bus.close()
         self.stream.link.close()
 
     def fileno(self) -> int | None:
-        """Descriptor to wait on, None while there is none or no reading is near."""
+        """Descriptor to wait on; None while there is none or no reading is near."""
         return None if self._resting_until_ns is not None else self._bus.fileno()
 
     def due_ns(self) -> int | None:
-        """When to open again, to notice silence, or to poll a bus without a descriptor."""
+        """Time to reopen the bus, to notice silence, or to poll without a descriptor, ns."""
         link = self.stream.link
         if link.state in (CLOSED, WAITING):
             return link.retry_ns
@@ -147,7 +140,6 @@ class CanBridgeDriver(Opened):
         return self.stream.silent_at_ns
 
     def read_ready(self) -> Sequence[Reading]:
-        """Readings that are complete now. Raises `DriverError` only if no try can ever succeed."""
         if self.link_state is CLOSED:
             raise RuntimeError("the CAN bridge is not open")
         if self.link_state is WAITING and not self._is_open_again():
@@ -204,9 +196,9 @@ class CanBridgeDriver(Opened):
             self._window_start_ns, self._window_frames = now_ns, 0
 
     def _rest(self, now_ns: int) -> int | None:
-        """Until when the frames may wait in the kernel, None for not at all.
+        """Return the time, ns, until which frames may wait in the kernel, or None.
 
-        Only where the kernel stamps them, so that waiting does not make them look fresher.
+        It must stamp them, so that waiting does not make them look fresher.
         """
         if not self._stamped or self._bus.more or self._bus.fileno() is None:
             return None
@@ -219,7 +211,7 @@ class CanBridgeDriver(Opened):
 def _bus_options(
     interface: str, frame_format: CanFormat, bitrate: int | None, data_bitrate: int | None
 ) -> dict[str, Any]:
-    """Arguments of python-can's bus. Raises `ValueError` where it would drop them silently."""
+    """Return arguments of python-can's bus. Raises `ValueError` for those that it would drop."""
     if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
         raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
     wants_fd = frame_format is CanFormat.SWEEP_FD

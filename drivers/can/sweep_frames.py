@@ -29,6 +29,9 @@ _HALF: Final = 1 << 31
 class FrameAssembler:
     """Sweeps from frames that hold all electrodes of one finger and the sweep's number."""
 
+    expected_ns: int | None = None
+    """Not told: the few frames of a sweep are no reason to rest between them."""
+
     def __init__(
         self, fingers: int, counters: CanCounters, order: Sequence[int] | None = None
     ) -> None:
@@ -101,8 +104,12 @@ class FrameAssembler:
         self._t_ns = max(t_ns, self._t_ns)
         return done if self._have != self._all else (*done, *self._finish())
 
+    def cut(self) -> Sequence[TactileReading]:
+        """Do nothing where frames were lost: numbered frames show it by themselves."""
+        return ()
+
     def interrupt(self) -> None:
-        """The link broke: drop the sweep at hand."""
+        """Drop the current sweep. Call when the link broke."""
         if self._have and not self._finished:
             self._counters.interrupted_sweeps += 1
             self._readings.miss(1)

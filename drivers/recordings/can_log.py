@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, Unpack
 
 from drivers.base import Reading
+from drivers.can.decoders import BoardOptions
 from drivers.can.frames import (
     CLASSIC_DATA_MAX,
     ERR_FLAG,
@@ -27,7 +28,7 @@ from drivers.can.frames import (
     CanFrame,
     Stamped,
 )
-from drivers.can.stream import BoardOptions, CanStream
+from drivers.can.stream import CanStream
 from drivers.recordings.csv_rows import open_recording
 
 LINE_MAX: Final = 256
@@ -87,7 +88,7 @@ class CanLog:
     """Candump text through the stream that the driver has. A `LinkLog`."""
 
     def __init__(self, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """As those of a `CanStream`. Raises `ValueError`."""
+        """Arguments: those of a `CanStream`. Raises `ValueError`."""
         self._fingers, self._board = fingers, board
         self.begin()
 

@@ -92,14 +92,7 @@ def test_a_counter_that_goes_round_while_frames_are_lost_is_told_by_time(
 
 
 def sweep_fd_decoder() -> CanDecoder:
-    return make_decoder(
-        CanFormat.SWEEP_FD,
-        FINGERS,
-        counters=CanCounters(),
-        arbitration_id=BASE_ID,
-        sequence="electrodes",
-        data_length=None,
-    )
+    return make_decoder(FINGERS, CanCounters(), format=CanFormat.SWEEP_FD, arbitration_id=BASE_ID)
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
@@ -143,14 +136,7 @@ def sweep_frames(first: int) -> Feed:
 
 def samples(sequence: str) -> Callable[[int], Feed]:
     def begin(_first: int) -> Feed:
-        decoder = make_decoder(
-            CanFormat.SYNTOUCH,
-            FINGERS,
-            counters=CanCounters(),
-            arbitration_id=BASE_ID,
-            sequence=sequence,
-            data_length=None,
-        )
+        decoder = make_decoder(FINGERS, CanCounters(), arbitration_id=BASE_ID, sequence=sequence)
         return lambda unit: decoder.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
 
     return begin
