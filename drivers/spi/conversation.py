@@ -89,20 +89,11 @@ class Conversation:
         self._fingers = tuple(fingers)
         self._port = port
         self._nonce = nonce
-        self._counters = BridgeCounters()
-        self._parser, self._sent = FrameParser(DIGEST), FrameParser(DIGEST)
+        self.counters = BridgeCounters()
+        self._parser, self._sent = FrameParser(DIGEST, self.counters), FrameParser(DIGEST)
         self._sweeps: SweepDecoder | None = None
         self._pings: dict[int, int] = {}
         """Send times of the PINGs that wait for an answer, by their nonce."""
-
-    @property
-    def counters(self) -> BridgeCounters:
-        """Counts over all reopenings of the port."""
-        frames, counters = self._parser.counters, self._counters
-        counters.bytes, counters.frames = frames.bytes, frames.frames
-        counters.bad_cobs, counters.bad_crc = frames.bad_cobs, frames.bad_crc
-        counters.too_long, counters.link_losses = frames.too_long, self.link.losses
-        return counters
 
     @property
     def period_ns(self) -> int | None:
@@ -143,10 +134,11 @@ class Conversation:
     def lost(self, cause: LinkCause, why: str, now_ns: int) -> None:
         """Give the link up until `opened`."""
         self._sweeps = None
-        self._counters.link_failures += 1
-        self._counters.unanswered_pings += len(self._pings)
+        self.counters.link_failures += 1
+        self.counters.unanswered_pings += len(self._pings)
         self._pings.clear()
         self.link.failed(cause, why, now_ns)
+        self.counters.link_losses = self.link.losses
 
     def say(self, now_ns: int) -> list[bytes]:
         """Return the frames to send now. May lose the link instead, by a timeout."""
@@ -180,13 +172,13 @@ class Conversation:
             if isinstance(message, Ping):
                 while len(self._pings) >= PINGS_OUT_MAX:
                     self._pings.pop(next(iter(self._pings)))
-                    self._counters.unanswered_pings += 1
+                    self.counters.unanswered_pings += 1
                 self._pings[message.nonce] = t_ns
                 self._pings_sent += 1
 
     def not_sent(self) -> None:
         """Count a frame that was given up, as there was no room for it."""
-        self._counters.host_tx_dropped += 1
+        self.counters.host_tx_dropped += 1
 
     def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
         """Return the readings that these bytes complete, oldest first. Never raises.
@@ -201,8 +193,8 @@ class Conversation:
                 continue
             message = decode(kind, payload)
             if message is None:
-                self._counters.bad_frames += kind in _FROM_BRIDGE
-                self._counters.unknown_frames += kind not in _FROM_BRIDGE
+                self.counters.bad_frames += kind in _FROM_BRIDGE
+                self.counters.unknown_frames += kind not in _FROM_BRIDGE
             elif isinstance(message, Sweep):
                 reading = self._on_sweep(message, arrival_ns, idle_ns)
                 if reading is not None:
@@ -229,7 +221,7 @@ class Conversation:
         return False
 
     def _refuse(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        self._counters.refused_bridges += 1
+        self.counters.refused_bridges += 1
         self.lost(cause, f"{self._port}: the bridge {why}", now_ns)
 
     def _on_message(self, message: Message, arrival_ns: int) -> None:
@@ -237,11 +229,11 @@ class Conversation:
             self._on_hello(message, arrival_ns)
         elif isinstance(message, BridgeStatus):
             self.status = message
-            self._counters.bridge_overruns = message.overruns
-            self._counters.bridge_tx_dropped = message.tx_dropped
-            self._counters.bridge_rx_errors = message.rx_errors
+            self.counters.bridge_overruns = message.overruns
+            self.counters.bridge_tx_dropped = message.tx_dropped
+            self.counters.bridge_rx_errors = message.rx_errors
         else:
-            self._counters.unknown_frames += 1  # our own words: an echo
+            self.counters.unknown_frames += 1  # our own words: an echo
 
     def _on_hello(self, hello: Hello, arrival_ns: int) -> None:
         if hello.nonce == 0:
@@ -273,7 +265,7 @@ class Conversation:
 
     def _on_reset(self, now_ns: int) -> None:
         if self._sweeps is not None:
-            self._counters.restarts += 1
+            self.counters.restarts += 1
             self.lost(LinkCause.DISCONNECTED, "the bridge was reset", now_ns)
         elif self._pings_sent < GREETING_TRIES:
             self._ping_due_ns = now_ns
@@ -297,7 +289,7 @@ class Conversation:
             self._ping_due_ns = now_ns + PING_FIRST_NS
             self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
             self._silent_at_ns = now_ns + self._silence_ns
-            self._sweeps = SweepDecoder(hello, self._sensors, self._counters)
+            self._sweeps = SweepDecoder(hello, self._sensors, self.counters)
 
     def _take(self, hello: Hello) -> None:
         self.hello = hello
@@ -309,7 +301,7 @@ class Conversation:
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:
-            self._counters.stale_sweeps += 1
+            self.counters.stale_sweeps += 1
             return None
         reading = self._sweeps.reading(sweep, arrival_ns, idle_ns)
         if reading is None:

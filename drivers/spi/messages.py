@@ -19,6 +19,7 @@ import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
+from drivers.base import DriverCounters
 from drivers.biotac import FORBIDDEN_COMMAND
 
 DELIMITER: Final = b"\0"
@@ -66,8 +67,8 @@ _WORD = np.dtype(">u2")
 
 
 @dataclass(slots=True)
-class FrameCounters:
-    """What a parser has received since it was made. Every drop is one count."""
+class FrameCounters(DriverCounters):
+    """Counters of a parser, among those of its driver."""
 
     bytes: int = 0
     frames: int = 0
@@ -96,19 +97,19 @@ def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
 class FrameParser:
     """Bytes in, whole frames out. Never raises; damaged frames are counted and dropped."""
 
-    def __init__(self, digest: int = 0) -> None:
-        """`digest`: see `encode_frame`."""
-        self.counters = FrameCounters()
+    def __init__(self, digest: int = 0, counters: FrameCounters | None = None) -> None:
+        """`digest`: see `encode_frame`. Counts in `counters`, if given."""
+        self.counters = counters or FrameCounters()
         self._digest = digest
         self.reset()
 
     @property
     def held_bytes(self) -> int:
-        """Bytes of an unfinished frame that are held back, at most `ENCODED_MAX_BYTES`."""
+        """Bytes of an unfinished frame, at most `ENCODED_MAX_BYTES`."""
         return len(self._held)
 
     def reset(self) -> None:
-        """Forget an unfinished frame. Call when the line was opened again."""
+        """Forget an unfinished frame. Call when the line is reopened."""
         self._held = b""
         self._is_overlong = False
 
@@ -151,7 +152,7 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """What the bridge is and how it samples; answers PING, and comes once after a reset."""
+    """Describes the bridge and its sampling; answers PING, and comes once after a reset."""
 
     TYPE: ClassVar[int] = 0x01
 
@@ -163,7 +164,7 @@ class Hello:
     period_ticks: int
     """Nominal ticks from one sweep to the next."""
     serials: tuple[str, ...]
-    """Serial number of each sensor, empty where none answered; in the order of chip selects."""
+    """Serial number by chip select, empty where no sensor answered."""
     commands: tuple[int, ...]
     """First command byte of each slot (manual figure 13)."""
     firmware: int = 0
@@ -247,8 +248,7 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
     present: int
     """Bit i: sensor i had a serial number when it was last looked for."""
     words: NDArray[np.uint16]
-    """Shape (slots, sensors), 16-bit response words of either byte order, not yet judged (manual
-    figure 15)."""
+    """Shape (slots, sensors), response words of either byte order (manual figure 15)."""
 
     def is_sound(self) -> bool:
         slots, sensors = self.words.shape

@@ -20,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
+from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
 from drivers.biotac import COUNT_OF_WORD, FAULT_OF_WORD, channel_of, electrode_columns
-from drivers.spi.messages import Hello, Sweep
+from drivers.spi.messages import FrameCounters, Hello, Sweep
 
 SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
 SEQ_FIRST_MAX = 1_000
@@ -57,15 +57,9 @@ AGE_MAX_NS = 10_000_000_000
 
 
 @dataclass(slots=True)
-class BridgeCounters(DriverCounters):
-    """Every kind of drop and fault since `open`."""
+class BridgeCounters(FrameCounters):
+    """Counters of frames, sweeps and the link, over all reopenings of the port."""
 
-    bytes: int = 0
-    frames: int = 0
-    bad_cobs: int = 0
-    bad_crc: int = 0
-    too_long: int = 0
-    """See `drivers.spi.messages.FrameCounters`."""
     unknown_frames: int = 0
     """Whole frames of a type that a bridge of version 1 never sends."""
     bad_frames: int = 0
