@@ -35,8 +35,7 @@ ERROR_WORDS: dict[int, str] = {
     0xA55F: "nothing to resend",
     0xA557: "write failed",
 }
-"""Sent in place of data (manual tables 8 and 11, C library). With parity ignored each of them
-decodes to 2629..2635, a perfectly plausible electrode."""
+"""Sent in place of data (tables 8 and 11, C library); 2629..2635 if parity is ignored."""
 UNPLUGGED_WORDS = (0x0000, 0xFFFF)
 """A line that nothing drives reads all zeros or all ones; both have even parity."""
 
@@ -58,7 +57,7 @@ SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
 
 
 def sample_command(channel: int) -> int:
-    """First command byte that samples a channel: `1 CCCCCC P`, odd parity (manual figure 13).
+    """Return the command byte that samples a channel: `1 CCCCCC P`, odd parity (figure 13).
 
     Raises `ValueError` for a channel that a BioTac SP does not have, channel 16 among them.
     """
@@ -69,14 +68,14 @@ def sample_command(channel: int) -> int:
 
 
 def channel_of(command: int) -> int | None:
-    """Channel that a command byte samples, or None if it is no valid sampling command."""
+    """Return the channel that a command byte samples, or None."""
     return _CHANNEL_OF_COMMAND.get(command)
 
 
 def encode_word(count: int) -> int:
-    """Response word of a 12-bit count, most significant byte first (manual figure 15).
+    """Return the response word of a count (manual figure 15): `D11..D5 P  D4..D0 0 0 P`.
 
-    `D11..D5 P  D4..D0 0 0 P`, each byte with odd parity. Raises `ValueError` outside 0..4095.
+    Each byte has odd parity, the most significant comes first. Raises `ValueError`.
     """
     if not 0 <= count <= COUNT_MAX:
         raise ValueError(f"{count} is not a 12-bit count")
@@ -89,16 +88,15 @@ def encode_word(count: int) -> int:
 def decode_words(
     words: NDArray[np.integer[Any]],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Counts and `ElectrodeFault` bits of response words, in the shape of `words`.
+    """Return counts, 0 where faulty, and `ElectrodeFault` bits of response words.
 
-    A word with a fault has the count 0. Words are the 16 bits as sent, first byte high, soonest
-    decoded as `np.intp`.
+    Words are the 16 bits as sent, first byte high; `np.intp` is decoded soonest.
     """
     return COUNT_OF_WORD[words], FAULT_OF_WORD[words]
 
 
 def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
-    """Which of the samples are electrodes: shape (n, 2), rows of (sample, electrode 0..23)."""
+    """Return which samples are electrodes: rows of (sample, electrode 0..23)."""
     pairs = [
         (at, channel - E1)
         for at, channel in enumerate(channels)
@@ -108,7 +106,7 @@ def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
 
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Count and fault of all 65536 words, so that a sweep is decoded by two look-ups."""
+    """Return count and fault of all 65536 words: a sweep takes two look-ups."""
     counts = np.zeros(1 << 16, dtype=np.uint16)
     faults = np.full(1 << 16, int(ElectrodeFault.PARITY), dtype=np.uint8)
     for count in range(COUNT_MAX + 1):

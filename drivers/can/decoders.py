@@ -31,10 +31,7 @@ from drivers.can.sweep_frames import FrameAssembler
 
 
 class SynTouchDecoder:
-    """Samples of SynTouch's board, one frame each.
-
-    Without a configured id it is that of the first sound sample since the link broke.
-    """
+    """Samples of SynTouch's board; without an id, that of the first sound sample counts."""
 
     def __init__(
         self,
@@ -131,7 +128,6 @@ class SweepFrameDecoder:
         return self.sweeps.push(row, sweep.sequence, sweep.tick_us, sweep.words, faults, t_ns)
 
     def interrupt(self) -> None:
-        """Drop the current sweep."""
         self.sweeps.interrupt()
 
     def _tick_stands(self, finger: int, sequence: int, tick_us: int) -> bool:

@@ -154,7 +154,6 @@ class CanBridgeDriver(Opened):
         return readings
 
     def _is_open_again(self) -> bool:
-        """Return True if the bus is open after a try, if one was due."""
         if not self.stream.link.is_due(self._clock()):
             return False
         self._try_to_open()
@@ -196,10 +195,7 @@ class CanBridgeDriver(Opened):
             self._window_start_ns, self._window_frames = now_ns, 0
 
     def _rest(self, now_ns: int) -> int | None:
-        """Return the time, ns, until which frames may wait in the kernel, or None.
-
-        It must stamp them, so that waiting does not make them look fresher.
-        """
+        """Return the time, ns, until which the kernel may stamp and keep frames, or None."""
         if not self._stamped or self._bus.more or self._bus.fileno() is None:
             return None
         expected_ns = self.stream.expected_ns

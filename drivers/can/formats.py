@@ -97,7 +97,6 @@ class SweepFrame(msgspec.Struct, frozen=True, gc=False):
     """`SweepStatus` bits."""
 
     def to_bytes(self) -> bytes:
-        """The 64 bytes."""
         head = _SWEEP_HEAD.pack(SWEEP_VERSION, self.finger, self.sequence, self.tick_us)
         return head + self.words + _SWEEP_STATUS.pack(self.status) + _RESERVED
 
@@ -131,10 +130,7 @@ def parse_sweep(data: bytes) -> SweepFrame | Reject:
 
 
 def sample_length(sensors: int, length: int | None) -> int:
-    """Return the length of SynTouch frames: `1 + 2 * sensors` unless given.
-
-    Raises `ValueError` if the words do not fit into it, or it into a classic frame.
-    """
+    """Return the length of SynTouch frames. Raises `ValueError` if it cannot be `length`."""
     if sensors > SENSORS_MAX:
         raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors

@@ -84,8 +84,7 @@ POINTS_MIN, POINTS_MAX = 2, 64
 COUPLED_POINTS_MIN, COUPLED_POINTS_MAX = 3, 49
 """Points of the coupled table; Shadow's own has 25, five by five."""
 SLOPE_MAX_DEG = 0.5
-"""Steepest segment, degrees per count: noise of one count moves the joint by as much. Usual are
-0.03 to 0.1."""
+"""Steepest segment, degrees per count of noise; usual are 0.03 to 0.1."""
 
 Point = tuple[float, float]
 """(raw, degrees)."""
@@ -115,7 +114,7 @@ class Table:
 
 
 class CoupledTable:
-    """A pair of raw values -> a pair of radians, linear in the triangles between measured pairs."""
+    """A pair of raw values -> a pair of radians, linear between measured pairs."""
 
     def __init__(self, points: Sequence[CoupledPoint]) -> None:
         """Raises `ValueError` if the raw pairs span no triangle."""
@@ -167,7 +166,7 @@ _LOW_RAD, _HIGH_RAD = (
 
 
 def impossible_angles(position_rad: NDArray[np.float64]) -> int:
-    """Return how many angles of `JOINTS`, radians, are out of reach. NaN is not counted."""
+    """Return how many angles of `JOINTS` are out of reach; NaN is not."""
     return int(((position_rad < _LOW_RAD) | (position_rad > _HIGH_RAD)).sum())
 
 
@@ -179,8 +178,7 @@ def _raw(sensors: Sequence[int], words: Sequence[int]) -> float | None:
 def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return triangles, shape (n, 3), whose circumcircle has no point inside; points: (p, 2).
 
-    A calibration has 25 points, so all triples are tried. Four points on one circle give both
-    pairs of triangles: either is right.
+    All triples are tried. Four points on one circle give both pairs of triangles.
     """
     triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
     a, b, c = (points[triples[:, corner]] for corner in range(3))
@@ -222,7 +220,7 @@ def load_calibration(path: Path) -> JointCalibration:
 
 
 def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
-    """Check the content of a file. Raises `CalibrationError`, whose message names `path`."""
+    """Check the content of a file. Raises `CalibrationError`."""
     problems = list(_problems(data))
     if problems:
         raise CalibrationError(path, problems)
@@ -309,7 +307,7 @@ def _shape_problems(rows: object, width: int, least: int, most: int) -> Iterator
 
 
 def _is_number(value: object) -> bool:
-    """Return True for a number that could be a raw value or angle; NaN and infinity cannot."""
+    """Return True for a finite number of a plausible size."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e9 < value < 1e9
 
 

@@ -21,10 +21,7 @@ SPARE_CYCLES: Final = 2
 
 
 class PalmDriver(DatagramDriver[PalmStream]):
-    """Gives the readings of a `PalmStream`, whose arguments it has.
-
-    `open` also raises `CalibrationError`, for a calibration with mistakes.
-    """
+    """Gives the readings of a `PalmStream`. `open` also raises `CalibrationError`."""
 
     name = "palm"
     bytes_max = PACKET_BYTES_MAX
@@ -55,20 +52,17 @@ class PalmDriver(DatagramDriver[PalmStream]):
 
     @property
     def counters(self) -> PalmCounters:
-        """Counters since `open`."""
         return self.stream.counters
 
     @property
     def serials(self) -> dict[str, str]:
-        """The sender, for each finger: packets carry no serial number, and another sender is
-        another hand."""
+        """The sender, for each finger: packets have no serial number."""
         return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
 
     def fileno(self) -> int | None:
         """The socket, but None while no round can end.
 
-        The kernel collects packets and notes their times. A loop that woke for each packet would
-        wake a thousand times a second for 71 readings.
+        The kernel stamps and keeps packets, so that the loop wakes 71 times a second, not 1000.
         """
         return None if self._clock() < self._attention_ns else super().fileno()
 

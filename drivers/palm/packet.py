@@ -110,10 +110,7 @@ class PalmPacket:
     """5 slots, in the order of `drivers.base.FINGERS`."""
 
     def to_bytes(self) -> bytes:
-        """Return the packet as the palm sends it, with zeros in what is not read. For twins.
-
-        Raises `ValueError` for a value that its field cannot hold.
-        """
+        """Return the packet as the palm sends it, with zeros in the rest. Raises `ValueError`."""
         layout = _LAYOUTS[self.palm]
         tactile = [self.tactile_type, self.tactile_valid]
         tactile += [word for slot in self.tactile for word in slot]
@@ -176,10 +173,7 @@ class PalmCounters(DatagramCounters):
 
 
 def parse_packet(data: bytes, counters: PalmCounters) -> PalmPacket | None:
-    """Return the packet of a datagram; count and return None for one without sensor data.
-
-    Damage to a value that stays in its range is not noticed, for want of a checksum.
-    """
+    """Return the packet of a datagram; count and return None for one without sensor data."""
     palm = PALM_OF_LENGTH.get(len(data))
     if palm is None:
         counters.bad_lengths += 1
@@ -228,8 +222,7 @@ _LAYOUTS: Final = {
     )
 }
 CAN_RECORD_BYTES = 12
-"""Length of a message of the motor buses that the palm appends and a relay may leave there: bus,
-length and id in four bytes, and eight of data."""
+"""Length of a CAN message that a relay may leave behind a packet: bus, length, id and data."""
 PALM_OF_LENGTH: Final = {
     layout.format.size + appended: palm
     for palm, layout in _LAYOUTS.items()

@@ -87,11 +87,10 @@ class PalmStream:
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
     ) -> None:
-        """`fingers`: the rows of a reading; raises `ValueError` for unknown fingers.
+        """`fingers`: the rows of a reading. Raises `ValueError`, and `CalibrationError`.
 
-        Joint readings need the hand's `calibration` file; raises `CalibrationError` for one with
-        mistakes. Without `heed_finger_bits` the packet's `tactile_valid` is ignored, for a palm
-        that does not set it (Shadow's own driver ignores it).
+        Joint readings need the hand's `calibration` file. Without `heed_finger_bits` the packet's
+        `tactile_valid` is ignored, as by Shadow's own driver, for a palm that does not set it.
         """
         check_fingers(fingers)
         self.counters = PalmCounters()
@@ -131,10 +130,7 @@ class PalmStream:
         return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
-        """Return the readings that a packet completes.
-
-        None: it is dropped, as it is no packet of this palm or came twice.
-        """
+        """Return the readings that a packet completes, or None if it is dropped."""
         packet = parse_packet(data, self.counters)
         if packet is None:
             return None
@@ -205,7 +201,6 @@ class PalmStream:
         return self._round * ROUND
 
     def _move_on(self, to_round: int) -> Sequence[TactileReading]:
-        """Close the current round, complete or not, and begin another."""
         finished = () if self._finished else (self._finish(),)
         self._miss(to_round - self._round - 1)
         self._begin(to_round)

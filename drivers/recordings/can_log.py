@@ -43,7 +43,7 @@ _LINE: Final = re.compile(
 
 
 def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
-    """A frame as a line of `candump -L`, with newline; `wall_ns`: when it came, ns since 1970."""
+    """Return a line of `candump -L`. `wall_ns`: arrival, ns since 1970."""
     seconds, rest_ns = divmod(wall_ns, 1_000_000_000)
     word = frame.arbitration_id
     if frame.flags & ERROR:
@@ -57,7 +57,7 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
 
 
 def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
-    """Frames as lines; what the kernel lost has none. Wall time is their time plus `offset_ns`."""
+    """Return frames as lines; `offset_ns`: from their time to wall time."""
     lines = [
         line_of(frame, max(until_ns + offset_ns, 0), channel)
         for frame, _, until_ns in frames
@@ -67,7 +67,7 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
 
 
 def frame_of(line: str) -> tuple[int, CanFrame] | None:
-    """When a frame came, ns since 1970, and the frame; None for a line that has none."""
+    """Return a line's time, ns since 1970, and frame, or None."""
     found = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
     if found is None:
         return None
@@ -93,7 +93,7 @@ class CanLog:
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
-        """Times, ns, and frames of a file; other lines are passed over. Raises `RecordingError`."""
+        """Yield times, ns, and frames; skip other lines. Raises `RecordingError`."""
         with open_recording(path) as stream:
             while line := stream.readline(LINE_MAX + 1):
                 found = frame_of(line.decode("ascii", "replace"))

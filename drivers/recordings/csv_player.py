@@ -60,9 +60,9 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed` is a factor of real time; None plays as fast as possible.
+        """`speed`: factor of real time, None for as fast as possible. `rate_hz`: grasps per second.
 
-        `rate_hz`: grasps per second of a table. Raises `ValueError` for an argument out of range.
+        Raises `ValueError` for an argument out of range.
         """
         check_fingers(fingers)
         if not rate_hz > 0.0:
@@ -80,10 +80,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
     def _reset(self) -> None:
         self.counters = ReplayCounters()
         self.period_ns: int | None = None
-        """Nominal time, ns, between readings as played, before any fault.
-
-        Tables: from `rate_hz`. Streams: the shortest step so far; None before it is known.
-        """
+        """Nominal time between readings as played, ns; of a stream, the shortest step so far."""
         self._injector = FaultInjector(self._faults, self._fingers, self.counters)
         self._row_index = 0
 

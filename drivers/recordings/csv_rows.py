@@ -36,8 +36,7 @@ TIME = "t"
 OBJECT = "object"
 SLIPPED = "slipped"
 LINE_BYTES_MAX = 65_536
-"""A row of five fingers and all joints has about 1,200 bytes. A far longer line is no recording:
-reading on for its end could take in a whole disk image."""
+"""A full row has 1,200 bytes. Reading on for a line's end could take in a disk image."""
 TIME_MAX_S = 1e11
 """The year 5138. Unix time in ms, us or ns lies above it: the wrong unit, not a time in seconds."""
 SHOWN_LENGTH_MAX = 40

@@ -50,9 +50,9 @@ class LinkLog(Protocol[Record]):
 
 
 class LinkLogDriver(RecordedDriver[Record]):
-    """Plays link logs in a row, as one run. `recorded_ns` of a reading is its time on their clock.
+    """Plays link logs in a row, as one run; without `speed` as fast as possible.
 
-    Without `speed` as fast as possible. `open` raises `DriverError`, `read_ready` `RecordingError`.
+    `open` raises `DriverError`, `read_ready` `RecordingError`.
     """
 
     def __init__(

@@ -37,10 +37,7 @@ class PalmFile:
         self.stream = self._make_stream()
 
     def records(self, path: Path) -> Iterator[tuple[int, bytes]]:
-        """Times, ns since the first, and packets. Raises `RecordingError` at once.
-
-        The last packet is cut off if the file ends in it.
-        """
+        """Yield times, ns since the first, and packets. Raises `RecordingError` at once."""
         with open_recording(path) as file:
             length = _packet_bytes(path, file)
         return _packets(path, length)

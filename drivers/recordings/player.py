@@ -22,18 +22,14 @@ class Timeline(Generic[Item]):
     """
 
     def __init__(self, speed: float | None, clock: Callable[[], int], *, delay_ns: int = 0) -> None:
-        """Without `speed` as fast as possible, else items come `delay_ns` late; `clock`: ns.
-
-        Raises `ValueError` for a speed that is not positive.
-        """
+        """Without `speed`, as fast as possible; else `delay_ns` late. Raises `ValueError`."""
         if speed is not None and not speed > 0.0:
             raise ValueError(f"{speed} is no positive speed")
         self.speed = speed
         self.exhausted = False
         """True when the last item has been taken, or after an error, until `start`."""
         self.handed_over_ns = self._opened_ns = clock()
-        """When the last reading was handed over: what a judge must take for now, to find it as old
-        as it was found then, however busy the machine is."""
+        """Time of the last reading handed over: the judge's now, whatever the load."""
         self._clock = clock
         self._delay_ns = delay_ns
         self._items: Generator[tuple[int, Item], None, None] | None = None
@@ -70,10 +66,7 @@ class Timeline(Generic[Item]):
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 
     def take(self) -> tuple[int, Item, int] | None:
-        """Time and content of the next item, and how late it is, ns; None if it is not due.
-
-        Raises `RecordingError` where the files cannot be read on.
-        """
+        """Return a due item's time, content and lateness, ns. Raises `RecordingError`."""
         if self._items is None:
             raise RuntimeError("the replay is not open")
         now_ns, item = self._clock(), self._next
@@ -91,10 +84,7 @@ class Timeline(Generic[Item]):
         return *item, now_ns - due_ns
 
     def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
-        """The same reading moved to now: as old as it was at the recording's time `at_ns`.
-
-        Its `recorded_ns` is counted from `axis_ns`, ns on the recording's clock.
-        """
+        """Return a reading of `at_ns` moved to now; `axis_ns`: the recording's zero, ns."""
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
         return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
@@ -110,7 +100,7 @@ class Timeline(Generic[Item]):
 
 
 class RecordedDriver(Opened, Generic[Item]):
-    """A driver without a device. Whoever derives starts `timeline`, and makes readings of it."""
+    """Base of drivers that play files: they start `timeline` and take from it."""
 
     name = "replay"
     live = False
@@ -129,7 +119,7 @@ class RecordedDriver(Opened, Generic[Item]):
 
     @property
     def handed_over_ns(self) -> int:
-        """When the last reading was handed over, monotonic ns; see `Timeline`."""
+        """See `Timeline`."""
         return self.timeline.handed_over_ns
 
     @property

@@ -50,7 +50,7 @@ def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
 
 
 class SerialLogParser:
-    """Takes the bytes of a file and gives its records. Never raises, and holds back 1024 bytes."""
+    """Bytes in, records out. Never raises; holds back 1024 bytes at most."""
 
     def __init__(self) -> None:
         self._frames = FrameParser()
@@ -64,10 +64,7 @@ class SerialLogParser:
 
 
 class SerialLog:
-    """Serial link logs through the conversation that the driver has. A `LinkLog`.
-
-    What the daemon asked the bridge then is in the file, so nothing is asked now.
-    """
+    """Serial link logs through the driver's conversation; nothing is asked. A `LinkLog`."""
 
     def __init__(self, fingers: Sequence[str], sensors: Sequence[str] | None = None) -> None:
         """As those of a `Conversation`. Raises `ValueError`."""
@@ -75,7 +72,7 @@ class SerialLog:
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
-        """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
+        """Yield times, ns, and records; skip damage. Raises `RecordingError`."""
         parser = SerialLogParser()
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):

@@ -71,8 +71,8 @@ class Conversation:
     ) -> None:
         """`port`: its name, for people. `nonce`: that of the PING before the first.
 
-        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the chip selects,
-        the same unless given. Raises `ValueError` for unknown or missing fingers.
+        `fingers`: the rows of a reading. `sensors`: the fingers by chip select, by default the
+        same. Raises `ValueError`.
         """
         self.link = Link(NAME)
         self.hello: Hello | None = None
@@ -102,7 +102,6 @@ class Conversation:
 
     @property
     def due_ns(self) -> int:
-        """When to call `say`, even if nothing has come."""
         if self._sweeps is None:
             return self._ping_due_ns
         return min(self._ping_due_ns, self._silent_at_ns)
@@ -208,7 +207,7 @@ class Conversation:
         return encode(Ping(self._nonce))
 
     def _has_our_layout(self, payload: bytes, now_ns: int) -> bool:
-        """Return True if a HELLO is of our version and layout, else give the link up."""
+        """Return True if a HELLO has our layout, else give the link up."""
         layout = layout_of(payload)
         if layout is None or layout == (VERSION, DIGEST):
             return True
@@ -254,7 +253,7 @@ class Conversation:
             self._sweeps.clock.round_trip(hello.tick, sent_ns, arrival_ns)
 
     def _is_confirmed(self, serials: tuple[str, ...]) -> bool:
-        """Return True if these are confirmed serial numbers, or those of the HELLO before."""
+        """Return True if two HELLOs in a row had these serial numbers."""
         before = self._confirmed if len(self._confirmed) == len(serials) else ("",) * len(serials)
         merged = tuple(new or old for new, old in zip(serials, before, strict=True))
         if merged != before and serials != self._unconfirmed:
@@ -314,7 +313,6 @@ class Conversation:
 
 
 def _about(hello: Hello) -> dict[str, Fact]:
-    """Return what a bridge says of itself."""
     sensors = ", ".join(serial or "none" for serial in hello.serials)
     return {
         "board": Fact(hello.board or "unnamed"),
@@ -334,7 +332,7 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
 
 
 def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
-    """Return SPI errors by chip select, `-` for one without a sensor, which always has some."""
+    """Return SPI errors by chip select, `-` for one without a sensor."""
     errors = [
         count if serial else None
         for count, serial in zip(status.spi_errors, hello.serials, strict=False)
@@ -344,7 +342,7 @@ def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
 
 
 def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
-    """Return what is known of a bridge's clock and of the duration of its sweeps."""
+    """Return facts about the clock and the duration of sweeps."""
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
     trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
     facts = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}

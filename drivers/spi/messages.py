@@ -25,8 +25,7 @@ from drivers.biotac import FORBIDDEN_COMMAND
 DELIMITER: Final = b"\0"
 """Ends a frame and occurs nowhere else, so that the next frame is found after any damage."""
 ENCODED_MAX_BYTES = 1024
-"""Longest encoded frame without its delimiter, and so the most that a parser holds back. The
-largest of version 1, a SWEEP of 64 slots and 5 sensors, takes 671."""
+"""Longest encoded frame without delimiter; the largest SWEEP of version 1 takes 671."""
 VERSION = 1
 FIRMWARE = 0x0002
 """Firmware in `deploy/bridge` of this graspd, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
@@ -82,7 +81,7 @@ class FrameCounters(DriverCounters):
 
 
 def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
-    """Return a frame with its delimiter; `digest` begins its checksum unless it is `UNSEEDED`.
+    """Return a frame; `digest` begins its checksum unless it is `UNSEEDED`.
 
     Raises `ValueError` for a type that is no byte and a frame longer than `ENCODED_MAX_BYTES`.
     """
@@ -236,7 +235,7 @@ class Hello:
 
 
 class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """The response words of one sweep over all slots and sensors, as they were read."""
+    """Response words of one sweep over all slots and sensors."""
 
     TYPE: ClassVar[int] = 0x02
 
@@ -387,13 +386,12 @@ def layout_of(payload: bytes) -> tuple[int, int] | None:
 
 
 def _text_to_bytes(text: str) -> bytes:
-    """Return ASCII padded with NUL to 16 bytes."""
     if not text.isascii() or "\0" in text or len(text) > TEXT_BYTES:
         raise ValueError(f"{text!r} is not at most {TEXT_BYTES} ASCII characters")
     return text.encode("ascii").ljust(TEXT_BYTES, b"\0")
 
 
 def _text(padded: bytes) -> str:
-    """Return the text with odd bytes as `?`: a sensor's nonsense must not take the link down."""
+    """Return the text; odd bytes, which a sensor may send, become `?`."""
     text = padded.partition(b"\0")[0].decode("ascii", errors="replace")
     return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text)

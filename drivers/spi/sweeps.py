@@ -50,8 +50,7 @@ short, as it may have been reset; each further fault needs longer, as a wrong ra
 AHEAD_TOLERANCE_NS = 1_000_000
 """A mapped time this much later than its arrival, ns, shows a clock that does not fit its past."""
 UNKNOWN_DELAY_NS = 20_000_000
-"""Assumed delay of an arrival without trusted ticks, ns: one latency timer of a USB serial adapter,
-16 ms, and 4 ms for the rest."""
+"""Assumed delay without trusted ticks, ns: 16 ms of a USB serial adapter, 4 ms for the rest."""
 AGE_MAX_NS = 10_000_000_000
 """No mapped time is older than this, ns: buffers hold seconds at most."""
 
@@ -147,7 +146,7 @@ class SweepDecoder:
         return TactileReading(t_ns, seq, *self._counts_and_faults(sweep))
 
     def _is_next(self, sweep: Sweep) -> bool:
-        """Return True if the sweep is newer than all before it; count those missing between."""
+        """Return True for a sweep newer than all before; count the missing ones."""
         if self._bridge_seq is None:
             if sweep.tick_start < self.hello.tick:
                 self._counters.stale_sweeps += 1  # it was under way when STOP arrived
@@ -233,13 +232,13 @@ class DeviceClock:
 
     @property
     def drift_ppm(self) -> float | None:
-        """How fast the bridge's clock is, parts per million; None: not known yet."""
+        """Drift of the bridge's clock, ppm, positive if fast; None: not known yet."""
         drift = self._drift
         return None if drift.slack == SLACK_MAX else (1.0 / (1.0 + drift.slope) - 1.0) * 1e6
 
     @property
     def rate_limits_ppm(self) -> tuple[float, float] | None:
-        """Least and most that the clock can be fast by the remembered PINGs, ppm."""
+        """Limits of the drift by the remembered PINGs, ppm."""
         least, most = -math.inf, math.inf
         for first, last in itertools.combinations(self._bounds, 2):
             if last.sent_ns > first.received_ns:
@@ -269,7 +268,7 @@ class DeviceClock:
         self._best = max(self._bounds, key=lambda earlier: self._earliest_ns(earlier, tick))
 
     def host_ns(self, tick: int, arrival_ns: int, idle_ns: int) -> int:
-        """Return the host time of `tick`, ns, for the next reading.
+        """Return the host time of a reading's `tick`, ns.
 
         It arrived at `arrival_ns`, and after `idle_ns`, when nothing was waiting to be read.
         """

@@ -42,7 +42,6 @@ class JointTwin:
 
     @property
     def injected(self) -> Counter[str]:
-        """Faults injected so far by name."""
         return self._injector.injected
 
     def messages(self) -> Iterator[JointMessage]:
@@ -55,7 +54,6 @@ class JointTwin:
             seq += 1
 
     def cycles(self) -> Iterator[list[bytes]]:
-        """Datagrams to send in each period."""
         for message in self.messages():
             yield self._injector.spoil(message.to_bytes())
 

@@ -63,10 +63,7 @@ class PalmTwin:
         sensors: Sequence[int] = SENSORS_AT_REST,
         seed: int = 0,
     ) -> None:
-        """`sensors` are the raw words that joints rest at.
-
-        Raises `ValueError` for a fault that datagrams cannot have.
-        """
+        """`sensors`: raw words that joints rest at. Raises `ValueError` for an unfit fault."""
         faults.refuse("the palm", "one_byte_at_a_time")
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
@@ -93,7 +90,6 @@ class PalmTwin:
                 self.packets_made += 1
 
     def cycles(self) -> Iterator[list[bytes]]:
-        """Datagrams to send in each millisecond."""
         silent = 0
         for packet in self.packets():
             if silent:
@@ -114,10 +110,7 @@ class PalmTwin:
     def serve(
         self, target: str, stop: threading.Event, *, period_ns: int | None = CYCLE_NS
     ) -> None:
-        """Send to `udp://ADDRESS:PORT` until told to stop or the counts end.
-
-        With `period_ns` None as fast as possible. Raises `ValueError` for a bad target.
-        """
+        """Send until told to stop or the counts end, without `period_ns` as fast as possible."""
         send_paced(self.cycles(), Endpoint.parse(target), stop, period_ns)
 
     def _packet(self, position: int, counts: Counts) -> PalmPacket:

@@ -82,10 +82,9 @@ class SpiTwin(Opened):
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
-        """`digest` is of the layout that it was built with; `drift_ppm` how fast its clock is.
+        """`digest`: layout that it was built with. `drift_ppm`: how fast its clock is.
 
-        `tap` is called with every piece of bytes that goes to the host. Raises `ValueError` for a
-        rate that is not positive and for a source without counts.
+        `tap` is called with all bytes that go to the host. Raises `ValueError`.
         """
         if rate_hz is not None and not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
@@ -139,11 +138,9 @@ class SpiTwin(Opened):
 
     @property
     def injected(self) -> Counter[str]:
-        """Faults injected so far by name."""
         return self._injector.injected
 
     def open(self) -> None:
-        """Plug in."""
         self.plug()
 
     def close(self) -> None:
@@ -152,7 +149,7 @@ class SpiTwin(Opened):
         self._replug_ns = None
 
     def plug(self) -> None:
-        """Make a pseudo-terminal, point the path at it, and say HELLO as after a reset."""
+        """Link the path to a new pseudo-terminal, and say HELLO."""
         self.unplug()
         self._refuse_to_replace()
         self._replug_ns = None
@@ -169,7 +166,7 @@ class SpiTwin(Opened):
         self._send(self._hello(0), waits=False)
 
     def _refuse_to_replace(self) -> None:
-        """Raise `FileExistsError` unless the path is free; a link to nothing was left by a twin."""
+        """Raise `FileExistsError` unless the path is free or a dead link."""
         if not self.path.exists():
             return
         if not self.path.is_symlink():
@@ -180,7 +177,7 @@ class SpiTwin(Opened):
         )
 
     def unplug(self) -> None:
-        """Take the pseudo-terminal away: the system tells the process that has it open."""
+        """Take the pseudo-terminal away."""
         ours = None if self._slave is None else os.ttyname(self._slave)
         if self.path.is_symlink() and str(self.path.readlink()) == ours:
             self.path.unlink()
@@ -192,7 +189,7 @@ class SpiTwin(Opened):
         self._unsent_bytes = 0
 
     def pull_fingers(self, *fingers: int) -> None:
-        """From now on nothing drives the lines of these fingers, and of no others."""
+        """Let nothing drive the lines of these fingers from now on."""
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
     def fileno(self) -> int | None:
@@ -200,7 +197,7 @@ class SpiTwin(Opened):
         return self._master
 
     def due_ns(self) -> int | None:
-        """When the next sweep, status or plugging in is due."""
+        """Time of the next sweep, status or plugging in, ns."""
         if self._master is None:
             return self._replug_ns
         if self._sweeping() and not self._unsent:
@@ -208,7 +205,7 @@ class SpiTwin(Opened):
         return self._status_due_ns
 
     def serve(self, stop: Callable[[], bool]) -> None:
-        """Run until `stop` says so; it is asked at least fifty times a second."""
+        """Run until `stop` returns True; it is asked 50 times a second."""
         while not stop():
             due_ns = self.due_ns()
             wait_ns = IDLE_NS if due_ns is None else max(due_ns - self._clock(), 0)

@@ -51,7 +51,6 @@ class Endpoint:
 
     @property
     def family(self) -> socket.AddressFamily:
-        """IPv4 or IPv6."""
         return socket.AF_INET6 if ":" in self.address else socket.AF_INET
 
 
@@ -61,8 +60,7 @@ class Datagram(NamedTuple):
     data: bytes
     """Cut off at one byte over the receiver's limit, so that its length says it was too long."""
     age_ns: int
-    """How long ago the kernel received it, ns. By the wall clock: wrong in the instant of a step,
-    and never below 0."""
+    """Time since the kernel received it, ns, 0 or more; wrong in the instant of a clock step."""
     sender: Sender
 
 
@@ -88,7 +86,6 @@ class DatagramReceiver:
 
     @property
     def port(self) -> int:
-        """The port that is listened on."""
         port: int = self._socket.getsockname()[1]
         return port
 
@@ -97,11 +94,10 @@ class DatagramReceiver:
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def receive(self, most: int) -> Iterator[Datagram]:
-        """What has arrived, oldest first, at most `most`. Raises `LinkError`."""
+        """Yield up to `most` datagrams, oldest first. Raises `LinkError`."""
         for _ in range(most):
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(
@@ -117,7 +113,7 @@ class DatagramReceiver:
             yield Datagram(data, self._age_ns(ancillary), sender[:2])
 
     def _age_ns(self, ancillary: list[tuple[int, int, bytes]]) -> int:
-        """Age of a datagram by its time stamp; the count of drops comes along."""
+        """Return the age by a datagram's time stamp; note the count of drops."""
         age_ns = 0
         for level, kind, value in ancillary:
             if level != socket.SOL_SOCKET:
