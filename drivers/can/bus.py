@@ -33,7 +33,7 @@ from drivers.can.frames import (
     Stamped,
     unpack_frame,
 )
-from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
+from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 
 FRAMES_PER_DRAIN: Final = 512
 """Frames taken at once, some 100 ms of a full bus, so that the loop gets its turn."""
@@ -180,16 +180,10 @@ class CanBus:
         receive, flags = raw.recvmsg, int(socket.MSG_DONTWAIT)
         for _ in range(FRAMES_PER_DRAIN):
             record, ancillary, _, _ = receive(CANFD_FRAME.size, ANCILLARY_BYTES, flags)
-            t_ns = now_ns
-            for level, kind, data in ancillary:
-                if level != socket.SOL_SOCKET:
-                    continue
-                if kind == SO_TIMESTAMPNS and len(data) == TIMESPEC.size:
-                    seconds, nanoseconds = TIMESPEC.unpack(data)
-                    t_ns = min(seconds * 1_000_000_000 + nanoseconds + ahead_ns, now_ns)
-                elif kind == SO_RXQ_OVFL and len(data) == DROPS.size:
-                    (total,) = DROPS.unpack(data)
-                    self._count_drops(total, frames)
+            wall_ns, drops = read_stamps(ancillary)
+            t_ns = now_ns if wall_ns is None else min(wall_ns + ahead_ns, now_ns)
+            if drops is not None:
+                self._count_drops(drops, frames)
             frame = unpack_frame(record)
             if frame is None:
                 self.malformed += 1

@@ -189,22 +189,21 @@ class SampleAssembler:
 
     def _is_next_sweep(self, place: int, until_ns: int) -> bool:
         """Return True if a sample may have come too late to be of this sweep."""
-        if self._last < 0:
-            return False
-        period_ns = self._readings.period_ns
-        if period_ns is None:
-            advance = max(place - self._last, 0)
-            return until_ns - self._t_ns - advance * SLOT_MIN_NS >= self._lateness_ns()
-        due_ns = self._origin_ns + self._position[place] * period_ns
-        return until_ns - due_ns >= self._lateness_ns()
+        return self._last >= 0 and self._late_ns(place, until_ns) >= self._lateness_ns()
 
     def _is_early(self, place: int, until_ns: int) -> bool:
         """Return True if a sample came too soon to be of this sweep: it is of the last one."""
+        late_ns = self._late_ns(place, until_ns)
+        if self._readings.period_ns is None:
+            return late_ns < 0
+        return -late_ns >= self._lateness_ns()
+
+    def _late_ns(self, place: int, until_ns: int) -> float:
+        """Return how much later than its place explains a sample came, ns; below 0 if earlier."""
         period_ns = self._readings.period_ns
         if period_ns is None:
-            return until_ns - self._t_ns < (place - self._last) * SLOT_MIN_NS
-        due_ns = self._origin_ns + self._position[place] * period_ns
-        return due_ns - until_ns >= self._lateness_ns()
+            return until_ns - self._t_ns - max(place - self._last, 0) * SLOT_MIN_NS
+        return until_ns - (self._origin_ns + self._position[place] * period_ns)
 
     def _lateness_ns(self) -> float:
         """Return the delay, ns, from which on a sample is of another sweep."""

@@ -27,6 +27,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -86,18 +87,16 @@ COUPLED_POINTS_MIN, COUPLED_POINTS_MAX = 3, 49
 SLOPE_MAX_DEG = 0.5
 """Steepest segment, degrees per count of noise; usual are 0.03 to 0.1."""
 
-Point = tuple[float, float]
-"""(raw, degrees)."""
-CoupledPoint = tuple[float, float, float, float]
-"""(raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
+Points = Sequence[Sequence[float]]
+"""Rows of (raw, degrees), or of (raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
 
 
 class Table:
     """One raw value -> radians."""
 
-    def __init__(self, points: Sequence[Point]) -> None:
+    def __init__(self, points: Points) -> None:
         """Raises `ValueError` for fewer than two points, or two with the same raw value."""
-        ordered = sorted(points)
+        ordered = sorted(points, key=itemgetter(0))
         self._raws = [raw for raw, _ in ordered]
         self._slopes: list[float] = []
         self._offsets: list[float] = []
@@ -116,7 +115,7 @@ class Table:
 class CoupledTable:
     """A pair of raw values -> a pair of radians, linear between measured pairs."""
 
-    def __init__(self, points: Sequence[CoupledPoint]) -> None:
+    def __init__(self, points: Points) -> None:
         """Raises `ValueError` if the raw pairs span no triangle."""
         table = np.array(points, dtype=np.float64)
         triangles = _delaunay(table[:, :2])
@@ -224,17 +223,9 @@ def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
     problems = list(_problems(data))
     if problems:
         raise CalibrationError(path, problems)
-    tables = {joint: Table(_points(rows)) for joint, rows in data.get("joints", {}).items()}
+    tables = {joint: Table(points) for joint, points in data.get("joints", {}).items()}
     coupled = data.get("coupled", {}).get(COUPLED_KEY)
-    return JointCalibration(tables, None if coupled is None else CoupledTable(_coupled(coupled)))
-
-
-def _points(rows: Sequence[Sequence[float]]) -> list[Point]:
-    return [(raw, degrees) for raw, degrees in rows]
-
-
-def _coupled(rows: Sequence[Sequence[float]]) -> list[CoupledPoint]:
-    return [(raw_1, raw_2, first, second) for raw_1, raw_2, first, second in rows]
+    return JointCalibration(tables, None if coupled is None else CoupledTable(coupled))
 
 
 def _problems(data: Mapping[str, Any]) -> Iterator[str]:
@@ -270,7 +261,7 @@ def _joint_problems(joint: str, rows: object) -> Iterator[str]:
         shape = list(_shape_problems(rows, 2, POINTS_MIN, POINTS_MAX))
         yield from shape
         if not shape and isinstance(rows, list):
-            points = sorted(_points(rows))
+            points = sorted(rows)
             yield from _raw_problems([raw for raw, _ in points])
             yield from _degree_problems(joint, [degrees for _, degrees in points])
             yield from _curve_problems(points)
@@ -281,18 +272,17 @@ def _coupled_problems(rows: object) -> Iterator[str]:
     yield from shape
     if shape or not isinstance(rows, list):
         return
-    points = _coupled(rows)
-    problems = list(_raw_problems([raw for point in points for raw in point[:2]]))
+    problems = list(_raw_problems([raw for point in rows for raw in point[:2]]))
     for at, joint in enumerate(COUPLED):
         problems += [
             f"{joint}: {problem}"
-            for problem in _degree_problems(joint, [point[2 + at] for point in points])
+            for problem in _degree_problems(joint, [point[2 + at] for point in rows])
         ]
-    problems += _steepness_problems(points)
+    problems += _steepness_problems(rows)
     yield from problems
     if not problems:
         try:
-            CoupledTable(points)
+            CoupledTable(rows)
         except ValueError as error:
             yield str(error)
 
@@ -326,7 +316,7 @@ def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
             yield f"{angle} degrees is out of reach, the joint goes from {low} to {high}"
 
 
-def _curve_problems(points: Sequence[Point]) -> Iterator[str]:
+def _curve_problems(points: Points) -> Iterator[str]:
     """`points` are sorted by raw."""
     slopes = []
     for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(points):
@@ -344,7 +334,7 @@ def _curve_problems(points: Sequence[Point]) -> Iterator[str]:
         yield "is not monotone: degrees must only rise or only fall with raw"
 
 
-def _steepness_problems(points: Sequence[CoupledPoint]) -> list[str]:
+def _steepness_problems(points: Points) -> list[str]:
     """Return the pairs of points between which noise would move the joints."""
     problems = []
     for first, second in itertools.combinations(points, 2):

@@ -19,7 +19,7 @@ from drivers.base import (
 )
 from drivers.recordings.csv_rows import Row, columns_of, read_rows
 from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
-from drivers.recordings.player import RecordedDriver, Timeline
+from drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Synthetic grasps, drawn by `drivers.twins.grasps.synthetic`: no hand ever made these."""
@@ -67,9 +67,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         check_fingers(fingers)
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
-        self._delay_ns = round(faults.delayed_s * _NS_PER_S)
-        super().__init__(paths, Timeline(speed, clock, delay_ns=self._delay_ns))
-        self._clock = clock
+        super().__init__(paths, speed, clock, delay_ns=round(faults.delayed_s * _NS_PER_S))
         self._fingers = tuple(fingers)
         self._table_period_ns = _NS_PER_S / rate_hz
         self._loop = loop
@@ -94,19 +92,19 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         if ignored:
             names = ", ".join(map(repr, list(ignored)[:IGNORED_COLUMNS_LOGGED]))
             _log.info("replay: unknown columns ignored: %d, such as %s", len(ignored), names)
-        self.timeline.start(self._items())
+        self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
         """The readings of one row if it is due, else none. Raises `RecordingError` for bad rows."""
-        due = self.timeline.take()
+        due = self.take()
         if due is None:
             return ()
         at_ns, (row, recorded_period_ns), late_ns = due
-        speed = self.timeline.speed
+        speed = self.speed
         if recorded_period_ns is not None:
             self.period_ns = round(recorded_period_ns / (speed or 1.0))
             self.counters.late += speed is not None and late_ns > self.period_ns
-        t_ns = self._clock() - self._delay_ns if speed is None else self.timeline.played_ns(at_ns)
+        t_ns = self._clock() - self._delay_ns if speed is None else self.played_ns(at_ns)
         return self._readings(row, t_ns, at_ns)
 
     def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:
