@@ -40,20 +40,17 @@ UNPLUGGED_WORDS = (0x0000, 0xFFFF)
 """A line that nothing drives reads all zeros or all ones; both have even parity."""
 
 SEQUENCE_ELECTRODES = tuple(range(E1, E24 + 1))
-"""Electrodes only: 24 samples (manual table 12)."""
 SEQUENCE_ALL = CHANNELS
-"""Every channel once: 28 samples (manual table 12)."""
 SEQUENCE_INTERLEAVED = tuple(
-    channel for other in (*range(E1, E24 + 1), PDC, TAC, TDC) for channel in (other, PAC)
+    channel for other in (*SEQUENCE_ELECTRODES, PDC, TAC, TDC) for channel in (other, PAC)
 )
 """The default: every other sample is PAC, 54 samples (manual table 12, order of the C library)."""
-
 SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
     "electrodes": SEQUENCE_ELECTRODES,
     "all": SEQUENCE_ALL,
     "interleaved": SEQUENCE_INTERLEAVED,
 }
-"""Sampling sequences by the name that a scene gives them."""
+"""Sampling sequences of manual table 12 by the name that a scene gives them."""
 
 
 def sample_command(channel: int) -> int:

@@ -1,11 +1,9 @@
 """One bus of python-can, drained without waiting; whatever it raises becomes a link failure.
 
-python-can's `recv` costs several times what the frame itself costs, so on `socketcan` the bus's
-own socket is read instead. Its arrival stamps are wall time, which can step. They are turned into
-monotonic time by the distance of the two clocks at the moment of reading, so that only a step
-between arrival and reading can falsify them: forward makes a frame look old, backward as if it
-had just come. Where the stamps are not wall time of the arrival, a frame is as old as it can be: it
-came after the last moment at which the bus had nothing more to read.
+On `socketcan` the bus's own socket is read, as python-can's `recv` costs several times a frame.
+Its stamps are wall time, which can step. They become monotonic time by the distance of the two
+clocks at the moment of reading, so that only a step between arrival and reading falsifies them.
+A frame without such a stamp came after the last moment at which the bus had nothing more to read.
 """
 
 from __future__ import annotations
@@ -112,7 +110,8 @@ class CanBus:
         self._wall_clock = wall_clock
         self._bus: can.BusABC | None = None
         self._socket: socket.socket | None = None
-        self._fileno: int | None = None
+        self.descriptor: int | None = None
+        """Descriptor to wait on; None while closed, and if the interface has none."""
 
     def open(self) -> None:
         """Take the bus. Raises as `open_bus` does."""
@@ -120,15 +119,15 @@ class CanBus:
         self.failure = None
         self._idle_ns = self._clock()
         self._bus = bus = open_bus(self._interface, self._channel, self._options)
-        self._fileno = _fileno(bus)
-        if self._fileno is not None:
-            _enlarge_buffer(self._fileno)
+        self.descriptor = _fileno(bus)
+        if self.descriptor is not None:
+            _enlarge_buffer(self.descriptor)
         if self._interface == "socketcan":
             self._use_socket(bus)
 
     def close(self) -> None:
         bus, self._bus = self._bus, None
-        self._socket = self._fileno = None
+        self._socket = self.descriptor = None
         if bus is None:
             return
         with contextlib.suppress(Exception):
@@ -138,10 +137,6 @@ class CanBus:
         if port is not None:
             with contextlib.suppress(Exception):
                 port.close()
-
-    def fileno(self) -> int | None:
-        """Descriptor to wait on; None if the interface has none."""
-        return self._fileno
 
     def drain(self) -> list[Stamped]:
         """Return up to `FRAMES_PER_DRAIN` frames that have arrived, oldest first.
@@ -219,7 +214,7 @@ class CanBus:
             message = bus.recv(timeout=0)
             if message is not None:
                 frames.append((_frame_of(message), since_ns, self._clock()))
-            elif not _has_more(self._fileno):
+            elif not _has_more(self.descriptor):
                 self._idle_ns = before_ns
                 return
 

@@ -1,9 +1,7 @@
-"""BioTac SPs behind a CAN bus: the driver. python-can opens the bus, any of its interfaces will do.
+"""BioTac SPs behind a CAN bus of any interface that python-can has.
 
-Where the bus has a descriptor (socketcan, slcan, udp_multicast and others) the loop waits on it.
-Where it has none (virtual, some vendors' libraries) the loop polls every millisecond: that costs a
-percent of a core and a reading at most a millisecond, and needs neither thread nor lock nor a
-queue of our own.
+The loop waits on the descriptor of the bus. A bus without one (virtual, some vendors' libraries) is
+polled every millisecond, which costs a percent of a core.
 """
 
 from __future__ import annotations
@@ -40,10 +38,9 @@ FD_CLOCK_HZ: Final = 80_000_000
 class CanBridgeDriver(Opened):
     """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for the two formats.
 
-    The constructor raises `ValueError` for an argument out of range. `open` and `read_ready` raise
-    `DriverError` only if no later try can succeed, such as for an interface that python-can does
-    not have. A bus that fails is closed and opened again; a sweep that is cut by that is dropped.
-    A bus without a frame of ours for ten periods, 100 ms at least, is `GREETING` until one comes.
+    The constructor raises `ValueError`; `open` and `read_ready` `DriverError` only if no later
+    try can succeed. A bus that fails is closed and opened again, and its current sweep dropped. A
+    bus without a frame of ours for ten periods, 100 ms at least, is `GREETING` until one comes.
     """
 
     name = NAME
@@ -126,7 +123,7 @@ class CanBridgeDriver(Opened):
 
     def fileno(self) -> int | None:
         """Descriptor to wait on; None while there is none or no reading is near."""
-        return None if self._resting_until_ns is not None else self._bus.fileno()
+        return None if self._resting_until_ns is not None else self._bus.descriptor
 
     def due_ns(self) -> int | None:
         """Time to reopen the bus, to notice silence, or to poll without a descriptor, ns."""
@@ -135,14 +132,16 @@ class CanBridgeDriver(Opened):
             return link.retry_ns
         if self._resting_until_ns is not None:
             return self._resting_until_ns
-        if self._bus.more or self._bus.fileno() is None:
+        if self._bus.more or self._bus.descriptor is None:
             return self._poll_due_ns
         return self.stream.silent_at_ns
 
     def read_ready(self) -> Sequence[Reading]:
         if self.link_state is CLOSED:
             raise RuntimeError("the CAN bridge is not open")
-        if self.link_state is WAITING and not self._is_open_again():
+        if self.link_state is WAITING and self.stream.link.is_due(self._clock()):
+            self._try_to_open()
+        if self.link_state is WAITING:
             return ()
         frames = self._bus.drain()
         readings, trouble = self.stream.receive(frames)
@@ -152,12 +151,6 @@ class CanBridgeDriver(Opened):
         if trouble is not None:
             self._lose(trouble)
         return readings
-
-    def _is_open_again(self) -> bool:
-        if not self.stream.link.is_due(self._clock()):
-            return False
-        self._try_to_open()
-        return self.link_state is not WAITING
 
     def _try_to_open(self) -> None:
         try:
@@ -196,7 +189,7 @@ class CanBridgeDriver(Opened):
 
     def _rest(self, now_ns: int) -> int | None:
         """Return the time, ns, until which the kernel may stamp and keep frames, or None."""
-        if not self._stamped or self._bus.more or self._bus.fileno() is None:
+        if not self._stamped or self._bus.more or self._bus.descriptor is None:
             return None
         expected_ns = self.stream.expected_ns
         if expected_ns is None or expected_ns - REST_MARGIN_NS <= now_ns:

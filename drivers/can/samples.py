@@ -1,20 +1,17 @@
 """Samples -> one `TactileReading` per sweep; what is missing is flagged.
 
-The real CAN format has no counter. What a sample is, its command byte says; which sweep it belongs
-to, only its place in the known order of the sequence and the time between samples can say:
+The real CAN format has no counter. A sample's command byte names its channel; its sweep follows
+from its place in the known order of the sequence and from the time between samples:
 
 - An electrode earlier in the order starts a new sweep, unless it is a copy of what this sweep has
   (duplicated) or one that this sweep lacks and just passed by (reordered, up to `REORDER_MAX`).
-- A sample that comes later than its place in the order explains starts a new sweep too: the
-  samples of one reading are never further apart than a sweep takes and three quarters of a period.
+- A sample that comes later than its place in the order explains starts a new sweep too.
 - A sweep that is lost as a whole is found by time alone.
-- Where an unknown number of samples is lost, the present sweep ends.
+- Losing an unknown number of samples ends the current sweep.
 
-What cannot be told apart: a sample of which the data is damaged so that it names another valid
-channel; a sender that stalls in the middle of a sweep from the loss of whole sweeps' worth of
-samples, so that both break the sweep; copies that come more than `REORDER_MAX` electrodes late,
-which count as a new sweep. In none of these is an electrode shifted or filled from memory: what a
-sweep did not receive is `MISSING` in it.
+Not noticed: data damaged so that it names another valid channel. A sender that stalls within a
+sweep looks like a loss of whole sweeps; a copy more than `REORDER_MAX` electrodes late looks like a
+new sweep. No electrode is shifted or filled from memory: what a sweep did not get is `MISSING`.
 """
 
 from __future__ import annotations

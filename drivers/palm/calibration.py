@@ -11,13 +11,11 @@
     THJ1_THJ2 = [[2132, 2294, 0.0, -20.0], ...]   # [raw THJ1, raw THJ2, degrees, degrees]
 
 Tables are linear between their points and, without clamping, beyond them, as in Shadow's driver.
-THJ1 and THJ2 see each other's magnets: both angles come from both raw values, linear in the
-triangles between points measured in pairs. J0 is the sum of J1 and J2 of a finger, which one motor
-moves. A joint that is left out has no angle (NaN).
+THJ1 and THJ2 see each other's magnets: both angles come from both raw values. J0 is the sum of J1
+and J2 of a finger, which one motor moves. A joint that is left out has no angle (NaN).
 
-A mistake anywhere refuses the whole file. Files shipped with hands hold the mistakes that are
-looked for: raw values with a digit too many, zeros where nothing was measured, tables that turn
-back.
+A mistake anywhere refuses the whole file, such as those of files shipped with hands: a digit too
+many, zeros for what was not measured, tables that turn back.
 """
 
 from __future__ import annotations

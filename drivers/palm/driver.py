@@ -1,7 +1,4 @@
-"""The palm stream of a Shadow hand as a driver: joints and BioTacs from one packet per millisecond.
-
-The packets come as UDP datagrams from a relay that reads the palm's EtherCAT status memory.
-"""
+"""The palm stream of a Shadow hand as a driver: joints and BioTacs by UDP from a relay."""
 
 from __future__ import annotations
 

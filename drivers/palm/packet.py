@@ -1,12 +1,9 @@
-"""The palm status packet of a Shadow hand: the motor, joint and tactile record of one millisecond.
+"""The palm status packet of a Shadow hand: the joint and tactile record of one millisecond.
 
-Bytes only. Little-endian and packed, as the palm's EtherCAT status memory holds it; its length
-tells which palm sent it. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile
-protocol header published by Shadow Robot, and its driver, which reads a BioTac from the first 16
-bytes of a finger's tactile slot on every palm.
-
-A packet has neither checksum nor sequence number. Only `tactile_type` orders packets: it takes 14
-values in turn.
+Bytes only: little-endian and packed, of a length that tells which palm sent it, without checksum or
+sequence number. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile protocol
+header published by Shadow Robot, and its driver, which reads a BioTac from the first 16 bytes of a
+finger's tactile slot on every palm.
 """
 
 from __future__ import annotations
@@ -178,12 +175,11 @@ def parse_packet(data: bytes, counters: PalmCounters) -> PalmPacket | None:
     if palm is None:
         counters.bad_lengths += 1
         return None
-    layout = _LAYOUTS[palm]
-    packet = _unpack(data, layout)
+    packet = _unpack(palm, data)
     if packet.command == COMMAND_EMPTY:
         counters.empty_packets += 1
         return None
-    is_sound = packet.which_motors in (0, 1) and _record_is_sound(data[layout.format.size :])
+    is_sound = packet.which_motors in (0, 1) and _record_is_sound(palm, data)
     if packet.command > COMMAND_MAX or not is_sound:
         counters.nonsense_packets += 1
         return None
@@ -194,32 +190,25 @@ def parse_packet(data: bytes, counters: PalmCounters) -> PalmPacket | None:
     return packet
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """How one palm's packet is laid out."""
-
-    palm: Palm
+class _Layout(NamedTuple):
     format: struct.Struct
     motors_first: bool
-    """Whether the motor block stands before the tactile block."""
+    """True if the motor block stands before the tactile block."""
 
 
-def _layout(palm: Palm, slot_bytes: int, *, motors_first: bool, middle: str, after: str) -> _Layout:
+def _layout(slot_bytes: int, *, motors_first: bool, middle: str = "", after: str = "") -> _Layout:
     """`middle` and `after` skip what stands before the tactile block, and after it."""
     motors = f"4xh{MOTOR_BYTES}x"
     slot = f"HHHBxH{slot_bytes - 10}x"
     tactile = f"{middle}IH{slot * TACTILE_FINGERS}{after}"
     blocks = motors + tactile if motors_first else tactile + motors
-    return _Layout(palm, struct.Struct(f"<I{SENSORS}H{blocks}2x"), motors_first)
+    return _Layout(struct.Struct(f"<I{SENSORS}H{blocks}2x"), motors_first)
 
 
 _LAYOUTS: Final = {
-    layout.palm: layout
-    for layout in (
-        _layout(Palm.PALM_0220, 16, motors_first=True, middle="", after=""),
-        _layout(Palm.PALM_0230, 32, motors_first=False, middle="80x", after="36x"),
-        _layout(Palm.PALM_0250, 78, motors_first=False, middle="", after=""),
-    )
+    Palm.PALM_0220: _layout(16, motors_first=True),
+    Palm.PALM_0230: _layout(32, motors_first=False, middle="80x", after="36x"),
+    Palm.PALM_0250: _layout(78, motors_first=False),
 }
 CAN_RECORD_BYTES = 12
 """Length of a CAN message that a relay may leave behind a packet: bus, length, id and data."""
@@ -235,14 +224,15 @@ _SLOT_WORDS = len(TactileSlot._fields)
 _CAN_BYTES_MAX = 8
 
 
-def _unpack(data: bytes, layout: _Layout) -> PalmPacket:
+def _unpack(palm: Palm, data: bytes) -> PalmPacket:
+    layout = _LAYOUTS[palm]
     command, *words = layout.format.unpack_from(data)
     sensors, blocks = words[:SENSORS], words[SENSORS:]
     motors_at = 0 if layout.motors_first else -1
     which_motors = blocks.pop(motors_at)
     tactile_type, tactile_valid, *slots = blocks
     return PalmPacket(
-        palm=layout.palm,
+        palm=palm,
         command=command,
         sensors=tuple(sensors),
         which_motors=which_motors,
@@ -254,6 +244,7 @@ def _unpack(data: bytes, layout: _Layout) -> PalmPacket:
     )
 
 
-def _record_is_sound(record: bytes) -> bool:
-    """Return True without a record, and if its length is one that a CAN message can have."""
+def _record_is_sound(palm: Palm, data: bytes) -> bool:
+    """Return True unless an appended record has a length that no CAN message has."""
+    record = data[_LAYOUTS[palm].format.size :]
     return not record or record[1] <= _CAN_BYTES_MAX

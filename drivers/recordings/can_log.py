@@ -1,8 +1,8 @@
 """The link log of a CAN bus: frames as `candump -L` writes and `canplayer` reads them.
 
-`(1436509052.249713) can0 100#0D3A1F` - seconds with six digits, interface, id in three or eight
-digits, `#`, data. `##` and a digit of flags begin the data of CAN FD, `R` stands for that of a
-remote frame, and bit 29 of an id marks an error frame (can-utils, lib.c and linux/can.h).
+`(1436509052.249713) can0 100#0D3A1F`: seconds, interface, id in three or eight digits, data. `##`
+and a digit of flags begin the data of CAN FD, `R` stands for that of a remote frame, and bit 29 of
+an id marks an error frame (can-utils, lib.c and linux/can.h).
 """
 
 from __future__ import annotations

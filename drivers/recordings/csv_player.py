@@ -35,17 +35,14 @@ _log = logging.getLogger(__name__)
 
 
 class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
-    """Plays CSV recordings, one row per call of `read_ready` at most.
+    """Plays CSV recordings, one row per call of `read_ready` at most, several files in a row.
 
-    `fingers` picks the fingers and their order. A row gives a `TactileReading`, in a stream with
-    joints a `JointReading` before it. With a `speed`, `t_ns` is when the row was due, so that a
-    late reading is an old one; else it is the time of handing over. `recorded_ns` is the file's own
-    time. The run starts with the first call of `read_ready`; several files play in a row, with
-    `loop` without end. A late reading is counted, never skipped.
+    A row gives a `TactileReading` of `fingers`, in a stream with joints a `JointReading` before it.
+    With a `speed`, `t_ns` is when the row was due; else it is the time of handing over.
+    `recorded_ns` is the file's own time. A late reading is counted, never skipped.
 
-    `open` raises `RecordingError` if any of the files or headers is not right, `read_ready` if a
-    row is not; values that are not counts, and a last row without a line end, make readings
-    faulty, or with `strict` raise as well. See `drivers.recordings.csv_rows.Recording`.
+    `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
+    not counts, and a last row without a line end, make readings faulty, or with `strict` raise.
     """
 
     def __init__(

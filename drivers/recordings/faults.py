@@ -1,7 +1,4 @@
-"""Faults that the replay puts into a recording on demand, in the words of PX4's failure injection.
-
-They let a user see what a controller does when a sensor fails, and they test the daemon.
-"""
+"""Faults that the replay injects on demand, in the words of PX4, for tests of a controller."""
 
 from __future__ import annotations
 

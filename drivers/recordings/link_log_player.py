@@ -1,8 +1,4 @@
-"""What came over a link, decoded again: candump text, framed serial bytes or palm packets.
-
-What was logged goes through the very decoders that live bytes and frames go through, at the times
-at which it came.
-"""
+"""Link logs through the decoders of live bytes and frames, at the times at which they came."""
 
 from __future__ import annotations
 

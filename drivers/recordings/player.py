@@ -16,9 +16,8 @@ Item = TypeVar("Item")
 class RecordedDriver(Opened, Generic[Item]):
     """Base of drivers that play items of known times, ns on the recording's clock, at any speed.
 
-    The first item is due at once and begins the run when it is asked for. Reading one ahead keeps
-    the work of reading out of the age of what is read; an error waits until the items before it
-    are taken.
+    The first item begins the run when it is asked for. Reading one ahead keeps the work of reading
+    out of the age of what is read; an error waits until the items before it are taken.
     """
 
     name = "replay"

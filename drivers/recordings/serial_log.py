@@ -1,9 +1,8 @@
 """The link log of a serial line: its bytes with their times, and what the bridge says in them.
 
-One record after the other, each a frame of `drivers.spi.messages`: type 1 for bytes from the
-device, 2 for bytes to it, 3 for the port having been opened; payload `t: u64` (monotonic ns,
-little-endian) and the bytes. COBS and CRC-32 let a reader find the next record after any damage,
-also the end of a file that was cut off.
+Each record is a frame of `drivers.spi.messages`: type 1 for bytes from the device, 2 for bytes to
+it, 3 for the port having been opened; payload `t: u64` (monotonic ns) and the bytes. So a reader
+finds the next record after any damage.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The host's side of the bridge's protocol: bytes in, readings and bytes out. No I/O.
-
-The protocol is `deploy/bridge/PROTOCOL.md`, its messages are `drivers.spi.messages`.
-"""
+"""The host's side of `deploy/bridge/PROTOCOL.md`: bytes in, readings and bytes out. No I/O."""
 
 from __future__ import annotations
 
@@ -57,8 +54,7 @@ class Conversation:
 
     The owner of the port calls `opened`, then `receive` with the bytes that come, then writes the
     frames of `say` and calls `sent` right before each. While `link` is `WAITING`, the port must be
-    closed, and opened again at `link.retry_ns`. A link log has no port: it calls `opened`,
-    `receive` and `sent` with its records.
+    closed, and opened again at `link.retry_ns`. A link log passes its records instead.
     """
 
     def __init__(

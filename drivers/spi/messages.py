@@ -1,10 +1,7 @@
-"""Frames and messages between the host and a bridge of BioTac SPs, version 1. Bytes only.
+"""Frames and messages of `deploy/bridge/PROTOCOL.md`, version 1. Bytes only.
 
-`deploy/bridge/PROTOCOL.md` defines both. A frame is `COBS(type: u8 | payload | crc: u32) 0x00`.
-Encoding raises `ValueError`, decoding returns None, for a message that the protocol forbids.
-
-Each message has `to_bytes` for its payload, `from_bytes`, which returns None for a wrong length,
-and `is_sound`, which returns True if the protocol allows its values.
+A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. Encoding raises `ValueError`, decoding
+returns None, for a message that the protocol forbids: one of a wrong length or that is not sound.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 """Sweeps of a bridge -> readings with the time at which they were made. No I/O.
 
-The bridge's ticks become host time by PINGs: one that is answered with a tick proves that this tick
-was not before the PING was sent. The latest of these lower bounds, carried on at the bridge's rate,
-is a time at which a reading can not yet have been made, or only just: never too fresh, and too old
-by at most the shortest way there. The rate comes from a decaying linear regression over the PINGs
-that leaves out late ones, as in Klipper's clock synchronisation. Arrivals of readings play no part,
-so neither batches of a USB adapter nor a stall of the host disturb it.
+A PING that is answered with a tick proves that this tick was not before the PING was sent. The
+latest of these lower bounds, carried on at the bridge's rate, makes a reading never too fresh, and
+too old by at most the shortest way there. The rate comes from a decaying linear regression that
+leaves out late PINGs, as in Klipper. Arrivals of readings play no part, so that neither batches of
+a USB adapter nor a stall of the host disturb it.
 """
 
 from __future__ import annotations
@@ -204,13 +203,11 @@ class DeviceClock:
     A mapped time is never later than the arrival and at most `AGE_MAX_NS` before it; it goes back
     only when the clock stops being trusted. Ticks are not trusted before the first answered PING,
     and when the clock stands, falls back, is ahead of its arrivals, or is wrong by more than
-    `RATE_TOLERANCE`. The mapped time then is `UNKNOWN_DELAY_NS` before the last time when nothing
-    was waiting to be read: rather too old than too fresh.
+    `RATE_TOLERANCE`. Then the time is `UNKNOWN_DELAY_NS` before the last time when nothing was
+    waiting to be read: rather too old than too fresh.
 
-    Measured over 600 s of sweeps at 100 Hz, with a clock wrong by 100 ppm, a PING per second, an
-    exponential delay of 1 ms on both ways and arrivals in batches of 16 ms: mapped times are 0.00
-    to 1.86 ms too old, median 0.18 ms. With 0.1 ms and no batches: 0.00 to 0.60 ms, median 0.04 ms
-    (`python -m tests.drivers.spi.clock_error`).
+    Measured with `python -m tests.drivers.spi.clock_error`, 600 s at 100 Hz, a clock wrong by
+    100 ppm, delays of 1 ms and batches of 16 ms: 0.00 to 1.86 ms too old, median 0.18 ms.
     """
 
     def __init__(self, tick_hz: int, counters: BridgeCounters) -> None:

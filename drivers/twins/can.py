@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
@@ -83,6 +82,7 @@ class CanTwin(Opened):
         self._period_ns = round(1e9 / rate_hz)
         self._faults = faults
         self._injector = LinkFaultInjector(faults, spared_bytes=ID_BYTES)
+        self.injected = self._injector.injected
         self._clock = clock
         self._interface, self._channel = interface, channel
         self._options: dict[str, Any] = {}
@@ -97,10 +97,6 @@ class CanTwin(Opened):
         self.frames_sent = 0
         self.unsent = 0
         """Frames that the bus did not take."""
-
-    @property
-    def injected(self) -> Counter[str]:
-        return self._injector.injected
 
     def open(self) -> None:
         """Take the bus. Raises `DriverError`, also where a package is missing."""

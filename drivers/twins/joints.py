@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -39,10 +38,7 @@ class JointTwin:
         self._names = tuple(names)
         self._rate_hz = rate_hz
         self._injector = LinkFaultInjector(faults)
-
-    @property
-    def injected(self) -> Counter[str]:
-        return self._injector.injected
+        self.injected = self._injector.injected
 
     def messages(self) -> Iterator[JointMessage]:
         """What is sent, before any fault, without end."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
 from drivers.base import FINGERS
 from drivers.palm.packet import (
-    CAN_RECORD_BYTES,
     CHANNELS,
     COMMAND_SENSOR_DATA,
     CYCLE_NS,
@@ -45,9 +43,8 @@ LATER_VERSION_BYTES = 4
 
 
 class PalmTwin:
-    """Plays counts as a palm would send them: one shape (fingers, 24) per round of 14 packets.
+    """Plays counts, shape (fingers, 24) per round of 14 packets, as a palm would send them.
 
-    `cycles` is deterministic: datagrams by the millisecond, after faults. `serve` sends them.
     With `stuck_clock` the palm always answers the same request. Fingers that are not in
     `fingers` have no sensor, and say so; those unplugged by a fault do not.
     """
@@ -58,29 +55,22 @@ class PalmTwin:
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
         palm: Palm = Palm.PALM_0220,
-        can_record: bool = False,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
-        sensors: Sequence[int] = SENSORS_AT_REST,
         seed: int = 0,
     ) -> None:
-        """`sensors`: raw words that joints rest at. Raises `ValueError` for an unfit fault."""
+        """Raises `ValueError` for a fault that datagrams cannot have."""
         faults.refuse("the palm", "one_byte_at_a_time")
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
         self._palm = palm
-        self._appended = bytes(CAN_RECORD_BYTES if can_record else 0)
         self._faults = faults
         self._injector = LinkFaultInjector(faults)
-        self._sensors = np.array(sensors)
+        self.injected = self._injector.injected
+        """Faults so far by name; `silenced`: packets made while the link was broken."""
         self._random = np.random.default_rng(seed)
         self._dead = frozenset(faults.dead_electrodes)
         self.packets_made = 0
         """Packets that the palm made, sent or not."""
-
-    @property
-    def injected(self) -> Counter[str]:
-        """Faults injected so far by name; `silenced` are packets made while the link was broken."""
-        return self._injector.injected
 
     def packets(self) -> Iterator[PalmPacket]:
         """What the palm makes, before any fault of the link."""
@@ -97,7 +87,7 @@ class PalmTwin:
                 self.injected["silenced"] += 1
                 yield []
                 continue
-            data = packet.to_bytes() + self._appended
+            data = packet.to_bytes()
             if self._faults.wrong_version:
                 data += bytes(LATER_VERSION_BYTES)
             if self._injector.breaks_here():
@@ -114,7 +104,7 @@ class PalmTwin:
         send_paced(self.cycles(), Endpoint.parse(target), stop, period_ns)
 
     def _packet(self, position: int, counts: Counts) -> PalmPacket:
-        sensors = self._sensors.copy()
+        sensors = np.array(SENSORS_AT_REST)
         sensors[:HALL_WORDS] += self._random.integers(-1, 2, HALL_WORDS)
         fitted = sum(1 << FINGERS.index(finger) for finger in self._rows)
         return PalmPacket(

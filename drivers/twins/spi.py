@@ -62,11 +62,9 @@ _WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16
 class SpiTwin(Opened):
     """The bridge's side of the protocol, one thread, driven by `run_once` or `serve`.
 
-    `path` becomes a symbolic link to the pseudo-terminal, a new one after each `plug`. `source`
-    gives the counts of each sweep, shape (sensors, 24); when it ends the twin falls silent but
-    still answers. With `rate_hz` None sweeps come as fast as the host reads and none is dropped;
-    else what the host does not take in time is dropped in whole frames. As on a real bridge,
-    unplugging resets it.
+    `path` becomes a symbolic link to a new pseudo-terminal at each `plug`, which is a reset.
+    `source`: counts of each sweep, shape (sensors, 24); after them the twin is silent but answers.
+    With `rate_hz` None sweeps come as fast as the host reads and none is dropped.
     """
 
     def __init__(
@@ -108,10 +106,11 @@ class SpiTwin(Opened):
         self._commands = tuple(sample_command(channel) for channel in channels)
         self._slots = [slot for slot, channel in enumerate(channels) if E1 <= channel <= E24]
         self._electrodes = [channels[slot] - E1 for slot in self._slots]
-        self.injected_in_sweeps: Counter[str] = Counter()
-        """Of the faults injected, those that hit sweeps."""
         self._faults = faults
         self._injector = LinkFaultInjector(faults)
+        self.injected = self._injector.injected
+        self.injected_in_sweeps: Counter[str] = Counter()
+        """Of the faults injected, those that hit sweeps."""
         self._digest = digest
         self._ticks_per_ns = TICK_HZ / 1e9 * (1.0 + drift_ppm * 1e-6)
         self._clock = clock
@@ -135,10 +134,6 @@ class SpiTwin(Opened):
         self._unsent_bytes = 0
         self._spi_errors = [0] * self._sensors
         self._parser.reset()
-
-    @property
-    def injected(self) -> Counter[str]:
-        return self._injector.injected
 
     def open(self) -> None:
         self.plug()

@@ -53,11 +53,11 @@ Stream = TypeVar("Stream", bound=DatagramStream)
 class DatagramDriver(Opened, Generic[Stream]):
     """Passes the datagrams of one sender to a stream.
 
-    The sender of the first good datagram is the only one until the link is lost: two hands on one
-    port look like one. It is known by address and port, as one computer may run two relays.
+    The sender of the first good datagram, by address and port, is the only one until the link is
+    lost: two hands on one port look like one.
 
-    The constructor raises `ValueError` for an argument out of range. `open` raises `LinkError` if
-    it cannot listen, which at the start means that the scene is wrong. `read_ready` raises nothing.
+    The constructor raises `ValueError`. `open` raises `LinkError` if it cannot listen, which at the
+    start means that the scene is wrong. `read_ready` raises nothing.
     """
 
     name: str

@@ -2,12 +2,10 @@
 
 The model describes the BioTac SP Stability Set (palm down and palm side; MIT licence,
 Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by 5763 parameters per class, against some
-92,000 counts of a class in the data set; it holds none of its grasps. Each class is a mixture of
-three Gaussians over the raw counts of ff, mf, th: clusters by k-means, with the 24 largest
-principal axes of each.
+92,000 counts of a class; it holds none of its grasps. A class is a mixture of three Gaussians over
+the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 
-`python -m drivers.twins.grasps.synthetic` writes the demo table again, byte for byte, with `--day`
-the demo day.
+`python -m drivers.twins.grasps.synthetic` writes the demo table, with `--day` the demo day.
 """
 
 from __future__ import annotations

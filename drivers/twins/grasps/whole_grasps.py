@@ -1,8 +1,7 @@
 """Streams of whole grasps: rest, approach, touch, close, settle, lift or slip, release.
 
-The end points are rows of a grasp table or drawn ones; what lies between them is made up, with the
-measured noise on it. Contact lowers counts, so an end point is a believable contact only where it
-lies at or below the rest; see `rest_above`.
+End points are rows of a grasp table or drawn; what lies between is made up, with measured noise.
+Contact lowers counts, so a believable end point lies at or below the rest; see `rest_above`.
 
 `python -m drivers.twins.grasps.whole_grasps` writes the demo recording again, byte for byte.
 """
