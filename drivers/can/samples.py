@@ -120,7 +120,7 @@ class SampleAssembler:
         if not self._synchronised and not self._starts(place):
             self._counters.unsynchronised_frames += 1
             return ()
-        if self._ahead(place, until_ns):
+        if place > self._last and not self._is_next_sweep(place, until_ns):
             if self._is_tail_of_previous(place):
                 if not self._previous_had >> place & 1:
                     self._counters.late_frames += 1
@@ -180,9 +180,6 @@ class SampleAssembler:
         if place == ELECTRODES - 1:
             self._learn(t_ns)
         return finished
-
-    def _ahead(self, place: int, until_ns: int) -> bool:
-        return place > self._last and not self._is_next_sweep(place, until_ns)
 
     def _is_next_sweep(self, place: int, until_ns: int) -> bool:
         """Return True if a sample may have come too late to be of this sweep."""

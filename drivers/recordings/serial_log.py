@@ -48,18 +48,12 @@ def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
     )
 
 
-class SerialLogParser:
-    """Bytes in, records out. Never raises; holds back 1024 bytes at most."""
-
-    def __init__(self) -> None:
-        self._frames = FrameParser()
-
-    def feed(self, chunk: bytes) -> Iterator[SerialRecord]:
-        """Records that these bytes complete, oldest first."""
-        for kind, payload in self._frames.feed(chunk):
-            if kind in _EVENTS and len(payload) >= _TIME.size:
-                (t_ns,) = _TIME.unpack_from(payload)
-                yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
+def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[SerialRecord]:
+    """Yield the records that some bytes of a file complete. Never raises."""
+    for kind, payload in parser.feed(chunk):
+        if kind in _EVENTS and len(payload) >= _TIME.size:
+            (t_ns,) = _TIME.unpack_from(payload)
+            yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
 
 
 class SerialLog:
@@ -72,10 +66,10 @@ class SerialLog:
 
     def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
         """Yield times, ns, and records; skip damage. Raises `RecordingError`."""
-        parser = SerialLogParser()
+        parser = FrameParser()
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):
-                for record in parser.feed(chunk):
+                for record in parse_records(parser, chunk):
                     yield record.t_ns, record
 
     def begin(self) -> None:

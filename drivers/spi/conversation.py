@@ -239,7 +239,7 @@ class Conversation:
             return  # an answer that came twice or too late
         if self._sweeps is None:
             self._greet(hello, arrival_ns)
-        elif not self._sweeps.fits(hello):
+        elif self._sweeps.hello.sampling != hello.sampling:
             self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
         elif not self._is_confirmed(hello.serials):
             # Misread or exchanged: at STOP the bridge reads them again.

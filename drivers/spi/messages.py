@@ -178,6 +178,11 @@ class Hello:
         return len(self.commands)
 
     @property
+    def sampling(self) -> tuple[object, ...]:
+        """What must not change while the bridge sweeps."""
+        return (self.sensors, self.commands, self.tick_hz, self.period_ticks)
+
+    @property
     def period_ns(self) -> int:
         """Nominal time from one sweep to the next, ns."""
         return self.period_ticks * 1_000_000_000 // self.tick_hz

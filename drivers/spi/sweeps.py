@@ -119,16 +119,6 @@ class SweepDecoder:
         self._faultless = bytes(self._source.size)
         self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
 
-    def fits(self, hello: Hello) -> bool:
-        """Return True if a later HELLO describes the same sampling."""
-        ours = self.hello
-        return (hello.sensors, hello.commands, hello.tick_hz, hello.period_ticks) == (
-            ours.sensors,
-            ours.commands,
-            ours.tick_hz,
-            ours.period_ticks,
-        )
-
     def reading(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         """Return the reading of a sweep, or None for one that is not newer or does not fit.
 

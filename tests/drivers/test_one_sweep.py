@@ -24,10 +24,10 @@ from drivers.can.readings import CanCounters
 from drivers.joints.message import JointMessage, JointStream
 from drivers.palm.stream import PalmStream
 from drivers.recordings.can_log import CanLog, frame_of, line_of
-from drivers.recordings.serial_log import SerialLog, SerialLogParser, encode_records
+from drivers.recordings.serial_log import SerialLog, encode_records, parse_records
 from drivers.spi.conversation import Conversation
 from drivers.spi.line import LineEvent
-from drivers.spi.messages import Ping, Sweep, encode
+from drivers.spi.messages import FrameParser, Ping, Sweep, encode
 from drivers.twins.palm import PalmTwin
 from tests.drivers.can.can_words import SLOT_NS, word
 from tests.drivers.one_sweep import (
@@ -245,7 +245,7 @@ def test_of_a_bridge_a_sweep_is_one_frame_with_a_checksum(
     def feed(event: LineEvent, data: bytes) -> None:
         nonlocal seen
         if logged:
-            for record in SerialLogParser().feed(encode_records(event, t_ns, data)):
+            for record in parse_records(FrameParser(), encode_records(event, t_ns, data)):
                 seen += expect_one_sweep(log.feed(t_ns, record))
         elif event is LineEvent.RECEIVED:
             seen += expect_one_sweep(conversation.receive(data, t_ns, t_ns))

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES
 from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns, read_rows
+from drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
 from drivers.twins.grasps import synthetic
 from drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
@@ -136,8 +136,18 @@ class WholeGrasps:
                     return
                 script = following
             jitter = joint_rng.normal(0.0, POSITION_NOISE_RAD, len(JOINT_NAMES))
-            counts = sampler.sample(script, t_s)
-            yield _grasp_row(script, t_s, counts, script.position_rad(t_s) + jitter)
+            timetable = script.timetable
+            has_begun = t_s >= timetable.approach_s
+            yield GraspRow(
+                t_s=t_s,
+                counts=sampler.sample(script, t_s),
+                joint_names=JOINT_NAMES,
+                position_rad=script.position_rad(t_s) + jitter,
+                phase=timetable.phase(t_s),
+                grasp=timetable.grasp if has_begun else 0,
+                slipped=timetable.slipped if has_begun else None,
+                object_name=timetable.object_name if has_begun else None,
+            )
 
     def timetables(self) -> Iterator[Timetable]:
         """Yield the truth about each grasp; may be called at any time."""
@@ -256,14 +266,6 @@ def synthetic_grasps(
     )
 
 
-def read_end_points(path: Path) -> list[EndPoint]:
-    """Return the grasps of a labelled table. Raises `RecordingError`."""
-    notes = ((row, row.annotation) for row in read_rows(path, synthetic.FINGERS, strict=True))
-    return [
-        EndPoint(row.counts, note.slipped is True, note.object_name or "") for row, note in notes
-    ]
-
-
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
     """Write rows of ff, mf, th as a stream that a replay plays.
 
@@ -286,26 +288,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     stream = synthetic_grasps(DEMO_GRASPS, sampling=Sampling.HELD, durations=DEMO_DURATIONS)
     with options.out.open("w", encoding="utf-8", newline="") as file:
         write_stream(stream, file, t_decimals=2)
-
-
-def _grasp_row(
-    script: GraspScript,
-    t_s: float,
-    counts: NDArray[np.uint16],
-    position_rad: NDArray[np.float64],
-) -> GraspRow:
-    timetable = script.timetable
-    begun = t_s >= timetable.approach_s
-    return GraspRow(
-        t_s=t_s,
-        counts=counts,
-        joint_names=JOINT_NAMES,
-        position_rad=position_rad,
-        phase=timetable.phase(t_s),
-        grasp=timetable.grasp if begun else 0,
-        slipped=timetable.slipped if begun else None,
-        object_name=timetable.object_name if begun else None,
-    )
 
 
 if __name__ == "__main__":
