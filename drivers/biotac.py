@@ -54,10 +54,7 @@ SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
 
 
 def sample_command(channel: int) -> int:
-    """Return the command byte that samples a channel: `1 CCCCCC P`, odd parity (figure 13).
-
-    Raises `ValueError` for a channel that a BioTac SP does not have, channel 16 among them.
-    """
+    """Return the command byte of a channel: `1 CCCCCC P`, odd parity. Raises `ValueError`."""
     if channel not in CHANNELS:
         raise ValueError(f"a BioTac SP has no channel {channel}")
     byte = 0x80 | channel << 1
@@ -70,10 +67,7 @@ def channel_of(command: int) -> int | None:
 
 
 def encode_word(count: int) -> int:
-    """Return the response word of a count (manual figure 15): `D11..D5 P  D4..D0 0 0 P`.
-
-    Each byte has odd parity, the most significant comes first. Raises `ValueError`.
-    """
+    """Return `D11..D5 P  D4..D0 0 0 P` of a count, bytes of odd parity. Raises `ValueError`."""
     if not 0 <= count <= COUNT_MAX:
         raise ValueError(f"{count} is not a 12-bit count")
     high, low = count >> 5 << 1, (count & 0x1F) << 3
@@ -85,10 +79,7 @@ def encode_word(count: int) -> int:
 def decode_words(
     words: NDArray[np.integer[Any]],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Return counts, 0 where faulty, and `ElectrodeFault` bits of response words.
-
-    Words are the 16 bits as sent, first byte high; `np.intp` is decoded soonest.
-    """
+    """Return counts, 0 where faulty, and `ElectrodeFault` bits of words, best `np.intp`."""
     return COUNT_OF_WORD[words], FAULT_OF_WORD[words]
 
 

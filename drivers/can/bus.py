@@ -139,10 +139,7 @@ class CanBus:
                 port.close()
 
     def drain(self) -> list[Stamped]:
-        """Return up to `FRAMES_PER_DRAIN` frames that have arrived, oldest first.
-
-        Never raises: a broken bus sets `failure`, after the frames before it.
-        """
+        """Return the next frames, oldest first. Never raises: a broken bus sets `failure`."""
         frames: list[Stamped] = []
         self.more = False
         try:

@@ -1,7 +1,4 @@
-"""CAN frames as graspd sees them, and the structs in which Linux hands them over. Bytes only.
-
-Source: linux/can.h and linux/can/error.h.
-"""
+"""CAN frames, and the structs of linux/can.h and linux/can/error.h. Bytes only."""
 
 from __future__ import annotations
 

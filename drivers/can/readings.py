@@ -111,10 +111,7 @@ class ReadingMaker:
         self.counters.missed_readings += sweeps
 
     def make(self, words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int) -> TactileReading:
-        """Return the reading of response words, shape (fingers, 24).
-
-        `marks`: `ElectrodeFault` bits known beforehand; words under `MISSING` are not read.
-        """
+        """Return the reading of words, shape (fingers, 24), with the known faults `marks`."""
         counts, faults = decode_words(words)
         if np.count_nonzero(faults) or np.count_nonzero(marks):
             absent = marks & np.uint8(ElectrodeFault.MISSING) != 0

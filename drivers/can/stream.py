@@ -1,7 +1,4 @@
-"""What one CAN bus brings: frames in with their times, readings out. No I/O.
-
-See `deploy/can/PROTOCOL.md` for the two formats.
-"""
+"""What one CAN bus brings: frames in with their times, readings out. No I/O."""
 
 from __future__ import annotations
 

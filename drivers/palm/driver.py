@@ -57,10 +57,7 @@ class PalmDriver(DatagramDriver[PalmStream]):
         return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
 
     def fileno(self) -> int | None:
-        """The socket, but None while no round can end.
-
-        The kernel stamps and keeps packets, so that the loop wakes 71 times a second, not 1000.
-        """
+        """The socket, but None while no round can end: 71 wakes a second instead of 1000."""
         return None if self._clock() < self._attention_ns else super().fileno()
 
     def due_ns(self) -> int | None:

@@ -62,10 +62,7 @@ _POSITIONS: Final = {2 * position + 1: position for position in range(ROUND)}
 
 
 def position_of(tactile_type: int) -> int | None:
-    """Return the position 0..13 in the round of a `tactile_type`, or None if it is no sample.
-
-    0x0001 is (PDC, TAC), 0x0003 (TDC, E1), 0x0005 (E2, E3) ... 0x0019 (E22, E23), 0x001B (E24, -).
-    """
+    """Return the position 0..13 in the round of a `tactile_type`, or None if it is no sample."""
     return _POSITIONS.get(tactile_type)
 
 

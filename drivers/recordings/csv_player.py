@@ -57,10 +57,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed`: factor of real time, None for as fast as possible. `rate_hz`: grasps per second.
-
-        Raises `ValueError` for an argument out of range.
-        """
+        """`speed`: factor of real time. `rate_hz`: grasps of a table per s. Raises `ValueError`."""
         check_fingers(fingers)
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")

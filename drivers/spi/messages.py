@@ -78,10 +78,7 @@ class FrameCounters(DriverCounters):
 
 
 def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
-    """Return a frame; `digest` begins its checksum unless it is `UNSEEDED`.
-
-    Raises `ValueError` for a type that is no byte and a frame longer than `ENCODED_MAX_BYTES`.
-    """
+    """Return a frame; `digest` begins its checksum unless it is `UNSEEDED`. Raises `ValueError`."""
     body = bytes([kind]) + payload
     seed = 0 if kind in UNSEEDED else digest
     encoded: bytes = cobs.encode(body + _U32.pack(zlib.crc32(body, seed)))

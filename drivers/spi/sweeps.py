@@ -120,10 +120,7 @@ class SweepDecoder:
         self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
 
     def reading(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
-        """Return the reading of a sweep, or None for one that is not newer or does not fit.
-
-        `idle_ns`: last time before the arrival at which nothing was waiting to be read.
-        """
+        """Return the reading of a sweep, or None for one that is not newer or does not fit."""
         if sweep.words.shape != self._sweep.shape:
             self._counters.bad_frames += 1
             return None

@@ -11,12 +11,12 @@ the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -122,25 +122,17 @@ def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
 
 def read_model() -> GraspModel:
     """Read the model of real grasps."""
-    document = json.loads(MODEL.read_text(encoding="utf-8"))
-    return {False: _grasp_class(document["stable"]), True: _grasp_class(document["slip"])}
+    model = msgspec.json.decode(MODEL.read_bytes(), type=_ModelFile, dec_hook=_to_array)
+    return {False: model.stable, True: model.slip}
 
 
-def _grasp_class(document: Mapping[str, Any]) -> GraspClass:
-    components = [
-        Component(
-            weight=component["weight"],
-            mean=np.array(component["mean"]),
-            axes=np.array(component["axes"]),
-            spread=np.array(component["spread"]),
-        )
-        for component in document["components"]
-    ]
-    return GraspClass(
-        lowest=np.array(document["lowest"]),
-        highest=np.array(document["highest"]),
-        components=tuple(components),
-    )
+class _ModelFile(msgspec.Struct):
+    stable: GraspClass
+    slip: GraspClass
+
+
+def _to_array(_kind: type, numbers: list[float]) -> NDArray[np.float64]:
+    return np.array(numbers, dtype=np.float64)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -267,10 +267,7 @@ def synthetic_grasps(
 
 
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
-    """Write rows of ff, mf, th as a stream that a replay plays.
-
-    A label column holds 0 or 1, so it is 0 before the first grasp, where the object is empty.
-    """
+    """Write a stream of ff, mf, th; the label is 0 before the first grasp."""
     electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
     file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
     for row in rows:
