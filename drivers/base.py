@@ -31,8 +31,7 @@ def check_fingers(fingers: Sequence[str]) -> None:
 def sensor_rows(fingers: Sequence[str], sensors: Sequence[str] | None) -> tuple[int, ...]:
     """Return the sensor of a device, from 0, for each row of a reading.
 
-    `fingers`: the rows. `sensors`: all fingers in the order of the device, the same if None.
-    Raises `ValueError` for unknown fingers and for those that the device lacks.
+    `sensors`: all fingers in the order of the device, None for `fingers`. Raises `ValueError`.
     """
     check_fingers(fingers)
     if sensors is None:
@@ -94,7 +93,7 @@ class TactileReading(msgspec.Struct, frozen=True, eq=False, gc=False):
         return self.t_ns if self.recorded_ns is None else self.recorded_ns
 
     def __post_init__(self) -> None:
-        """Check the shapes: a driver that breaks them is a bug, not bad input."""
+        """Check the shapes: another one is a bug in the driver."""
         if self.counts.ndim != 2 or self.counts.shape[1] != ELECTRODES:
             raise ValueError(f"counts have shape {self.counts.shape}, not (fingers, {ELECTRODES})")
         if self.faults.shape != self.counts.shape:
@@ -135,7 +134,7 @@ class DriverCounters:
     """Readings that the sensor made (by its sequence) and that never arrived."""
 
     def as_dict(self) -> dict[str, int]:
-        """All counters by name, for the status message."""
+        """Return all counters by name."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
@@ -250,10 +249,9 @@ class Driver(Protocol):
 
     @property
     def serials(self) -> dict[str, str]:
-        """Known serial numbers of the sensors, by finger.
+        """Known serial numbers of the sensors by finger, or the sender if a link has none.
 
-        A link without serial numbers names its sender instead. Another number is another sensor:
-        between the readings of the two, `read_ready` has returned nothing once.
+        Another number is another sensor; between the two, `read_ready` has returned nothing once.
         """
 
     def describe(self) -> dict[str, Fact]:

@@ -35,33 +35,26 @@ ERROR_WORDS: dict[int, str] = {
     0xA55F: "nothing to resend",
     0xA557: "write failed",
 }
-"""Sent in place of data (manual tables 8 and 11, C library). With parity ignored each of them
-decodes to 2629..2635, a perfectly plausible electrode."""
+"""Sent in place of data (tables 8 and 11, C library); 2629..2635 if parity is ignored."""
 UNPLUGGED_WORDS = (0x0000, 0xFFFF)
 """A line that nothing drives reads all zeros or all ones; both have even parity."""
 
 SEQUENCE_ELECTRODES = tuple(range(E1, E24 + 1))
-"""Electrodes only: 24 samples (manual table 12)."""
 SEQUENCE_ALL = CHANNELS
-"""Every channel once: 28 samples (manual table 12)."""
 SEQUENCE_INTERLEAVED = tuple(
-    channel for other in (*range(E1, E24 + 1), PDC, TAC, TDC) for channel in (other, PAC)
+    channel for other in (*SEQUENCE_ELECTRODES, PDC, TAC, TDC) for channel in (other, PAC)
 )
 """The default: every other sample is PAC, 54 samples (manual table 12, order of the C library)."""
-
 SEQUENCES: Final[dict[str, tuple[int, ...]]] = {
     "electrodes": SEQUENCE_ELECTRODES,
     "all": SEQUENCE_ALL,
     "interleaved": SEQUENCE_INTERLEAVED,
 }
-"""Sampling sequences by the name that a scene gives them."""
+"""Sampling sequences of manual table 12 by the name that a scene gives them."""
 
 
 def sample_command(channel: int) -> int:
-    """First command byte that samples a channel: `1 CCCCCC P`, odd parity (manual figure 13).
-
-    Raises `ValueError` for a channel that a BioTac SP does not have, channel 16 among them.
-    """
+    """Return the command byte of a channel: `1 CCCCCC P`, odd parity. Raises `ValueError`."""
     if channel not in CHANNELS:
         raise ValueError(f"a BioTac SP has no channel {channel}")
     byte = 0x80 | channel << 1
@@ -69,15 +62,12 @@ def sample_command(channel: int) -> int:
 
 
 def channel_of(command: int) -> int | None:
-    """Channel that a command byte samples, or None if it is no valid sampling command."""
+    """Return the channel that a command byte samples, or None."""
     return _CHANNEL_OF_COMMAND.get(command)
 
 
 def encode_word(count: int) -> int:
-    """Response word of a 12-bit count, most significant byte first (manual figure 15).
-
-    `D11..D5 P  D4..D0 0 0 P`, each byte with odd parity. Raises `ValueError` outside 0..4095.
-    """
+    """Return `D11..D5 P  D4..D0 0 0 P` of a count, bytes of odd parity. Raises `ValueError`."""
     if not 0 <= count <= COUNT_MAX:
         raise ValueError(f"{count} is not a 12-bit count")
     high, low = count >> 5 << 1, (count & 0x1F) << 3
@@ -89,16 +79,12 @@ def encode_word(count: int) -> int:
 def decode_words(
     words: NDArray[np.integer[Any]],
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Counts and `ElectrodeFault` bits of response words, in the shape of `words`.
-
-    A word with a fault has the count 0. Words are the 16 bits as sent, first byte high, soonest
-    decoded as `np.intp`.
-    """
+    """Return counts, 0 where faulty, and `ElectrodeFault` bits of words, best `np.intp`."""
     return COUNT_OF_WORD[words], FAULT_OF_WORD[words]
 
 
 def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
-    """Which of the samples are electrodes: shape (n, 2), rows of (sample, electrode 0..23)."""
+    """Return which samples are electrodes: rows of (sample, electrode 0..23)."""
     pairs = [
         (at, channel - E1)
         for at, channel in enumerate(channels)
@@ -108,7 +94,7 @@ def electrode_columns(channels: Iterable[int | None]) -> NDArray[np.intp]:
 
 
 def _tables() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Count and fault of all 65536 words, so that a sweep is decoded by two look-ups."""
+    """Return count and fault of all 65536 words: a sweep takes two look-ups."""
     counts = np.zeros(1 << 16, dtype=np.uint16)
     faults = np.full(1 << 16, int(ElectrodeFault.PARITY), dtype=np.uint8)
     for count in range(COUNT_MAX + 1):

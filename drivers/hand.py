@@ -14,7 +14,7 @@ JOINTS = frozenset(
 
 
 def joint_name(column: str) -> str | None:
-    """The joint that a column holds, without hand prefix, or None: `rh_FFJ3` gives `FFJ3`."""
+    """Return the joint of a column, or None: `rh_FFJ3` gives `FFJ3`."""
     if column.startswith(HAND_PREFIXES):
         column = column.partition("_")[2]
     return column if column in JOINTS else None

@@ -15,3 +15,17 @@ DROPS: Final = struct.Struct("@I")
 """Ancillary data of `SO_RXQ_OVFL`: dropped since the socket was opened, wrapping at 2**32."""
 ANCILLARY_BYTES: Final = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(DROPS.size)
 """Room for both."""
+
+
+def read_stamps(ancillary: list[tuple[int, int, bytes]]) -> tuple[int | None, int | None]:
+    """Return the wall time of the arrival, ns, and the sum of drops; None: not told."""
+    wall_ns = drops = None
+    for level, kind, data in ancillary:
+        if level != socket.SOL_SOCKET:
+            continue
+        if kind == SO_TIMESTAMPNS and len(data) == TIMESPEC.size:
+            seconds, rest_ns = TIMESPEC.unpack(data)
+            wall_ns = seconds * 1_000_000_000 + rest_ns
+        elif kind == SO_RXQ_OVFL and len(data) == DROPS.size:
+            (drops,) = DROPS.unpack(data)
+    return wall_ns, drops

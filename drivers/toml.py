@@ -20,12 +20,11 @@ _TOKEN = re.compile(
     r"""[^"'\#\[\]{}.=,\n]++""",
     re.DOTALL,
 )
-"""Strings, comments, brackets, dots, and what ends a key. Where a string does not end, `tomllib`
-reads no further either."""
+"""Strings, comments, brackets, dots, and what ends a key. `tomllib` stops at an open string too."""
 
 
 class NestedTooDeeplyError(ValueError):
-    """The text is not read: it nests more deeply than anything that graspd knows."""
+    """The text nests more deeply than anything that graspd reads."""
 
 
 def loads(text: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from daemon.record.topics import (
 )
 from drivers.base import DriverCounters, Reading, RecordingError, TactileReading
 from drivers.recordings.csv_rows import open_recording
-from drivers.recordings.player import RecordedDriver, Timeline
+from drivers.recordings.player import RecordedDriver
 
 _log = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class McapReplayDriver(RecordedDriver[_Item]):
 
         Raises `ValueError` without files or for a speed that is not positive.
         """
-        super().__init__(paths, Timeline(speed, clock))
+        super().__init__(paths, speed, clock)
         self._axis_ns = axis_ns
         self._fingers = tuple(fingers)
         self.on_event: Callable[[RecordedEvent], None] | None = None
@@ -84,11 +84,11 @@ class McapReplayDriver(RecordedDriver[_Item]):
             missing = [finger for finger in self._fingers if finger not in recorded]
             if missing:
                 raise RecordingError(path, f"has no finger {missing[0]}, only {recorded}")
-        self.timeline.start(self._items())
+        self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
         """Return the next reading if it is due. An event that is due goes to `on_event` instead."""
-        taken = self.timeline.take()
+        taken = self.take()
         if taken is None:
             return ()
         at_ns, item, late_ns = taken
@@ -96,18 +96,18 @@ class McapReplayDriver(RecordedDriver[_Item]):
             if self.on_event is not None:
                 self.on_event(item)
             return ()
-        if self.timeline.speed is not None and self.period_ns is not None:
+        if self.speed is not None and self.period_ns is not None:
             self.counters.late += late_ns > self.period_ns
         if isinstance(item, TactileReading):
             self._count(item)
-        return [self.timeline.hand_over(item, at_ns, self._axis_ns)]
+        return [self.hand_over(item, at_ns, self._axis_ns)]
 
     def _count(self, made: TactileReading) -> None:
         self.counters.readings += 1
         self.counters.faulty_readings += bool(made.faults.any())
         step_ns = made.t_ns - self._last_ns if self._last_ns is not None else 0
         if step_ns > 0:
-            step_ns = round(step_ns / (self.timeline.speed or 1.0))
+            step_ns = round(step_ns / (self.speed or 1.0))
             self.period_ns = min(step_ns, self.period_ns or step_ns)
         self._last_ns = made.t_ns
 

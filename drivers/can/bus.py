@@ -1,11 +1,9 @@
 """One bus of python-can, drained without waiting; whatever it raises becomes a link failure.
 
-python-can's `recv` costs several times what the frame itself costs, so on `socketcan` the bus's
-own socket is read instead. Its arrival stamps are wall time, which can step. They are turned into
-monotonic time by the distance of the two clocks at the moment of reading, so that only a step
-between arrival and reading can falsify them: forward makes a frame look old, backward as if it
-had just come. Where the stamps are not wall time of the arrival, a frame is as old as it can be: it
-came after the last moment at which the bus had nothing more to read.
+On `socketcan` the bus's own socket is read, as python-can's `recv` costs several times a frame.
+Its stamps are wall time, which can step. They become monotonic time by the distance of the two
+clocks at the moment of reading, so that only a step between arrival and reading falsifies them.
+A frame without such a stamp came after the last moment at which the bus had nothing more to read.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ from drivers.can.frames import (
     Stamped,
     unpack_frame,
 )
-from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
+from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, read_stamps
 
 FRAMES_PER_DRAIN: Final = 512
 """Frames taken at once, some 100 ms of a full bus, so that the loop gets its turn."""
@@ -55,7 +53,7 @@ _MISSING_MODULE: Final = re.compile(r"No module named '([^'.]+)|(\w+)(?: module 
 
 
 def open_bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
-    """A bus of python-can. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+    """Open a bus of python-can. Raises `LinkError`; `DriverError` if no later try can succeed."""
     if interface not in can.VALID_INTERFACES:
         known = "socketcan, slcan, udp_multicast, virtual"
         raise DriverError(f"python-can has no interface {interface!r}; it has {known} and others")
@@ -83,7 +81,7 @@ def _what_is_missing(interface: str, error: Exception) -> str:
 
 
 class CanBus:
-    """Opens, drains and closes one bus."""
+    """One bus."""
 
     def __init__(
         self,
@@ -93,17 +91,17 @@ class CanBus:
         clock: Callable[[], int],
         wall_clock: Callable[[], int],
     ) -> None:
-        """`options` go to the constructor of python-can's bus, over the ones that we need."""
+        """`options`: arguments of python-can's bus, which replace our own."""
         self.failure: LinkError | None = None
-        """Why the bus is of no use any more, None while it is."""
+        """Why the bus broke; None while it works."""
         self.more = False
         """True if the last drain left frames behind."""
         self.tap: Callable[[list[Stamped]], None] | None = None
-        """Gets what every drain brings, if it brings anything."""
+        """Called with the frames of each drain that has some."""
         self.malformed = 0
-        """Records from the socket that are no CAN frames; its owner resets it."""
+        """Records from the socket that are no CAN frames. The owner resets it."""
         self.kernel_drops = 0
-        """Frames dropped by the kernel because its buffer was full, likewise."""
+        """Frames that the kernel dropped as its buffer was full. The owner resets it."""
         self._interface = interface
         self._channel = channel
         self._options = {**_OPTIONS.get(interface, {}), **options}
@@ -112,24 +110,24 @@ class CanBus:
         self._wall_clock = wall_clock
         self._bus: can.BusABC | None = None
         self._socket: socket.socket | None = None
-        self._fileno: int | None = None
+        self.descriptor: int | None = None
+        """Descriptor to wait on; None while closed, and if the interface has none."""
 
     def open(self) -> None:
-        """Take the bus. Raises `LinkError`, or `DriverError` if no later try can succeed."""
+        """Take the bus. Raises as `open_bus` does."""
         self.close()
         self.failure = None
         self._idle_ns = self._clock()
         self._bus = bus = open_bus(self._interface, self._channel, self._options)
-        self._fileno = _fileno(bus)
-        if self._fileno is not None:
-            _enlarge_buffer(self._fileno)
+        self.descriptor = _fileno(bus)
+        if self.descriptor is not None:
+            _enlarge_buffer(self.descriptor)
         if self._interface == "socketcan":
             self._use_socket(bus)
 
     def close(self) -> None:
-        """Let go of the bus, whatever state it is in."""
         bus, self._bus = self._bus, None
-        self._socket = self._fileno = None
+        self._socket = self.descriptor = None
         if bus is None:
             return
         with contextlib.suppress(Exception):
@@ -140,15 +138,8 @@ class CanBus:
             with contextlib.suppress(Exception):
                 port.close()
 
-    def fileno(self) -> int | None:
-        """Descriptor to wait on, None where the interface has none."""
-        return self._fileno
-
     def drain(self) -> list[Stamped]:
-        """Frames that have arrived, oldest first, at most `FRAMES_PER_DRAIN`.
-
-        Never raises and never waits: a broken bus sets `failure`, after the frames before it.
-        """
+        """Return the next frames, oldest first. Never raises: a broken bus sets `failure`."""
         frames: list[Stamped] = []
         self.more = False
         try:
@@ -167,7 +158,6 @@ class CanBus:
         return frames
 
     def _use_socket(self, bus: can.BusABC) -> None:
-        """Read the bus's socket ourselves, and have the kernel report what it drops."""
         raw = getattr(bus, "socket", None)
         if not isinstance(raw, socket.socket):
             return
@@ -182,16 +172,10 @@ class CanBus:
         receive, flags = raw.recvmsg, int(socket.MSG_DONTWAIT)
         for _ in range(FRAMES_PER_DRAIN):
             record, ancillary, _, _ = receive(CANFD_FRAME.size, ANCILLARY_BYTES, flags)
-            t_ns = now_ns
-            for level, kind, data in ancillary:
-                if level != socket.SOL_SOCKET:
-                    continue
-                if kind == SO_TIMESTAMPNS and len(data) == TIMESPEC.size:
-                    seconds, nanoseconds = TIMESPEC.unpack(data)
-                    t_ns = min(seconds * 1_000_000_000 + nanoseconds + ahead_ns, now_ns)
-                elif kind == SO_RXQ_OVFL and len(data) == DROPS.size:
-                    (total,) = DROPS.unpack(data)
-                    self._count_drops(total, frames)
+            wall_ns, drops = read_stamps(ancillary)
+            t_ns = now_ns if wall_ns is None else min(wall_ns + ahead_ns, now_ns)
+            if drops is not None:
+                self._count_drops(drops, frames)
             frame = unpack_frame(record)
             if frame is None:
                 self.malformed += 1
@@ -199,7 +183,7 @@ class CanBus:
                 frames.append((frame, t_ns, t_ns))
 
     def _count_drops(self, total: int, frames: list[Stamped]) -> None:
-        """The kernel reports a running sum of 32 bits per socket, with the frame after the loss."""
+        """Take the kernel's running sum of 32 bits, which comes with the frame after a loss."""
         dropped = (total - self._drops_seen) % (1 << 32)
         if dropped:
             now_ns = self._clock()
@@ -227,13 +211,12 @@ class CanBus:
             message = bus.recv(timeout=0)
             if message is not None:
                 frames.append((_frame_of(message), since_ns, self._clock()))
-            elif not _has_more(self._fileno):
+            elif not _has_more(self.descriptor):
                 self._idle_ns = before_ns
                 return
 
 
 def _fileno(bus: can.BusABC) -> int | None:
-    """Descriptor of a bus, None where it has none."""
     try:
         descriptor = bus.fileno()
     except Exception:  # noqa: BLE001 (python-can lets any exception through)
@@ -251,7 +234,7 @@ def _has_more(descriptor: int | None) -> bool:
 
 
 def _enlarge_buffer(descriptor: int) -> None:
-    """Let the kernel keep more frames while the loop is busy, where the descriptor is a socket."""
+    """Let the kernel keep more frames while the loop is busy, if the descriptor is a socket."""
     if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
         return
     with socket.socket(fileno=os.dup(descriptor)) as same, contextlib.suppress(OSError):

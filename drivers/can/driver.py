@@ -1,9 +1,7 @@
-"""BioTac SPs behind a CAN bus: the driver. python-can opens the bus, any of its interfaces will do.
+"""BioTac SPs behind a CAN bus of any interface that python-can has.
 
-Where the bus has a descriptor (socketcan, slcan, udp_multicast and others) the loop waits on it.
-Where it has none (virtual, some vendors' libraries) the loop polls every millisecond: that costs a
-percent of a core and a reading at most a millisecond, and needs neither thread nor lock nor a
-queue of our own.
+The loop waits on the descriptor of the bus. A bus without one (virtual, some vendors' libraries) is
+polled every millisecond, which costs a percent of a core.
 """
 
 from __future__ import annotations
@@ -17,19 +15,20 @@ import can
 
 from drivers.base import DriverError, Fact, LinkError, Opened, Reading
 from drivers.can.bus import STAMPED_INTERFACES, CanBus
+from drivers.can.decoders import BoardOptions
 from drivers.can.formats import CanFormat
 from drivers.can.frames import LOST, Stamped
 from drivers.can.readings import CanCounters
-from drivers.can.stream import NAME, BoardOptions, CanStream
+from drivers.can.stream import NAME, CanStream
 from drivers.link import CLOSED, UP, WAITING, LinkState
 
 POLL_NS: Final = 1_000_000
-"""How often a bus without a descriptor is asked for frames, ns."""
+"""Time between reads of a bus without a descriptor, ns."""
 REST_MARGIN_NS: Final = 1_000_000
 REST_MAX_NS: Final = 15_000_000
-"""Where a reading takes many frames, waking for each costs more than the frames. The kernel keeps
-them meanwhile: the loop rests until this time before the reading should be complete, and at most a
-quarter of what the kernel's usual buffer holds, ns."""
+"""Waking for each of a reading's many frames costs more than the frames. The loop rests until this
+margin before the reading should be complete, and at most a quarter of what the kernel's usual
+buffer holds, ns."""
 RATE_WINDOW_NS: Final = 1_000_000_000
 """Frames per second are counted over this time, ns."""
 FD_CLOCK_HZ: Final = 80_000_000
@@ -39,16 +38,13 @@ FD_CLOCK_HZ: Final = 80_000_000
 class CanBridgeDriver(Opened):
     """Readings from a CAN bus. See `deploy/can/PROTOCOL.md` for the two formats.
 
-    The constructor raises `ValueError` for an argument out of range. `open` raises `DriverError`
-    only where no later try can succeed, such as an interface that python-can does not have;
-    otherwise the driver tries again until the bus is there. A bus that fails is closed, opened
-    again, and counted; a sweep that was cut through by that is dropped. A bus without a frame of
-    ours for ten periods, 100 ms at least, is `GREETING` until one comes.
+    The constructor raises `ValueError`; `open` and `read_ready` `DriverError` only if no later
+    try can succeed. A bus that fails is closed and opened again, and its current sweep dropped. A
+    bus without a frame of ours for ten periods, 100 ms at least, is `GREETING` until one comes.
     """
 
     name = NAME
     exhausted = False
-    """A live link never is."""
     live = True
 
     def __init__(
@@ -63,15 +59,13 @@ class CanBridgeDriver(Opened):
         wall_clock: Callable[[], int] = time.time_ns,
         **board: Unpack[BoardOptions],
     ) -> None:
-        """Describe the bus; nothing is opened yet.
+        """`bitrate` and `data_bitrate`, bit/s: not with socketcan, where they belong to `ip link`.
 
-        `bitrate` and `data_bitrate`, bit/s: not with socketcan, where they belong to `ip link`.
-        `fingers` and `board`: as those of a `CanStream`.
+        `fingers` and `board`: see `drivers.can.decoders.make_decoder`.
         """
         self._stamped = interface in STAMPED_INTERFACES
         self._make_stream = functools.partial(CanStream, f"{interface} {channel}", fingers, **board)
         self.stream = self._make_stream()
-        """What the bus has brought since `open`, and how its link stands."""
         frame_format = CanFormat(board.get("format", CanFormat.SYNTOUCH))
         options = _bus_options(interface, frame_format, bitrate, data_bitrate)
         self._bus = CanBus(interface, channel, options, clock, wall_clock)
@@ -80,12 +74,11 @@ class CanBridgeDriver(Opened):
 
     @property
     def counters(self) -> CanCounters:
-        """Counters since `open`."""
         return self.stream.counters
 
     @property
     def link_state(self) -> LinkState:
-        """What the link is doing. `GREETING`: the bus is open, no frame of ours has come yet."""
+        """`GREETING` while the bus is open and no frame of ours comes."""
         return self.stream.link.state
 
     @property
@@ -96,23 +89,21 @@ class CanBridgeDriver(Opened):
 
     @property
     def period_ns(self) -> int | None:
-        """Time between readings, ns, as measured; None until it is known."""
         return self.stream.period_ns
 
     @property
     def serials(self) -> dict[str, str]:
-        """Always empty: no CAN frame carries a sensor's serial number."""
+        """Empty: no CAN frame carries a sensor's serial number."""
         return {}
 
     def describe(self) -> dict[str, Fact]:
-        """Bus, link, and how much it brings."""
-        known = self.stream.describe()
+        facts = self.stream.describe()
         if self.link_state is UP:
-            known["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
-        return known
+            facts["frames"] = Fact(f"{self.frames_per_s:.0f} /s")
+        return facts
 
     def open(self) -> None:
-        """Take the bus, or begin to try. Raises `DriverError` if no try can ever succeed."""
+        """Try once to take the bus. Raises `DriverError` if no try can ever succeed."""
         self.close()
         self.stream = self._make_stream()
         self._resting_until_ns = None
@@ -122,35 +113,35 @@ class CanBridgeDriver(Opened):
         self.stream.link.start(now_ns)
         self._try_to_open()
 
-    def tap(self, taker: Callable[[list[Stamped]], None]) -> None:
-        """Hand all frames that come from now on to `taker` too."""
-        self._bus.tap = taker
+    def tap(self, sink: Callable[[list[Stamped]], None]) -> None:
+        """Pass all frames that come from now on to `sink` too."""
+        self._bus.tap = sink
 
     def close(self) -> None:
-        """Let go of the bus."""
         self._bus.close()
         self.stream.link.close()
 
     def fileno(self) -> int | None:
-        """Descriptor to wait on, None while there is none or no reading is near."""
-        return None if self._resting_until_ns is not None else self._bus.fileno()
+        """Descriptor to wait on; None while there is none or no reading is near."""
+        return None if self._resting_until_ns is not None else self._bus.descriptor
 
     def due_ns(self) -> int | None:
-        """When to open again, to notice silence, or to poll a bus without a descriptor."""
+        """Time to reopen the bus, to notice silence, or to poll without a descriptor, ns."""
         link = self.stream.link
         if link.state in (CLOSED, WAITING):
             return link.retry_ns
         if self._resting_until_ns is not None:
             return self._resting_until_ns
-        if self._bus.more or self._bus.fileno() is None:
+        if self._bus.more or self._bus.descriptor is None:
             return self._poll_due_ns
         return self.stream.silent_at_ns
 
     def read_ready(self) -> Sequence[Reading]:
-        """Readings that are complete now. Raises `DriverError` only if no try can ever succeed."""
         if self.link_state is CLOSED:
             raise RuntimeError("the CAN bridge is not open")
-        if self.link_state is WAITING and not self._is_open_again():
+        if self.link_state is WAITING and self.stream.link.is_due(self._clock()):
+            self._try_to_open()
+        if self.link_state is WAITING:
             return ()
         frames = self._bus.drain()
         readings, trouble = self.stream.receive(frames)
@@ -160,13 +151,6 @@ class CanBridgeDriver(Opened):
         if trouble is not None:
             self._lose(trouble)
         return readings
-
-    def _is_open_again(self) -> bool:
-        """Return True if the bus is open after a try, if one was due."""
-        if not self.stream.link.is_due(self._clock()):
-            return False
-        self._try_to_open()
-        return self.link_state is not WAITING
 
     def _try_to_open(self) -> None:
         try:
@@ -204,11 +188,8 @@ class CanBridgeDriver(Opened):
             self._window_start_ns, self._window_frames = now_ns, 0
 
     def _rest(self, now_ns: int) -> int | None:
-        """Until when the frames may wait in the kernel, None for not at all.
-
-        Only where the kernel stamps them, so that waiting does not make them look fresher.
-        """
-        if not self._stamped or self._bus.more or self._bus.fileno() is None:
+        """Return the time, ns, until which the kernel may stamp and keep frames, or None."""
+        if not self._stamped or self._bus.more or self._bus.descriptor is None:
             return None
         expected_ns = self.stream.expected_ns
         if expected_ns is None or expected_ns - REST_MARGIN_NS <= now_ns:
@@ -219,7 +200,7 @@ class CanBridgeDriver(Opened):
 def _bus_options(
     interface: str, frame_format: CanFormat, bitrate: int | None, data_bitrate: int | None
 ) -> dict[str, Any]:
-    """Arguments of python-can's bus. Raises `ValueError` where it would drop them silently."""
+    """Return arguments of python-can's bus. Raises `ValueError` for those that it would drop."""
     if interface == "socketcan" and (bitrate is not None or data_bitrate is not None):
         raise ValueError("bit rates of socketcan are set by `ip link set CHANNEL type can bitrate`")
     wants_fd = frame_format is CanFormat.SWEEP_FD

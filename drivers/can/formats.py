@@ -1,16 +1,13 @@
-"""What the data bytes of a CAN frame mean: SynTouch's samples, and sweep frames of our own.
+"""Meaning of a CAN frame's data: SynTouch's samples, and sweep frames of our own.
 
-SynTouch's board sends one classic frame per sample: the command byte, then each sensor's raw
-response word. Source: the public driver of that board, `clearpathrobotics/numatac_can_driver`
-(`numatac_can_driver.cpp`, `bt_can.h`); its words are those of `drivers.biotac`. Neither the
-arbitration id nor the frame length is written down in public, so both are configuration.
+SynTouch's board sends one classic frame per sample: the command byte, then each sensor's response
+word (`drivers.biotac`). Source: the public driver `clearpathrobotics/numatac_can_driver`
+(`numatac_can_driver.cpp`, `bt_can.h`). Arbitration id and frame length are not public, so both are
+configuration. The sweep frame is graspd's own: one CAN FD frame per finger and sweep.
+`deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc` describe both.
 
-The sweep frame is graspd's own: one CAN FD frame per finger and sweep. No product sends it.
-Both are described in `deploy/can/PROTOCOL.md` and `deploy/can/graspd.dbc`.
-
-A new format starts here: a member of `CanFormat` and what its bytes mean. Then `decoders` gets its
-decoder (`make_decoder`; a type error says where one is missing), `daemon/scene/drivers.py` its
-name, `drivers/twins/can.py` a twin that sends it, and the two pages above its description.
+A new format needs a member of `CanFormat`, a decoder in `decoders.make_decoder`, a name in
+`daemon/scene/drivers.py`, a twin that sends it, and a description on the two pages above.
 """
 
 from __future__ import annotations
@@ -97,7 +94,6 @@ class SweepFrame(msgspec.Struct, frozen=True, gc=False):
     """`SweepStatus` bits."""
 
     def to_bytes(self) -> bytes:
-        """The 64 bytes."""
         head = _SWEEP_HEAD.pack(SWEEP_VERSION, self.finger, self.sequence, self.tick_us)
         return head + self.words + _SWEEP_STATUS.pack(self.status) + _RESERVED
 
@@ -131,10 +127,7 @@ def parse_sweep(data: bytes) -> SweepFrame | Reject:
 
 
 def sample_length(sensors: int, length: int | None) -> int:
-    """Return the length of SynTouch frames: `1 + 2 * sensors` unless given.
-
-    Raises `ValueError` if the words do not fit into it, or it into a classic frame.
-    """
+    """Return the length of SynTouch frames. Raises `ValueError` if it cannot be `length`."""
     if sensors > SENSORS_MAX:
         raise ValueError(f"a classic frame carries 1 to {SENSORS_MAX} sensors, not {sensors}")
     used = 1 + WORD_BYTES * sensors

@@ -1,7 +1,4 @@
-"""CAN frames as graspd sees them, and the structs in which Linux hands them over. Bytes only.
-
-Source: linux/can.h and linux/can/error.h.
-"""
+"""CAN frames, and the structs of linux/can.h and linux/can/error.h. Bytes only."""
 
 from __future__ import annotations
 
@@ -64,12 +61,11 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
 
 
 Stamped = tuple[CanFrame, int, int]
-"""A frame and the monotonic times, ns, between which it arrived: one and the same where the
-interface stamps frames. A frame with `LOST` stands where the kernel dropped others."""
+"""A frame, or `LOST`, and the monotonic times, ns, between which it arrived."""
 
 
 def unpack_frame(raw: bytes) -> CanFrame | None:
-    """The frame in a `can_frame` or `canfd_frame`, None if it is neither."""
+    """Return the frame in a `can_frame` or `canfd_frame`, or None."""
     if len(raw) == CAN_FRAME.size:
         word, length, data = CAN_FRAME.unpack(raw)
         longest, flags = CLASSIC_DATA_MAX, 0
@@ -91,18 +87,18 @@ def unpack_frame(raw: bytes) -> CanFrame | None:
 
 
 def is_bus_off(frame: CanFrame) -> bool:
-    """Return True if an error frame says that the controller has left the bus."""
+    """Return True for an error frame: the controller left the bus."""
     return bool(frame.flags & ERROR and frame.arbitration_id & ERROR_BUS_OFF)
 
 
 def is_overflow(frame: CanFrame) -> bool:
-    """Return True if an error frame says that the controller's receive buffer ran over."""
+    """Return True for an error frame: the controller's receive buffer ran over."""
     if not (frame.flags & ERROR and frame.arbitration_id & ERROR_CONTROLLER):
         return False
     return len(frame.data) > 1 and bool(frame.data[1] & CONTROLLER_RX_OVERFLOW)
 
 
 def describe_error(frame: CanFrame) -> str:
-    """The error classes of an error frame in words."""
+    """Return the error classes of an error frame in words."""
     names = [name for bit, name in _ERROR_CLASSES.items() if frame.arbitration_id & bit]
     return ", ".join(names) or "unknown error class"

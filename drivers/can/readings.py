@@ -22,22 +22,20 @@ OUTAGE_NS: Final = 2_000_000_000
 
 @dataclass(slots=True)
 class CanCounters(DriverCounters):
-    """What a CAN bus brought, and what became of it."""
+    """Counters of frames, sweeps and the bus."""
 
     lost_frames: int = 0
     """Frames with electrodes that did not come although others of their sweep did."""
     duplicate_frames: int = 0
     """Frames that came again; the copy is dropped."""
     reordered_frames: int = 0
-    """Frames that came after their successor and in time for their sweep; of sweep frames, those
-    of a finger after one with a higher number."""
+    """Frames that came in time for their sweep, but after a later one."""
     late_frames: int = 0
     """Frames that came when their sweep was over; dropped."""
     unsynchronised_frames: int = 0
     """Frames dropped after opening, or after a known loss, until a sweep began."""
     untimed_frames: int = 0
-    """Samples dropped because their time is unknown: the loop stalled, and the bus does not stamp
-    them."""
+    """Samples dropped as the loop stalled and the bus does not stamp them."""
     unexpected_channels: int = 0
     """Samples of a channel that the configured sequence does not have."""
     interrupted_sweeps: int = 0
@@ -59,8 +57,7 @@ class CanCounters(DriverCounters):
     accepted_frames: int = 0
     """Of these, samples or sweep frames of our sensors, before duplicates and losses."""
     foreign_frames: int = 0
-    """Frames with another arbitration id than the configured or the latched one; until an id is
-    latched, frames that are no sound sample."""
+    """Frames with another arbitration id; without one, frames that are no sound sample."""
     remote_frames: int = 0
     error_frames: int = 0
     """Frames in which the controller reports trouble on the bus."""
@@ -89,7 +86,7 @@ class CanCounters(DriverCounters):
 
 
 class ReadingMaker:
-    """Numbers readings, counts what is wrong with them, knows their period."""
+    """Numbers readings, counts their faults, learns their period."""
 
     def __init__(self, counters: CanCounters) -> None:
         self.counters = counters
@@ -98,28 +95,23 @@ class ReadingMaker:
         self.period_ns: int | None = None
 
     def learn(self, gap_ns: int) -> None:
-        """Take in the time between two sweeps in a row, ns, unless it is an outage or none."""
+        """Take the time between two sweeps in a row, unless it is an outage."""
         if 0 < gap_ns <= OUTAGE_NS:
             self._gaps_ns.append(gap_ns)
         if len(self._gaps_ns) >= PERIODS_NEEDED:
             self.period_ns = round(statistics.median(self._gaps_ns))
 
     def forget_period(self) -> None:
-        """What was learned may be of sweeps of which some were lost."""
+        """Drop a period that may be one of lost sweeps."""
         self._gaps_ns.clear()
         self.period_ns = None
 
     def miss(self, sweeps: int) -> None:
-        """Count sweeps that were made and never arrived."""
         self.seq += sweeps
         self.counters.missed_readings += sweeps
 
     def make(self, words: NDArray[np.intp], marks: NDArray[np.uint8], t_ns: int) -> TactileReading:
-        """The reading of response words, shape (fingers, 24).
-
-        `marks`: `ElectrodeFault` bits that are known beforehand; a word under `MISSING` means
-        nothing and is not looked at.
-        """
+        """Return the reading of words, shape (fingers, 24), with the known faults `marks`."""
         counts, faults = decode_words(words)
         if np.count_nonzero(faults) or np.count_nonzero(marks):
             absent = marks & np.uint8(ElectrodeFault.MISSING) != 0

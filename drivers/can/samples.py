@@ -1,20 +1,17 @@
 """Samples -> one `TactileReading` per sweep; what is missing is flagged.
 
-The real CAN format has no counter. What a sample is, its command byte says; which sweep it belongs
-to, only its place in the known order of the sequence and the time between samples can say:
+The real CAN format has no counter. A sample's command byte names its channel; its sweep follows
+from its place in the known order of the sequence and from the time between samples:
 
 - An electrode earlier in the order starts a new sweep, unless it is a copy of what this sweep has
   (duplicated) or one that this sweep lacks and just passed by (reordered, up to `REORDER_MAX`).
-- A sample that comes later than its place in the order explains starts a new sweep too: the
-  samples of one reading are never further apart than a sweep takes and three quarters of a period.
+- A sample that comes later than its place in the order explains starts a new sweep too.
 - A sweep that is lost as a whole is found by time alone.
-- Where an unknown number of samples is lost, the present sweep ends.
+- Losing an unknown number of samples ends the current sweep.
 
-What cannot be told apart: a sample of which the data is damaged so that it names another valid
-channel; a sender that stalls in the middle of a sweep from the loss of whole sweeps' worth of
-samples, so that both break the sweep; copies that come more than `REORDER_MAX` electrodes late,
-which count as a new sweep. In none of these is an electrode shifted or filled from memory: what a
-sweep did not receive is `MISSING` in it.
+Not noticed: data damaged so that it names another valid channel. A sender that stalls within a
+sweep looks like a loss of whole sweeps; a copy more than `REORDER_MAX` electrodes late looks like a
+new sweep. No electrode is shifted or filled from memory: what a sweep did not get is `MISSING`.
 """
 
 from __future__ import annotations
@@ -29,20 +26,17 @@ from drivers.biotac import E1, E24
 from drivers.can.readings import OUTAGE_NS, CanCounters, ReadingMaker
 
 REORDER_MAX: Final = 3
-"""Samples may come up to this many electrodes late: adapters with two or three receive buffers swap
-neighbours, a bus does not."""
+"""Most electrodes by which a sample may be late: adapters with few buffers swap neighbours."""
 NEXT_SWEEP_PERIODS: Final = 0.75
 """A sample this much later than its place explains, in periods, is of another sweep. Samples of
 whole sweeps that are lost make it one period or more: a sweep broken without need is flagged, two
 sweeps in one reading would not be."""
 SLOT_MIN_NS: Final = 100_000
-"""Least time between samples, ns: a frame with three words takes 103 bits at 1 Mbit/s. While the
-period is not known, it is taken for that of the fastest board."""
+"""Least time between samples, ns: 103 bits at 1 Mbit/s, as of the fastest board."""
 ARRIVAL_JITTER_NS: Final = 5_000_000
 """A sweep that comes less than this late, ns, tells of no missed one."""
 EVEN_SHARE: Final = 1 / 3
-"""Of the time from one end to the next, what two samples may at most be apart where no sweep is
-missing; one that is takes half of it."""
+"""Largest share of a period between two samples without a lost sweep, which takes half."""
 
 _ALL: Final = (1 << ELECTRODES) - 1
 
@@ -57,11 +51,9 @@ class SampleAssembler:
         counters: CanCounters,
         rows: Sequence[int] | None = None,
     ) -> None:
-        """`sensors`: words of a sample. `sequence`: channels in order.
+        """`sensors`: words of a sample. `rows`: the sensor, from 0, of each row of a reading.
 
-        `rows`: which sensor, from 0, is which row of a reading; each in its turn unless given.
-
-        Raises `ValueError` unless E1 to E24 are in the sequence once each.
+        `sequence`: channels in order. Raises `ValueError` unless it has E1 to E24 once each.
         """
         electrodes = [channel for channel in sequence if E1 <= channel <= E24]
         if sorted(electrodes) != list(range(E1, E24 + 1)):
@@ -101,7 +93,7 @@ class SampleAssembler:
 
     @property
     def expected_ns(self) -> int | None:
-        """When the next reading should be complete, monotonic ns; None while that is not known."""
+        """Time when the next reading should be complete, ns; None: not known yet."""
         period_ns = self._readings.period_ns
         if period_ns is None or self._last < 0:
             return None
@@ -111,10 +103,10 @@ class SampleAssembler:
     def push(
         self, channel: int, words: bytes, t_ns: int, until_ns: int | None = None
     ) -> Sequence[TactileReading]:
-        """Take one sample, received at `t_ns`; the readings that it completes, oldest first.
+        """Take a sample; return the readings that it completes, oldest first.
 
-        `words` holds each sensor's response word in turn, two bytes each. With `until_ns` the
-        sample came at any time from `t_ns` to then; too wide a doubt makes it useless.
+        `words`: each sensor's response word, two bytes each. It came at `t_ns`, or with `until_ns`
+        at any time between the two; too wide a doubt makes it useless.
         """
         place = self._place.get(channel)
         if place is None:
@@ -128,7 +120,7 @@ class SampleAssembler:
         if not self._synchronised and not self._starts(place):
             self._counters.unsynchronised_frames += 1
             return ()
-        if self._ahead(place, until_ns):
+        if place > self._last and not self._is_next_sweep(place, until_ns):
             if self._is_tail_of_previous(place):
                 if not self._previous_had >> place & 1:
                     self._counters.late_frames += 1
@@ -147,7 +139,7 @@ class SampleAssembler:
         return (*finished, *self._store(place, words, t_ns))
 
     def cut(self) -> Sequence[TactileReading]:
-        """End the present sweep and wait for another: an unknown number of samples was lost."""
+        """End the current sweep. Call when an unknown number of samples was lost."""
         self._counters.cut_sweeps += not self._finished and self._have != 0
         self._run = 0
         finished = self._finish()
@@ -156,13 +148,12 @@ class SampleAssembler:
         return finished
 
     def interrupt(self) -> None:
-        """The link broke: drop the sweep at hand, wait for the beginning of another."""
+        """Drop the current sweep. Call when the link broke."""
         self._counters.interrupted_sweeps += not self._finished and self._have != 0
         self._forget()
 
     def _count_run(self, place: int, t_ns: int) -> None:
-        """Count the samples in a row that came each right after its predecessor in the order, and
-        keep the widest time between two since the last end."""
+        """Count samples without a gap in their order, and keep the widest time between two."""
         if place != self._seen:
             follows = place == (self._seen + 1) % ELECTRODES
             self._run = self._run + 1 if follows else 1
@@ -176,13 +167,13 @@ class SampleAssembler:
         self._finished = False
 
     def _starts(self, place: int) -> bool:
-        """Return True if a sweep begins with this sample, one of the first after opening."""
+        """Return True if a sweep begins with this sample."""
         self._synchronised = place == 0 or place < self._last
         self._last = -1 if self._synchronised else place
         return self._synchronised
 
     def _untimed(self, place: int, t_ns: int) -> Sequence[TactileReading]:
-        """A sample without a time ends the sweep at hand; the period is learned all the same."""
+        """End the current sweep at a sample without a time, and learn the period."""
         self._counters.untimed_frames += 1
         finished = self._finish()
         self._begin()
@@ -190,48 +181,39 @@ class SampleAssembler:
             self._learn(t_ns)
         return finished
 
-    def _ahead(self, place: int, until_ns: int) -> bool:
-        """Return True if a sample is of this sweep and the furthest so far."""
-        return place > self._last and not self._is_next_sweep(place, until_ns)
-
     def _is_next_sweep(self, place: int, until_ns: int) -> bool:
         """Return True if a sample may have come too late to be of this sweep."""
-        if self._last < 0:
-            return False
-        period_ns = self._readings.period_ns
-        if period_ns is None:
-            advance = max(place - self._last, 0)
-            return until_ns - self._t_ns - advance * SLOT_MIN_NS >= self._lateness_ns()
-        due_ns = self._origin_ns + self._position[place] * period_ns
-        return until_ns - due_ns >= self._lateness_ns()
+        return self._last >= 0 and self._late_ns(place, until_ns) >= self._lateness_ns()
 
     def _is_early(self, place: int, until_ns: int) -> bool:
         """Return True if a sample came too soon to be of this sweep: it is of the last one."""
+        late_ns = self._late_ns(place, until_ns)
+        if self._readings.period_ns is None:
+            return late_ns < 0
+        return -late_ns >= self._lateness_ns()
+
+    def _late_ns(self, place: int, until_ns: int) -> float:
+        """Return how much later than its place explains a sample came, ns; below 0 if earlier."""
         period_ns = self._readings.period_ns
         if period_ns is None:
-            return until_ns - self._t_ns < (place - self._last) * SLOT_MIN_NS
-        due_ns = self._origin_ns + self._position[place] * period_ns
-        return due_ns - until_ns >= self._lateness_ns()
+            return until_ns - self._t_ns - max(place - self._last, 0) * SLOT_MIN_NS
+        return until_ns - (self._origin_ns + self._position[place] * period_ns)
 
     def _lateness_ns(self) -> float:
-        """How late a sample must be to be of another sweep, ns."""
+        """Return the delay, ns, from which on a sample is of another sweep."""
         period_ns = self._readings.period_ns or self._samples * SLOT_MIN_NS
         return NEXT_SWEEP_PERIODS * period_ns
 
     def _is_tail_of_previous(self, place: int) -> bool:
-        """Return True if one of the last electrodes comes where a sweep has just begun.
-
-        It is late, doubled, or came after a loss of all between.
-        """
+        """Return True for one of the last electrodes where a sweep has just begun."""
         return place >= ELECTRODES - REORDER_MAX and 0 <= self._last < REORDER_MAX
 
     def _holds(self, place: int, words: bytes) -> bool:
-        """Return True if these words came last for this place."""
         start = place * self._width
         return self._buffer[start : start + self._width] == words
 
     def _repeats(self, place: int, words: bytes, t_ns: int, until_ns: int) -> bool:
-        """Deal with a sample that stays in this sweep: a copy or a late one. False: a new sweep."""
+        """Take a copy or a late sample, or return False: a new sweep begins."""
         if self._last - place > REORDER_MAX or self._is_next_sweep(place, until_ns):
             return False
         if not self._have >> place & 1:
@@ -262,7 +244,7 @@ class SampleAssembler:
         self._t_ns = t_ns
 
     def _finish(self) -> Sequence[TactileReading]:
-        """Close the sweep at hand and hand over its reading, unless that was done before."""
+        """Close the current sweep; return its reading, if that was not done before."""
         if self._finished or not self._have:
             return ()
         self._finished = True
@@ -296,12 +278,11 @@ class SampleAssembler:
             self._broken = True
 
     def _learn(self, end_ns: int) -> None:
-        """A sweep ended at `end_ns`, and maybe the one before it ended right before.
+        """Learn the period from the end of a sweep and of the one before.
 
-        Samples without a gap in their order tell of one period even where the time between them
-        broke the sweep: else a period that is wrong once, and breaks every sweep, would stay. Not
-        where a whole sweep may be missing in the widest gap between them: there only of a board
-        that always pauses between its sweeps.
+        Samples without a gap in their order tell of a period even if the time between them broke
+        the sweep: else a period that is wrong once, and breaks every sweep, would stay. If a whole
+        sweep may be missing in the widest gap, the board must be one that always pauses there.
         """
         known = not self._broken or self._run > ELECTRODES
         if known and self._previous_end_ns is not None:

@@ -1,15 +1,12 @@
-"""What one CAN bus brings: frames in with their times, readings out. No I/O.
-
-See `deploy/can/PROTOCOL.md` for the two formats.
-"""
+"""What one CAN bus brings: frames in with their times, readings out. No I/O."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, TypedDict
+from typing import Final, Unpack
 
 from drivers.base import DeviceFault, Fact, LinkCause, LinkError, Reading
-from drivers.can.decoders import make_decoder
+from drivers.can.decoders import BoardOptions, make_decoder
 from drivers.can.formats import CanFormat
 from drivers.can.frames import (
     ERROR,
@@ -26,21 +23,11 @@ from drivers.link import GREETING, UP, Link
 
 NAME: Final = "can"
 SILENCE_PERIODS: Final = 10
-"""Readings that may be missing before the link is down."""
+"""Missing readings after which the link is lost."""
 SILENCE_MIN_NS: Final = 100_000_000
 """Shortest silence that is one, ns: above what an adapter or a busy host holds back."""
 _SPECIAL: Final = ERROR | REMOTE | LOST
 """Flags of what is no data frame."""
-
-
-class BoardOptions(TypedDict, total=False):
-    """Arguments of a `CanStream` that say what the board sends."""
-
-    sensors: Sequence[str] | None
-    format: str
-    arbitration_id: int | None
-    sequence: str
-    data_length: int | None
 
 
 class CanStream:
@@ -50,75 +37,42 @@ class CanStream:
     comes, and `lost` when it is gone. All times are monotonic ns.
     """
 
-    def __init__(
-        self,
-        bus: str,
-        fingers: Sequence[str],
-        *,
-        sensors: Sequence[str] | None = None,
-        format: str = CanFormat.SYNTOUCH,  # noqa: A002 (the key of the scene)
-        arbitration_id: int | None = None,
-        sequence: str = "interleaved",
-        data_length: int | None = None,
-    ) -> None:
-        """`bus` names it for people. Raises `ValueError` for arguments that do not fit each other.
-
-        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the board's words,
-        three at most, the same unless given; a board may have more sensors than fingers are wanted
-        (`syntouch` only: sweep frames say whose they are). `format`: a `CanFormat`.
-        `arbitration_id`: of the samples, or of finger 0 (`ff`) of the sweep frames; above 0x7FF it
-        has 29 bits. None takes the id of the first sound sample until the link is lost, which is
-        for bring-up only, except with `sweep_fd`, where it stands for 0x5B0. `sequence`: a key of
-        `drivers.biotac.SEQUENCES` (`syntouch` only). `data_length`: bytes of a sample frame where
-        the board pads it.
-        """
-        frame_format = CanFormat(format)
+    def __init__(self, bus: str, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
+        """`bus`: its name, for people. `fingers` and `board`: see `make_decoder`."""
         self.counters = CanCounters()
         self.link = Link(NAME)
         self.last_error: str | None = None
-        """The last failure of the bus or error frame, for people; None before the first.
-
-        Silence is neither: `link` counts it.
-        """
-        self._where = f"{bus}, {frame_format}"
+        """Last failure of the bus or error frame, for people; silence is neither."""
+        self._where = f"{bus}, {CanFormat(board.get('format', CanFormat.SYNTOUCH))}"
         self._accepted = 0
         self._silent_at_ns = 0
-        self._decoder = make_decoder(
-            frame_format,
-            fingers,
-            counters=self.counters,
-            sensors=sensors,
-            arbitration_id=arbitration_id,
-            sequence=sequence,
-            data_length=data_length,
-        )
+        self._decoder = make_decoder(fingers, self.counters, **board)
 
     @property
     def period_ns(self) -> int | None:
         """Time between readings, ns, as measured; None until it is known."""
-        return self._decoder.period_ns
+        return self._decoder.sweeps.period_ns
 
     @property
     def expected_ns(self) -> int | None:
-        """When the next reading should be complete, where many frames make one."""
-        return self._decoder.expected_ns
+        """Time when the next reading should be complete, if many frames make one."""
+        return self._decoder.sweeps.expected_ns
 
     @property
     def silent_at_ns(self) -> int | None:
-        """When silence is to be noticed; None while the link is not up."""
+        """Time when silence is to be noticed; None while the link is not up."""
         return self._silent_at_ns if self.link.state is UP else None
 
     def describe(self) -> dict[str, Fact]:
-        """Bus, link and why it is not up, and whose frames are taken."""
-        known = {"bus": Fact(self._where), **self.link.describe()}
+        facts = {"bus": Fact(self._where), **self.link.describe()}
         if self.last_error is not None:
-            known["last error"] = Fact(self.last_error, DeviceFault.BUS_ERROR)
+            facts["last error"] = Fact(self.last_error, DeviceFault.BUS_ERROR)
         if self._decoder.arbitration_id is not None:
-            known["arbitration id"] = Fact(f"{self._decoder.arbitration_id:#x}")
-        return known
+            facts["arbitration id"] = Fact(f"{self._decoder.arbitration_id:#x}")
+        return facts
 
     def receive(self, frames: Sequence[Stamped]) -> tuple[list[Reading], LinkError | None]:
-        """The readings that frames complete, oldest first; and why the bus is lost, if it is."""
+        """Return the complete readings, oldest first, and why the bus is lost, if it is."""
         readings: list[Reading] = []
         trouble = None
         for frame, t_ns, until_ns in frames:
@@ -127,13 +81,13 @@ class CanStream:
                 continue
             trouble = self._take_special(frame) or trouble
             if frame.flags & LOST or is_overflow(frame):
-                readings += self._decoder.cut()
+                readings += self._decoder.sweeps.cut()
         return readings, trouble
 
     def watch(self, now_ns: int, *, more: bool = False) -> None:
-        """Up with the first frame of ours, and down when there was none for too long.
+        """Take the link up at the first frame of ours, and down after none for too long.
 
-        Not with `more`: frames that have come and were not taken yet.
+        `more`: frames wait that were not taken yet, so that there is no silence.
         """
         if self.counters.accepted_frames > self._accepted:
             self._accepted = self.counters.accepted_frames
@@ -146,13 +100,13 @@ class CanStream:
             self.link.greeting()
 
     def lost(self, error: LinkError, now_ns: int) -> None:
-        """The bus is of no use any more, or could not be opened."""
+        """Note that the bus broke, or could not be opened."""
         self.counters.bus_faults += 1
         self.last_error = str(error)
         self._down(error, now_ns)
 
     def interrupt(self) -> None:
-        """Frames are missing from here on: a sweep that was cut through is dropped."""
+        """Drop the current sweep. Call when frames are missing from here on."""
         self._decoder.interrupt()
 
     def _down(self, error: LinkError, now_ns: int) -> None:
@@ -164,7 +118,7 @@ class CanStream:
         return max(SILENCE_PERIODS * (self.period_ns or 0), SILENCE_MIN_NS)
 
     def _take_special(self, frame: CanFrame) -> LinkError | None:
-        """Count a remote or error frame; why the link is lost, if it is."""
+        """Count a remote or error frame; return why the link is lost, if it is."""
         if frame.flags & (REMOTE | LOST):
             self.counters.remote_frames += bool(frame.flags & REMOTE)
             return None

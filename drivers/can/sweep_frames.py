@@ -29,10 +29,13 @@ _HALF: Final = 1 << 31
 class FrameAssembler:
     """Sweeps from frames that hold all electrodes of one finger and the sweep's number."""
 
+    expected_ns: int | None = None
+    """Not told: the few frames of a sweep are no reason to rest between them."""
+
     def __init__(
         self, fingers: int, counters: CanCounters, order: Sequence[int] | None = None
     ) -> None:
-        """`order`: for each row when its frame comes in a sweep; each in its turn unless given."""
+        """`order`: place of each row's frame in a sweep, by default the row."""
         self._order = range(fingers) if order is None else order
         self._fingers = fingers
         self._all = (1 << fingers) - 1
@@ -56,17 +59,16 @@ class FrameAssembler:
 
     @property
     def period_ns(self) -> int | None:
-        """Time between sweeps, ns, as measured; None until it is known."""
         return self._readings.period_ns
 
     def push(
         self, row: int, sequence: int, tick_us: int, words: bytes, faults: int, t_ns: int
     ) -> Sequence[TactileReading]:
-        """Take the frame of finger `row`; the readings that it completes, oldest first.
+        """Take the frame of finger `row`; return the readings that it completes, oldest first.
 
-        `sequence` is the sweep's number, 16 bits; `tick_us` when it ended by the device's clock,
-        32 bits. `words` are 24 response words, two bytes each. `faults`: `ElectrodeFault` bits that
-        hold for all electrodes of the finger; with `MISSING` its words mean nothing.
+        `sequence`: the sweep's number, 16 bits. `tick_us`: its end by the device's clock, 32 bits.
+        `words`: 24 response words. `faults`: `ElectrodeFault` bits of all electrodes; words under
+        `MISSING` mean nothing.
         """
         done: Sequence[TactileReading] = ()
         if self._current is None or sequence != self._current:
@@ -101,8 +103,12 @@ class FrameAssembler:
         self._t_ns = max(t_ns, self._t_ns)
         return done if self._have != self._all else (*done, *self._finish())
 
+    def cut(self) -> Sequence[TactileReading]:
+        """Do nothing where frames were lost: numbered frames show it by themselves."""
+        return ()
+
     def interrupt(self) -> None:
-        """The link broke: drop the sweep at hand."""
+        """Drop the current sweep. Call when the link broke."""
         if self._have and not self._finished:
             self._counters.interrupted_sweeps += 1
             self._readings.miss(1)
@@ -121,7 +127,7 @@ class FrameAssembler:
         return back <= LATE_FRAMES_MAX and (self._tick_us - tick_us) % _TICKS < _HALF
 
     def _advance(self, sequence: int, tick_us: int, t_ns: int) -> None:
-        """Begin a sweep; count those left out, or a restart of the device."""
+        """Begin a sweep; count those missing, or a restart of the device."""
         if self._current is not None:
             jump = (sequence - self._current) % (1 << 16)
             backwards = (tick_us - self._tick_us) % _TICKS >= _HALF
@@ -135,7 +141,7 @@ class FrameAssembler:
         self._begin(tick_us, t_ns)
 
     def _finish(self) -> Sequence[TactileReading]:
-        """Close the sweep at hand; the first one after opening only if it is complete."""
+        """Close the current sweep; the first one must be complete."""
         if self._finished or not self._have:
             return ()
         self._finished = True

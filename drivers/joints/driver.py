@@ -20,5 +20,4 @@ class JointStreamDriver(DatagramDriver[JointStream]):
 
     @property
     def counters(self) -> JointCounters:
-        """Counters since `open`."""
         return self.stream.counters

@@ -87,7 +87,7 @@ class JointStream:
         self._last_old: float | None = None
 
     def receive(self, data: bytes, t_ns: int) -> list[JointReading] | None:
-        """Return the reading of a message, if it has a known joint; None if it is dropped."""
+        """Return the reading, if a joint is known; None if the message is dropped."""
         message = self.parse(data)
         if message is None or not self.admits(message):
             return None
@@ -98,7 +98,7 @@ class JointStream:
         return [JointReading(t_ns, seq, message.names, message.position_rad)]
 
     def parse(self, data: bytes) -> JointMessage | None:
-        """Return the message of a datagram; count and return None for one that is none."""
+        """Return the message of a datagram, or count it and return None."""
         try:
             message = _message(data)
         except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
@@ -121,7 +121,7 @@ class JointStream:
         return JointMessage(seq, t_s, tuple(angles), np.array(list(angles.values()), dtype=float))
 
     def admits(self, message: JointMessage) -> bool:
-        """Return True for a message newer than all admitted before, by number or else by time."""
+        """Return True for a message newer than all before, by number or time."""
         counted = message.seq is not None
         now = message.seq if counted else message.t_s
         if now is None:
@@ -153,7 +153,7 @@ class JointStream:
 
 
 def _message(data: bytes) -> tuple[int | None, float | None, Mapping[str, Any]] | None:
-    """Return number, time and joints of a datagram; None or `ValueError` if it is no message."""
+    """Return number, time and joints. No message: None or `ValueError`."""
     if len(data) > DATAGRAM_BYTES_MAX:
         return None
     # JSON has no NaN; as text it costs only the joint that has it.

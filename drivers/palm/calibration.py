@@ -11,13 +11,11 @@
     THJ1_THJ2 = [[2132, 2294, 0.0, -20.0], ...]   # [raw THJ1, raw THJ2, degrees, degrees]
 
 Tables are linear between their points and, without clamping, beyond them, as in Shadow's driver.
-THJ1 and THJ2 see each other's magnets: both angles come from both raw values, linear in the
-triangles between points measured in pairs. J0 is the sum of J1 and J2 of a finger, which one motor
-moves. A joint that is left out has no angle (NaN).
+THJ1 and THJ2 see each other's magnets: both angles come from both raw values. J0 is the sum of J1
+and J2 of a finger, which one motor moves. A joint that is left out has no angle (NaN).
 
-A mistake anywhere refuses the whole file. Files shipped with hands hold the mistakes that are
-looked for: raw values with a digit too many, zeros where nothing was measured, tables that turn
-back.
+A mistake anywhere refuses the whole file, such as those of files shipped with hands: a digit too
+many, zeros for what was not measured, tables that turn back.
 """
 
 from __future__ import annotations
@@ -27,6 +25,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -84,21 +83,18 @@ POINTS_MIN, POINTS_MAX = 2, 64
 COUPLED_POINTS_MIN, COUPLED_POINTS_MAX = 3, 49
 """Points of the coupled table; Shadow's own has 25, five by five."""
 SLOPE_MAX_DEG = 0.5
-"""Steepest segment, degrees per count: noise of one count moves the joint by as much. Usual are
-0.03 to 0.1."""
+"""Steepest segment, degrees per count of noise; usual are 0.03 to 0.1."""
 
-Point = tuple[float, float]
-"""(raw, degrees)."""
-CoupledPoint = tuple[float, float, float, float]
-"""(raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
+Points = Sequence[Sequence[float]]
+"""Rows of (raw, degrees), or of (raw THJ1, raw THJ2, degrees THJ1, degrees THJ2)."""
 
 
 class Table:
     """One raw value -> radians."""
 
-    def __init__(self, points: Sequence[Point]) -> None:
+    def __init__(self, points: Points) -> None:
         """Raises `ValueError` for fewer than two points, or two with the same raw value."""
-        ordered = sorted(points)
+        ordered = sorted(points, key=itemgetter(0))
         self._raws = [raw for raw, _ in ordered]
         self._slopes: list[float] = []
         self._offsets: list[float] = []
@@ -115,9 +111,9 @@ class Table:
 
 
 class CoupledTable:
-    """A pair of raw values -> a pair of radians, linear in the triangles between measured pairs."""
+    """A pair of raw values -> a pair of radians, linear between measured pairs."""
 
-    def __init__(self, points: Sequence[CoupledPoint]) -> None:
+    def __init__(self, points: Points) -> None:
         """Raises `ValueError` if the raw pairs span no triangle."""
         table = np.array(points, dtype=np.float64)
         triangles = _delaunay(table[:, :2])
@@ -167,7 +163,7 @@ _LOW_RAD, _HIGH_RAD = (
 
 
 def impossible_angles(position_rad: NDArray[np.float64]) -> int:
-    """Return how many angles of `JOINTS`, radians, are out of reach. NaN is not counted."""
+    """Return how many angles of `JOINTS` are out of reach; NaN is not."""
     return int(((position_rad < _LOW_RAD) | (position_rad > _HIGH_RAD)).sum())
 
 
@@ -179,8 +175,7 @@ def _raw(sensors: Sequence[int], words: Sequence[int]) -> float | None:
 def _delaunay(points: NDArray[np.float64]) -> NDArray[np.intp]:
     """Return triangles, shape (n, 3), whose circumcircle has no point inside; points: (p, 2).
 
-    A calibration has 25 points, so all triples are tried. Four points on one circle give both
-    pairs of triangles: either is right.
+    All triples are tried. Four points on one circle give both pairs of triangles.
     """
     triples = np.array(list(itertools.combinations(range(len(points)), 3)), dtype=np.intp)
     a, b, c = (points[triples[:, corner]] for corner in range(3))
@@ -222,21 +217,13 @@ def load_calibration(path: Path) -> JointCalibration:
 
 
 def parse_calibration(data: Mapping[str, Any], path: Path) -> JointCalibration:
-    """Check the content of a file. Raises `CalibrationError`, whose message names `path`."""
+    """Check the content of a file. Raises `CalibrationError`."""
     problems = list(_problems(data))
     if problems:
         raise CalibrationError(path, problems)
-    tables = {joint: Table(_points(rows)) for joint, rows in data.get("joints", {}).items()}
+    tables = {joint: Table(points) for joint, points in data.get("joints", {}).items()}
     coupled = data.get("coupled", {}).get(COUPLED_KEY)
-    return JointCalibration(tables, None if coupled is None else CoupledTable(_coupled(coupled)))
-
-
-def _points(rows: Sequence[Sequence[float]]) -> list[Point]:
-    return [(raw, degrees) for raw, degrees in rows]
-
-
-def _coupled(rows: Sequence[Sequence[float]]) -> list[CoupledPoint]:
-    return [(raw_1, raw_2, first, second) for raw_1, raw_2, first, second in rows]
+    return JointCalibration(tables, None if coupled is None else CoupledTable(coupled))
 
 
 def _problems(data: Mapping[str, Any]) -> Iterator[str]:
@@ -272,7 +259,7 @@ def _joint_problems(joint: str, rows: object) -> Iterator[str]:
         shape = list(_shape_problems(rows, 2, POINTS_MIN, POINTS_MAX))
         yield from shape
         if not shape and isinstance(rows, list):
-            points = sorted(_points(rows))
+            points = sorted(rows)
             yield from _raw_problems([raw for raw, _ in points])
             yield from _degree_problems(joint, [degrees for _, degrees in points])
             yield from _curve_problems(points)
@@ -283,18 +270,17 @@ def _coupled_problems(rows: object) -> Iterator[str]:
     yield from shape
     if shape or not isinstance(rows, list):
         return
-    points = _coupled(rows)
-    problems = list(_raw_problems([raw for point in points for raw in point[:2]]))
+    problems = list(_raw_problems([raw for point in rows for raw in point[:2]]))
     for at, joint in enumerate(COUPLED):
         problems += [
             f"{joint}: {problem}"
-            for problem in _degree_problems(joint, [point[2 + at] for point in points])
+            for problem in _degree_problems(joint, [point[2 + at] for point in rows])
         ]
-    problems += _steepness_problems(points)
+    problems += _steepness_problems(rows)
     yield from problems
     if not problems:
         try:
-            CoupledTable(points)
+            CoupledTable(rows)
         except ValueError as error:
             yield str(error)
 
@@ -309,7 +295,7 @@ def _shape_problems(rows: object, width: int, least: int, most: int) -> Iterator
 
 
 def _is_number(value: object) -> bool:
-    """Return True for a number that could be a raw value or angle; NaN and infinity cannot."""
+    """Return True for a finite number of a plausible size."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e9 < value < 1e9
 
 
@@ -328,7 +314,7 @@ def _degree_problems(joint: str, degrees: Sequence[float]) -> Iterator[str]:
             yield f"{angle} degrees is out of reach, the joint goes from {low} to {high}"
 
 
-def _curve_problems(points: Sequence[Point]) -> Iterator[str]:
+def _curve_problems(points: Points) -> Iterator[str]:
     """`points` are sorted by raw."""
     slopes = []
     for (raw, degrees), (next_raw, next_degrees) in itertools.pairwise(points):
@@ -346,7 +332,7 @@ def _curve_problems(points: Sequence[Point]) -> Iterator[str]:
         yield "is not monotone: degrees must only rise or only fall with raw"
 
 
-def _steepness_problems(points: Sequence[CoupledPoint]) -> list[str]:
+def _steepness_problems(points: Points) -> list[str]:
     """Return the pairs of points between which noise would move the joints."""
     problems = []
     for first, second in itertools.combinations(points, 2):

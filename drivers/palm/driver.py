@@ -1,7 +1,4 @@
-"""The palm stream of a Shadow hand as a driver: joints and BioTacs from one packet per millisecond.
-
-The packets come as UDP datagrams from a relay that reads the palm's EtherCAT status memory.
-"""
+"""The palm stream of a Shadow hand as a driver: joints and BioTacs by UDP from a relay."""
 
 from __future__ import annotations
 
@@ -13,8 +10,7 @@ from typing import Final
 from drivers.base import Reading
 from drivers.link import LinkState
 from drivers.palm.packet import CYCLE_NS, PACKET_BYTES_MAX, PalmCounters
-from drivers.palm.rounds import ROUND_NS
-from drivers.palm.stream import PalmStream
+from drivers.palm.stream import ROUND_NS, PalmStream
 from drivers.udp.driver import DatagramDriver
 
 SPARE_CYCLES: Final = 2
@@ -22,10 +18,7 @@ SPARE_CYCLES: Final = 2
 
 
 class PalmDriver(DatagramDriver[PalmStream]):
-    """Gives the readings of a `PalmStream`, whose arguments it has.
-
-    `open` also raises `CalibrationError`, for a calibration with mistakes.
-    """
+    """Gives the readings of a `PalmStream`. `open` also raises `CalibrationError`."""
 
     name = "palm"
     bytes_max = PACKET_BYTES_MAX
@@ -56,21 +49,15 @@ class PalmDriver(DatagramDriver[PalmStream]):
 
     @property
     def counters(self) -> PalmCounters:
-        """Counters since `open`."""
         return self.stream.counters
 
     @property
     def serials(self) -> dict[str, str]:
-        """The sender, for each finger: packets carry no serial number, and another sender is
-        another hand."""
+        """The sender, for each finger: packets have no serial number."""
         return {} if self.sender is None else dict.fromkeys(self._fingers, self.sender)
 
     def fileno(self) -> int | None:
-        """The socket, but None while no round can end.
-
-        The kernel collects packets and notes their times. A loop that woke for each packet would
-        wake a thousand times a second for 71 readings.
-        """
+        """The socket, but None while no round can end: 71 wakes a second instead of 1000."""
         return None if self._clock() < self._attention_ns else super().fileno()
 
     def due_ns(self) -> int | None:

@@ -1,12 +1,9 @@
-"""The palm status packet of a Shadow hand: the motor, joint and tactile record of one millisecond.
+"""The palm status packet of a Shadow hand: the joint and tactile record of one millisecond.
 
-Bytes only. Little-endian and packed, as the palm's EtherCAT status memory holds it; its length
-tells which palm sent it. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile
-protocol header published by Shadow Robot, and its driver, which reads a BioTac from the first 16
-bytes of a finger's tactile slot on every palm.
-
-A packet has neither checksum nor sequence number. Only `tactile_type` orders packets: it takes 14
-values in turn.
+Bytes only: little-endian and packed, of a length that tells which palm sent it, without checksum or
+sequence number. Source: the palm protocol headers (0220, 0230, 0240, 0250) and tactile protocol
+header published by Shadow Robot, and its driver, which reads a BioTac from the first 16 bytes of a
+finger's tactile slot on every palm.
 """
 
 from __future__ import annotations
@@ -23,8 +20,8 @@ CYCLE_NS = 1_000_000
 """The palm makes one packet per millisecond."""
 SENSORS = 37
 """Words of `sensors`, of which 0..25 are Hall sensors (`drivers.palm.calibration`)."""
-MOTORS = 10
-"""Motor records per packet: the even ones or the odd ones of 20."""
+MOTOR_BYTES: Final = 8 + 10 * 4
+"""Behind `which_motors`: two masks, and the records of the even or the odd ones of 20 motors."""
 TACTILE_FINGERS = 5
 """Tactile slots, in the order of `drivers.base.FINGERS`."""
 
@@ -44,8 +41,6 @@ TYPE_METADATA_LAST: Final = 0xFFFF
 VALID_OTHER_0, VALID_OTHER_1 = 4, 8
 """Bits of `TactileSlot.valid`; 1 and 2 are those of the PAC words."""
 VALID_ALL = 0x0F
-
-_CAN_RECORD: Final = struct.Struct("<BBH8s")
 
 
 class Channel(NamedTuple):
@@ -67,10 +62,7 @@ _POSITIONS: Final = {2 * position + 1: position for position in range(ROUND)}
 
 
 def position_of(tactile_type: int) -> int | None:
-    """Return the position 0..13 in the round of a `tactile_type`, or None if it is no sample.
-
-    0x0001 is (PDC, TAC), 0x0003 (TDC, E1), 0x0005 (E2, E3) ... 0x0019 (E22, E23), 0x001B (E24, -).
-    """
+    """Return the position 0..13 in the round of a `tactile_type`, or None if it is no sample."""
     return _POSITIONS.get(tactile_type)
 
 
@@ -94,58 +86,34 @@ class TactileSlot(NamedTuple):
     other_1: int
 
 
-class CanRecord(NamedTuple):
-    """One message of the hand's motor buses, appended to the packet by the palm."""
-
-    bus: int
-    length: int
-    identifier: int
-    data: bytes
-    """8 bytes, of which `length` count."""
-
-
 @dataclass(frozen=True, slots=True)
 class PalmPacket:
-    """One packet. Middle and proximal tactile data and auxiliary words of a 0230 are not read."""
+    """What is read of one packet: neither motors nor, on a 0230, middle and proximal slots."""
 
     palm: Palm
     command: int
     sensors: tuple[int, ...]
     """37 raw words, Hall sensors first."""
-    motor_type: int
     which_motors: int
     """0 even, 1 odd."""
-    motors_arrived: int
-    motors_failed: int
-    motor_words: tuple[int, ...]
-    """20 words: of each of 10 motors raw torque, and a word that `motor_type` explains."""
     tactile_type: int
     """Which channels `other_0` and `other_1` are: see `position_of`."""
     tactile_valid: int
     """Bit 0 first finger ... bit 4 thumb."""
     tactile: tuple[TactileSlot, ...]
     """5 slots, in the order of `drivers.base.FINGERS`."""
-    idle_time_us: int
-    """What the palm had to spare of its millisecond; should stay above 50."""
-    can_record: CanRecord | None = None
 
     def to_bytes(self) -> bytes:
-        """Return the packet as the palm sends it, with zeros in what is not read. For twins.
-
-        Raises `ValueError` for a value that its field cannot hold.
-        """
+        """Return the packet as the palm sends it, with zeros in the rest. Raises `ValueError`."""
         layout = _LAYOUTS[self.palm]
-        motor = [self.motor_type, self.which_motors, self.motors_arrived, self.motors_failed]
-        motor += self.motor_words
         tactile = [self.tactile_type, self.tactile_valid]
         tactile += [word for slot in self.tactile for word in slot]
-        blocks = motor + tactile if layout.motors_first else tactile + motor
+        motors = [self.which_motors]
+        blocks = motors + tactile if layout.motors_first else tactile + motors
         try:
-            packet = layout.format.pack(self.command, *self.sensors, *blocks, self.idle_time_us)
-            record = b"" if self.can_record is None else _CAN_RECORD.pack(*self.can_record)
+            return layout.format.pack(self.command, *self.sensors, *blocks)
         except struct.error as error:
             raise ValueError(f"this is no palm packet: {error}") from error
-        return packet + record
 
 
 @dataclass(slots=True)
@@ -198,114 +166,82 @@ class PalmCounters(DatagramCounters):
     """Packets of another kind of palm than the first since the link came up; dropped."""
 
 
-class PalmParser:
-    """Datagrams in, packets out."""
-
-    def __init__(self, counters: PalmCounters) -> None:
-        self._counters = counters
-
-    def parse(self, data: bytes) -> PalmPacket | None:
-        """Return the packet of a datagram; count and return None for one without sensor data.
-
-        Damage to a value that stays in its range is not noticed, for want of a checksum.
-        """
-        palm = PALM_OF_LENGTH.get(len(data))
-        if palm is None:
-            self._counters.bad_lengths += 1
-            return None
-        packet = _unpack(data, _LAYOUTS[palm])
-        if packet.command == COMMAND_EMPTY:
-            self._counters.empty_packets += 1
-            return None
-        if packet.command > COMMAND_MAX or not _is_plausible(packet):
-            self._counters.nonsense_packets += 1
-            return None
-        if packet.command != COMMAND_SENSOR_DATA:
-            self._counters.service_packets += 1
-            return None
-        self._counters.packets += 1
-        return packet
+def parse_packet(data: bytes, counters: PalmCounters) -> PalmPacket | None:
+    """Return the packet of a datagram; count and return None for one without sensor data."""
+    palm = PALM_OF_LENGTH.get(len(data))
+    if palm is None:
+        counters.bad_lengths += 1
+        return None
+    packet = _unpack(palm, data)
+    if packet.command == COMMAND_EMPTY:
+        counters.empty_packets += 1
+        return None
+    is_sound = packet.which_motors in (0, 1) and _record_is_sound(palm, data)
+    if packet.command > COMMAND_MAX or not is_sound:
+        counters.nonsense_packets += 1
+        return None
+    if packet.command != COMMAND_SENSOR_DATA:
+        counters.service_packets += 1
+        return None
+    counters.packets += 1
+    return packet
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """How one palm's packet is laid out."""
-
-    palm: Palm
+class _Layout(NamedTuple):
     format: struct.Struct
     motors_first: bool
-    """Whether the motor block stands before the tactile block."""
+    """True if the motor block stands before the tactile block."""
 
 
-def _layout(palm: Palm, slot_bytes: int, *, motors_first: bool, middle: str, after: str) -> _Layout:
+def _layout(slot_bytes: int, *, motors_first: bool, middle: str = "", after: str = "") -> _Layout:
     """`middle` and `after` skip what stands before the tactile block, and after it."""
-    motors = "IhII" + "hH" * MOTORS
+    motors = f"4xh{MOTOR_BYTES}x"
     slot = f"HHHBxH{slot_bytes - 10}x"
     tactile = f"{middle}IH{slot * TACTILE_FINGERS}{after}"
     blocks = motors + tactile if motors_first else tactile + motors
-    return _Layout(palm, struct.Struct(f"<I{SENSORS}H{blocks}H"), motors_first)
+    return _Layout(struct.Struct(f"<I{SENSORS}H{blocks}2x"), motors_first)
 
 
 _LAYOUTS: Final = {
-    layout.palm: layout
-    for layout in (
-        _layout(Palm.PALM_0220, 16, motors_first=True, middle="", after=""),
-        _layout(Palm.PALM_0230, 32, motors_first=False, middle="80x", after="36x"),
-        _layout(Palm.PALM_0250, 78, motors_first=False, middle="", after=""),
-    )
+    Palm.PALM_0220: _layout(16, motors_first=True),
+    Palm.PALM_0230: _layout(32, motors_first=False, middle="80x", after="36x"),
+    Palm.PALM_0250: _layout(78, motors_first=False),
 }
-PACKET_BYTES: Final = {palm: layout.format.size for palm, layout in _LAYOUTS.items()}
-"""Length of a packet: 220, 416 and 530 bytes."""
-CAN_RECORD_BYTES = _CAN_RECORD.size
-"""Length of the CAN record that a relay may leave appended."""
+CAN_RECORD_BYTES = 12
+"""Length of a CAN message that a relay may leave behind a packet: bus, length, id and data."""
 PALM_OF_LENGTH: Final = {
-    length + appended: palm
-    for palm, length in PACKET_BYTES.items()
+    layout.format.size + appended: palm
+    for palm, layout in _LAYOUTS.items()
     for appended in (0, CAN_RECORD_BYTES)
 }
-"""All lengths that a packet can have."""
+"""All lengths that a packet can have: 220, 416 and 530 bytes, and with the record."""
 PACKET_BYTES_MAX = max(PALM_OF_LENGTH)
 
-_MOTOR_WORDS = 4 + 2 * MOTORS
 _SLOT_WORDS = len(TactileSlot._fields)
-_TACTILE_WORDS = 2 + _SLOT_WORDS * TACTILE_FINGERS
 _CAN_BYTES_MAX = 8
 
 
-def _unpack(data: bytes, layout: _Layout) -> PalmPacket:
-    words = layout.format.unpack_from(data)
-    first = 1 + SENSORS
-    motor_at, tactile_at = first, first + _MOTOR_WORDS
-    if not layout.motors_first:
-        motor_at, tactile_at = first + _TACTILE_WORDS, first
-    records, slots = motor_at + 4, tactile_at + 2
-    appended = len(data) > layout.format.size
+def _unpack(palm: Palm, data: bytes) -> PalmPacket:
+    layout = _LAYOUTS[palm]
+    command, *words = layout.format.unpack_from(data)
+    sensors, blocks = words[:SENSORS], words[SENSORS:]
+    motors_at = 0 if layout.motors_first else -1
+    which_motors = blocks.pop(motors_at)
+    tactile_type, tactile_valid, *slots = blocks
     return PalmPacket(
-        palm=layout.palm,
-        command=words[0],
-        sensors=words[1:first],
-        motor_type=words[motor_at],
-        which_motors=words[motor_at + 1],
-        motors_arrived=words[motor_at + 2],
-        motors_failed=words[motor_at + 3],
-        motor_words=words[records : records + 2 * MOTORS],
-        tactile_type=words[tactile_at],
-        tactile_valid=words[tactile_at + 1],
+        palm=palm,
+        command=command,
+        sensors=tuple(sensors),
+        which_motors=which_motors,
+        tactile_type=tactile_type,
+        tactile_valid=tactile_valid,
         tactile=tuple(
-            [
-                TactileSlot(*words[at : at + _SLOT_WORDS])
-                for at in range(slots, slots + _SLOT_WORDS * TACTILE_FINGERS, _SLOT_WORDS)
-            ]
-        ),
-        idle_time_us=words[-1],
-        can_record=(
-            CanRecord(*_CAN_RECORD.unpack_from(data, layout.format.size)) if appended else None
+            [TactileSlot(*slots[at : at + _SLOT_WORDS]) for at in range(0, len(slots), _SLOT_WORDS)]
         ),
     )
 
 
-def _is_plausible(packet: PalmPacket) -> bool:
-    """Return True if the fields of few values hold one of them."""
-    if packet.can_record is not None and packet.can_record.length > _CAN_BYTES_MAX:
-        return False
-    return packet.which_motors in (0, 1)
+def _record_is_sound(palm: Palm, data: bytes) -> bool:
+    """Return True unless an appended record has a length that no CAN message has."""
+    record = data[_LAYOUTS[palm].format.size :]
+    return not record or record[1] <= _CAN_BYTES_MAX

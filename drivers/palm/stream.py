@@ -1,8 +1,19 @@
 """Packets of one palm with their times in, tactile and joint readings out. No I/O.
 
-Palm packets have neither checksum nor sequence number. UDP's checksum covers the way from the
-relay; plausible damage before it is not noticed. Two hands of one kind that share a relay's socket
-look like one: use one port per hand.
+A packet carries two channels of each BioTac, named by its `tactile_type`. Packets have no other
+sequence, so a packet's place is its type, counted on from the furthest packet before it:
+
+- A lost packet leaves its one or two electrodes `MISSING` in this round and moves no others. A
+  round that lacks packets is handed over when the first packet of the next round comes.
+- A packet up to half a round late takes its place while its round is the current one.
+- Two different packets for one place contradict each other (a damaged `tactile_type`, or a request
+  that stands still): both are dropped and the place is `MISSING`.
+- Lost whole rounds are noticed by time alone, `LATE_MAX` cycles after a packet was due.
+
+Packets have no checksum; UDP's covers the way from the relay. Not noticed: damage before it that
+leaves a value in 0..4095 and its validity bit set; a damaged `tactile_type` that names the place of
+a packet lost in the same round. Two hands of one kind that share a relay's socket look like one:
+use one port per hand.
 """
 
 from __future__ import annotations
@@ -11,18 +22,52 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.base import JointReading, Reading
-from drivers.palm.packet import SENSORS, Palm, PalmCounters, PalmPacket, PalmParser
-from drivers.palm.rounds import ROUND_NS, RoundAssembler
+from drivers.base import (
+    COUNT_MAX,
+    ELECTRODES,
+    FINGERS,
+    ElectrodeFault,
+    JointReading,
+    Reading,
+    TactileReading,
+    check_fingers,
+)
+from drivers.palm.packet import (
+    CHANNELS,
+    CYCLE_NS,
+    ROUND,
+    SENSORS,
+    TYPE_METADATA_FIRST,
+    TYPE_METADATA_LAST,
+    VALID_OTHER_0,
+    VALID_OTHER_1,
+    Palm,
+    PalmCounters,
+    PalmPacket,
+    parse_packet,
+    position_of,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from drivers.palm.calibration import JointCalibration
 
+ROUND_NS: Final = ROUND * CYCLE_NS
+"""Time between two samples of an electrode: 71.43 Hz."""
 JOINT_PERIOD_NS: Final = 10_000_000
 """100 Hz, which is enough for the position of a hand; 1000 Hz would cost processor time."""
+LATE_MAX: Final = 10
+"""Most cycles that a packet may be late; later, a whole round counts as lost. So after
+`ROUND - 1 + LATE_MAX` cycles of silence no packet counts for the round before."""
+OUTAGE_NS: Final = 2_000_000_000
+"""After a longer outage, ns, the number of rounds is unknown: it counts as one missed."""
+
+_COMPLETE: Final = (1 << ROUND) - 1
+_TELLING: Final = 0b11
+"""The packets with pressure and temperature, which show an absent sensor."""
 
 
 class PalmStream:
@@ -34,7 +79,6 @@ class PalmStream:
     """
 
     period_ns: int | None = ROUND_NS
-    """Time between tactile readings, ns."""
 
     def __init__(
         self,
@@ -43,17 +87,27 @@ class PalmStream:
         calibration: Path | None = None,
         heed_finger_bits: bool = True,
     ) -> None:
-        """`fingers`: the rows of a reading; raises `ValueError` for unknown fingers.
+        """`fingers`: the rows of a reading. Raises `ValueError`, and `CalibrationError`.
 
-        Joint readings need the hand's `calibration` file; raises `CalibrationError` for one with
-        mistakes. Without `heed_finger_bits` the packet's `tactile_valid` is ignored, for a palm
-        that does not set it (Shadow's own driver ignores it).
+        Joint readings need the hand's `calibration` file. Without `heed_finger_bits` the packet's
+        `tactile_valid` is ignored, as by Shadow's own driver, for a palm that does not set it.
         """
+        check_fingers(fingers)
         self.counters = PalmCounters()
         self.palm: Palm | None = None
         """Kind of palm; None until a packet came, and after `interrupt`."""
-        self._parser = PalmParser(self.counters)
-        self._rounds = RoundAssembler(fingers, self.counters, heed_finger_bits=heed_finger_bits)
+        self._slots = tuple(FINGERS.index(finger) for finger in fingers)
+        self._heed_finger_bits = heed_finger_bits
+        shape = (len(fingers), ELECTRODES)
+        self._counts = np.zeros(shape, dtype=np.uint16)
+        self._faults = np.zeros(shape, dtype=np.uint8)
+        self._latest = np.zeros(shape, dtype=np.uint16)
+        self._known = np.zeros(shape, dtype=np.bool_)
+        self._was_absent = np.zeros(len(fingers), dtype=np.bool_)
+        self._place: int | None = None
+        """Furthest place so far, counted over all rounds; None until a round begins."""
+        self._place_t_ns: int | None = None
+        self._begin(0)
         self._previous = b""
         self._calibration: JointCalibration | None = None
         self._joint_due_ns = 0
@@ -68,36 +122,168 @@ class PalmStream:
 
     @property
     def sender_kind(self) -> str:
-        """Kind of palm, for people."""
         return f"palm {self.palm}"
 
     @property
     def cycles_to_go(self) -> int:
-        """See `RoundAssembler.cycles_to_go`."""
-        return self._rounds.cycles_to_go
+        """Packets until the current round can be complete; 0 before the first round."""
+        return 0 if self._place is None else (ROUND - 1 - self._place) % ROUND
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
-        """Return the readings that a packet completes, or None if it is dropped: no packet of
-        this palm, or the same again. `t_ns`: monotonic time of its arrival."""
-        packet = self._parser.parse(data)
+        """Return the readings that a packet completes, or None if it is dropped."""
+        packet = parse_packet(data, self.counters)
         if packet is None:
             return None
         self.palm = self.palm or packet.palm
         if packet.palm is not self.palm:
             self.counters.other_palms += 1
             return None
-        if data == self._previous or self._rounds.repeats(packet):
+        if data == self._previous or self._repeats(packet):
             self.counters.duplicate_packets += 1
             return None
         self._previous = data
-        readings = self._rounds.push(packet, t_ns)
+        readings = self.push(packet, t_ns)
         joints = self._joint_reading(packet, t_ns)
         return readings if joints is None else (joints, *readings)
 
     def interrupt(self) -> None:
-        """Drop the current round; another palm may come next."""
-        self._rounds.interrupt()
+        """Drop the current round; another palm may come next. Call after an outage."""
         self.palm = None
+        self.counters.interrupted_rounds += not self._finished and self._have != 0
+        self._place = None
+        self._known[:] = False
+
+    def push(self, packet: PalmPacket, t_ns: int) -> Sequence[TactileReading]:
+        """Take a packet, received at `t_ns`; return the readings that it completes."""
+        position = position_of(packet.tactile_type)
+        if position is None:
+            is_metadata = TYPE_METADATA_FIRST <= packet.tactile_type <= TYPE_METADATA_LAST
+            self.counters.metadata_packets += is_metadata
+            self.counters.unknown_types += not is_metadata
+            return ()
+        place = self._place_of(position, t_ns)
+        if place is None:
+            self.counters.unsynchronised_packets += 1
+            return ()
+        is_behind = self._place is not None and place < self._place
+        if not is_behind:
+            self._place, self._place_t_ns = place, t_ns
+        if place // ROUND < self._round:
+            self.counters.late_packets += 1
+            return ()
+        finished: Sequence[TactileReading] = ()
+        if place // ROUND > self._round:
+            finished = self._move_on(place // ROUND)
+        elif self.packets[position] is not None:
+            self._contradict(position)
+            return ()
+        elif is_behind:
+            self.counters.reordered_packets += 1
+        self._store(position, packet, t_ns)
+        return (*finished, self._finish()) if self._have == _COMPLETE else finished
+
+    def _repeats(self, packet: PalmPacket) -> bool:
+        """Return True if the current round already has this very packet."""
+        position = position_of(packet.tactile_type)
+        return position is not None and self.packets[position] == packet
+
+    def _place_of(self, position: int, t_ns: int) -> int | None:
+        if self._place is not None and self._place_t_ns is not None:
+            return self._place + _step(self._place, position, t_ns - self._place_t_ns)
+        if position != 0:
+            return None
+        if self._place_t_ns is None:
+            return 0
+        outage_ns = t_ns - self._place_t_ns
+        missed = outage_ns // ROUND_NS if outage_ns <= OUTAGE_NS else 1
+        self._miss(missed)
+        self._begin(self._round + missed + 1)
+        return self._round * ROUND
+
+    def _move_on(self, to_round: int) -> Sequence[TactileReading]:
+        finished = () if self._finished else (self._finish(),)
+        self._miss(to_round - self._round - 1)
+        self._begin(to_round)
+        return finished
+
+    def _miss(self, rounds: int) -> None:
+        self.counters.missed_readings += rounds
+        self.counters.lost_packets += rounds * ROUND
+
+    def _begin(self, at_round: int) -> None:
+        self._round = at_round
+        self._have = 0
+        """Bit i: position i has come, in conflict or not."""
+        self._finished = False
+        self.packets: list[PalmPacket | None] = [None] * ROUND
+        """What has come of this round, by position."""
+        self._counts[:] = 0
+        self._faults[:] = ElectrodeFault.MISSING
+        self._absent = [False] * len(self._slots)
+
+    def _store(self, position: int, packet: PalmPacket, t_ns: int) -> None:
+        self.packets[position] = packet
+        self._have |= 1 << position
+        self._t_ns = t_ns
+        first, second = CHANNELS[position]
+        for row, slot in enumerate(self._slots):
+            if self._heed_finger_bits and not packet.tactile_valid >> slot & 1:
+                self.counters.invalid_fingers += 1
+                continue
+            values = packet.tactile[slot]
+            fresh = values.valid & VALID_OTHER_0 != 0
+            self._put(row, first.electrode, values.other_0, fresh=fresh)
+            if second is not None:
+                fresh = values.valid & VALID_OTHER_1 != 0
+                self._put(row, second.electrode, values.other_1, fresh=fresh)
+
+    def _put(self, row: int, electrode: int | None, value: int, *, fresh: bool) -> None:
+        if electrode is None:  # pressure and temperature only tell whether there is a sensor
+            self._absent[row] |= fresh and value > COUNT_MAX
+        elif not fresh:
+            self.counters.held_values += 1
+            if self._known[row, electrode]:
+                self._counts[row, electrode] = self._latest[row, electrode]
+                self._faults[row, electrode] = ElectrodeFault.HELD
+        elif value > COUNT_MAX:
+            self.counters.not_counts += 1
+            self._faults[row, electrode] = ElectrodeFault.NOT_A_COUNT
+        else:
+            self._counts[row, electrode] = self._latest[row, electrode] = value
+            self._faults[row, electrode] = ElectrodeFault.NONE
+            self._known[row, electrode] = True
+
+    def _contradict(self, position: int) -> None:
+        self.counters.conflicting_packets += 1
+        if self._finished:
+            return
+        for channel in CHANNELS[position]:
+            if channel is not None and channel.electrode is not None:
+                self._counts[:, channel.electrode] = 0
+                self._faults[:, channel.electrode] = ElectrodeFault.MISSING
+                self._known[:, channel.electrode] = False
+
+    def _finish(self) -> TactileReading:
+        self._finished = True
+        self.counters.lost_packets += ROUND - self._have.bit_count()
+        self._drop_absent_fingers()
+        faults = self._faults.copy()
+        self.counters.readings += 1
+        self.counters.faulty_readings += bool(faults.any())
+        return TactileReading(self._t_ns, self._round, self._counts.copy(), faults)
+
+    def _drop_absent_fingers(self) -> None:
+        """Flag fingers without a sensor, which show unwritten memory: no counts, or only zeros."""
+        silent: NDArray[np.bool_] = ((self._counts == 0) & (self._faults == 0)).all(axis=1)
+        absent = np.array(self._absent)
+        if self._have & _TELLING != _TELLING:
+            absent |= self._was_absent
+        self._was_absent = absent
+        for row in np.flatnonzero(silent | absent):
+            self.counters.absent_fingers += 1
+            self._counts[row] = 0
+            self._faults[row] = ElectrodeFault.MISSING
+            self._known[row] = False
 
     def _joint_reading(self, packet: PalmPacket, t_ns: int) -> JointReading | None:
         if self._calibration is None or t_ns < self._joint_due_ns:
@@ -114,3 +300,12 @@ class PalmStream:
         reading = JointReading(t_ns, self._joint_seq, JOINTS, angles)
         self._joint_seq += 1
         return reading
+
+
+def _step(place: int, position: int, elapsed_ns: int) -> int:
+    """Return the places from the furthest packet to this one; 0 or less for a late one."""
+    step = (position - place) % ROUND or ROUND
+    if step > ROUND // 2 and elapsed_ns < step * CYCLE_NS // 2:
+        return step - ROUND
+    overdue_ns = elapsed_ns - (step + LATE_MAX) * CYCLE_NS
+    return step + max(0, overdue_ns // ROUND_NS + 1) * ROUND

@@ -1,8 +1,8 @@
 """The link log of a CAN bus: frames as `candump -L` writes and `canplayer` reads them.
 
-`(1436509052.249713) can0 100#0D3A1F` - seconds with six digits, interface, id in three or eight
-digits, `#`, data. `##` and a digit of flags begin the data of CAN FD, `R` stands for that of a
-remote frame, and bit 29 of an id marks an error frame (can-utils, lib.c and linux/can.h).
+`(1436509052.249713) can0 100#0D3A1F`: seconds, interface, id in three or eight digits, data. `##`
+and a digit of flags begin the data of CAN FD, `R` stands for that of a remote frame, and bit 29 of
+an id marks an error frame (can-utils, lib.c and linux/can.h).
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final, Unpack
 
 from drivers.base import Reading
+from drivers.can.decoders import BoardOptions
 from drivers.can.frames import (
     CLASSIC_DATA_MAX,
     ERR_FLAG,
@@ -27,7 +28,7 @@ from drivers.can.frames import (
     CanFrame,
     Stamped,
 )
-from drivers.can.stream import BoardOptions, CanStream
+from drivers.can.stream import CanStream
 from drivers.recordings.csv_rows import open_recording
 
 LINE_MAX: Final = 256
@@ -42,7 +43,7 @@ _LINE: Final = re.compile(
 
 
 def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
-    """A frame as a line of `candump -L`, with newline; `wall_ns`: when it came, ns since 1970."""
+    """Return a line of `candump -L`. `wall_ns`: arrival, ns since 1970."""
     seconds, rest_ns = divmod(wall_ns, 1_000_000_000)
     word = frame.arbitration_id
     if frame.flags & ERROR:
@@ -56,7 +57,7 @@ def line_of(frame: CanFrame, wall_ns: int, channel: str) -> str:
 
 
 def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> bytes:
-    """Frames as lines; what the kernel lost has none. Wall time is their time plus `offset_ns`."""
+    """Return frames as lines; `offset_ns`: from their time to wall time."""
     lines = [
         line_of(frame, max(until_ns + offset_ns, 0), channel)
         for frame, _, until_ns in frames
@@ -66,7 +67,7 @@ def encode_frames(frames: Sequence[Stamped], offset_ns: int, channel: str) -> by
 
 
 def frame_of(line: str) -> tuple[int, CanFrame] | None:
-    """When a frame came, ns since 1970, and the frame; None for a line that has none."""
+    """Return a line's time, ns since 1970, and frame, or None."""
     found = None if len(line) > LINE_MAX else _LINE.fullmatch(line)
     if found is None:
         return None
@@ -87,12 +88,12 @@ class CanLog:
     """Candump text through the stream that the driver has. A `LinkLog`."""
 
     def __init__(self, fingers: Sequence[str], **board: Unpack[BoardOptions]) -> None:
-        """As those of a `CanStream`. Raises `ValueError`."""
+        """Arguments: those of a `CanStream`. Raises `ValueError`."""
         self._fingers, self._board = fingers, board
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, CanFrame]]:
-        """Times, ns, and frames of a file; other lines are passed over. Raises `RecordingError`."""
+        """Yield times, ns, and frames; skip other lines. Raises `RecordingError`."""
         with open_recording(path) as stream:
             while line := stream.readline(LINE_MAX + 1):
                 found = frame_of(line.decode("ascii", "replace"))

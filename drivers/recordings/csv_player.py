@@ -19,7 +19,7 @@ from drivers.base import (
 )
 from drivers.recordings.csv_rows import Row, columns_of, read_rows
 from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
-from drivers.recordings.player import RecordedDriver, Timeline
+from drivers.recordings.player import RecordedDriver
 
 DEMO_TABLE = Path(__file__).parent / "demo" / "synthetic_grasps.csv"
 """Synthetic grasps, drawn by `drivers.twins.grasps.synthetic`: no hand ever made these."""
@@ -35,17 +35,14 @@ _log = logging.getLogger(__name__)
 
 
 class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
-    """Plays CSV recordings, one row per call of `read_ready` at most.
+    """Plays CSV recordings, one row per call of `read_ready` at most, several files in a row.
 
-    `fingers` picks the fingers and their order. A row gives a `TactileReading`, in a stream with
-    joints a `JointReading` before it. With a `speed`, `t_ns` is when the row was due, so that a
-    late reading is an old one; else it is the time of handing over. `recorded_ns` is the file's own
-    time. The run starts with the first call of `read_ready`; several files play in a row, with
-    `loop` without end. A late reading is counted, never skipped.
+    A row gives a `TactileReading` of `fingers`, in a stream with joints a `JointReading` before it.
+    With a `speed`, `t_ns` is when the row was due; else it is the time of handing over.
+    `recorded_ns` is the file's own time. A late reading is counted, never skipped.
 
-    `open` raises `RecordingError` if any of the files or headers is not right, `read_ready` if a
-    row is not; values that are not counts, and a last row without a line end, make readings
-    faulty, or with `strict` raise as well. See `drivers.recordings.csv_rows.Recording`.
+    `open` and `read_ready` raise `RecordingError` for a wrong file, header or row. Values that are
+    not counts, and a last row without a line end, make readings faulty, or with `strict` raise.
     """
 
     def __init__(
@@ -60,16 +57,11 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         faults: ReplayFaults = ReplayFaults(),  # noqa: B008 (immutable)
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """`speed` is a factor of real time; None plays as fast as possible.
-
-        `rate_hz`: grasps per second of a table. Raises `ValueError` for an argument out of range.
-        """
+        """`speed`: factor of real time. `rate_hz`: grasps of a table per s. Raises `ValueError`."""
         check_fingers(fingers)
         if not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
-        self._delay_ns = round(faults.delayed_s * _NS_PER_S)
-        super().__init__(paths, Timeline(speed, clock, delay_ns=self._delay_ns))
-        self._clock = clock
+        super().__init__(paths, speed, clock, delay_ns=round(faults.delayed_s * _NS_PER_S))
         self._fingers = tuple(fingers)
         self._table_period_ns = _NS_PER_S / rate_hz
         self._loop = loop
@@ -80,10 +72,7 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
     def _reset(self) -> None:
         self.counters = ReplayCounters()
         self.period_ns: int | None = None
-        """Nominal time, ns, between readings as played, before any fault.
-
-        Tables: from `rate_hz`. Streams: the shortest step so far; None before it is known.
-        """
+        """Nominal time between readings as played, ns; of a stream, the shortest step so far."""
         self._injector = FaultInjector(self._faults, self._fingers, self.counters)
         self._row_index = 0
 
@@ -97,19 +86,19 @@ class ReplayDriver(RecordedDriver[tuple[Row, int | None]]):
         if ignored:
             names = ", ".join(map(repr, list(ignored)[:IGNORED_COLUMNS_LOGGED]))
             _log.info("replay: unknown columns ignored: %d, such as %s", len(ignored), names)
-        self.timeline.start(self._items())
+        self.start(self._items())
 
     def read_ready(self) -> Sequence[Reading]:
         """The readings of one row if it is due, else none. Raises `RecordingError` for bad rows."""
-        due = self.timeline.take()
+        due = self.take()
         if due is None:
             return ()
         at_ns, (row, recorded_period_ns), late_ns = due
-        speed = self.timeline.speed
+        speed = self.speed
         if recorded_period_ns is not None:
             self.period_ns = round(recorded_period_ns / (speed or 1.0))
             self.counters.late += speed is not None and late_ns > self.period_ns
-        t_ns = self._clock() - self._delay_ns if speed is None else self.timeline.played_ns(at_ns)
+        t_ns = self._clock() - self._delay_ns if speed is None else self.played_ns(at_ns)
         return self._readings(row, t_ns, at_ns)
 
     def _items(self) -> Generator[tuple[int, tuple[Row, int | None]], None, None]:

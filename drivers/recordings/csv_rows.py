@@ -1,8 +1,7 @@
-"""CSV recordings, read row by row: grasp tables and streams.
+"""CSV recordings, read row by row, so that memory does not grow.
 
 A grasp table has one row per grasp, as in the BioTac SP Stability Set. A stream has one row per
-sweep with a column `t` in seconds, and joint angles if they were recorded. Memory does not grow
-with the file.
+sweep with a column `t` in seconds, and joint angles if they were recorded.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ TIME = "t"
 OBJECT = "object"
 SLIPPED = "slipped"
 LINE_BYTES_MAX = 65_536
-"""A row of five fingers and all joints has about 1,200 bytes. A far longer line is no recording:
-reading on for its end could take in a whole disk image."""
+"""A full row has 1,200 bytes. Reading on for a line's end could take in a disk image."""
 TIME_MAX_S = 1e11
 """The year 5138. Unix time in ms, us or ns lies above it: the wrong unit, not a time in seconds."""
 SHOWN_LENGTH_MAX = 40
@@ -105,10 +103,9 @@ class Row:
 class Recording:
     """The rows of one file: iterate once.
 
-    `lines` gives the file's lines with their ends, each at most `LINE_BYTES_MAX` + 1 bytes long
-    (as `read_lines` does). The constructor takes the header and the first row's line, so it raises
-    `RecordingError` for a wrong header and for a file without rows. Iterating raises it for a row
-    that is not one. A value that is not a count only makes its electrode faulty, unless `strict`.
+    `lines`: as of `read_lines`. The constructor raises `RecordingError` for a wrong header and a
+    file without rows, iterating for a wrong row. A value that is no count only makes its electrode
+    faulty, unless `strict`.
 
     A count is an integer in 0..4095 in ASCII digits: `2602`, `2602.0` or `2.602e3`. A last row
     without a line end may be cut off in mid value: all its electrodes are faulty, its angles NaN.

@@ -1,7 +1,4 @@
-"""Faults that the replay puts into a recording on demand, in the words of PX4's failure injection.
-
-They let a user see what a controller does when a sensor fails, and they test the daemon.
-"""
+"""Faults that the replay injects on demand, in the words of PX4, for tests of a controller."""
 
 from __future__ import annotations
 
@@ -71,10 +68,7 @@ class ReplayCounters(DriverCounters):
 
 
 class FaultInjector:
-    """Applies `ReplayFaults` to one run and counts what it injects.
-
-    Raises `ValueError` if a fault names a finger that the run does not have.
-    """
+    """Applies `ReplayFaults` to one run. Raises `ValueError` for a finger that it lacks."""
 
     def __init__(
         self, faults: ReplayFaults, fingers: Sequence[str], counters: ReplayCounters
@@ -91,10 +85,7 @@ class FaultInjector:
         """Counts and faults that a stuck sensor repeats."""
 
     def inject(self, counts: NDArray[np.uint16], flags: NDArray[np.uint8]) -> int | None:
-        """Spoil the next reading in place, and return its sequence number; None if it is lost.
-
-        `counts` and `flags` (`ElectrodeFault` bits): shape (fingers, 24).
-        """
+        """Spoil the next reading in place; return its sequence number, or None if it is lost."""
         faults, counters = self._faults, self._counters
         index = self._index
         self._index += 1

@@ -1,8 +1,4 @@
-"""What came over a link, decoded again: candump text, framed serial bytes or palm packets.
-
-What was logged goes through the very decoders that live bytes and frames go through, at the times
-at which it came.
-"""
+"""Link logs through the decoders of live bytes and frames, at the times at which they came."""
 
 from __future__ import annotations
 
@@ -13,7 +9,7 @@ from typing import Protocol, TypeVar
 
 from drivers.base import DriverCounters, Reading, RecordingError
 from drivers.recordings.csv_rows import open_recording
-from drivers.recordings.player import RecordedDriver, Timeline
+from drivers.recordings.player import RecordedDriver
 
 CANDUMP, SERIAL = ".log", ".serial"
 """Endings of the two kinds of files that graspd writes."""
@@ -50,9 +46,9 @@ class LinkLog(Protocol[Record]):
 
 
 class LinkLogDriver(RecordedDriver[Record]):
-    """Plays link logs in a row, as one run. `recorded_ns` of a reading is its time on their clock.
+    """Plays link logs in a row, as one run; without `speed` as fast as possible.
 
-    Without `speed` as fast as possible. `open` raises `DriverError`, `read_ready` `RecordingError`.
+    `open` raises `DriverError`, `read_ready` `RecordingError`.
     """
 
     def __init__(
@@ -64,7 +60,7 @@ class LinkLogDriver(RecordedDriver[Record]):
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """Nothing is opened yet. Raises `ValueError` without files or for a speed of 0 or less."""
-        super().__init__(paths, Timeline(speed, clock))
+        super().__init__(paths, speed, clock)
         self._log = log
 
     @property
@@ -76,7 +72,7 @@ class LinkLogDriver(RecordedDriver[Record]):
     def period_ns(self) -> int | None:
         """Time between readings, ns, as played."""
         recorded_ns = self._log.stream.period_ns
-        return None if recorded_ns is None else round(recorded_ns / (self.timeline.speed or 1.0))
+        return None if recorded_ns is None else round(recorded_ns / (self.speed or 1.0))
 
     def open(self) -> None:
         """Start over with the first file."""
@@ -85,7 +81,7 @@ class LinkLogDriver(RecordedDriver[Record]):
             open_recording(path).close()
         self._log.begin()
         logs = [self._log.records(path) for path in self.paths]
-        self.timeline.start(self._records(logs))
+        self.start(self._records(logs))
         if self.exhausted:
             raise RecordingError(self.paths[0], "has nothing that came over a link")
 
@@ -100,8 +96,8 @@ class LinkLogDriver(RecordedDriver[Record]):
 
     def read_ready(self) -> Sequence[Reading]:
         """The readings of the first record that completes any, if enough records are due."""
-        while (due := self.timeline.take()) is not None:
+        while (due := self.take()) is not None:
             t_ns, record, _ = due
             if readings := self._log.feed(t_ns, record):
-                return [self.timeline.hand_over(reading, t_ns) for reading in readings]
+                return [self.hand_over(reading, t_ns) for reading in readings]
         return ()

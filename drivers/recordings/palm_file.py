@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from drivers.base import Reading, RecordingError
-from drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, PalmParser
+from drivers.palm.packet import CYCLE_NS, PALM_OF_LENGTH, PalmCounters, parse_packet
 from drivers.palm.stream import PalmStream
 from drivers.recordings.csv_rows import open_recording
 
@@ -37,10 +37,7 @@ class PalmFile:
         self.stream = self._make_stream()
 
     def records(self, path: Path) -> Iterator[tuple[int, bytes]]:
-        """Times, ns since the first, and packets. Raises `RecordingError` at once.
-
-        The last packet is cut off if the file ends in it.
-        """
+        """Yield times, ns since the first, and packets. Raises `RecordingError` at once."""
         with open_recording(path) as file:
             length = _packet_bytes(path, file)
         return _packets(path, length)
@@ -78,8 +75,7 @@ def _packet_bytes(path: Path, file: BinaryIO) -> int:
 def _share_of_sense(head: bytes, length: int) -> float:
     """Share of the first packets that hold sensor data, if packets have this length."""
     counters = PalmCounters()
-    parser = PalmParser(counters)
     starts = range(0, min(len(head), PACKETS_TRIED * length) - length + 1, length)
     for start in starts:
-        parser.parse(head[start : start + length])
+        parse_packet(head[start : start + length], counters)
     return counters.packets / max(len(starts), 1)

@@ -13,52 +13,71 @@ from drivers.base import Fact, Opened, Reading, RecordingError
 Item = TypeVar("Item")
 
 
-class Timeline(Generic[Item]):
-    """Plays items of known times, ns on a clock of the recording's, at any speed.
+class RecordedDriver(Opened, Generic[Item]):
+    """Base of drivers that play items of known times, ns on the recording's clock, at any speed.
 
-    The first item is due at once and begins the run when it is asked for. Reading one ahead keeps
-    the work of reading out of the age of what is read; an error waits until the items before it
-    are taken.
+    The first item begins the run when it is asked for. Reading one ahead keeps the work of reading
+    out of the age of what is read; an error waits until the items before it are taken.
     """
 
-    def __init__(self, speed: float | None, clock: Callable[[], int], *, delay_ns: int = 0) -> None:
-        """Without `speed` as fast as possible, else items come `delay_ns` late; `clock`: ns.
+    name = "replay"
+    live = False
 
-        Raises `ValueError` for a speed that is not positive.
-        """
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        speed: float | None,
+        clock: Callable[[], int],
+        *,
+        delay_ns: int = 0,
+    ) -> None:
+        """Without `speed`, as fast as possible; else `delay_ns` late. Raises `ValueError`."""
+        if not paths:
+            raise ValueError("no recording to replay")
         if speed is not None and not speed > 0.0:
             raise ValueError(f"{speed} is no positive speed")
+        self.paths = tuple(paths)
         self.speed = speed
         self.exhausted = False
         """True when the last item has been taken, or after an error, until `start`."""
         self.handed_over_ns = self._opened_ns = clock()
-        """When the last reading was handed over: what a judge must take for now, to find it as old
-        as it was found then, however busy the machine is."""
+        """Time of the last reading handed over: the judge's now, whatever the load."""
         self._clock = clock
         self._delay_ns = delay_ns
-        self._items: Generator[tuple[int, Item], None, None] | None = None
+        self._playing: Generator[tuple[int, Item], None, None] | None = None
         self._next: tuple[int, Item] | None = None
         self._failure: RecordingError | None = None
         self._began: tuple[int, int] | None = None
         """When the first item was asked for, by the clock and by the recording's."""
 
+    @property
+    def serials(self) -> dict[str, str]:
+        return {}
+
+    def describe(self) -> dict[str, Fact]:
+        return {"recordings": Fact(", ".join(map(str, self.paths)))}
+
+    def fileno(self) -> int | None:
+        """None: a file is always readable, the clock says when."""
+        return None
+
     def start(self, items: Generator[tuple[int, Item], None, None]) -> None:
         """Play these from the first one on."""
-        self.stop()
+        self.close()
         self._began = None
         self.handed_over_ns = self._opened_ns = self._clock()
-        self._items = items
+        self._playing = items
         self._read_ahead(items)
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Close the file that plays."""
-        if self._items is not None:
-            self._items.close()
-            self._items = None
+        if self._playing is not None:
+            self._playing.close()
+            self._playing = None
 
     def due_ns(self) -> int | None:
         """When the next item is due; a time in the past for at once; None if there is none."""
-        if self._items is None or self.exhausted:
+        if self._playing is None or self.exhausted:
             return None
         if self.speed is None or self._next is None or self._began is None:
             return self._opened_ns
@@ -70,11 +89,8 @@ class Timeline(Generic[Item]):
         return began_ns + round((at_ns - first_ns) / (self.speed or 1.0))
 
     def take(self) -> tuple[int, Item, int] | None:
-        """Time and content of the next item, and how late it is, ns; None if it is not due.
-
-        Raises `RecordingError` where the files cannot be read on.
-        """
-        if self._items is None:
+        """Return a due item's time, content and lateness, ns. Raises `RecordingError`."""
+        if self._playing is None:
             raise RuntimeError("the replay is not open")
         now_ns, item = self._clock(), self._next
         if self._began is None and item is not None:
@@ -87,14 +103,11 @@ class Timeline(Generic[Item]):
             if self._failure is not None:
                 raise self._failure
             return None
-        self._read_ahead(self._items)
+        self._read_ahead(self._playing)
         return *item, now_ns - due_ns
 
     def hand_over(self, made: Reading, at_ns: int, axis_ns: int = 0) -> Reading:
-        """The same reading moved to now: as old as it was at the recording's time `at_ns`.
-
-        Its `recorded_ns` is counted from `axis_ns`, ns on the recording's clock.
-        """
+        """Return a reading of `at_ns` moved to now; `axis_ns`: the recording's zero, ns."""
         self.handed_over_ns = self._clock()
         t_ns = self.handed_over_ns - (at_ns - made.t_ns)
         return msgspec.structs.replace(made, t_ns=t_ns, recorded_ns=made.t_ns - axis_ns)
@@ -107,48 +120,3 @@ class Timeline(Generic[Item]):
         except RecordingError as error:
             self._failure = error
             self.exhausted = False
-
-
-class RecordedDriver(Opened, Generic[Item]):
-    """A driver without a device. Whoever derives starts `timeline`, and makes readings of it."""
-
-    name = "replay"
-    live = False
-
-    def __init__(self, paths: Sequence[Path], timeline: Timeline[Item]) -> None:
-        """Nothing is opened yet. Raises `ValueError` without files."""
-        if not paths:
-            raise ValueError("no recording to replay")
-        self.paths = tuple(paths)
-        self.timeline = timeline
-
-    @property
-    def exhausted(self) -> bool:
-        """True when the last item has been handed over, or after an error, until `open`."""
-        return self.timeline.exhausted
-
-    @property
-    def handed_over_ns(self) -> int:
-        """When the last reading was handed over, monotonic ns; see `Timeline`."""
-        return self.timeline.handed_over_ns
-
-    @property
-    def serials(self) -> dict[str, str]:
-        """A recording is of no sensor that is there."""
-        return {}
-
-    def describe(self) -> dict[str, Fact]:
-        """Which recordings are played."""
-        return {"recordings": Fact(", ".join(map(str, self.paths)))}
-
-    def close(self) -> None:
-        """Close the file that plays."""
-        self.timeline.stop()
-
-    def fileno(self) -> int | None:
-        """None: a file is always readable, the clock says when."""
-        return None
-
-    def due_ns(self) -> int | None:
-        """When the next item is due; a time in the past for at once."""
-        return self.timeline.due_ns()

@@ -1,9 +1,8 @@
 """The link log of a serial line: its bytes with their times, and what the bridge says in them.
 
-One record after the other, each a frame of `drivers.spi.messages`: type 1 for bytes from the
-device, 2 for bytes to it, 3 for the port having been opened; payload `t: u64` (monotonic ns,
-little-endian) and the bytes. COBS and CRC-32 let a reader find the next record after any damage,
-also the end of a file that was cut off.
+Each record is a frame of `drivers.spi.messages`: type 1 for bytes from the device, 2 for bytes to
+it, 3 for the port having been opened; payload `t: u64` (monotonic ns) and the bytes. So a reader
+finds the next record after any damage.
 """
 
 from __future__ import annotations
@@ -49,25 +48,16 @@ def encode_records(event: LineEvent, t_ns: int, data: bytes) -> bytes:
     )
 
 
-class SerialLogParser:
-    """Takes the bytes of a file and gives its records. Never raises, and holds back 1024 bytes."""
-
-    def __init__(self) -> None:
-        self._frames = FrameParser()
-
-    def feed(self, chunk: bytes) -> Iterator[SerialRecord]:
-        """Records that these bytes complete, oldest first."""
-        for kind, payload in self._frames.feed(chunk):
-            if kind in _EVENTS and len(payload) >= _TIME.size:
-                (t_ns,) = _TIME.unpack_from(payload)
-                yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
+def parse_records(parser: FrameParser, chunk: bytes) -> Iterator[SerialRecord]:
+    """Yield the records that some bytes of a file complete. Never raises."""
+    for kind, payload in parser.feed(chunk):
+        if kind in _EVENTS and len(payload) >= _TIME.size:
+            (t_ns,) = _TIME.unpack_from(payload)
+            yield SerialRecord(LineEvent(kind), t_ns, payload[_TIME.size :])
 
 
 class SerialLog:
-    """Serial link logs through the conversation that the driver has. A `LinkLog`.
-
-    What the daemon asked the bridge then is in the file, so nothing is asked now.
-    """
+    """Serial link logs through the driver's conversation; nothing is asked. A `LinkLog`."""
 
     def __init__(self, fingers: Sequence[str], sensors: Sequence[str] | None = None) -> None:
         """As those of a `Conversation`. Raises `ValueError`."""
@@ -75,11 +65,11 @@ class SerialLog:
         self.begin()
 
     def records(self, path: Path) -> Iterator[tuple[int, SerialRecord]]:
-        """Times, ns, and records of a file; damage is passed over. Raises `RecordingError`."""
-        parser = SerialLogParser()
+        """Yield times, ns, and records; skip damage. Raises `RecordingError`."""
+        parser = FrameParser()
         with open_recording(path) as stream:
             while chunk := stream.read(CHUNK_BYTES):
-                for record in parser.feed(chunk):
+                for record in parse_records(parser, chunk):
                     yield record.t_ns, record
 
     def begin(self) -> None:

@@ -1,7 +1,4 @@
-"""The host's side of the bridge's protocol: bytes in, readings and bytes out. No I/O.
-
-The protocol is `deploy/bridge/PROTOCOL.md`, its messages are `drivers.spi.messages`.
-"""
+"""The host's side of `deploy/bridge/PROTOCOL.md`: bytes in, readings and bytes out. No I/O."""
 
 from __future__ import annotations
 
@@ -57,8 +54,7 @@ class Conversation:
 
     The owner of the port calls `opened`, then `receive` with the bytes that come, then writes the
     frames of `say` and calls `sent` right before each. While `link` is `WAITING`, the port must be
-    closed, and opened again at `link.retry_ns`. A link log has no port: it calls `opened`,
-    `receive` and `sent` with its records.
+    closed, and opened again at `link.retry_ns`. A link log passes its records instead.
     """
 
     def __init__(
@@ -71,8 +67,8 @@ class Conversation:
     ) -> None:
         """`port`: its name, for people. `nonce`: that of the PING before the first.
 
-        `fingers`: the rows of a reading. `sensors`: the fingers in the order of the chip selects,
-        the same unless given. Raises `ValueError` for unknown or missing fingers.
+        `fingers`: the rows of a reading. `sensors`: the fingers by chip select, by default the
+        same. Raises `ValueError`.
         """
         self.link = Link(NAME)
         self.hello: Hello | None = None
@@ -89,20 +85,11 @@ class Conversation:
         self._fingers = tuple(fingers)
         self._port = port
         self._nonce = nonce
-        self._counters = BridgeCounters()
-        self._parser, self._sent = FrameParser(DIGEST), FrameParser(DIGEST)
+        self.counters = BridgeCounters()
+        self._parser, self._sent = FrameParser(DIGEST, self.counters), FrameParser(DIGEST)
         self._sweeps: SweepDecoder | None = None
         self._pings: dict[int, int] = {}
         """Send times of the PINGs that wait for an answer, by their nonce."""
-
-    @property
-    def counters(self) -> BridgeCounters:
-        """Counts over all reopenings of the port."""
-        frames, counters = self._parser.counters, self._counters
-        counters.bytes, counters.frames = frames.bytes, frames.frames
-        counters.bad_cobs, counters.bad_crc = frames.bad_cobs, frames.bad_crc
-        counters.too_long, counters.link_losses = frames.too_long, self.link.losses
-        return counters
 
     @property
     def period_ns(self) -> int | None:
@@ -111,7 +98,6 @@ class Conversation:
 
     @property
     def due_ns(self) -> int:
-        """When to call `say`, even if nothing has come."""
         if self._sweeps is None:
             return self._ping_due_ns
         return min(self._ping_due_ns, self._silent_at_ns)
@@ -143,10 +129,11 @@ class Conversation:
     def lost(self, cause: LinkCause, why: str, now_ns: int) -> None:
         """Give the link up until `opened`."""
         self._sweeps = None
-        self._counters.link_failures += 1
-        self._counters.unanswered_pings += len(self._pings)
+        self.counters.link_failures += 1
+        self.counters.unanswered_pings += len(self._pings)
         self._pings.clear()
         self.link.failed(cause, why, now_ns)
+        self.counters.link_losses = self.link.losses
 
     def say(self, now_ns: int) -> list[bytes]:
         """Return the frames to send now. May lose the link instead, by a timeout."""
@@ -180,13 +167,13 @@ class Conversation:
             if isinstance(message, Ping):
                 while len(self._pings) >= PINGS_OUT_MAX:
                     self._pings.pop(next(iter(self._pings)))
-                    self._counters.unanswered_pings += 1
+                    self.counters.unanswered_pings += 1
                 self._pings[message.nonce] = t_ns
                 self._pings_sent += 1
 
     def not_sent(self) -> None:
         """Count a frame that was given up, as there was no room for it."""
-        self._counters.host_tx_dropped += 1
+        self.counters.host_tx_dropped += 1
 
     def receive(self, chunk: bytes, arrival_ns: int, idle_ns: int) -> list[Reading]:
         """Return the readings that these bytes complete, oldest first. Never raises.
@@ -201,8 +188,8 @@ class Conversation:
                 continue
             message = decode(kind, payload)
             if message is None:
-                self._counters.bad_frames += kind in _FROM_BRIDGE
-                self._counters.unknown_frames += kind not in _FROM_BRIDGE
+                self.counters.bad_frames += kind in _FROM_BRIDGE
+                self.counters.unknown_frames += kind not in _FROM_BRIDGE
             elif isinstance(message, Sweep):
                 reading = self._on_sweep(message, arrival_ns, idle_ns)
                 if reading is not None:
@@ -216,7 +203,7 @@ class Conversation:
         return encode(Ping(self._nonce))
 
     def _has_our_layout(self, payload: bytes, now_ns: int) -> bool:
-        """Return True if a HELLO is of our version and layout, else give the link up."""
+        """Return True if a HELLO has our layout, else give the link up."""
         layout = layout_of(payload)
         if layout is None or layout == (VERSION, DIGEST):
             return True
@@ -229,7 +216,7 @@ class Conversation:
         return False
 
     def _refuse(self, cause: LinkCause, why: str, now_ns: int) -> None:
-        self._counters.refused_bridges += 1
+        self.counters.refused_bridges += 1
         self.lost(cause, f"{self._port}: the bridge {why}", now_ns)
 
     def _on_message(self, message: Message, arrival_ns: int) -> None:
@@ -237,11 +224,11 @@ class Conversation:
             self._on_hello(message, arrival_ns)
         elif isinstance(message, BridgeStatus):
             self.status = message
-            self._counters.bridge_overruns = message.overruns
-            self._counters.bridge_tx_dropped = message.tx_dropped
-            self._counters.bridge_rx_errors = message.rx_errors
+            self.counters.bridge_overruns = message.overruns
+            self.counters.bridge_tx_dropped = message.tx_dropped
+            self.counters.bridge_rx_errors = message.rx_errors
         else:
-            self._counters.unknown_frames += 1  # our own words: an echo
+            self.counters.unknown_frames += 1  # our own words: an echo
 
     def _on_hello(self, hello: Hello, arrival_ns: int) -> None:
         if hello.nonce == 0:
@@ -252,7 +239,7 @@ class Conversation:
             return  # an answer that came twice or too late
         if self._sweeps is None:
             self._greet(hello, arrival_ns)
-        elif not self._sweeps.fits(hello):
+        elif self._sweeps.hello.sampling != hello.sampling:
             self.lost(LinkCause.SETTINGS, "the bridge changed what it samples", arrival_ns)
         elif not self._is_confirmed(hello.serials):
             # Misread or exchanged: at STOP the bridge reads them again.
@@ -262,7 +249,7 @@ class Conversation:
             self._sweeps.clock.round_trip(hello.tick, sent_ns, arrival_ns)
 
     def _is_confirmed(self, serials: tuple[str, ...]) -> bool:
-        """Return True if these are confirmed serial numbers, or those of the HELLO before."""
+        """Return True if two HELLOs in a row had these serial numbers."""
         before = self._confirmed if len(self._confirmed) == len(serials) else ("",) * len(serials)
         merged = tuple(new or old for new, old in zip(serials, before, strict=True))
         if merged != before and serials != self._unconfirmed:
@@ -273,7 +260,7 @@ class Conversation:
 
     def _on_reset(self, now_ns: int) -> None:
         if self._sweeps is not None:
-            self._counters.restarts += 1
+            self.counters.restarts += 1
             self.lost(LinkCause.DISCONNECTED, "the bridge was reset", now_ns)
         elif self._pings_sent < GREETING_TRIES:
             self._ping_due_ns = now_ns
@@ -297,7 +284,7 @@ class Conversation:
             self._ping_due_ns = now_ns + PING_FIRST_NS
             self._silence_ns = max(SILENCE_PERIODS * hello.period_ns, SILENCE_MIN_NS)
             self._silent_at_ns = now_ns + self._silence_ns
-            self._sweeps = SweepDecoder(hello, self._sensors, self._counters)
+            self._sweeps = SweepDecoder(hello, self._sensors, self.counters)
 
     def _take(self, hello: Hello) -> None:
         self.hello = hello
@@ -309,7 +296,7 @@ class Conversation:
 
     def _on_sweep(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
         if self._sweeps is None:
-            self._counters.stale_sweeps += 1
+            self.counters.stale_sweeps += 1
             return None
         reading = self._sweeps.reading(sweep, arrival_ns, idle_ns)
         if reading is None:
@@ -322,7 +309,6 @@ class Conversation:
 
 
 def _about(hello: Hello) -> dict[str, Fact]:
-    """Return what a bridge says of itself."""
     sensors = ", ".join(serial or "none" for serial in hello.serials)
     return {
         "board": Fact(hello.board or "unnamed"),
@@ -342,7 +328,7 @@ def _sensor_fault(serials: Sequence[str]) -> DeviceFault | None:
 
 
 def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
-    """Return SPI errors by chip select, `-` for one without a sensor, which always has some."""
+    """Return SPI errors by chip select, `-` for one without a sensor."""
     errors = [
         count if serial else None
         for count, serial in zip(status.spi_errors, hello.serials, strict=False)
@@ -352,7 +338,7 @@ def _about_errors(status: BridgeStatus, hello: Hello) -> Fact:
 
 
 def _about_time(sweeps: SweepDecoder) -> dict[str, Fact]:
-    """Return what is known of a bridge's clock and of the duration of its sweeps."""
+    """Return facts about the clock and the duration of sweeps."""
     clock, tick_hz = sweeps.clock, sweeps.hello.tick_hz
     trust = Fact("trusted") if clock.trusted else Fact("not trusted", DeviceFault.CLOCK_NOT_TRUSTED)
     facts = {"clock": trust, "clock rate": Fact(f"{tick_hz} Hz")}

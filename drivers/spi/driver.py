@@ -22,13 +22,12 @@ POLL_NS = 2_000_000
 class SpiBridgeDriver(Opened):
     """Readings of the sensors behind one bridge; reconnects after every loss.
 
-    `fingers` and `sensors`: see `Conversation`; a board may have more sensors. `t_ns` of a reading
-    is when the bridge finished the sweep; `seq` continues across losses of the link. Electrodes
-    that the bridge does not sample, and those of an absent sensor, are `MISSING`.
+    `t_ns` of a reading is when the bridge finished the sweep; `seq` continues across losses of the
+    link. Electrodes that are not sampled, and those of an absent sensor, are `MISSING`.
 
-    `baud` means nothing to a USB device. Ports without a descriptor (`rfc2217://`, `loop://`) are
-    polled. The constructor raises `ValueError`. `open` raises `DriverError` for a port name that
-    can never work. A missing device raises nothing: `describe` tells of it.
+    Ports without a descriptor (`rfc2217://`, `loop://`) are polled. The constructor raises
+    `ValueError`, `open` `DriverError` for a port name that can never work. A missing device raises
+    nothing: `describe` tells of it.
     """
 
     name = NAME

@@ -1,10 +1,7 @@
-"""Frames and messages between the host and a bridge of BioTac SPs, version 1. Bytes only.
+"""Frames and messages of `deploy/bridge/PROTOCOL.md`, version 1. Bytes only.
 
-`deploy/bridge/PROTOCOL.md` defines both. A frame is `COBS(type: u8 | payload | crc: u32) 0x00`.
-Encoding raises `ValueError`, decoding returns None, for a message that the protocol forbids.
-
-Each message has `to_bytes` for its payload, `from_bytes`, which returns None for a wrong length,
-and `is_sound`, which returns True if the protocol allows its values.
+A frame is `COBS(type: u8 | payload | crc: u32) 0x00`. Encoding raises `ValueError`, decoding
+returns None, for a message that the protocol forbids: one of a wrong length or that is not sound.
 """
 
 from __future__ import annotations
@@ -19,13 +16,13 @@ import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
+from drivers.base import DriverCounters
 from drivers.biotac import FORBIDDEN_COMMAND
 
 DELIMITER: Final = b"\0"
 """Ends a frame and occurs nowhere else, so that the next frame is found after any damage."""
 ENCODED_MAX_BYTES = 1024
-"""Longest encoded frame without its delimiter, and so the most that a parser holds back. The
-largest of version 1, a SWEEP of 64 slots and 5 sensors, takes 671."""
+"""Longest encoded frame without delimiter; the largest SWEEP of version 1 takes 671."""
 VERSION = 1
 FIRMWARE = 0x0002
 """Firmware in `deploy/bridge` of this graspd, major * 256 + minor (`BRIDGE_FIRMWARE` there)."""
@@ -66,8 +63,8 @@ _WORD = np.dtype(">u2")
 
 
 @dataclass(slots=True)
-class FrameCounters:
-    """What a parser has received since it was made. Every drop is one count."""
+class FrameCounters(DriverCounters):
+    """Counters of a parser, among those of its driver."""
 
     bytes: int = 0
     frames: int = 0
@@ -81,10 +78,7 @@ class FrameCounters:
 
 
 def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
-    """Return a frame with its delimiter; `digest` begins its checksum unless it is `UNSEEDED`.
-
-    Raises `ValueError` for a type that is no byte and a frame longer than `ENCODED_MAX_BYTES`.
-    """
+    """Return a frame; `digest` begins its checksum unless it is `UNSEEDED`. Raises `ValueError`."""
     body = bytes([kind]) + payload
     seed = 0 if kind in UNSEEDED else digest
     encoded: bytes = cobs.encode(body + _U32.pack(zlib.crc32(body, seed)))
@@ -96,19 +90,19 @@ def encode_frame(kind: int, payload: bytes, digest: int = 0) -> bytes:
 class FrameParser:
     """Bytes in, whole frames out. Never raises; damaged frames are counted and dropped."""
 
-    def __init__(self, digest: int = 0) -> None:
-        """`digest`: see `encode_frame`."""
-        self.counters = FrameCounters()
+    def __init__(self, digest: int = 0, counters: FrameCounters | None = None) -> None:
+        """`digest`: see `encode_frame`. Counts in `counters`, if given."""
+        self.counters = counters or FrameCounters()
         self._digest = digest
         self.reset()
 
     @property
     def held_bytes(self) -> int:
-        """Bytes of an unfinished frame that are held back, at most `ENCODED_MAX_BYTES`."""
+        """Bytes of an unfinished frame, at most `ENCODED_MAX_BYTES`."""
         return len(self._held)
 
     def reset(self) -> None:
-        """Forget an unfinished frame. Call when the line was opened again."""
+        """Forget an unfinished frame. Call when the line is reopened."""
         self._held = b""
         self._is_overlong = False
 
@@ -151,7 +145,7 @@ class FrameParser:
 
 @dataclass(frozen=True, slots=True)
 class Hello:
-    """What the bridge is and how it samples; answers PING, and comes once after a reset."""
+    """Describes the bridge and its sampling; answers PING, and comes once after a reset."""
 
     TYPE: ClassVar[int] = 0x01
 
@@ -163,7 +157,7 @@ class Hello:
     period_ticks: int
     """Nominal ticks from one sweep to the next."""
     serials: tuple[str, ...]
-    """Serial number of each sensor, empty where none answered; in the order of chip selects."""
+    """Serial number by chip select, empty where no sensor answered."""
     commands: tuple[int, ...]
     """First command byte of each slot (manual figure 13)."""
     firmware: int = 0
@@ -179,6 +173,11 @@ class Hello:
     @property
     def slots(self) -> int:
         return len(self.commands)
+
+    @property
+    def sampling(self) -> tuple[object, ...]:
+        """What must not change while the bridge sweeps."""
+        return (self.sensors, self.commands, self.tick_hz, self.period_ticks)
 
     @property
     def period_ns(self) -> int:
@@ -235,7 +234,7 @@ class Hello:
 
 
 class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
-    """The response words of one sweep over all slots and sensors, as they were read."""
+    """Response words of one sweep over all slots and sensors."""
 
     TYPE: ClassVar[int] = 0x02
 
@@ -247,8 +246,7 @@ class Sweep(msgspec.Struct, frozen=True, eq=False, gc=False):
     present: int
     """Bit i: sensor i had a serial number when it was last looked for."""
     words: NDArray[np.uint16]
-    """Shape (slots, sensors), 16-bit response words of either byte order, not yet judged (manual
-    figure 15)."""
+    """Shape (slots, sensors), response words of either byte order (manual figure 15)."""
 
     def is_sound(self) -> bool:
         slots, sensors = self.words.shape
@@ -387,13 +385,12 @@ def layout_of(payload: bytes) -> tuple[int, int] | None:
 
 
 def _text_to_bytes(text: str) -> bytes:
-    """Return ASCII padded with NUL to 16 bytes."""
     if not text.isascii() or "\0" in text or len(text) > TEXT_BYTES:
         raise ValueError(f"{text!r} is not at most {TEXT_BYTES} ASCII characters")
     return text.encode("ascii").ljust(TEXT_BYTES, b"\0")
 
 
 def _text(padded: bytes) -> str:
-    """Return the text with odd bytes as `?`: a sensor's nonsense must not take the link down."""
+    """Return the text; odd bytes, which a sensor may send, become `?`."""
     text = padded.partition(b"\0")[0].decode("ascii", errors="replace")
     return "".join(letter if letter.isprintable() and letter.isascii() else "?" for letter in text)

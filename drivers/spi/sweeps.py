@@ -1,11 +1,10 @@
 """Sweeps of a bridge -> readings with the time at which they were made. No I/O.
 
-The bridge's ticks become host time by PINGs: one that is answered with a tick proves that this tick
-was not before the PING was sent. The latest of these lower bounds, carried on at the bridge's rate,
-is a time at which a reading can not yet have been made, or only just: never too fresh, and too old
-by at most the shortest way there. The rate comes from a decaying linear regression over the PINGs
-that leaves out late ones, as in Klipper's clock synchronisation. Arrivals of readings play no part,
-so neither batches of a USB adapter nor a stall of the host disturb it.
+A PING that is answered with a tick proves that this tick was not before the PING was sent. The
+latest of these lower bounds, carried on at the bridge's rate, makes a reading never too fresh, and
+too old by at most the shortest way there. The rate comes from a decaying linear regression that
+leaves out late PINGs, as in Klipper. Arrivals of readings play no part, so that neither batches of
+a USB adapter nor a stall of the host disturb it.
 """
 
 from __future__ import annotations
@@ -20,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.base import ELECTRODES, DriverCounters, ElectrodeFault, TactileReading
+from drivers.base import ELECTRODES, ElectrodeFault, TactileReading
 from drivers.biotac import COUNT_OF_WORD, FAULT_OF_WORD, channel_of, electrode_columns
-from drivers.spi.messages import Hello, Sweep
+from drivers.spi.messages import FrameCounters, Hello, Sweep
 
 SEQ_HALF, SEQ_END = 1 << 31, 1 << 32
 SEQ_FIRST_MAX = 1_000
@@ -50,22 +49,15 @@ short, as it may have been reset; each further fault needs longer, as a wrong ra
 AHEAD_TOLERANCE_NS = 1_000_000
 """A mapped time this much later than its arrival, ns, shows a clock that does not fit its past."""
 UNKNOWN_DELAY_NS = 20_000_000
-"""Assumed delay of an arrival without trusted ticks, ns: one latency timer of a USB serial adapter,
-16 ms, and 4 ms for the rest."""
+"""Assumed delay without trusted ticks, ns: 16 ms of a USB serial adapter, 4 ms for the rest."""
 AGE_MAX_NS = 10_000_000_000
 """No mapped time is older than this, ns: buffers hold seconds at most."""
 
 
 @dataclass(slots=True)
-class BridgeCounters(DriverCounters):
-    """Every kind of drop and fault since `open`."""
+class BridgeCounters(FrameCounters):
+    """Counters of frames, sweeps and the link, over all reopenings of the port."""
 
-    bytes: int = 0
-    frames: int = 0
-    bad_cobs: int = 0
-    bad_crc: int = 0
-    too_long: int = 0
-    """See `drivers.spi.messages.FrameCounters`."""
     unknown_frames: int = 0
     """Whole frames of a type that a bridge of version 1 never sends."""
     bad_frames: int = 0
@@ -127,21 +119,8 @@ class SweepDecoder:
         self._faultless = bytes(self._source.size)
         self._sweep = self._words[:-1].reshape(hello.slots, hello.sensors)
 
-    def fits(self, hello: Hello) -> bool:
-        """Return True if a later HELLO describes the same sampling."""
-        ours = self.hello
-        return (hello.sensors, hello.commands, hello.tick_hz, hello.period_ticks) == (
-            ours.sensors,
-            ours.commands,
-            ours.tick_hz,
-            ours.period_ticks,
-        )
-
     def reading(self, sweep: Sweep, arrival_ns: int, idle_ns: int) -> TactileReading | None:
-        """Return the reading of a sweep, or None for one that is not newer or does not fit.
-
-        `idle_ns`: last time before the arrival at which nothing was waiting to be read.
-        """
+        """Return the reading of a sweep, or None for one that is not newer or does not fit."""
         if sweep.words.shape != self._sweep.shape:
             self._counters.bad_frames += 1
             return None
@@ -153,7 +132,7 @@ class SweepDecoder:
         return TactileReading(t_ns, seq, *self._counts_and_faults(sweep))
 
     def _is_next(self, sweep: Sweep) -> bool:
-        """Return True if the sweep is newer than all before it; count those missing between."""
+        """Return True for a sweep newer than all before; count the missing ones."""
         if self._bridge_seq is None:
             if sweep.tick_start < self.hello.tick:
                 self._counters.stale_sweeps += 1  # it was under way when STOP arrived
@@ -211,13 +190,11 @@ class DeviceClock:
     A mapped time is never later than the arrival and at most `AGE_MAX_NS` before it; it goes back
     only when the clock stops being trusted. Ticks are not trusted before the first answered PING,
     and when the clock stands, falls back, is ahead of its arrivals, or is wrong by more than
-    `RATE_TOLERANCE`. The mapped time then is `UNKNOWN_DELAY_NS` before the last time when nothing
-    was waiting to be read: rather too old than too fresh.
+    `RATE_TOLERANCE`. Then the time is `UNKNOWN_DELAY_NS` before the last time when nothing was
+    waiting to be read: rather too old than too fresh.
 
-    Measured over 600 s of sweeps at 100 Hz, with a clock wrong by 100 ppm, a PING per second, an
-    exponential delay of 1 ms on both ways and arrivals in batches of 16 ms: mapped times are 0.00
-    to 1.86 ms too old, median 0.18 ms. With 0.1 ms and no batches: 0.00 to 0.60 ms, median 0.04 ms
-    (`python -m tests.drivers.spi.clock_error`).
+    Measured with `python -m tests.drivers.spi.clock_error`, 600 s at 100 Hz, a clock wrong by
+    100 ppm, delays of 1 ms and batches of 16 ms: 0.00 to 1.86 ms too old, median 0.18 ms.
     """
 
     def __init__(self, tick_hz: int, counters: BridgeCounters) -> None:
@@ -239,13 +216,13 @@ class DeviceClock:
 
     @property
     def drift_ppm(self) -> float | None:
-        """How fast the bridge's clock is, parts per million; None: not known yet."""
+        """Drift of the bridge's clock, ppm, positive if fast; None: not known yet."""
         drift = self._drift
         return None if drift.slack == SLACK_MAX else (1.0 / (1.0 + drift.slope) - 1.0) * 1e6
 
     @property
     def rate_limits_ppm(self) -> tuple[float, float] | None:
-        """Least and most that the clock can be fast by the remembered PINGs, ppm."""
+        """Limits of the drift by the remembered PINGs, ppm."""
         least, most = -math.inf, math.inf
         for first, last in itertools.combinations(self._bounds, 2):
             if last.sent_ns > first.received_ns:
@@ -275,7 +252,7 @@ class DeviceClock:
         self._best = max(self._bounds, key=lambda earlier: self._earliest_ns(earlier, tick))
 
     def host_ns(self, tick: int, arrival_ns: int, idle_ns: int) -> int:
-        """Return the host time of `tick`, ns, for the next reading.
+        """Return the host time of a reading's `tick`, ns.
 
         It arrived at `arrival_ns`, and after `idle_ns`, when nothing was waiting to be read.
         """

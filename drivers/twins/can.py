@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
@@ -30,8 +29,7 @@ SAMPLE_ID: Final = 0x100
 OTHER_COUNTS: Final = {PAC: 2050, PDC: 2800, TAC: 2010, TDC: 2260}
 """What the channels that are no electrodes read; an untouched hand's values."""
 SEND_TIMEOUT_S: Final = 0.1
-"""How long a full transmit queue may hold the twin up, s. Not on a virtual bus, whose queue a
-reader in the same thread empties."""
+"""Longest wait for a full transmit queue, s; a virtual bus is emptied by the same thread."""
 DOWN_S: Final = 0.2
 """How long a broken link stays down, s."""
 ID_BYTES: Final = 4
@@ -46,9 +44,8 @@ Outgoing = tuple[int, bytes]
 class CanTwin(Opened):
     """Sends the sweeps of `counts` in one of the two formats.
 
-    `send_sweep` sends one at once and waits for nothing, for tests; `serve` sends at `rate_hz`.
-    `first_sweep` is the number of the first sweep frame. The constructor raises `ValueError` for
-    an argument that does not fit.
+    `send_sweep` sends one at once; `serve` sends at `rate_hz`. `first_sweep`: number of the
+    first sweep frame. The constructor raises `ValueError`.
     """
 
     def __init__(
@@ -85,6 +82,7 @@ class CanTwin(Opened):
         self._period_ns = round(1e9 / rate_hz)
         self._faults = faults
         self._injector = LinkFaultInjector(faults, spared_bytes=ID_BYTES)
+        self.injected = self._injector.injected
         self._clock = clock
         self._interface, self._channel = interface, channel
         self._options: dict[str, Any] = {}
@@ -100,18 +98,12 @@ class CanTwin(Opened):
         self.unsent = 0
         """Frames that the bus did not take."""
 
-    @property
-    def injected(self) -> Counter[str]:
-        """How often each fault was put in, by its name."""
-        return self._injector.injected
-
     def open(self) -> None:
         """Take the bus. Raises `DriverError`, also where a package is missing."""
         self.close()
         self._bus = open_bus(self._interface, self._channel, self._options)
 
     def close(self) -> None:
-        """Let go of the bus."""
         bus, self._bus = self._bus, None
         if bus is not None:
             bus.shutdown()
@@ -125,14 +117,10 @@ class CanTwin(Opened):
         return bool(frames)
 
     def flush(self) -> None:
-        """Send what faults still hold back."""
         self._put_all(self._injector.flush())
 
     def serve(self, stop: threading.Event) -> None:
-        """Send sweeps at their rate, frames evenly spread, until told to stop or counts end.
-
-        A broken link is taken up again after `DOWN_S`.
-        """
+        """Send sweeps at their rate until told to stop or the counts end."""
         due_ns = self._clock()
         while not stop.is_set():
             frames = self.next_frames()
@@ -148,7 +136,7 @@ class CanTwin(Opened):
             due_ns = max(due_ns + self._period_ns, self._clock() - self._period_ns)
 
     def next_frames(self) -> list[Outgoing]:
-        """The frames of the next sweep before any fault of the link; none when counts ended."""
+        """Return the next sweep's frames before link faults; none after the last."""
         counts = next(self._counts, None)
         if counts is None:
             return []
@@ -162,7 +150,7 @@ class CanTwin(Opened):
         return frames
 
     def _words_of(self, row: int, counts: Counts) -> list[bytes]:
-        """One finger's response words of E1 to E24, with the sensor's faults."""
+        """Return a finger's words of E1 to E24, with the sensor's faults."""
         if row in self._faults.unplugged_fingers:
             return [_UNDRIVEN] * ELECTRODES
         dead = {electrode for finger, electrode in self._faults.dead_electrodes if finger == row}
@@ -199,7 +187,7 @@ class CanTwin(Opened):
         return self._clock() // 1000 % (1 << 32)
 
     def _send(self, frame: Outgoing) -> bool:
-        """Send one frame with the link's faults. False when the link broke, and was remade."""
+        """Send a frame with link faults. Return False if the link broke."""
         if self._injector.breaks_here():
             self.open()
             return False
@@ -212,7 +200,7 @@ class CanTwin(Opened):
             self.put((int.from_bytes(frame[:ID_BYTES]), frame[ID_BYTES:]))
 
     def put(self, outgoing: Outgoing) -> None:
-        """Put one frame on the bus; what it does not take is counted in `unsent`."""
+        """Put a frame on the bus, or count it in `unsent`."""
         identifier, data = outgoing
         message = can.Message(
             timestamp=self._clock() / 1e9,  # only a bus with preserve_timestamps keeps it
@@ -233,7 +221,7 @@ class CanTwin(Opened):
             self.frames_sent += 1
 
     def _discard_received(self) -> None:
-        """Others may talk on the bus; the queue of a virtual one has no bound."""
+        """Empty the queue of a virtual bus, which has no bound."""
         if self._interface == "virtual" and self._bus is not None:
             with contextlib.suppress(can.CanError):
                 while self._bus.recv(timeout=0) is not None:

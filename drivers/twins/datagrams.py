@@ -16,10 +16,7 @@ BEHIND_MAX_NS = 100_000_000
 def send_paced(
     cycles: Iterable[list[bytes]], target: Endpoint, stop: threading.Event, period_ns: int | None
 ) -> None:
-    """Send the datagrams of one cycle after the other until told to stop or they end.
-
-    With `period_ns` None as fast as the kernel takes them. A missing listener is not noticed.
-    """
+    """Send the datagrams of each cycle until told to stop; `period_ns` None: without a pause."""
     with socket.socket(target.family, socket.SOCK_DGRAM) as sender:
         due_ns = time.monotonic_ns()
         for datagrams in cycles:

@@ -51,7 +51,7 @@ class LinkFaults:
             raise ValueError("disconnect_every_frames must be at least 1")
 
     def refuse(self, link: str, *names: str) -> None:
-        """Raise `ValueError` if one of these faults is asked for: this link cannot show it."""
+        """Raise `ValueError` for one of these faults, which the link cannot show."""
         for name in names:
             if getattr(self, name) != getattr(LinkFaults(), name):
                 raise ValueError(f"{link} cannot show the fault {name.replace('_', '-')}")
@@ -71,10 +71,9 @@ class LinkFaultInjector:
         self._frames = 0
 
     def spoil(self, frame: bytes, *, waits: bool = True) -> list[bytes]:
-        """Return the frames to send now, in order, instead of this one.
+        """Return the frames to send now instead of this one.
 
-        A frame that does not wait is neither reordered nor held back for a burst, and takes
-        along what was.
+        A frame that does not wait is sent at once, after those held back.
         """
         faults = self.faults
         if self._happens(faults.drop_probability, "drop"):
@@ -109,7 +108,7 @@ class LinkFaultInjector:
         return held
 
     def breaks_here(self) -> bool:
-        """Return True if the link breaks in the middle of the next frame; call once per frame."""
+        """Return True if the link breaks in the next frame. Call once per frame."""
         self._frames += 1
         every = self.faults.disconnect_every_frames
         if every is None or self._frames % every:

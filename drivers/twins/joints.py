@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -39,11 +38,7 @@ class JointTwin:
         self._names = tuple(names)
         self._rate_hz = rate_hz
         self._injector = LinkFaultInjector(faults)
-
-    @property
-    def injected(self) -> Counter[str]:
-        """Faults injected so far by name."""
-        return self._injector.injected
+        self.injected = self._injector.injected
 
     def messages(self) -> Iterator[JointMessage]:
         """What is sent, before any fault, without end."""
@@ -55,7 +50,6 @@ class JointTwin:
             seq += 1
 
     def cycles(self) -> Iterator[list[bytes]]:
-        """Datagrams to send in each period."""
         for message in self.messages():
             yield self._injector.spoil(message.to_bytes())
 

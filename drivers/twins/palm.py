@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
@@ -13,10 +12,8 @@ from drivers.palm.packet import (
     CHANNELS,
     COMMAND_SENSOR_DATA,
     CYCLE_NS,
-    MOTORS,
     ROUND,
     VALID_ALL,
-    CanRecord,
     Channel,
     Palm,
     PalmPacket,
@@ -35,9 +32,6 @@ SENSORS_AT_REST = (
 """Raw sensor words of a real hand (Shadow's documentation), with noise of one count."""
 HALL_WORDS = 26
 """Of these, the ones with noise."""
-IDLE_TIMES_US = (430, 394)
-MOTORS_ARRIVED = (0x55555, 0xAAAAA)
-"""Of the packets with even and with odd motors (same source)."""
 OTHER_COUNTS = {"PDC": 2779, "TAC": 2006, "TDC": 2247}
 PAC_COUNT = 2048
 ABSENT_WORDS = {"PDC": -22072 & 0xFFFF, "TAC": 32570, "TDC": 0}
@@ -49,9 +43,8 @@ LATER_VERSION_BYTES = 4
 
 
 class PalmTwin:
-    """Plays counts as a palm would send them: one shape (fingers, 24) per round of 14 packets.
+    """Plays counts, shape (fingers, 24) per round of 14 packets, as a palm would send them.
 
-    `cycles` is deterministic: datagrams by the millisecond, after faults. `serve` sends them.
     With `stuck_clock` the palm always answers the same request. Fingers that are not in
     `fingers` have no sensor, and say so; those unplugged by a fault do not.
     """
@@ -62,32 +55,22 @@ class PalmTwin:
         fingers: Sequence[str] = ("ff", "mf", "th"),
         *,
         palm: Palm = Palm.PALM_0220,
-        can_record: bool = False,
         faults: LinkFaults = LinkFaults(),  # noqa: B008 (immutable)
-        sensors: Sequence[int] = SENSORS_AT_REST,
         seed: int = 0,
     ) -> None:
-        """`sensors` are the raw words that joints rest at.
-
-        Raises `ValueError` for a fault that datagrams cannot have.
-        """
+        """Raises `ValueError` for a fault that datagrams cannot have."""
         faults.refuse("the palm", "one_byte_at_a_time")
         self._counts = iter(counts)
         self._rows = {finger: row for row, finger in enumerate(fingers)}
         self._palm = palm
-        self._can_record = CanRecord(0, 0, 0, bytes(8)) if can_record else None
         self._faults = faults
         self._injector = LinkFaultInjector(faults)
-        self._sensors = np.array(sensors)
+        self.injected = self._injector.injected
+        """Faults so far by name; `silenced`: packets made while the link was broken."""
         self._random = np.random.default_rng(seed)
         self._dead = frozenset(faults.dead_electrodes)
         self.packets_made = 0
         """Packets that the palm made, sent or not."""
-
-    @property
-    def injected(self) -> Counter[str]:
-        """Faults injected so far by name; `silenced` are packets made while the link was broken."""
-        return self._injector.injected
 
     def packets(self) -> Iterator[PalmPacket]:
         """What the palm makes, before any fault of the link."""
@@ -97,7 +80,6 @@ class PalmTwin:
                 self.packets_made += 1
 
     def cycles(self) -> Iterator[list[bytes]]:
-        """Datagrams to send in each millisecond."""
         silent = 0
         for packet in self.packets():
             if silent:
@@ -118,31 +100,21 @@ class PalmTwin:
     def serve(
         self, target: str, stop: threading.Event, *, period_ns: int | None = CYCLE_NS
     ) -> None:
-        """Send to `udp://ADDRESS:PORT` until told to stop or the counts end.
-
-        With `period_ns` None as fast as possible. Raises `ValueError` for a bad target.
-        """
+        """Send until told to stop or the counts end, without `period_ns` as fast as possible."""
         send_paced(self.cycles(), Endpoint.parse(target), stop, period_ns)
 
     def _packet(self, position: int, counts: Counts) -> PalmPacket:
-        odd = self.packets_made % 2
-        sensors = self._sensors.copy()
+        sensors = np.array(SENSORS_AT_REST)
         sensors[:HALL_WORDS] += self._random.integers(-1, 2, HALL_WORDS)
         fitted = sum(1 << FINGERS.index(finger) for finger in self._rows)
         return PalmPacket(
             palm=self._palm,
             command=COMMAND_SENSOR_DATA,
             sensors=tuple(sensors.tolist()),
-            motor_type=0,
-            which_motors=odd,
-            motors_arrived=MOTORS_ARRIVED[odd],
-            motors_failed=0,
-            motor_words=(0, 0) * MOTORS,
+            which_motors=self.packets_made % 2,
             tactile_type=2 * position + 1,
             tactile_valid=fitted,
             tactile=tuple(self._slot(finger, position, counts) for finger in FINGERS),
-            idle_time_us=IDLE_TIMES_US[odd],
-            can_record=self._can_record,
         )
 
     def _slot(self, finger: str, position: int, counts: Counts) -> TactileSlot:

@@ -62,11 +62,9 @@ _WORDS = np.array([encode_word(count) for count in range(4096)], dtype=np.uint16
 class SpiTwin(Opened):
     """The bridge's side of the protocol, one thread, driven by `run_once` or `serve`.
 
-    `path` becomes a symbolic link to the pseudo-terminal, a new one after each `plug`. `source`
-    gives the counts of each sweep, shape (sensors, 24); when it ends the twin falls silent but
-    still answers. With `rate_hz` None sweeps come as fast as the host reads and none is dropped;
-    else what the host does not take in time is dropped in whole frames. As on a real bridge,
-    unplugging resets it.
+    `path` becomes a symbolic link to a new pseudo-terminal at each `plug`, which is a reset.
+    `source`: counts of each sweep, shape (sensors, 24); after them the twin is silent but answers.
+    With `rate_hz` None sweeps come as fast as the host reads and none is dropped.
     """
 
     def __init__(
@@ -82,10 +80,9 @@ class SpiTwin(Opened):
         clock: Callable[[], int] = time.monotonic_ns,
         tap: Callable[[bytes], None] | None = None,
     ) -> None:
-        """`digest` is of the layout that it was built with; `drift_ppm` how fast its clock is.
+        """`digest`: layout that it was built with. `drift_ppm`: how fast its clock is.
 
-        `tap` is called with every piece of bytes that goes to the host. Raises `ValueError` for a
-        rate that is not positive and for a source without counts.
+        `tap` is called with all bytes that go to the host. Raises `ValueError`.
         """
         if rate_hz is not None and not rate_hz > 0.0:
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
@@ -109,10 +106,11 @@ class SpiTwin(Opened):
         self._commands = tuple(sample_command(channel) for channel in channels)
         self._slots = [slot for slot, channel in enumerate(channels) if E1 <= channel <= E24]
         self._electrodes = [channels[slot] - E1 for slot in self._slots]
-        self.injected_in_sweeps: Counter[str] = Counter()
-        """Of the faults injected, those that hit sweeps."""
         self._faults = faults
         self._injector = LinkFaultInjector(faults)
+        self.injected = self._injector.injected
+        self.injected_in_sweeps: Counter[str] = Counter()
+        """Of the faults injected, those that hit sweeps."""
         self._digest = digest
         self._ticks_per_ns = TICK_HZ / 1e9 * (1.0 + drift_ppm * 1e-6)
         self._clock = clock
@@ -137,13 +135,7 @@ class SpiTwin(Opened):
         self._spi_errors = [0] * self._sensors
         self._parser.reset()
 
-    @property
-    def injected(self) -> Counter[str]:
-        """Faults injected so far by name."""
-        return self._injector.injected
-
     def open(self) -> None:
-        """Plug in."""
         self.plug()
 
     def close(self) -> None:
@@ -152,7 +144,7 @@ class SpiTwin(Opened):
         self._replug_ns = None
 
     def plug(self) -> None:
-        """Make a pseudo-terminal, point the path at it, and say HELLO as after a reset."""
+        """Link the path to a new pseudo-terminal, and say HELLO."""
         self.unplug()
         self._refuse_to_replace()
         self._replug_ns = None
@@ -169,7 +161,7 @@ class SpiTwin(Opened):
         self._send(self._hello(0), waits=False)
 
     def _refuse_to_replace(self) -> None:
-        """Raise `FileExistsError` unless the path is free; a link to nothing was left by a twin."""
+        """Raise `FileExistsError` unless the path is free or a dead link."""
         if not self.path.exists():
             return
         if not self.path.is_symlink():
@@ -180,7 +172,7 @@ class SpiTwin(Opened):
         )
 
     def unplug(self) -> None:
-        """Take the pseudo-terminal away: the system tells the process that has it open."""
+        """Take the pseudo-terminal away."""
         ours = None if self._slave is None else os.ttyname(self._slave)
         if self.path.is_symlink() and str(self.path.readlink()) == ours:
             self.path.unlink()
@@ -192,7 +184,7 @@ class SpiTwin(Opened):
         self._unsent_bytes = 0
 
     def pull_fingers(self, *fingers: int) -> None:
-        """From now on nothing drives the lines of these fingers, and of no others."""
+        """Let nothing drive the lines of these fingers from now on."""
         self._faults = dataclasses.replace(self._faults, unplugged_fingers=fingers)
 
     def fileno(self) -> int | None:
@@ -200,7 +192,7 @@ class SpiTwin(Opened):
         return self._master
 
     def due_ns(self) -> int | None:
-        """When the next sweep, status or plugging in is due."""
+        """Time of the next sweep, status or plugging in, ns."""
         if self._master is None:
             return self._replug_ns
         if self._sweeping() and not self._unsent:
@@ -208,7 +200,7 @@ class SpiTwin(Opened):
         return self._status_due_ns
 
     def serve(self, stop: Callable[[], bool]) -> None:
-        """Run until `stop` says so; it is asked at least fifty times a second."""
+        """Run until `stop` returns True; it is asked 50 times a second."""
         while not stop():
             due_ns = self.due_ns()
             wait_ns = IDLE_NS if due_ns is None else max(due_ns - self._clock(), 0)

@@ -41,10 +41,7 @@ class DatagramStream(Protocol):
         """Kind of the sender, for people, such as `palm 0220`."""
 
     def receive(self, data: bytes, t_ns: int) -> Sequence[Reading] | None:
-        """Return the readings that a datagram completes, or None if it is dropped.
-
-        `t_ns`: monotonic time of its arrival.
-        """
+        """Return the readings that a datagram completes, or None if it is dropped."""
 
     def interrupt(self) -> None:
         """The link broke: another sender may come next."""
@@ -56,11 +53,11 @@ Stream = TypeVar("Stream", bound=DatagramStream)
 class DatagramDriver(Opened, Generic[Stream]):
     """Passes the datagrams of one sender to a stream.
 
-    The sender of the first good datagram is the only one until the link is lost: two hands on one
-    port look like one. It is known by address and port, as one computer may run two relays.
+    The sender of the first good datagram, by address and port, is the only one until the link is
+    lost: two hands on one port look like one.
 
-    The constructor raises `ValueError` for an argument out of range. `open` raises `LinkError` if
-    it cannot listen, which at the start means that the scene is wrong. `read_ready` raises nothing.
+    The constructor raises `ValueError`. `open` raises `LinkError` if it cannot listen, which at the
+    start means that the scene is wrong. `read_ready` raises nothing.
     """
 
     name: str
@@ -156,7 +153,7 @@ class DatagramDriver(Opened, Generic[Stream]):
         return readings
 
     def _datagrams(self) -> Iterator[tuple[bytes, int]]:
-        """Yield the datagrams that wait, oldest first, each with its time of arrival, ns."""
+        """Yield waiting datagrams, oldest first, with their time of arrival, ns."""
         if self._link.state is LinkState.CLOSED:
             raise RuntimeError(f"the {self.name} link is not open")
         receiver = self._receiver or self._listen_again()
@@ -177,7 +174,6 @@ class DatagramDriver(Opened, Generic[Stream]):
             self.stream.counters.kernel_drops = self._earlier_drops + receiver.dropped
 
     def _confirm(self) -> None:
-        """Note that the last datagram was good."""
         self._good_t_ns = self._t_ns
         if self._link.state is not LinkState.UP:
             self._sender = self._heard

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from drivers.base import LinkError
-from drivers.kernel_stamps import ANCILLARY_BYTES, DROPS, SO_RXQ_OVFL, SO_TIMESTAMPNS, TIMESPEC
+from drivers.kernel_stamps import ANCILLARY_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, read_stamps
 
 SCHEME = "udp://"
 RECEIVE_BUFFER_BYTES: Final = 128 * 1024
 """Asked of the kernel, which doubles it: about 0.2 s of palm packets while the loop is away. What
 waits longer is too old to judge, and a full buffer drops the newest."""
-
-_NS_PER_S: Final = 1_000_000_000
 
 Sender = tuple[str, int]
 """Numeric address and port."""
@@ -51,7 +49,6 @@ class Endpoint:
 
     @property
     def family(self) -> socket.AddressFamily:
-        """IPv4 or IPv6."""
         return socket.AF_INET6 if ":" in self.address else socket.AF_INET
 
 
@@ -61,8 +58,7 @@ class Datagram(NamedTuple):
     data: bytes
     """Cut off at one byte over the receiver's limit, so that its length says it was too long."""
     age_ns: int
-    """How long ago the kernel received it, ns. By the wall clock: wrong in the instant of a step,
-    and never below 0."""
+    """Time since the kernel received it, ns, 0 or more; wrong in the instant of a clock step."""
     sender: Sender
 
 
@@ -88,7 +84,6 @@ class DatagramReceiver:
 
     @property
     def port(self) -> int:
-        """The port that is listened on."""
         port: int = self._socket.getsockname()[1]
         return port
 
@@ -97,11 +92,10 @@ class DatagramReceiver:
         return self._socket.fileno()
 
     def close(self) -> None:
-        """Close the socket."""
         self._socket.close()
 
     def receive(self, most: int) -> Iterator[Datagram]:
-        """What has arrived, oldest first, at most `most`. Raises `LinkError`."""
+        """Yield up to `most` datagrams, oldest first. Raises `LinkError`."""
         for _ in range(most):
             try:
                 data, ancillary, _, sender = self._socket.recvmsg(
@@ -114,17 +108,7 @@ class DatagramReceiver:
             except OSError as error:
                 text = f"cannot receive: {error.strerror}"
                 raise LinkError.from_errno(error, text) from error
-            yield Datagram(data, self._age_ns(ancillary), sender[:2])
-
-    def _age_ns(self, ancillary: list[tuple[int, int, bytes]]) -> int:
-        """Age of a datagram by its time stamp; the count of drops comes along."""
-        age_ns = 0
-        for level, kind, value in ancillary:
-            if level != socket.SOL_SOCKET:
-                continue
-            if kind == SO_TIMESTAMPNS and len(value) == TIMESPEC.size:
-                seconds, rest_ns = TIMESPEC.unpack(value)
-                age_ns = max(0, time.time_ns() - seconds * _NS_PER_S - rest_ns)
-            elif kind == SO_RXQ_OVFL and len(value) == DROPS.size:
-                (self.dropped,) = DROPS.unpack(value)
-        return age_ns
+            wall_ns, drops = read_stamps(ancillary)
+            age_ns = 0 if wall_ns is None else max(0, time.time_ns() - wall_ns)
+            self.dropped = self.dropped if drops is None else drops
+            yield Datagram(data, age_ns, sender[:2])

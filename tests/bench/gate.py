@@ -20,11 +20,10 @@ from drivers.twins.grasps.whole_grasps import (
     GraspRow,
     Sampling,
     WholeGrasps,
-    read_end_points,
     rest_above,
 )
 from models.runtime import TactileModel
-from tests.drivers.twins.signals import crept_s, fresh_residuals, played
+from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 
 TABLES = ("palm_down", "palm_side")
 MAX_AGE_NS = 100_000_000

@@ -24,10 +24,10 @@ from drivers.can.readings import CanCounters
 from drivers.joints.message import JointMessage, JointStream
 from drivers.palm.stream import PalmStream
 from drivers.recordings.can_log import CanLog, frame_of, line_of
-from drivers.recordings.serial_log import SerialLog, SerialLogParser, encode_records
+from drivers.recordings.serial_log import SerialLog, encode_records, parse_records
 from drivers.spi.conversation import Conversation
 from drivers.spi.line import LineEvent
-from drivers.spi.messages import Ping, Sweep, encode
+from drivers.spi.messages import FrameParser, Ping, Sweep, encode
 from drivers.twins.palm import PalmTwin
 from tests.drivers.can.can_words import SLOT_NS, word
 from tests.drivers.one_sweep import (
@@ -92,14 +92,7 @@ def test_a_counter_that_goes_round_while_frames_are_lost_is_told_by_time(
 
 
 def sweep_fd_decoder() -> CanDecoder:
-    return make_decoder(
-        CanFormat.SWEEP_FD,
-        FINGERS,
-        counters=CanCounters(),
-        arbitration_id=BASE_ID,
-        sequence="electrodes",
-        data_length=None,
-    )
+    return make_decoder(FINGERS, CanCounters(), format=CanFormat.SWEEP_FD, arbitration_id=BASE_ID)
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
@@ -143,14 +136,7 @@ def sweep_frames(first: int) -> Feed:
 
 def samples(sequence: str) -> Callable[[int], Feed]:
     def begin(_first: int) -> Feed:
-        decoder = make_decoder(
-            CanFormat.SYNTOUCH,
-            FINGERS,
-            counters=CanCounters(),
-            arbitration_id=BASE_ID,
-            sequence=sequence,
-            data_length=None,
-        )
+        decoder = make_decoder(FINGERS, CanCounters(), arbitration_id=BASE_ID, sequence=sequence)
         return lambda unit: decoder.push(sample(unit, SEQUENCES[sequence]), unit.at * SLOT_NS)
 
     return begin
@@ -259,7 +245,7 @@ def test_of_a_bridge_a_sweep_is_one_frame_with_a_checksum(
     def feed(event: LineEvent, data: bytes) -> None:
         nonlocal seen
         if logged:
-            for record in SerialLogParser().feed(encode_records(event, t_ns, data)):
+            for record in parse_records(FrameParser(), encode_records(event, t_ns, data)):
                 seen += expect_one_sweep(log.feed(t_ns, record))
         elif event is LineEvent.RECEIVED:
             seen += expect_one_sweep(conversation.receive(data, t_ns, t_ns))

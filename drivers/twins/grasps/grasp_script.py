@@ -18,8 +18,7 @@ CREEP_SHARE: Range = (0.05, 0.07)
 CREEP_TAU_S: Range = (0.10, 0.14)
 """Time constant of that creep, s."""
 LOAD_COUNTS: Range = (20.0, 60.0)
-"""What a finger's most pressed electrode falls by when it takes the load, counts: the weight of a
-light object, far less than a grasp."""
+"""Fall of a finger's most pressed electrode under load, counts: far less than by a grasp."""
 LOAD_S = 0.15
 """The load comes within this time, s."""
 SLIPPING_ELECTRODES = 0.5
@@ -166,7 +165,7 @@ class GraspScript:
         )
 
     def deviation(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Counts against the rest, shape (fingers, 24), as sampled at `t_s`, shape () or (24,)."""
+        """Return counts against the rest, (fingers, 24), at `t_s`, () or (24,)."""
         timetable = self.timetable
         if t_s.max() <= min(timetable.touched_s) or t_s.min() >= timetable.open_s:
             return np.zeros_like(self._deviation)
@@ -196,7 +195,7 @@ class GraspScript:
     def _lift_changes(
         self, slipped: bool, rng: np.random.Generator
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Load in counts, and share of the deviation that is lost, both of shape (fingers, 24)."""
+        """Return load, counts, and lost share of the deviation: (fingers, 24) each."""
         nothing = np.zeros_like(self._deviation)
         if slipped:
             losing = rng.random(nothing.shape) < SLIPPING_ELECTRODES
@@ -215,7 +214,7 @@ class GraspScript:
 def _touches(
     fingers: int, first_s: float, durations: Durations, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """When each finger touches, s: the first one at `first_s`, the last one a drawn time later."""
+    """Return when each finger touches, s; the first one at `first_s`."""
     order = rng.random(fingers)
     span_s = rng.uniform(*durations.touch_s)
     order -= order.min()
@@ -225,6 +224,6 @@ def _touches(
 
 
 def _minimum_jerk(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Way made after this share of the time, 0..1: how arms and hands move (Flash, Hogan 1985)."""
+    """Return the way after a share of the time, 0..1 (Flash, Hogan 1985)."""
     share = np.minimum(np.maximum(share, 0.0), 1.0)
     return share * share * share * (10.0 + share * (6.0 * share - 15.0))

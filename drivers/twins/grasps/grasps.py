@@ -23,10 +23,7 @@ _FIRST_FINGER_CELL, _CELLS_PER_FINGER, _ELECTRODES_CELL = 8, 6, 5
 
 
 def recorded_counts(path: Path, fingers: Sequence[str] = ("ff", "mf", "th")) -> Iterator[Counts]:
-    """Counts of a recording, row by row: grasp table, stream, or ROS export of a Shadow hand.
-
-    Raises `RecordingError` if the file is none of these or holds a value that is no count.
-    """
+    """Yield the counts of a grasp table, stream or ROS export. Raises `RecordingError`."""
     try:
         with path.open(newline="") as file:
             header = file.readline(64 * 1024)

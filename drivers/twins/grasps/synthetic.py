@@ -2,23 +2,21 @@
 
 The model describes the BioTac SP Stability Set (palm down and palm side; MIT licence,
 Zapata-Impata et al. 2018, Garcia-Garcia et al. 2019) by 5763 parameters per class, against some
-92,000 counts of a class in the data set; it holds none of its grasps. Each class is a mixture of
-three Gaussians over the raw counts of ff, mf, th: clusters by k-means, with the 24 largest
-principal axes of each.
+92,000 counts of a class; it holds none of its grasps. A class is a mixture of three Gaussians over
+the raw counts of ff, mf, th, with the 24 largest principal axes of each.
 
-`python -m drivers.twins.grasps.synthetic` writes the demo table again, byte for byte, with `--day`
-the demo day.
+`python -m drivers.twins.grasps.synthetic` writes the demo table, with `--day` the demo day.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -124,25 +122,17 @@ def write_table(grasps: SyntheticGrasps, file: TextIO) -> None:
 
 def read_model() -> GraspModel:
     """Read the model of real grasps."""
-    document = json.loads(MODEL.read_text(encoding="utf-8"))
-    return {False: _grasp_class(document["stable"]), True: _grasp_class(document["slip"])}
+    model = msgspec.json.decode(MODEL.read_bytes(), type=_ModelFile, dec_hook=_to_array)
+    return {False: model.stable, True: model.slip}
 
 
-def _grasp_class(document: Mapping[str, Any]) -> GraspClass:
-    components = [
-        Component(
-            weight=component["weight"],
-            mean=np.array(component["mean"]),
-            axes=np.array(component["axes"]),
-            spread=np.array(component["spread"]),
-        )
-        for component in document["components"]
-    ]
-    return GraspClass(
-        lowest=np.array(document["lowest"]),
-        highest=np.array(document["highest"]),
-        components=tuple(components),
-    )
+class _ModelFile(msgspec.Struct):
+    stable: GraspClass
+    slip: GraspClass
+
+
+def _to_array(_kind: type, numbers: list[float]) -> NDArray[np.float64]:
+    return np.array(numbers, dtype=np.float64)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

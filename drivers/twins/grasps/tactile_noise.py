@@ -29,10 +29,9 @@ class TactileNoise(Protocol):
 
 
 class MeasuredNoise:
-    """Gaussian noise, isolated downward spikes of single electrodes, and the warm-up drift.
+    """Gaussian noise, downward spikes of single electrodes, and the warm-up drift.
 
-    In a sweep at most one electrode of a finger spikes, and never twice in a row; the recordings
-    show no other kind.
+    At most one electrode of a finger spikes in a sweep, and never twice in a row, as recorded.
     """
 
     def __init__(
@@ -48,7 +47,6 @@ class MeasuredNoise:
         self._spiked = rng.integers(0, ELECTRODES, fingers)
 
     def sweep(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """See `TactileNoise`."""
         noise = self._rng.normal(0.0, NOISE_COUNTS, (self._fingers.size, ELECTRODES))
         drift = DRIFT_COUNTS_PER_S * np.minimum(t_s, WARM_UP_S)
         noise += np.minimum(drift, self._drift_max)

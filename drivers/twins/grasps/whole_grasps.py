@@ -1,8 +1,7 @@
 """Streams of whole grasps: rest, approach, touch, close, settle, lift or slip, release.
 
-The end points are rows of a grasp table or drawn ones; what lies between them is made up, with the
-measured noise on it. Contact lowers counts, so an end point is a believable contact only where it
-lies at or below the rest; see `rest_above`.
+End points are rows of a grasp table or drawn; what lies between is made up, with measured noise.
+Contact lowers counts, so a believable end point lies at or below the rest; see `rest_above`.
 
 `python -m drivers.twins.grasps.whole_grasps` writes the demo recording again, byte for byte.
 """
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES
 from drivers.recordings.csv_player import DEMO_RECORDING
-from drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns, read_rows
+from drivers.recordings.csv_rows import OBJECT, SLIPPED, TIME, electrode_columns
 from drivers.twins.grasps import synthetic
 from drivers.twins.grasps.grasp_script import (
     JOINT_NAMES,
@@ -46,8 +45,7 @@ POSITION_NOISE_RAD = 0.0003
 REST_QUANTILE = 0.98
 """See `rest_above`."""
 WARM_REST_MAX = COUNT_MAX - 50
-"""No electrode drifts above this, counts: one of the synthetic first finger rests at 3975 and would
-drift to the end of a sensor's range in three minutes."""
+"""No electrode drifts above this, counts: the end of the range would look like a fault."""
 DEMO_GRASPS = 12
 DEMO_DURATIONS = Durations(
     first_rest_s=(1.2, 1.2),
@@ -69,8 +67,7 @@ class Sampling(StrEnum):
     FRESH = "fresh"
     """Every electrode is sampled at the time of the row."""
     HELD = "held"
-    """Rows of 100 Hz with values of 71.43 Hz, one request per ms, held: the public recordings. Each
-    pair of electrodes repeats in 2 of 7 rows."""
+    """Rows of 100 Hz hold values of 71.43 Hz, as recorded: a pair repeats in 2 of 7 rows."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,10 +90,7 @@ class GraspRow:
 
 
 class WholeGrasps:
-    """A stream of grasps; iterating starts it over, and the same seed gives the same stream.
-
-    Memory does not grow with the length.
-    """
+    """A stream of grasps: the same for the same seed, and from the start at each iteration."""
 
     def __init__(
         self,
@@ -110,10 +104,10 @@ class WholeGrasps:
         loop: bool = False,
         seed: int = 0,
     ) -> None:
-        """`rest`: untouched counts, shape (fingers, 24); `loop` plays the end points without end.
+        """`rest`: untouched counts, shape (fingers, 24). `loop`: play the end points without end.
 
-        `noise` is made of the number of fingers and a source of chance, `MeasuredNoise` unless
-        given. Raises `ValueError` for a rate that is not positive or, held, not 100 Hz.
+        `noise`: by default `MeasuredNoise`. Raises `ValueError` for a rate that is not positive or,
+        held, not 100 Hz.
         """
         if not 0.0 < rate_hz < float("inf"):
             raise ValueError(f"rate_hz is {rate_hz}, must be positive")
@@ -142,11 +136,21 @@ class WholeGrasps:
                     return
                 script = following
             jitter = joint_rng.normal(0.0, POSITION_NOISE_RAD, len(JOINT_NAMES))
-            counts = sampler.sample(script, t_s)
-            yield _grasp_row(script, t_s, counts, script.position_rad(t_s) + jitter)
+            timetable = script.timetable
+            has_begun = t_s >= timetable.approach_s
+            yield GraspRow(
+                t_s=t_s,
+                counts=sampler.sample(script, t_s),
+                joint_names=JOINT_NAMES,
+                position_rad=script.position_rad(t_s) + jitter,
+                phase=timetable.phase(t_s),
+                grasp=timetable.grasp if has_begun else 0,
+                slipped=timetable.slipped if has_begun else None,
+                object_name=timetable.object_name if has_begun else None,
+            )
 
     def timetables(self) -> Iterator[Timetable]:
-        """The truth about each grasp in turn, before, while or after the stream is played."""
+        """Yield the truth about each grasp; may be called at any time."""
         return (script.timetable for script in self._scripts())
 
     def _scripts(self) -> Iterator[GraspScript]:
@@ -198,7 +202,7 @@ class FreshSampler:
 
 
 class HeldSampler(FreshSampler):
-    """Keeps two rounds: an electrode that the present one has not come to yet has its old value."""
+    """Rows of two rounds: an electrode not yet sampled has its old value."""
 
     def __init__(self, rest: NDArray[np.float64], noise: TactileNoise) -> None:
         super().__init__(rest, noise)
@@ -222,12 +226,10 @@ class HeldSampler(FreshSampler):
 def rest_above(
     end_points: NDArray[np.uint16], quantile: float = REST_QUANTILE
 ) -> NDArray[np.float64]:
-    """A resting level for the grasps of a table: counts (grasps, fingers, 24) -> (fingers, 24).
+    """Return a resting level, (fingers, 24), for the grasps of a table, (grasps, fingers, 24).
 
-    A table does not tell what its fingers rest at. Contact lowers counts, and in many grasps an
-    electrode is hardly pressed, so the rest is near the upper end of what an electrode shows. It is
-    a quantile and not the largest, which a single odd grasp decides; the few end points above it
-    rise at contact.
+    Contact lowers counts, and in many grasps an electrode is hardly pressed, so the rest is near
+    the upper end of what it shows. A quantile is not decided by one odd grasp, as a maximum is.
     """
     return np.asarray(np.quantile(end_points, quantile, axis=0), dtype=np.float64)
 
@@ -241,11 +243,7 @@ def synthetic_grasps(
     loop: bool = False,
     seed: int = 0,
 ) -> WholeGrasps:
-    """Return a stream of synthetic grasps, half of them slipping.
-
-    End points and rest are drawn from the model of `drivers.twins.grasps.synthetic`. Raises
-    `ValueError` as `WholeGrasps` does.
-    """
+    """Return a stream of synthetic grasps, half of them slipping. Raises `ValueError`."""
     model = synthetic.read_model()
     rng = np.random.default_rng([seed, 2])
     shape = (-1, len(synthetic.FINGERS), ELECTRODES)
@@ -268,19 +266,8 @@ def synthetic_grasps(
     )
 
 
-def read_end_points(path: Path) -> list[EndPoint]:
-    """Return the grasps of a labelled table in the order of the file. Raises `RecordingError`."""
-    notes = ((row, row.annotation) for row in read_rows(path, synthetic.FINGERS, strict=True))
-    return [
-        EndPoint(row.counts, note.slipped is True, note.object_name or "") for row, note in notes
-    ]
-
-
 def write_stream(rows: Iterable[GraspRow], file: TextIO, t_decimals: int) -> None:
-    """Write rows of ff, mf, th as a stream that a replay plays.
-
-    A label column holds 0 or 1, so it is 0 before the first grasp, where the object is empty.
-    """
+    """Write a stream of ff, mf, th; the label is 0 before the first grasp."""
     electrodes = [name for finger in synthetic.FINGERS for name in electrode_columns(finger)]
     file.write(",".join([TIME, OBJECT, SLIPPED, *electrodes, *JOINT_NAMES]) + "\n")
     for row in rows:
@@ -298,26 +285,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     stream = synthetic_grasps(DEMO_GRASPS, sampling=Sampling.HELD, durations=DEMO_DURATIONS)
     with options.out.open("w", encoding="utf-8", newline="") as file:
         write_stream(stream, file, t_decimals=2)
-
-
-def _grasp_row(
-    script: GraspScript,
-    t_s: float,
-    counts: NDArray[np.uint16],
-    position_rad: NDArray[np.float64],
-) -> GraspRow:
-    timetable = script.timetable
-    begun = t_s >= timetable.approach_s
-    return GraspRow(
-        t_s=t_s,
-        counts=counts,
-        joint_names=JOINT_NAMES,
-        position_rad=position_rad,
-        phase=timetable.phase(t_s),
-        grasp=timetable.grasp if begun else 0,
-        slipped=timetable.slipped if begun else None,
-        object_name=timetable.object_name if begun else None,
-    )
 
 
 if __name__ == "__main__":

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ElectrodeFault, TactileReading
-from drivers.palm.packet import ROUND, PalmCounters, PalmParser
-from drivers.palm.rounds import RoundAssembler
+from drivers.palm.packet import ROUND
+from drivers.palm.stream import PalmStream
 from drivers.recordings.faults import FaultInjector, ReplayCounters, ReplayFaults
 from drivers.twins.faults import LinkFaults
 from drivers.twins.palm import PalmTwin
 from tests.daemon.fakes import FINGERS, MS
 from tests.daemon.judge.fault_bench import Fault, Step
+from tests.drivers.palm.palm_stream import tactile
 
 JOINTS_LOST_FOR = 120
 """Readings at 100 Hz: longer than `joints_lost_ms` of the scene, 1000 ms."""
@@ -156,8 +157,7 @@ def on_a_palm_link(faults: LinkFaults) -> Fault:
     def spoil(sound: Sequence[Step]) -> list[Step]:
         counts = [step.tactile.counts for step in sound if step.tactile is not None]
         joints = {step.now_ns: step.joints for step in sound}
-        counters = PalmCounters()
-        parser, sweeps = PalmParser(counters), RoundAssembler(FINGERS, counters)
+        stream = PalmStream(FINGERS)
         before = PalmTwin([counts[0]] * SYNCHRONISING, seed=1).packets()
         lead_in = ([packet.to_bytes()] for packet in before)
         steps: list[Step] = []
@@ -165,16 +165,10 @@ def on_a_palm_link(faults: LinkFaults) -> Fault:
         now_ns = start_ns - SYNCHRONISING * ROUND * MS
         for datagrams in itertools.chain(lead_in, PalmTwin(counts[1:], faults=faults).cycles()):
             now_ns += MS
-            packets = [packet for data in datagrams if (packet := parser.parse(data))]
-            readings = [
-                reading
-                for packet in packets
-                if not sweeps.repeats(packet)
-                for reading in sweeps.push(packet, now_ns)
-            ]
+            readings = [made for data in datagrams for made in stream.receive(data, now_ns) or ()]
             if now_ns > start_ns:
                 steps.append(Step(now_ns, None, joints.get(now_ns)))
-                steps += [Step(now_ns, reading, None) for reading in readings]
+                steps += [Step(now_ns, reading, None) for reading in tactile(readings)]
         return steps
 
     return spoil

@@ -17,8 +17,8 @@ from daemon.judge.health import Health, PastSweeps
 from daemon.judge.pipeline import Pipeline
 from daemon.judge.reasons import Decision, GateState, Reason
 from drivers.base import ElectrodeFault, TactileReading
-from drivers.palm.packet import ROUND, PalmCounters, PalmPacket
-from drivers.palm.rounds import RoundAssembler
+from drivers.palm.packet import ROUND, PalmPacket
+from drivers.palm.stream import PalmStream
 from drivers.twins.grasps.grasp_script import Durations
 from drivers.twins.grasps.grasps import recorded_counts
 from drivers.twins.grasps.whole_grasps import PALM_RATE_HZ, RATE_HZ, Sampling, synthetic_grasps
@@ -27,6 +27,7 @@ from tests.bench.recurrence import TABLES, UNTOUCHED, again
 from tests.daemon.fakes import FINGERS, MS, Clock
 from tests.daemon.judge.fault_bench import START_NS, Finding, Grasp, Step, network
 from tests.daemon.judge.judge_faults import ring, ring_on_a_palm
+from tests.drivers.palm.palm_stream import tactile
 
 # By the words of `daemon.judge.recurrence`.
 SWEEPS, READ_MIN = 128, 12
@@ -79,8 +80,7 @@ def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stabl
     packets: int,
 ) -> None:
     """Where it begins anew a packet is lost, or two contradict each other: a round lacks those."""
-    counters, clock = PalmCounters(), Clock(START_NS)
-    sweeps = RoundAssembler(FINGERS, counters)
+    clock, stream = Clock(START_NS), PalmStream(FINGERS)
     pipeline = Pipeline(network(), FINGERS, Limits(), clock, hand=HandLimits())
     moments = synthetic_grasps(1, rate_hz=PALM_RATE_HZ, durations=HELD, seed=0)
     source = PalmTwin(moment.counts for moment in moments).packets()
@@ -91,7 +91,7 @@ def test_a_ring_of_palm_packets_that_is_no_whole_number_of_rounds_is_never_stabl
         packet = last[0] if stable >= UNDER_RING else next(source)
         last.append(packet)
         turning += stable >= UNDER_RING
-        for reading in () if sweeps.repeats(packet) else sweeps.push(packet, clock.now_ns):
+        for reading in tactile(stream.receive(packet.to_bytes(), clock.now_ns) or ()):
             is_stable = pipeline.judge(reading).decision is Decision.STABLE
             assert not (is_stable and turning > packets + GRACE * ROUND)
             stable += is_stable

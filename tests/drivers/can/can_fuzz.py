@@ -19,9 +19,9 @@ def decoder(
 ) -> tuple[CanDecoder, CanCounters]:
     counters = CanCounters()
     made = make_decoder(
-        frame_format,
         ("ff", "mf", "th"),
-        counters=counters,
+        counters,
+        format=frame_format,
         arbitration_id=arbitration_id,
         sequence="electrodes",
         data_length=options.get("data_length"),

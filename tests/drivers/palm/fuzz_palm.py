@@ -18,8 +18,8 @@ from drivers.joints.message import (
     JointMessage,
     JointStream,
 )
-from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
-from drivers.palm.rounds import RoundAssembler
+from drivers.palm.packet import CAN_RECORD_BYTES, Palm, PalmPacket, parse_packet
+from drivers.palm.stream import PalmStream
 from drivers.twins.palm import PalmTwin
 from tests.bench.fuzz import Target
 from tests.drivers.twins.signals import GeneratedContact
@@ -32,11 +32,9 @@ MESSAGES = 2000
 NAMES = sorted(JOINTS)
 
 _PACKETS = [
-    (packet.to_bytes(), packet)
-    for palm, can_record in itertools.product(Palm, (False, True))
-    for packet in PalmTwin(
-        itertools.islice(GeneratedContact(), ROUNDS), palm=palm, can_record=can_record
-    ).packets()
+    (packet.to_bytes() + appended, packet)
+    for palm, appended in itertools.product(Palm, (b"", bytes(CAN_RECORD_BYTES)))
+    for packet in PalmTwin(itertools.islice(GeneratedContact(), ROUNDS), palm=palm).packets()
 ]
 
 
@@ -48,29 +46,26 @@ class _Palm:
     """Packets, and behind them the rounds, which must bear whatever the parser lets through."""
 
     def __init__(self) -> None:
-        counters = PalmCounters()
-        self._parser = PalmParser(counters)
-        self._sweeps = RoundAssembler(FINGERS, counters)
+        self._stream = PalmStream(FINGERS)
         self._t_ns = 0
         self._fed = 0
 
     def feed(self, chunk: bytes) -> list[PalmPacket]:
         self._fed += 1
         self._t_ns += CYCLE_NS * (40 if self._fed % 100 == 0 else 1)
-        packet = self._parser.parse(chunk)
+        packet = parse_packet(chunk, self._stream.counters)
         if packet is None:
             return []
-        if not self._sweeps.repeats(packet):
-            for reading in self._sweeps.push(packet, self._t_ns):
-                if reading.counts.max() > COUNT_MAX:
-                    raise ValueError(f"{reading.counts} has values that are no counts")
+        for reading in self._stream.push(packet, self._t_ns):
+            if reading.counts.max() > COUNT_MAX:
+                raise ValueError(f"{reading.counts} has values that are no counts")
         if self._fed % 1000 == 0:
-            self._sweeps.interrupt()
+            self._stream.interrupt()
         return [packet]
 
     @property
     def held_bytes(self) -> int:
-        return sum(packet is not None for packet in self._sweeps.packets)
+        return sum(packet is not None for packet in self._stream.packets)
 
 
 def _is_a_packet(packet: PalmPacket) -> bool:

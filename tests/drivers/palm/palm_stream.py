@@ -15,8 +15,8 @@ import pytest
 from drivers.base import ElectrodeFault, JointReading, Reading, TactileReading
 from drivers.joints.driver import JointStreamDriver
 from drivers.palm.driver import PalmDriver
-from drivers.palm.packet import Palm, PalmCounters, PalmPacket, PalmParser
-from drivers.palm.rounds import RoundAssembler
+from drivers.palm.packet import Palm, PalmCounters, PalmPacket
+from drivers.palm.stream import PalmStream
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.palm import PalmTwin
 from drivers.udp.receiver import Datagram, DatagramReceiver
@@ -59,7 +59,7 @@ def rows(number: int, seed: int = 1) -> list[Counts]:
 class Played:
     """What came out of a stream."""
 
-    counters: PalmCounters = field(default_factory=PalmCounters)
+    counters: PalmCounters
     readings: list[TactileReading] = field(default_factory=list)
 
     def sound(self) -> list[TactileReading]:
@@ -67,18 +67,12 @@ class Played:
 
 
 def play(cycles: Iterable[Sequence[bytes]], fingers: Sequence[str] = FINGERS) -> Played:
-    """Datagrams by the millisecond through parser and sweeps, as the driver does it."""
-    played = Played()
-    parser, sweeps = PalmParser(played.counters), RoundAssembler(fingers, played.counters)
+    """Datagrams by the millisecond through a stream, as the driver does it."""
+    stream = PalmStream(fingers)
+    played = Played(stream.counters)
     for cycle, datagrams in enumerate(cycles):
         for data in datagrams:
-            packet = parser.parse(data)
-            if packet is None:
-                continue
-            if sweeps.repeats(packet):
-                played.counters.duplicate_packets += 1
-                continue
-            played.readings.extend(sweeps.push(packet, cycle * MS))
+            played.readings += tactile(stream.receive(data, cycle * MS) or ())
     return played
 
 

@@ -72,14 +72,14 @@ def test_the_palm_is_a_driver() -> None:
 
 
 @pytest.mark.parametrize("palm", list(Palm))
-@pytest.mark.parametrize("can_record", [False, True])
+@pytest.mark.parametrize("appended", [b"", bytes(12)])
 def test_every_count_arrives_over_udp(
-    driver: PalmDriver, clock: Clock, palm: Palm, can_record: bool
+    driver: PalmDriver, clock: Clock, palm: Palm, appended: bytes
 ) -> None:
-    twin = PalmTwin(rows(20), palm=palm, can_record=can_record)
+    twin = PalmTwin(rows(20), palm=palm)
     with Sender(driver) as sender:
         readings = []
-        for batch in rounds_of(data for cycle in twin.cycles() for data in cycle):
+        for batch in rounds_of(packet.to_bytes() + appended for packet in twin.packets()):
             sender.send(*batch)
             readings += tactile(driver.read_ready())
             clock.now_ns += MS

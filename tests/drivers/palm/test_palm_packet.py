@@ -11,12 +11,11 @@ import pytest
 
 from drivers.palm.packet import (
     CHANNELS,
-    CanRecord,
     Palm,
     PalmCounters,
     PalmPacket,
-    PalmParser,
     TactileSlot,
+    parse_packet,
     position_of,
 )
 
@@ -136,7 +135,7 @@ def filled(palm: Palm) -> ctypes.LittleEndianStructure:
 
 
 def parse(data: bytes) -> PalmPacket | None:
-    return PalmParser(PalmCounters()).parse(data)
+    return parse_packet(data, PalmCounters())
 
 
 def packet_of(palm: Palm) -> PalmPacket:
@@ -162,32 +161,24 @@ def test_every_field_is_read_from_its_place(palm: Palm, appended: bytes) -> None
     assert packet is not None
     assert packet.palm is palm
     assert list(packet.sensors) == SNAPSHOT
-    assert (packet.command, packet.motor_type, packet.which_motors) == (1, 5, 1)
-    assert (packet.motors_arrived, packet.motors_failed) == (0xAAAAA, 0x00400)
-    assert packet.motor_words == tuple(
-        word for motor in status.motors for word in (motor.torque, motor.misc)
-    )
+    assert (packet.command, packet.which_motors) == (1, 1)
     assert (packet.tactile_type, packet.tactile_valid) == (0x0019, 0x13)
     biotacs = [finger.biotac for finger in status.tactile]
     assert packet.tactile == tuple(
         TactileSlot(biotac.pac[0], biotac.pac[1], biotac.other_0, biotac.data_valid, biotac.other_1)
         for biotac in biotacs
     )
-    assert packet.idle_time_us == 430
-    record = CanRecord(1, 3, 0x215, bytes([1, 2, 3, 0, 0, 0, 0, 0])) if appended else None
-    assert packet.can_record == record
 
 
-@pytest.mark.parametrize("record", [None, CanRecord(0, 8, 0x201, bytes(range(8)))])
 @palms
-def test_a_packet_is_written_where_it_is_read(palm: Palm, record: CanRecord | None) -> None:
-    packet = dataclasses.replace(packet_of(palm), can_record=record)
+def test_a_packet_is_written_where_it_is_read(palm: Palm) -> None:
+    packet = packet_of(palm)
     data = packet.to_bytes()
-    assert len(data) == LENGTHS[palm] + (0 if record is None else 12)
+    assert len(data) == LENGTHS[palm]
     assert parse(data) == packet
     status = STRUCTURES[palm].from_buffer_copy(data)
     assert status.tactile[4].biotac.other_1 == packet.tactile[4].other_1
-    assert status.motors[9].torque == packet.motor_words[18]
+    assert status.which_motors == packet.which_motors
 
 
 @pytest.mark.parametrize(
@@ -197,8 +188,6 @@ def test_a_packet_is_written_where_it_is_read(palm: Palm, record: CanRecord | No
         {"sensors": (65536,) * 37},
         {"which_motors": 1 << 15},
         {"tactile": (TactileSlot(0, 0, -1, 0, 0),) * 5},
-        {"motor_words": (0,) * 19},
-        {"can_record": CanRecord(256, 0, 0, b"")},
     ],
 )
 def test_what_does_not_fit_a_packet_is_not_written(change: dict[str, Any]) -> None:
@@ -210,14 +199,14 @@ def test_what_does_not_fit_a_packet_is_not_written(change: dict[str, Any]) -> No
 @pytest.mark.parametrize("length", [0, 1, 219, 221, 231, 233, 415, 417, 429, 531, 541, 543, 65507])
 def test_a_length_that_no_palm_sends_is_counted_and_dropped(length: int) -> None:
     counters = PalmCounters()
-    assert PalmParser(counters).parse(b"\x01" + bytes(max(length - 1, 0))) is None
+    assert parse_packet(b"\x01" + bytes(max(length - 1, 0)), counters) is None
     assert (counters.bad_lengths, counters.packets) == (1, 0)
 
 
 @pytest.mark.parametrize("length", [220, 232, 416, 428, 530, 542])
 def test_an_empty_packet_is_counted_and_dropped(length: int) -> None:
     counters = PalmCounters()
-    assert PalmParser(counters).parse(bytes(length)) is None
+    assert parse_packet(bytes(length), counters) is None
     assert (counters.empty_packets, counters.packets) == (1, 0)
 
 
@@ -238,9 +227,9 @@ def test_a_field_that_no_palm_sends_is_counted_and_dropped(
 ) -> None:
     data = bytearray(bytes(filled(Palm.PALM_0220)) + bytes(12))
     counters = PalmCounters()
-    assert PalmParser(counters).parse(bytes(data)) is not None
+    assert parse_packet(bytes(data), counters) is not None
     data[offset] = value
-    assert PalmParser(counters).parse(bytes(data)) is None
+    assert parse_packet(bytes(data), counters) is None
     assert getattr(counters, counter) == 1
     assert counters.packets == 1
 

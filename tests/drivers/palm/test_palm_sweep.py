@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from drivers.base import ElectrodeFault
-from drivers.palm.packet import PalmCounters, PalmPacket
-from drivers.palm.rounds import RoundAssembler
+from drivers.palm.packet import PalmPacket
+from drivers.palm.stream import PalmStream
 from drivers.twins.palm import PalmTwin
 from tests.drivers.palm.palm_stream import (
     FINGERS,
@@ -126,7 +126,7 @@ def test_a_finger_that_the_palm_marks_invalid_is_missing() -> None:
     played = play_packets(stream)
     assert flags(played.readings[0], MISSING) == [[0, electrode] for electrode in range(7, 24)]
     assert played.counters.invalid_fingers == ROUND - 5
-    sweeps = RoundAssembler(FINGERS, PalmCounters(), heed_finger_bits=False)
+    sweeps = PalmStream(FINGERS, heed_finger_bits=False)
     heedless = [reading for packet in stream for reading in sweeps.push(packet, 0)]
     assert not heedless[0].faults.any()
 
@@ -198,14 +198,14 @@ def test_a_packet_without_samples_takes_no_place(tactile_type: int, counter: str
 def test_a_packet_ten_cycles_after_it_was_due_tells_of_a_lost_round(
     after_ns: int, lost: int
 ) -> None:
-    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    sweeps = PalmStream(FINGERS)
     stream = packets(2)
     readings = [reading for at in range(ROUND) for reading in sweeps.push(stream[at], at * MS)]
     end_ns = 13 * MS + after_ns
     for at in range(ROUND):
         readings += sweeps.push(stream[ROUND + at], end_ns + at * MS)
     assert [reading.seq for reading in readings] == [0, 1 + lost]
-    assert (counters.missed_readings, counters.lost_packets) == (lost, lost * ROUND)
+    assert (sweeps.counters.missed_readings, sweeps.counters.lost_packets) == (lost, lost * ROUND)
 
 
 @pytest.mark.parametrize(
@@ -215,15 +215,15 @@ def test_a_packet_ten_cycles_after_it_was_due_tells_of_a_lost_round(
 def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
     after_ns: int, missed: int
 ) -> None:
-    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    sweeps = PalmStream(FINGERS)
     stream = packets(2)
     for at in range(ROUND):
         sweeps.push(stream[at], at * MS)
     sweeps.interrupt()
-    assert counters.interrupted_rounds == 0
+    assert sweeps.counters.interrupted_rounds == 0
     assert sweeps.push(stream[ROUND + 3], 15 * MS) == ()
     sweeps.push(stream[ROUND], 13 * MS + after_ns)
-    assert (counters.missed_readings, counters.unsynchronised_packets) == (missed, 1)
+    assert (sweeps.counters.missed_readings, sweeps.counters.unsynchronised_packets) == (missed, 1)
 
 
 @pytest.mark.parametrize(
@@ -239,12 +239,12 @@ def test_after_an_interruption_rounds_are_counted_by_time_for_two_seconds(
 def test_a_packet_is_late_that_comes_in_half_the_time_of_its_step_ahead(
     step: int, after_ns: int, late: bool
 ) -> None:
-    sweeps = RoundAssembler(FINGERS, counters := PalmCounters())
+    sweeps = PalmStream(FINGERS)
     stream = packets(1)
     for at in range(ROUND):
         sweeps.push(stream[at], at * MS)
     sweeps.push(stream[(ROUND - 1 + step) % ROUND], 13 * MS + after_ns)
-    assert counters.conflicting_packets == late, "its place is taken already"
+    assert sweeps.counters.conflicting_packets == late, "its place is taken already"
 
 
 def test_a_packet_of_the_round_before_is_late() -> None:
@@ -256,7 +256,7 @@ def test_a_packet_of_the_round_before_is_late() -> None:
 
 
 def test_how_long_no_round_can_end() -> None:
-    sweeps = RoundAssembler(FINGERS, PalmCounters())
+    sweeps = PalmStream(FINGERS)
     left = [sweeps.cycles_to_go]
     for at, packet in enumerate(packets(2)):
         sweeps.push(packet, at * MS)

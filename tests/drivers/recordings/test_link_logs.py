@@ -18,9 +18,9 @@ from drivers.recordings.can_log import CanLog, frame_of, line_of
 from drivers.recordings.link_log_player import LinkLogDriver
 from drivers.recordings.serial_log import (
     SerialLog,
-    SerialLogParser,
     SerialRecord,
     encode_records,
+    parse_records,
 )
 from drivers.spi.line import LineEvent
 from drivers.spi.messages import FrameParser
@@ -137,11 +137,11 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
     made: list[SerialRecord], size: int
 ) -> None:
     data = encoded(made)
-    parser = SerialLogParser()
+    parser = FrameParser()
     found = [
         record
         for start in range(0, len(data), size)
-        for record in parser.feed(data[start : start + size])
+        for record in parse_records(parser, data[start : start + size])
     ]
     assert found == made
     frames = FrameParser()
@@ -152,7 +152,7 @@ def test_records_come_back_however_the_file_is_cut_into_chunks(
 
 @given(st.binary(min_size=961, max_size=2000))
 def test_long_bytes_come_back_in_pieces(data: bytes) -> None:
-    found = list(SerialLogParser().feed(encode_records(LineEvent.RECEIVED, 5, data)))
+    found = list(parse_records(FrameParser(), encode_records(LineEvent.RECEIVED, 5, data)))
     assert b"".join(record.data for record in found) == data
     assert max(len(record.data) for record in found) == 960
     assert {(record.event, record.t_ns) for record in found} == {(LineEvent.RECEIVED, 5)}
@@ -165,14 +165,14 @@ def test_damage_costs_the_record_that_is_damaged_and_the_one_after_it_at_most(
     whole = bytearray(encoded(made))
     at = data.draw(st.integers(0, len(whole) - 1))
     whole[at] ^= data.draw(st.integers(1, 255))
-    found = list(SerialLogParser().feed(bytes(whole)))
+    found = list(parse_records(FrameParser(), bytes(whole)))
     assert len(found) >= len(made) - 2
     assert all(record in made for record in found)
 
 
 @given(st.binary(max_size=3000))
 def test_no_bytes_make_the_record_parser_raise(data: bytes) -> None:
-    list(SerialLogParser().feed(data))
+    list(parse_records(FrameParser(), data))
 
 
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"no frames\n" * 1000, bytes(range(256))])

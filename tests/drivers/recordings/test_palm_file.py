@@ -21,13 +21,13 @@ def player(path: Path, clock: Clock) -> tuple[PalmFile, LinkLogDriver[bytes]]:
     return log, LinkLogDriver([path], log, speed=1.0, clock=clock)
 
 
-@pytest.mark.parametrize(("palm", "can_record"), [(Palm.PALM_0220, True), (Palm.PALM_0250, False)])
+@pytest.mark.parametrize(("palm", "appended"), [(Palm.PALM_0220, bytes(12)), (Palm.PALM_0250, b"")])
 def test_a_file_of_packets_plays_count_for_count(
-    tmp_path: Path, palm: Palm, can_record: bool
+    tmp_path: Path, palm: Palm, appended: bytes
 ) -> None:
-    twin = PalmTwin(rows(40), palm=palm, can_record=can_record)
+    twin = PalmTwin(rows(40), palm=palm)
     path = tmp_path / "hand.palm"
-    path.write_bytes(b"".join(packet.to_bytes() for packet in twin.packets()) + bytes(5))
+    path.write_bytes(b"".join(packet.to_bytes() + appended for packet in twin.packets()) + bytes(5))
     readings = []
     clock = Clock()
     log, driver = player(path, clock)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import COUNT_MAX, ELECTRODES
-from drivers.twins.grasps.grasp_script import Timetable
+from drivers.recordings.csv_rows import read_rows
+from drivers.twins.grasps.grasp_script import EndPoint, Timetable
 from drivers.twins.grasps.grasps import Counts
 from drivers.twins.grasps.tactile_noise import (
     DRIFT_COUNTS_PER_S,
@@ -109,3 +111,11 @@ def crept_s(timetable: Timetable, rate_counts_per_s: float) -> float:
     if rate <= rate_counts_per_s:
         return timetable.closed_s
     return timetable.closed_s + timetable.creep_tau_s * math.log(rate / rate_counts_per_s)
+
+
+def read_end_points(path: Path) -> list[EndPoint]:
+    """The grasps of a labelled table of ff, mf, th, in the order of the file."""
+    notes = ((row, row.annotation) for row in read_rows(path, ("ff", "mf", "th"), strict=True))
+    return [
+        EndPoint(row.counts, note.slipped is True, note.object_name or "") for row, note in notes
+    ]

@@ -21,7 +21,7 @@ from drivers.twins.grasps.whole_grasps import (
     synthetic_grasps,
 )
 from tests.drivers.recordings.tables import rows_of
-from tests.drivers.twins.signals import crept_s, fresh_residuals, played
+from tests.drivers.twins.signals import crept_s, fresh_residuals, played, read_end_points
 
 REST = np.full((3, 24), 3000.0)
 SILENCE = np.zeros((1, 3, 24))
@@ -192,7 +192,7 @@ def test_real_end_points_are_reached_with_real_noise(bts3_dir: Path, sampling: S
     if not path.exists():
         pytest.skip("no untouched recording beside the real grasps")
     residuals = fresh_residuals(np.array(list(recorded_counts(path))))
-    end_points = whole_grasps.read_end_points(bts3_dir / "palm_down.csv")
+    end_points = read_end_points(bts3_dir / "palm_down.csv")
     rest = rest_above(np.array([end_point.counts for end_point in end_points]))
     grasps = WholeGrasps(rest, end_points[:10], sampling=sampling, noise=played(residuals))
     moments = list(grasps)
