@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("graspd")
 
-Message = list[bytes]
+Frames = list[bytes]
 Socket = zmq.Socket[bytes]
 
 STATUS = b"status."
@@ -258,9 +258,9 @@ class Door:
         """Send an answer with its routing id; False if the proxy is behind and it is dropped."""
         return _sent(self._ask, frames)
 
-    def receive(self) -> list[Message]:
+    def receive(self) -> list[Frames]:
         """Return at most `QUESTIONS_MAX` questions that have come, each with its routing id."""
-        received: list[Message] = []
+        received: list[Frames] = []
         with suppress(zmq.Again):
             while len(received) < QUESTIONS_MAX:
                 received.append(self._ask.recv_multipart(zmq.NOBLOCK))

@@ -247,7 +247,15 @@ class Status(_Message, frozen=True, kw_only=True):
     versions: dict[str, str]
 
 
-MESSAGES = (Verdict, GateMessage, Tactile, OutcomeMessage, Status)
+Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
+MESSAGES: Final[dict[str, type[Message]]] = {
+    "verdict": Verdict,
+    "gate": GateMessage,
+    "tactile": Tactile,
+    "outcome": OutcomeMessage,
+    "status": Status,
+}
+"""Messages by the first part of their topic."""
 
 encode = msgspec.json.Encoder().encode
 """JSON payload of a message."""
@@ -264,6 +272,6 @@ def schema() -> dict[str, Any]:
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "graspd wire messages, version 1",
-        "anyOf": [{"$ref": f"#/$defs/{message.__name__}"} for message in MESSAGES],
-        "$defs": msgspec.json.schema_components(MESSAGES)[1],
+        "anyOf": [{"$ref": f"#/$defs/{message.__name__}"} for message in MESSAGES.values()],
+        "$defs": msgspec.json.schema_components(MESSAGES.values())[1],
     }

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Final
 
 from daemon.publish.companion import REPEATED, Requests
-from daemon.publish.door import Message
+from daemon.publish.door import Frames
 from daemon.publish.messages import OBJECT_PATTERN
 from daemon.trust.lift_book import GraspId, Report
 
@@ -37,7 +37,7 @@ the owner of its grasps by them."""
 class Question:
     """Waits for an answer."""
 
-    envelope: Message
+    envelope: Frames
     """Routing id, and the delimiter of a REQ socket."""
     due_ns: int
     lifts: bool
@@ -56,7 +56,7 @@ class Questions:
         self.waiting: dict[Peer, Question] = {}
         """Questions without an answer, by the peer's routing id; the oldest first."""
 
-    def take(self, messages: Iterable[Message], now_ns: int, requests: Requests) -> None:
+    def take(self, messages: Iterable[Frames], now_ns: int, requests: Requests) -> None:
         """Take the messages of peers, and pass on to `requests` what they want."""
         asked = 0
         for peer, *envelope, text in messages:
@@ -81,7 +81,7 @@ class Questions:
             self.counters["given_up"] += 1
         self.waiting[peer] = question
 
-    def _take_outcome(self, envelope: Message, text: bytes, requests: Requests) -> None:
+    def _take_outcome(self, envelope: Frames, text: bytes, requests: Requests) -> None:
         """Pass on how a lift has ended, or refuse a text that does not say so."""
         told = _REPORT.fullmatch(text)
         if told is None:
@@ -95,7 +95,7 @@ class Questions:
         )
         requests.outcome(report, partial(self._answer_outcome, envelope))
 
-    def _answer_outcome(self, envelope: Message, refusal: str | None) -> None:
+    def _answer_outcome(self, envelope: Frames, refusal: str | None) -> None:
         """Tell the peer whether its outcome was taken. A peer that has gone misses it."""
         answer: dict[str, object] = {"v": 1, "ok": refusal in (None, REPEATED)}
         if refusal == REPEATED:
@@ -106,7 +106,7 @@ class Questions:
         self.counters["outcomes" if answer["ok"] else refused] += 1
         self._answer(envelope, json.dumps(answer, separators=(",", ":")).encode())
 
-    def _answer(self, envelope: Message, payload: bytes) -> None:
+    def _answer(self, envelope: Frames, payload: bytes) -> None:
         self.counters["dropped"] += not self._send((*envelope, payload))
 
     def answer(self, payload: bytes, now_ns: int | None = None) -> list[Peer]:

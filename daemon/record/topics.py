@@ -12,15 +12,8 @@ import msgspec
 import numpy as np
 
 from daemon.judge.pipeline import Judgement
-from daemon.publish.messages import (
-    WIRE_VERSION,
-    Count,
-    GateMessage,
-    OutcomeMessage,
-    Status,
-    Tactile,
-    Verdict,
-)
+from daemon.publish import messages
+from daemon.publish.messages import WIRE_VERSION, Count, Tactile
 from daemon.record.flat import schema_of, table
 from daemon.record.viewers import Log, RawImage
 from daemon.trust.learner import LearnerState
@@ -118,20 +111,17 @@ class Topic(StrEnum):
     LOG = "log"
 
 
-MESSAGES: Final[dict[Topic, type[msgspec.Struct]]] = {
-    Topic.TACTILE: Tactile,
-    Topic.VERDICT: Verdict,
-    Topic.GATE: GateMessage,
-    Topic.STATUS: Status,
-    Topic.OUTCOME: OutcomeMessage,
-    Topic.JOINTS: Joints,
-    Topic.JUDGED: Judged,
-    Topic.ASKED: Event,
-    Topic.EXCHANGED: Exchanged,
-    Topic.SKIPPED: Event,
-    Topic.IMAGE: RawImage,
-    Topic.LOG: Log,
+MESSAGES: Final[dict[str, type[msgspec.Struct]]] = {
+    **messages.MESSAGES,
+    "joints": Joints,
+    "judged": Judged,
+    "asked": Event,
+    "exchanged": Exchanged,
+    "skipped": Event,
+    "image": RawImage,
+    "log": Log,
 }
+"""Messages by the first part of their topic."""
 EVENTS: Final = (Topic.ASKED, Topic.SKIPPED)
 EVENT: Final = b"{}"
 """Payload of an event."""
@@ -150,7 +140,7 @@ def schemas() -> dict[str, tuple[str, bytes]]:
     for topic, message in MESSAGES.items():
         family = "foxglove" if message in (RawImage, Log) else "graspd"
         schema = json.dumps(schema_of(message)).encode()
-        described[topic.value] = f"{family}.{message.__name__}", schema
+        described[topic] = f"{family}.{message.__name__}", schema
     return described
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from daemon.publish.messages import Tactile, Verdict
 from models.contract import Finger
 from models.layout import ELECTRODES
-from models.levels import PIXELS, Rest, fall_of, levels_of
+from models.levels import PIXELS, RestCounts, fall_of, levels_of
 
 OLD_NS = 1_000_000_000
 """Older images are not shown: they would look alive."""
@@ -49,7 +49,7 @@ class Fingers:
     def __init__(self) -> None:
         self._tactile: Tactile | None = None
         self._tactile_ns = 0
-        self._rests: dict[str, Rest] = {}
+        self._rest = RestCounts()
 
     def take(self, tactile: Tactile, now_ns: int, resting: Collection[str]) -> bool:
         """Take a reading that arrived at `now_ns`; return False if its parts do not fit.
@@ -63,8 +63,11 @@ class Fingers:
         self._tactile, self._tactile_ns = tactile, now_ns
         for index, finger in enumerate(tactile.fingers):
             if finger in resting:
-                rest = self._rests.setdefault(finger, Rest())
-                rest.learn(np.array(tactile.counts[index]), np.array(tactile.faults[index]) == 0)
+                counts, sound = (
+                    np.array(tactile.counts[index]),
+                    np.array(tactile.faults[index]) == 0,
+                )
+                self._rest.learn(finger, counts, sound)
         return True
 
     def images(self, verdict: Verdict, now_ns: int) -> list[FingerImage]:
@@ -81,7 +84,7 @@ class Fingers:
         sound = np.array(tactile.faults[index]) == 0
         electrodes = range(1, ELECTRODES + 1)
         repaired = [f"{name}_{number}" in verdict.repaired for number in electrodes]
-        rest = self._rests[name].counts if name in self._rests else None
+        rest = self._rest.of(name)
         fall = fall_of(counts, sound, rest)
         return FingerImage(
             name=name,

@@ -12,16 +12,12 @@ import msgspec
 from daemon.judge.reasons import ADVICE, WATCHED_LIFT, Decision, GateState, Reason
 from daemon.process.sleep import boottime_ns
 from daemon.publish.messages import (
+    MESSAGES,
     GateMessage,
     OutcomeMessage,
     Status,
     Tactile,
     Verdict,
-    decode_gate,
-    decode_outcome,
-    decode_status,
-    decode_tactile,
-    decode_verdict,
 )
 from daemon.watch import figures
 from daemon.watch.evidence import SUPERVISED, doubt, rests_on, stillness
@@ -45,16 +41,6 @@ EXPECTED = {
 """Reasons of a hand that is open, or of a grasp that settles."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
-
-Message = Verdict | GateMessage | Tactile | OutcomeMessage | Status
-DECODERS: dict[str, Callable[[bytes], Message]] = {
-    "verdict": decode_verdict,
-    "gate": decode_gate,
-    "tactile": decode_tactile,
-    "outcome": decode_outcome,
-    "status": decode_status,
-}
-"""By first part of a topic."""
 
 
 class View:
@@ -81,11 +67,10 @@ class View:
     def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
         """Take one message that arrived at `now_ns`, monotonic ns of this computer."""
         kind, _, hand = topic.decode("ascii", "replace").partition(".")
-        decode = DECODERS.get(kind)
-        if decode is None or (self._hand is not None and hand != self._hand):
+        if kind not in MESSAGES or (self._hand is not None and hand != self._hand):
             return
         try:
-            message = decode(payload)
+            message = msgspec.json.decode(payload, type=MESSAGES[kind])
         except (msgspec.DecodeError, UnicodeDecodeError):
             self._unreadable += 1
             return
