@@ -2,7 +2,6 @@
 
 Judging the whole backlog would give verdicts on the past. A realtime loop that never sleeps is
 ended by the kernel (RLIMIT_RTTIME).
-
 """
 
 from __future__ import annotations

@@ -26,7 +26,6 @@ class RealtimeMode(Companion):
 
     Only the loop's thread gets the priority, before libzmq's threads, which copy messages. One
     warning says what is refused.
-
     """
 
     def __init__(self, wanted: Realtime) -> None:

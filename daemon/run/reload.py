@@ -22,7 +22,6 @@ class Reload(Companion):
     """Stands before a `StopSignal`: the loop hears of a reload once there is a scene to run.
 
     Requests that come during a preparation lead to one more preparation.
-
     """
 
     def __init__(
