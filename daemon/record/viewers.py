@@ -1,5 +1,4 @@
-"""What viewers show without knowing graspd, made of its messages: tactile images as
-`foxglove.RawImage`, and changes as `foxglove.Log`."""
+"""Tactile images as `foxglove.RawImage`, and changes as `foxglove.Log`, for viewers."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from models.levels import FULL, HEIGHT, PIXELS, WIDTH, RestCounts, fall_of, leve
 INFO: Final = 2
 WARNING: Final = 3
 SCALE: Final = 4
-"""Pixels of an image per pixel of the tactile image, each way."""
+"""Pixels per pixel of the tactile image, each way."""
 _COLOURS: Final = {
     -100: (59, 125, 216),
     0: (38, 44, 54),
@@ -38,7 +37,7 @@ _COLOURS: Final = {
     80: (251, 180, 26),
     100: (252, 255, 190),
 }
-"""Colours by level: blue is risen, yellow pressed the most."""
+"""By level: blue is risen, yellow pressed the most."""
 _PALETTE = np.array(
     [
         np.interp(np.arange(-FULL, FULL + 1), list(_COLOURS), channel)
@@ -46,7 +45,7 @@ _PALETTE = np.array(
     ]
 ).T.astype(np.uint8)
 _MARK = np.array((0, 220, 220), np.uint8)
-"""Colour of an electrode whose count is faulty."""
+"""Of an electrode whose count is faulty."""
 
 LogLine = tuple[int, str, str]
 """Level, name and text."""
@@ -60,7 +59,6 @@ class Time(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, wall_ns: int) -> Time:
-        """Return the time `wall_ns`, ns since 1970."""
         return cls(*divmod(max(wall_ns, 0), 1_000_000_000))
 
 
@@ -167,17 +165,13 @@ class Painter:
     """Draws readings by where each finger rests, which it learns."""
 
     def __init__(self, images_hz: float) -> None:
-        """Draw at most `images_hz` images a second; 0 draws none."""
         self._period_ns = round(1e9 / images_hz) if images_hz else None
         self._due_ns = 0
         self._gate: GateState | None = None
         self._rest = RestCounts()
 
     def paint(self, message: Message, wall_ns: int) -> RawImage | None:
-        """Return the image of a reading of wall time `wall_ns`, ns, if one is due.
-
-        Raises `ValueError` for a reading whose parts do not fit.
-        """
+        """Return the image of a reading if one is due. Raises `ValueError`."""
         if isinstance(message, Verdict):
             self._gate = message.gate
         if not isinstance(message, Tactile) or self._period_ns is None:
@@ -212,7 +206,7 @@ class Painter:
     def _finger(
         self, name: str, counts: NDArray[np.float64], sound: NDArray[np.bool_]
     ) -> NDArray[np.uint8]:
-        """Draw one finger, shape (`HEIGHT`, `WIDTH`, 3); `counts`, `sound` have shape (24,)."""
+        """Draw one finger, shape (`HEIGHT`, `WIDTH`, 3)."""
         if self._gate is GateState.IDLE:
             self._rest.learn(name, counts, sound)
         rest = self._rest.of(name)
