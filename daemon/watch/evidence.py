@@ -1,4 +1,4 @@
-"""What a verdict rests on, in words, and whether that is enough to show `stable` as a promise."""
+"""What a verdict rests on, in words, and whether that is enough for a promise."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from daemon.publish.messages import Verdict
 from daemon.watch.snapshot import Line
 
 SURE_MS = LONG_NS / 1e6
-"""After this long without motion, ms, a slow slide is excluded too."""
+"""Time without motion, ms, after which a slow slide is excluded."""
 LIKELY = 0.25
-"""A likelier slip is never shown as a promise, whatever `stable` has been worth before."""
+"""A likelier slip is never shown as a promise."""
 NO_OUTCOME = "no outcome told yet"
 SUPERVISED = Line(
     "supervised", "lift only while a person watches, and tell the outcome: it teaches"
@@ -18,7 +18,7 @@ SUPERVISED = Line(
 
 
 def doubt(verdict: Verdict) -> str | None:
-    """Say why `stable` is not a promise yet; None if lifts have shown that it keeps the target."""
+    """Return why `stable` is not a promise yet; None if lifts have shown that it is."""
     risk, p_slip = verdict.risk, verdict.p_slip
     if verdict.early:
         return "judged early: it may still slide slowly, and is judged once more"
@@ -36,7 +36,7 @@ def doubt(verdict: Verdict) -> str | None:
 
 
 def rests_on(verdict: Verdict) -> str:
-    """Say in one line what the probability and the verdict rest on."""
+    """Return in one line what the verdict rests on."""
     network, risk = verdict.p_slip_model, verdict.risk
     said = "" if network is None else f"network {percent(network)}, "
     if risk is None or (risk.lifts == 0 and verdict.outcomes == 0):
@@ -48,7 +48,7 @@ def rests_on(verdict: Verdict) -> str:
 
 
 def stillness(still_ms: float | None) -> str:
-    """Say how long a hand has been still; `-` if that is not told."""
+    """Return how long a hand has been still; `-` if that is not known."""
     if still_ms is None:
         return "-"
     whole_ms = int(still_ms)
@@ -58,17 +58,17 @@ def stillness(still_ms: float | None) -> str:
 
 
 def lift(verdict: Verdict, ended: str | None) -> str:
-    """Say how the lift of a judged grasp ended; `-`: it was not to be lifted."""
+    """Return how a lift ended; `-`: it was not to be made."""
     if ended is not None:
         return "held" if ended == "stable" else "slipped"
     return "not told" if verdict.verdict is Decision.STABLE or verdict.supervised else "-"
 
 
 def percent(share: float) -> str:
-    """Write a share as percent, with two digits below 10 %."""
+    """Return a share as percent, with two digits below 10 %."""
     return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
 def counted(count: int, what: str) -> str:
-    """Write a count with its noun."""
+    """Return a count with its noun."""
     return f"{count} {what}{'' if count == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""Figures of a daemon in words: how learning goes, how fast it is, its session and drivers."""
+"""Figures of a daemon in words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from daemon.watch.snapshot import Line
 
 
 def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Say how learning goes, what matters most first."""
+    """Return how learning goes, what matters most first."""
     risk = None if verdict is None else verdict.risk
     lines = []
     if status is not None and status.lifts is not None:
@@ -33,10 +33,7 @@ def learning(verdict: Verdict | None, status: Status | None) -> list[Line]:
 def timing(
     verdict: Verdict | None, status: Status | None, verdicts_hz: float, lost: int, unreadable: int
 ) -> list[Line]:
-    """Give rates, delays and losses; `-` stands for what is not known.
-
-    `lost` counts gaps of `seq`; `unreadable` counts messages that are not graspd's.
-    """
+    """Return rates, delays and losses; `lost` counts gaps of `seq`."""
     lines = [
         Line("readings", "-" if status is None else f"{status.readings_hz:.0f} /s"),
         Line("verdicts", f"{verdicts_hz:.0f} /s"),
@@ -59,7 +56,7 @@ def timing(
 
 
 def session(verdict: Verdict | None, status: Status | None) -> list[Line]:
-    """Say whether the session is calibrated, and which electrodes are repaired."""
+    """Return whether the session is calibrated, and which electrodes are repaired."""
     said = "this model needs none"
     if status is None:
         said = "-"
@@ -71,7 +68,7 @@ def session(verdict: Verdict | None, status: Status | None) -> list[Line]:
 
 
 def drivers(status: Status | None) -> list[Line]:
-    """Give the counters of the drivers that are not 0, and versions."""
+    """Return the counters of the drivers that are not 0, and versions."""
     if status is None:
         return []
     lines = [

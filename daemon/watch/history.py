@@ -1,4 +1,4 @@
-"""The last five minutes of a hand, second by second, by the clock of the watching computer."""
+"""The last five minutes of a hand, second by second."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from daemon.watch.snapshot import Tone
 SECONDS = 300
 SECOND_NS = 1_000_000_000
 NO_SHARE = -1
-"""Stands for a second without a probability of slip."""
+"""A second without a probability of slip."""
 TONE_CODE = {
     Tone.SLIP: "x",
     Tone.TROUBLE: "t",
@@ -25,12 +25,10 @@ class History:
 
     def __init__(self) -> None:
         self._first: int | None = None
-        """Number of the first second."""
         self._seconds: dict[int, tuple[str, int]] = {}
-        """By number, the newest last: letters of its tones; highest probability of slip, %."""
+        """By number, the newest last: letters of its tones; highest probability, %."""
 
     def add(self, now_ns: int, tone: Tone, p_slip: float | None) -> None:
-        """Add what holds at `now_ns`."""
         second, code = now_ns // SECOND_NS, TONE_CODE[tone]
         share = NO_SHARE if p_slip is None else round(100 * p_slip)
         if self._first is None:
@@ -41,7 +39,7 @@ class History:
             del self._seconds[next(iter(self._seconds))]
 
     def seconds(self) -> list[tuple[str, int]]:
-        """Return the last five minutes, the oldest second first; one without a call was silent."""
+        """Return five minutes, the oldest second first; one without a call was silent."""
         if self._first is None:
             return []
         newest = max(self._seconds)

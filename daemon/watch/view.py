@@ -1,4 +1,4 @@
-"""The state of one hand, from the messages of its feed and the time since the last one."""
+"""The state of one hand, from its messages and the time since the last one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from daemon.watch.history import History
 from daemon.watch.snapshot import Line, Snapshot, Tone
 
 TICK_S = 0.02
-"""Time between two looks at the feeds, s; silence is timed this exactly."""
+"""Time between two looks at the feeds, s: silence is timed this exactly."""
 SNAPSHOTS_HZ = 10
 """Snapshots a second; a rate is taken over as many of them."""
 EXPECTED = {
@@ -38,13 +38,13 @@ EXPECTED = {
     Reason.NOT_TARED,
     Reason.NOT_ASKED,
 }
-"""Reasons of a hand that is open, or of a grasp that settles."""
+"""Reasons of an open hand, or of a grasp that settles."""
 OVERLOADED = "readings come faster than they are judged: check the PC's load, use a smaller model"
 NO_MESSAGE = "no message has come yet: is graspd running on this endpoint?"
 
 
 class View:
-    """Takes messages and gives a `Snapshot` at any time. Uses constant memory and no socket."""
+    """Takes messages and gives a `Snapshot` at any time, in constant memory."""
 
     def __init__(
         self, endpoint: str, hand: str | None = None, wall: Callable[[], float] = time.time
@@ -65,7 +65,7 @@ class View:
         self._history = History()
 
     def take(self, topic: bytes, payload: bytes, now_ns: int) -> None:
-        """Take one message that arrived at `now_ns`, monotonic ns of this computer."""
+        """Take a message that arrived at `now_ns`, monotonic."""
         kind, _, hand = topic.decode("ascii", "replace").partition(".")
         if kind not in MESSAGES or (self._hand is not None and hand != self._hand):
             return
@@ -99,7 +99,7 @@ class View:
         self._grasps.take(verdict, now_ns)
 
     def snapshot(self, now_ns: int) -> Snapshot:
-        """Return what is to be seen at `now_ns`. Call it `SNAPSHOTS_HZ` times a second."""
+        """Return what is to be seen. Call it `SNAPSHOTS_HZ` times a second."""
         tone, why = self._verdict_now(now_ns)
         silent = tone is Tone.SILENT
         last, status = self._verdict, self._status
@@ -171,7 +171,7 @@ class View:
         return Tone.STABLE, [Line("lift", "it is judged to hold"), *also]
 
     def _resting(self) -> Sequence[str]:
-        """Return the fingers that are tared, while the gate says that nothing touches."""
+        """Return the tared fingers, while the gate says that nothing touches."""
         if self._status is None or self._gate is not GateState.IDLE:
             return ()
         return self._status.tared or ()
@@ -203,7 +203,7 @@ class HandFeed(NamedTuple):
 
 
 def snapshots(hands: Sequence[HandFeed], is_over: Callable[[], bool]) -> Iterator[list[Snapshot]]:
-    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits `TICK_S`."""
+    """Yield a snapshot of each hand ten times a second until `is_over()`, which waits."""
     due_s = 0.0
     while not is_over():
         for feed, view in hands:
