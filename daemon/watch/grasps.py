@@ -6,7 +6,7 @@ from collections import Counter
 
 from daemon.judge.reasons import Decision, GateState
 from daemon.publish.messages import OutcomeMessage, Verdict
-from daemon.watch.evidence import lift
+from daemon.watch.figures import lift
 from daemon.watch.snapshot import JudgedGrasp
 
 GRASPS_MAX = 8
