@@ -92,14 +92,14 @@ def load_clients(folder: Path) -> Clients:
         raise KeysError(f"{folder}: cannot list the keys: {error.strerror}") from error
     if len(paths) > CLIENTS_MAX:
         raise KeysError(f"{folder}: more than {CLIENTS_MAX} keys")
-    found = Clients({}, [])
+    clients = Clients({}, [])
     for path in paths:
         try:
             _refuse_open(path)
-            found.admitted[load_public(path)] = path.stem
+            clients.admitted[load_public(path)] = path.stem
         except KeysError as error:
-            found.refused.append(str(error))
-    return found
+            clients.refused.append(str(error))
+    return clients
 
 
 def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
@@ -107,14 +107,14 @@ def _load(path: Path, what: str) -> tuple[bytes, bytes | None]:
         content = read_regular(path, FILE_MAX_BYTES)
     except OSError as error:
         raise KeysError(f"{path}: cannot read {what}: {error.strerror}") from error
-    found: dict[bytes, bytes] = {}
+    fields: dict[bytes, bytes] = {}
     for line in content.splitlines():
         name, is_set, value = line.partition(b"=")
         if is_set:
-            found.setdefault(name.strip(), value.strip(b" \t'\""))
-    if b"public-key" not in found:
+            fields.setdefault(name.strip(), value.strip(b" \t'\""))
+    if b"public-key" not in fields:
         raise KeysError(f"{path}: has no public key")
-    public, secret = found[b"public-key"], found.get(b"secret-key")
+    public, secret = fields[b"public-key"], fields.get(b"secret-key")
     for key in (public, secret):
         if key is not None and not Z85_KEY.fullmatch(key):
             raise KeysError(f"{path}: a key must have 40 characters of Z85")

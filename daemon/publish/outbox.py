@@ -165,7 +165,7 @@ class Outbox:
         after which subscribers take the grasp for unknown.
         """
         moment, worth = judgement.moment, judgement.assessment
-        known = judgement.decision is not Decision.UNKNOWN
+        valid = judgement.decision is not Decision.UNKNOWN
         for change in moment.changes:
             self._gate_change(judgement.t_ns, moment, change)
         now_ns = self._clock()
@@ -177,7 +177,7 @@ class Outbox:
             verdict=judgement.decision,
             verdict_code=DECISION_CODE[judgement.decision],
             p_slip=judgement.p_slip,
-            valid=known,
+            valid=valid,
             reasons=list(judgement.reasons),
             age_ms=max(now_ns - judgement.t_ns, 0) / 1e6,
             latency_us=latency_us,
@@ -189,11 +189,11 @@ class Outbox:
             silence_ms=silence_ns / 1e6,
             model=self._model,
             model_sha=self._model_sha,
-            p_slip_model=judgement.opinion.p_slip if known else None,
+            p_slip_model=judgement.opinion.p_slip if valid else None,
             outcomes=0 if worth is None else worth.outcomes,
             supervised=judgement.supervised,
             risk=None if worth is None else worth.report,
-            early=known and moment.early,
+            early=valid and moment.early,
             still_ms=moment.still_ms,
             motion=moment.motion,
             motion_limits=moment.motion_limits,

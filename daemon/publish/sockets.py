@@ -219,11 +219,11 @@ def _state(folder: Path) -> object:
     """Return a value that changes when a file in the folder, or its rights, change."""
     try:
         with os.scandir(folder) as entries:
-            found = {entry.name: _signature(entry) for entry in entries}
+            signatures = {entry.name: _signature(entry) for entry in entries}
         about = os.stat(folder)
     except OSError as error:
         return error.errno
-    return found, about.st_ino, about.st_ctime_ns
+    return signatures, about.st_ino, about.st_ctime_ns
 
 
 def _signature(entry: os.DirEntry[str]) -> object:

@@ -99,10 +99,11 @@ class Comparison(Companion):
 
 def trained_on(recordings: Sequence[Path], model: TactileModel) -> list[str]:
     """Return the names of the recordings that a model was trained on."""
-    digests, found = {dataset.sha256 for dataset in model.contract.datasets}, []
+    digests = {dataset.sha256 for dataset in model.contract.datasets}
+    names = []
     for path in recordings:
         if path.is_file():
             with path.open("rb") as file:
                 if hashlib.file_digest(file, "sha256").hexdigest() in digests:
-                    found.append(path.name)
-    return found
+                    names.append(path.name)
+    return names

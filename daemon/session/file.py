@@ -122,8 +122,8 @@ class SessionFile:
         Raises `SessionFileError`.
         """
         _write(_beside(self.path, kept.serials), kept, None)
-        newest = {path for _, path in _others(self.path)[:OTHERS_MAX]}
-        for path in set(self.path.parent.glob(_beside_any(self.path))) - newest:
+        newest = list(others(self.path))[:OTHERS_MAX]
+        for path in set(self.path.parent.glob(_beside_any(self.path))) - set(newest):
             self._remove(path)
 
     def remove(self) -> bool:
@@ -165,13 +165,9 @@ def kept_now(
     return KeptSession(tuple(fingers), dict(serials), time.time(), statistics, learned)
 
 
-def others(path: Path) -> list[KeptSession]:
+def others(path: Path) -> dict[Path, KeptSession]:
     """Return the sessions of other sensors beside `path`, the newest first."""
-    return [kept for kept, _ in _others(path)]
-
-
-def _others(path: Path) -> list[tuple[KeptSession, Path]]:
-    found = []
+    sessions = {}
     for each in path.parent.glob(_beside_any(path)):
         try:
             kept = read(each)
@@ -179,8 +175,9 @@ def _others(path: Path) -> list[tuple[KeptSession, Path]]:
             log.warning("%s; it counts for nothing", error)
             continue
         if kept is not None:
-            found.append((kept, each))
-    return sorted(found, key=lambda both: both[0].saved_at, reverse=True)
+            sessions[each] = kept
+    newest = sorted(sessions, key=lambda each: sessions[each].saved_at, reverse=True)
+    return {each: sessions[each] for each in newest}
 
 
 def _beside(path: Path, serials: Mapping[str, str]) -> Path:

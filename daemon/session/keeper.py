@@ -84,7 +84,7 @@ class SessionKeeper(SensorWatch):
         """What the file has and this run does not use."""
         self._restore()
         self._others = [
-            _state_of(kept) for kept in others(file.path) if kept.fingers == self._fingers
+            _state_of(kept) for kept in others(file.path).values() if kept.fingers == self._fingers
         ]
         """Sessions of other sensors, the newest first."""
         self._leaving: deque[SavedState] = deque(maxlen=OTHERS_MAX)
